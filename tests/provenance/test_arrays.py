@@ -31,7 +31,7 @@ NAMES = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="/"
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     arrays=st.dictionaries(NAMES, ARRAYS, max_size=4),
     metadata=st.dictionaries(
@@ -85,13 +85,10 @@ def test_rasters_are_packed_with_checksums_and_clouds_lie_plain(tmp_path: Path) 
         assert file["product/arrays/x"].id.get_offset() % 64 == 0
 
 
-@pytest.mark.parametrize("is_mapped", [True, False])
-def test_arrays_of_any_memory_layout_larger_than_a_block_come_back(
-    tmp_path: Path, is_mapped: bool
-) -> None:
+def test_arrays_of_any_memory_layout_larger_than_a_block_come_back(tmp_path: Path) -> None:
     values = np.arange(3 * 1_100_000, dtype=np.float64).reshape(-1, 3)
-    payload = Given(arrays={"columns": values.T, "every_other": values[::2]}, mapped=is_mapped)
-    digest = write_product_file(tmp_path / "a.h5", payload)
+    arrays = {"columns": values.T, "every_other": values[::2]}
+    digest = write_product_file(tmp_path / "a.h5", Given(arrays=arrays))
     stored = read_product_file(tmp_path / "a.h5")
     np.testing.assert_array_equal(stored.arrays["columns"], values.T)
     np.testing.assert_array_equal(stored.arrays["every_other"], values[::2])
@@ -149,36 +146,33 @@ import numpy as np
 from orthoflow_provenance.arrays import read_product_file, write_product_file
 from tests.provenance_records import Given
 
-noise = np.random.default_rng(0).integers(0, 255, 6_000_000, dtype=np.uint8)
-for limit_bytes in map(int, sys.argv[3:]):
-    path = Path(sys.argv[1], f"{limit_bytes}.h5")
-    # A limit on the size of files fails where a full disk does: in the middle of a write.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, resource.RLIM_INFINITY))
-    both = Given(arrays={"a": noise, "b": noise}, mapped=sys.argv[2] == "mapped")
-    try:
-        write_product_file(path, both)
-    except OSError as error:
-        print(error.errno, path.exists(), end=" ")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    write_product_file(path, Given(arrays={"a": noise}))
+path = Path(sys.argv[1], "a.h5")
+noise = np.random.default_rng(0).integers(0, 255, 1_500_000, dtype=np.uint8)
+for is_mapped in (True, False):
+    both = Given(arrays={"a": noise, "b": noise}, mapped=is_mapped)
+    for limit_bytes in (0, 1000, 750_000, 2_999_000, 3_001_000):
+        # A limit on the size of files fails where a full disk does: in the middle of a write.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, resource.RLIM_INFINITY))
+        try:
+            write_product_file(path, both)
+        except OSError as error:
+            print(error.errno, path.exists())
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    write_product_file(path, both)
     print(read_product_file(path).arrays["a"].sum() == noise.sum())
+    path.unlink()
 """
 
 
-@pytest.mark.parametrize("layout", ["mapped", "packed"])
-def test_a_full_disk_is_an_ordinary_error_and_the_process_lives(
-    tmp_path: Path, layout: str
-) -> None:
-    limits = [0, 1000, 3_000_000, 11_999_000, 12_001_000]
-    command = [sys.executable, "-c", FULL_DISK, str(tmp_path), layout, *map(str, limits)]
+def test_a_full_disk_is_an_ordinary_error_and_the_process_lives(tmp_path: Path) -> None:
     root = Path(__file__).resolve().parents[2]
-    path = [str(root), str(root / "provenance")]
     done = subprocess.run(
-        command,
+        [sys.executable, "-c", FULL_DISK, str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
-        env={"PYTHONPATH": ":".join(path), "PYTHONDONTWRITEBYTECODE": "1"},
+        env={"PYTHONPATH": f"{root}:{root / 'provenance'}", "PYTHONDONTWRITEBYTECODE": "1"},
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == "27 False True\n" * 5  # EFBIG, the half-written file is gone
+    # EFBIG, the half-written file is gone.
+    assert done.stdout == ("27 False\n" * 5 + "True\n") * 2

@@ -6,25 +6,20 @@ import dataclasses
 import hashlib
 import json
 import os
-import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from orthoflow_provenance import record as module
 from orthoflow_provenance.arrays import payload_digest
 from orthoflow_provenance.document import (
     RUN_FORMAT,
     InputFileError,
-    PublishedFile,
-    RecordedCell,
-    RecordedEnvironment,
+    Metric,
     RecordedFile,
     RecordedInput,
     RecordFormatError,
@@ -39,101 +34,50 @@ from tests.provenance_records import cloud_payload, sample_record, walls_payload
 
 WALL = "wall@plane=hough2d,orient=pnp#2"
 
-TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
-NAME = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="/"), min_size=1).map(
-    lambda text: f"n{text}"
-)
-NUMBER = st.floats(allow_nan=False, allow_infinity=False)
-SHORT = st.integers(-(2**62), 2**62)
-UNIQUE: dict[type, Callable[[Any], str]] = {
-    RecordedCell: lambda cell: cell.address,
-    RecordedEnvironment: lambda environment: environment.id,
-    RecordedInput: lambda entry: entry.name,
-}
-JSON_VALUE = st.none() | st.booleans() | st.integers() | TEXT | st.lists(TEXT, max_size=3)
 
-
-# Any: what a dataclass's field may hold.
-def of_type(kind: Any) -> st.SearchStrategy[Any]:
-    """Values of the types that the dataclasses of a record declare."""
-    origin, parts = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind):
-        return of_class(kind)
-    if origin is Literal:
-        return st.sampled_from(parts)
-    if origin is tuple:
-        return st.lists(of_type(parts[0]), max_size=3, unique_by=UNIQUE.get(parts[0])).map(tuple)
-    if origin is Mapping:
-        return st.dictionaries(NAME, of_type(parts[1]), max_size=3)
-    if origin in (Union, UnionType):
-        return st.one_of(*map(of_type, parts))
-    plain = {str: TEXT, float: NUMBER, bool: st.booleans(), bytes: st.binary(max_size=20)}
-    return plain.get(kind, {int: SHORT, type(None): st.none()}.get(kind, JSON_VALUE))
-
-
-def of_class(kind: type) -> st.SearchStrategy[Any]:
-    hints = typing.get_type_hints(kind)
-    fields = {name: of_type(hint) for name, hint in hints.items()}
-    if kind in UNIQUE:
-        fields[{RecordedCell: "address", RecordedEnvironment: "id"}.get(kind, "name")] = NAME
-    if kind is RecordedFile:
-        fields["name"] = TEXT.map(lambda text: text.replace("/", ""))
-    if "embedded" in fields:  # neither products nor files lie where the test writes records
-        fields["embedded"] = st.just(value=False)
-    return st.builds(kind, **fields)
-
-
-@settings(max_examples=25)
-@given(of_class(RunRecord))
-def test_any_record_comes_back_as_it_was_written(
-    tmp_path_factory: pytest.TempPathFactory, record: RunRecord
-) -> None:
-    path = tmp_path_factory.mktemp("record") / "run.h5"
-    write_record(path, record, lambda _: None, keep_folders=True)
-    read = read_record(path)
-    assert read == record
-    for cell, written in zip(read.cells, record.cells, strict=True):
-        assert list(cell.assignment) == list(written.assignment)
-
-
-def test_equal_runs_give_equal_files(tmp_path: Path) -> None:
+def test_a_record_comes_back_and_equal_runs_give_equal_files(tmp_path: Path) -> None:
     path, record, shelf = write_sample(tmp_path)
-    seal = write_record(tmp_path / "again.h5", record, shelf.find)
+    odd = "\t\x1b[2J\u2028 e\u0301 \U0001f469\r\n"
+    cell = dataclasses.replace(
+        record.cells[1],
+        log=odd,
+        warnings=("", odd),
+        params={odd: [2**70, -0.0, None, {"": "1"}]},
+        metrics=(Metric(name=odd, value=5e-324, unit="1"),),
+    )
+    record = dataclasses.replace(record, cells=(record.cells[0], cell), name=odd, status="ok")
+    seal = write_record(path, record, shelf.find)
+    assert read_record(path) == record
+    assert list(read_record(path).cells[1].assignment) == ["plane", "orient"]
+    write_record(tmp_path / "again.h5", record, shelf.find)
     assert (tmp_path / "again.h5").read_bytes() == path.read_bytes()
     with safe_open(path, RUN_FORMAT) as file:
         assert file.attrs["content_sha256"] == seal.encode()
 
 
-def test_an_embedded_product_comes_back_with_its_digest(tmp_path: Path) -> None:
-    path, _, _ = write_sample(tmp_path)
+def test_embedded_products_come_back_and_others_are_named_by_their_digest(tmp_path: Path) -> None:
+    path, record, _ = write_sample(tmp_path)
     with open_record(path) as opened:
         stored = opened.payload(WALL, "walls")
+        with pytest.raises(RecordFormatError, match=r"by its digest only, sha256:.*--embed"):
+            opened.payload("cloud", "cloud")
+        with pytest.raises(RecordFormatError, match="no output walls of the cell nowhere"):
+            opened.payload("nowhere", "walls")
     assert stored.digest == payload_digest(stored) == payload_digest(walls_payload())
     np.testing.assert_array_equal(
         stored.arrays["walls/0/depth_m"], walls_payload().arrays["walls/0/depth_m"]
     )
-
-
-def test_an_embedded_cloud_is_mapped_from_the_record_and_outlives_it(tmp_path: Path) -> None:
-    path, record, _ = write_sample(tmp_path, embed=True)
+    write_sample(tmp_path, embed=True)
     assert verify_record(path) == ()
     with open_record(path) as opened:
         stored = opened.payload("cloud", "cloud")
         outputs = [out for cell in opened.record.cells for out in cell.outputs.values()]
     assert all(output.embedded for output in outputs)
+    assert not record.cells[0].outputs["cloud"].embedded
+    # Mapped arrays outlive the open file.
     assert isinstance(stored.arrays["x"].base, np.memmap)
     assert stored.arrays["x"].flags.aligned
     np.testing.assert_array_equal(stored.arrays["x"], cloud_payload().arrays["x"])
-    assert not any(out.embedded for cell in record.cells[:1] for out in cell.outputs.values())
-
-
-def test_a_product_that_is_not_embedded_is_named_by_its_digest(tmp_path: Path) -> None:
-    path, _, _ = write_sample(tmp_path)
-    with open_record(path) as opened:
-        with pytest.raises(RecordFormatError, match=r"by its digest only, sha256:.*--embed"):
-            opened.payload("cloud", "cloud")
-        with pytest.raises(RecordFormatError, match="no output walls of the cell nowhere"):
-            opened.payload("nowhere", "walls")
 
 
 def test_a_product_that_left_the_store_cannot_be_embedded(tmp_path: Path) -> None:
@@ -192,55 +136,29 @@ def test_folders_stay_out_of_the_record(tmp_path: Path) -> None:
     assert read_record(path) == told
 
 
-def test_what_is_no_record_is_a_finding_and_an_error(tmp_path: Path) -> None:
-    _, _, shelf = write_sample(tmp_path)
-    (product,) = [shelf.files[digest] for digest in list(shelf.files)[:1]]
-    with pytest.raises(
-        RecordFormatError, match="must be of format orthoflow-run, got 'orthoflow-p"
-    ):
-        read_record(product)
-    (tmp_path / "run.h5").unlink()
-    (finding,) = verify_record(tmp_path / "run.h5")
-    assert "No such file" in finding.problem
-    with pytest.raises(FileNotFoundError):
-        read_record(tmp_path / "run.h5")
-
-
 def test_any_changed_byte_is_found(tmp_path: Path) -> None:
-    path, _, _ = write_sample(tmp_path, embed=True)
+    path, _, _ = write_sample(tmp_path)
     content = path.read_bytes()
     rng = np.random.default_rng(11)
-    with h5py.File(path) as file:
-        spans = [
-            (item.id.get_offset(), item.id.get_storage_size())
-            for item in _datasets(file)
-            if item.id.get_offset() is not None
-        ]
-    inside = [start + int(rng.integers(length)) for start, length in spans if length]
-    for offset in (*inside, *rng.integers(0, len(content), 60)):
+    for offset in rng.integers(0, len(content), 40):
         flipped = bytearray(content)
         flipped[offset] ^= 1 << int(rng.integers(8))
         path.write_bytes(flipped)
         assert verify_record(path), offset
 
 
-def _datasets(group: h5py.Group) -> Iterator[h5py.Dataset]:
-    for item in group.values():
-        if isinstance(item, h5py.Dataset):
-            yield item
-        else:
-            yield from _datasets(item)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
-def test_a_truncated_record_is_a_finding(tmp_path: Path, share: float) -> None:
-    path, _, _ = write_sample(tmp_path)
+def test_a_truncated_record_and_what_is_none_are_findings(tmp_path: Path) -> None:
+    path, _, shelf = write_sample(tmp_path)
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * share)])
-    (finding,) = verify_record(path)
-    assert finding.code in ("damaged", "foreign")
-    with pytest.raises(RecordFormatError, match=r"^run\.h5"):
-        read_record(path)
+    for share, code in ((0.0, "foreign"), (0.3, "damaged"), (0.999, "damaged")):
+        path.write_bytes(content[: int(len(content) * share)])
+        assert [found.code for found in verify_record(path)] == [code]
+        with pytest.raises(RecordFormatError, match=r"^run\.h5"):
+            read_record(path)
+    path.unlink()
+    assert "No such file" in verify_record(path)[0].problem
+    with pytest.raises(RecordFormatError, match="of format orthoflow-run, got 'orthoflow-product'"):
+        read_record(next(iter(shelf.files.values())))
 
 
 @pytest.mark.parametrize("is_sealed_again", [False, True])
@@ -259,10 +177,6 @@ def test_bytes_behind_the_end_are_found(tmp_path: Path, *, is_sealed_again: bool
 # --- changes made with a program ------------------------------------------------------------------
 
 
-def _attribute(place: str, name: str, value: object) -> Callable[[h5py.File], None]:
-    return lambda file: file[place].attrs.__setitem__(name, value)
-
-
 def _order_links(file: h5py.File) -> None:
     properties = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
     properties.set_link_creation_order(h5py.h5p.CRT_ORDER_TRACKED)
@@ -273,62 +187,53 @@ def _order_links(file: h5py.File) -> None:
     file.move("new", "inputs")
 
 
-def _change_metric(file: h5py.File) -> None:
+def _change_objects(file: h5py.File) -> set[str]:
+    """Change objects that repeat the document, each in another way, and name their places."""
+    file["cells/cloud"].attrs["wall_s"] = 0.5
+    file["cells/ortho"].attrs["note"] = 1
+    wall = file[f"cells/{WALL}"].attrs
+    wall["wall_s"] = np.float32(wall["wall_s"])
+    (environment,) = file["environments"].values()
+    del environment.attrs["python"]
+    file.attrs["created_by"] = np.bytes_(b"other")
     table = file["metrics"][()]
     table["value"][-1] += 1
     file["metrics"][...] = table
-
-
-def _retype(file: h5py.File) -> None:
-    value = file["cells/cloud"].attrs["wall_s"]
-    del file["cells/cloud"].attrs["wall_s"]
-    file["cells/cloud"].attrs["wall_s"] = np.float32(value)
-
-
-def _array(file: h5py.File) -> h5py.Dataset:
-    (product,) = file["products"].values()
-    return product["arrays/walls/0/mask"]
-
-
-def _change_array(file: h5py.File) -> None:
-    _array(file)[3, 4] ^= 1
-
-
-OBJECTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
-    "attribute of a cell": (_attribute("cells/cloud", "wall_s", 0.5), "/cells/cloud"),
-    "attribute of the file": (_attribute("/", "created_by", np.bytes_(b"other")), "/"),
-    "attribute added": (_attribute("cells/cloud", "note", 1), "/cells/cloud"),
-    "attribute removed": (
-        lambda file: file["cells/cloud"].attrs.__delitem__("step"),
-        "/cells/cloud",
-    ),
-    "type of an attribute": (_retype, "/cells/cloud"),
-    "metric": (_change_metric, "/metrics"),
-    "links in another order": (_order_links, "/inputs"),
-    "dataset added": (lambda file: file.__setitem__("cells/cloud/notes", 3), "/cells/cloud/notes"),
-    "group added": (lambda file: file.create_group("notes"), "/notes"),
-    "file added": (lambda file: file.__setitem__("files/x", np.zeros(3, "u1")), "/files/x"),
-    "product added": (lambda file: file.create_group("products/x"), "/products/x"),
-    "log removed": (lambda file: file.__delitem__("cells/cloud/log"), "/cells/cloud/log"),
-    "cell added": (lambda file: file.copy("cells/ortho", "cells/ortho2"), "/cells/ortho2"),
-    "content digest": (_attribute("/", "content_sha256", np.bytes_(b"0" * 64)), "/"),
-}
+    _order_links(file)
+    file["cells/cloud/notes"] = 3
+    file.create_group("notes")
+    file["files/x"] = np.zeros(3, "u1")
+    file.create_group("products/x")
+    del file["cells/cloud/log"]
+    file["cells/ortho/log"][...] = b"?"
+    file.copy("cells/ortho", "cells/ortho2")
+    return {
+        *("/", "/cells/cloud", "/cells/ortho", f"/cells/{WALL}", environment.name, "/metrics"),
+        *("/inputs", "/cells/cloud/notes", "/notes", "/files/x", "/products/x"),
+        *("/cells/cloud/log", "/cells/ortho/log", "/cells/ortho2"),
+    }
 
 
 @pytest.mark.parametrize("is_sealed_again", [False, True])
-@pytest.mark.parametrize(("change", "place"), OBJECTS.values(), ids=OBJECTS)
 def test_what_the_document_does_not_say_is_found_even_when_sealed(
-    tmp_path: Path, change: Callable[[h5py.File], object], place: str, *, is_sealed_again: bool
+    tmp_path: Path, *, is_sealed_again: bool
 ) -> None:
     path, _, _ = write_sample(tmp_path)
     with h5py.File(path, "r+") as file:
-        change(file)
+        changed = _change_objects(file)
+        inside = {f"/cells/ortho2/{name}" for name in file["cells/ortho"]}
         if is_sealed_again:
             hostile.seal(file)
     findings = verify_record(path)
-    assert place in {found.place for found in findings if found.code == "object"}, findings
-    assert is_sealed_again or "seal" in {found.code for found in findings}
-    assert place in {found.place for found in verify_record(path, with_arrays=False)}
+    assert {found.place for found in findings if found.code == "object"} == changed | inside
+    assert ("seal" in {found.code for found in findings}) is not is_sealed_again
+    places = {found.place for found in verify_record(path, with_arrays=False)}
+    assert places == changed | inside
+    write_sample(tmp_path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["content_sha256"] = np.bytes_(b"0" * 64)
+        hostile.seal(file)
+    assert [found[:2] for found in verify_record(path)] == [("object", "/")]
 
 
 @pytest.mark.parametrize(
@@ -352,7 +257,8 @@ def test_arrays_that_are_not_what_their_digest_says_are_not_read(
 ) -> None:
     path, _, _ = write_sample(tmp_path)
     with h5py.File(path, "r+") as file:
-        _change_array(file)
+        (product,) = file["products"].values()
+        product["arrays/walls/0/mask"][3, 4] ^= 1
         if is_sealed_again:
             hostile.seal(file)
     assert "product" in {found.code for found in verify_record(path)}
@@ -363,60 +269,72 @@ def test_arrays_that_are_not_what_their_digest_says_are_not_read(
         opened.payload(WALL, "walls")
 
 
-def _set(address: str, **values: object) -> Callable[[hostile.Record], None]:
-    return lambda record: record.cell(address).update(values)
+def _contradict(record: hostile.Record) -> None:
+    cloud, wall, failed = record.document["cells"]
+    cloud.update(wall_s=-1.0, key="f" * 64, environment="x", step="../x")
+    cloud["outputs"]["cloud"].update(digest="md5:0")
+    wall.update(key="", started="", error_message="")
+    wall["metrics"][0].update(unit="")
+    failed.update(error_message="", outputs={"..": {**wall["outputs"]["walls"], "source": ""}})
+    record.document["inputs"][0]["files"][0].update(name="/home/a.laz", sha256="0")
+    record.document.update(run_id="", status="ok", workflow_resolved="{'seed': 7}")
+    record.name_published("../ortho.tif", "a", "A")
+    record.add_figure(WALL, "Residuals")
+    record.add_figure(WALL, "nul")
+    record.add_figure("ortho", "depth", "text/html")
 
 
-def _set_run(**values: object) -> Callable[[hostile.Record], None]:
-    return lambda record: record.document.update(values)
-
-
-CONTRADICTIONS: dict[str, tuple[Callable[[hostile.Record], object], str, str]] = {
-    "infinite metric": (
-        lambda record: record.cell(WALL)["metrics"][0].update(unit=""),
-        "field",
-        f"/cells/{WALL}/metrics",
-    ),
-    "negative time": (_set("cloud", wall_s=-1.0), "field", "/cells/cloud@wall_s"),
-    "key": (_set("cloud", key="f" * 64), "key", "/cells/cloud@key"),
-    "no key": (_set("cloud", key=""), "field", "/cells/cloud"),
-    "environment": (_set("cloud", environment="x"), "reference", "/cells/cloud@environment"),
-    "status of the run": (_set_run(status="ok"), "field", "/@status"),
-    "impossible status": (_set("cloud", status="fine"), "document", "/document"),
-    "no run id": (_set_run(run_id=""), "field", "/"),
-    "seed": (_set_run(seed="seven"), "document", "/document"),
-    "repeat": (_set("cloud", repeat=True), "document", "/document"),
-    "unknown field": (_set("cloud", colour="blue"), "document", "/document"),
-    "missing field": (lambda record: record.cell("cloud").pop("log"), "document", "/document"),
-    "parameters": (_set("cloud", params=[]), "document", "/document"),
-    "input differs from its source": (
-        lambda record: record.cell(WALL)["inputs"]["cloud"].update(digest="sha256:" + "0" * 64),
-        "reference",
-        f"/cells/{WALL}/inputs/cloud",
-    ),
-    "digest": (
-        lambda record: record.cell("cloud")["outputs"]["cloud"].update(digest="md5:0"),
-        "reference",
-        "/cells/cloud/outputs/cloud",
-    ),
-    "resolved workflow": (_set_run(workflow_resolved="{'seed': 7}"), "field", "/document"),
-    "folder of an input file": (
-        lambda record: record.document["inputs"][0]["files"][0].update(name="/home/a.laz"),
-        "name",
-        "/inputs/scan",
-    ),
-}
-
-
-@pytest.mark.parametrize(("change", "code", "place"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
-def test_records_that_contradict_themselves_are_found_even_when_sealed(
-    tmp_path: Path, change: Callable[[hostile.Record], object], code: str, place: str
-) -> None:
+def test_records_that_contradict_themselves_are_found_even_when_sealed(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
-    hostile.reseal(path, change)
-    found = {(finding.code, finding.place) for finding in verify_record(path)}
-    assert (code, place) in found
-    assert "seal" not in {code for code, _ in found}
+    hostile.reseal(path, _contradict)
+    wall = f"/cells/{WALL}"
+    assert Counter((found.code, found.place) for found in verify_record(path)) == {
+        ("field", "/"): 1,
+        ("field", "/@status"): 1,
+        ("field", "/document"): 1,
+        ("name", "/inputs/scan"): 1,
+        ("field", "/inputs/scan"): 1,
+        ("name", "/published"): 2,
+        ("name", "/cells/cloud@step"): 1,
+        ("name", f"{wall}/figures"): 1,
+        ("field", f"{wall}/figures"): 1,
+        ("name", "/cells/ortho/figures"): 1,
+        ("name", "/cells/ortho/outputs/.."): 1,
+        ("key", "/cells/cloud@key"): 1,
+        ("reference", "/cells/cloud@environment"): 1,
+        ("field", "/cells/cloud@wall_s"): 1,
+        ("reference", "/cells/cloud/outputs/cloud"): 1,
+        ("field", wall): 2,
+        ("field", f"{wall}/metrics"): 1,
+        ("reference", f"{wall}/inputs/cloud"): 1,
+        ("field", "/cells/ortho"): 1,
+    }
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"status": "fine"},
+        {"repeat": True},
+        {"seed": "seven"},
+        {"params": []},
+        {"colour": "blue"},
+        {"log": ...},
+    ],
+    ids=str,
+)
+def test_a_document_with_other_fields_or_types_is_found(
+    tmp_path: Path, change: dict[str, object]
+) -> None:
+    def write(record: hostile.Record) -> None:
+        cell = record.cell("cloud")
+        cell |= change
+        for name in [name for name, value in change.items() if value is ...]:
+            del cell[name]
+
+    path, _, _ = write_sample(tmp_path)
+    hostile.reseal(path, write)
+    assert [found[:2] for found in verify_record(path)] == [("document", "/document")]
 
 
 @pytest.mark.parametrize(
@@ -427,8 +345,6 @@ def test_a_document_of_another_form_is_found(tmp_path: Path, text: str) -> None:
     with h5py.File(path, "r+") as file:
         hostile.rewrite(file, text)
     assert "document" in {finding.code for finding in verify_record(path)}
-    with pytest.raises(RecordFormatError):
-        read_record(path)
 
 
 def test_seal_and_digests_are_those_that_the_specification_describes(tmp_path: Path) -> None:
@@ -481,17 +397,12 @@ def write_embedded(folder: Path, contents: tuple[bytes, ...], name: str = "photo
     return path
 
 
-@settings(max_examples=15)
-@given(st.lists(st.binary(max_size=5000), max_size=4).map(tuple))
-def test_any_files_come_back_with_their_bytes(
-    tmp_path_factory: pytest.TempPathFactory, contents: tuple[bytes, ...]
-) -> None:
-    folder = tmp_path_factory.mktemp("embedded")
-    path = write_embedded(folder, contents)
+def test_embedded_files_come_back_with_their_bytes(tmp_path: Path) -> None:
+    path = write_embedded(tmp_path, CONTENTS)
     assert verify_record(path) == ()
-    taken = extract_files(path, read_record(path).inputs, folder / "out")
-    assert tuple(file.read_bytes() for file in taken["photos"]) == contents
-    assert {file.name for file in taken["photos"]} <= {"photo.jpg"}
+    taken = extract_files(path, read_record(path).inputs, tmp_path / "out")
+    assert tuple(file.read_bytes() for file in taken["photos"]) == CONTENTS
+    assert {file.name for file in taken["photos"]} == {"photo.jpg"}
 
 
 def test_a_changed_byte_is_named_and_not_taken_out(tmp_path: Path) -> None:
@@ -524,12 +435,3 @@ def test_a_file_that_changed_or_is_gone_is_not_embedded(tmp_path: Path) -> None:
         with pytest.raises(InputFileError, match=sentence):
             write_record(tmp_path / "run.h5", record, lambda _: None, input_file=find)
     assert not (tmp_path / "run.h5").exists()
-
-
-@pytest.mark.parametrize("path", ["../ortho.tif", "/etc/passwd", "products//ortho.tif", ""])
-def test_published_files_lie_below_the_folder_of_the_record(tmp_path: Path, path: str) -> None:
-    published = PublishedFile(path=path, size_bytes=1, sha256="0" * 64)
-    record = dataclasses.replace(record_with(()), published=(published,))
-    write_record(tmp_path / "run.h5", record, lambda _: None)
-    [finding] = verify_record(tmp_path / "run.h5")
-    assert finding.place == "/published"

@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import h5py
 import pytest
 
 from orthoflow.diagnostics import PLAIN_WARNING
@@ -18,7 +17,6 @@ from orthoflow.records.verify import verify_run
 from tests import hostile_records as hostile
 from tests.studios import Studio, open_studio
 
-LEADING_OUT = ("/out", "..", "nul", "a\x1b]0;b")
 COMMANDS = (
     ("show",),
     ("report",),
@@ -81,39 +79,9 @@ def test_names_that_lead_elsewhere_are_found_and_nothing_is_written_there(
         done = finished(command[0], run, *command[1:])
         assert done.exit_code == (3 if command[0] == "replay" else done.exit_code), done.output
         assert done.exit_code in (0, 3), (command, done.output)
+        if what == "figure" and command in (("report",), ("export", "--to", "figures")):
+            assert "so its file cannot be written" in done.output
     assert everything(tmp_path) == before
-
-
-@pytest.mark.parametrize("name", LEADING_OUT, ids=ascii)
-def test_figures_with_impossible_names_are_found_and_not_written(
-    finished: Studio, folder: Path, name: str
-) -> None:
-    run = hostile.changed(
-        finished.folder / "first", folder / "run", lambda record: NAMED["figure"](record, name)
-    )
-    assert verify_run(run).findings
-    (run / "report.html").unlink()
-    for command in (("report", run), ("export", run, "--to", "figures", "-o", "drawn")):
-        done = finished(*command)
-        assert done.exit_code == 3, done.output
-        assert "so its file cannot be written" in done.output
-    assert sorted(path.name for path in folder.iterdir()) == ["run"]
-    assert not (run / "report.html").exists()
-
-
-def test_a_cell_that_no_path_can_name_is_refused_whatever_is_asked(
-    finished: Studio, folder: Path
-) -> None:
-    run = hostile.changed(finished.folder / "first", folder / "run", lambda record: None)
-    with h5py.File(run / "run.h5", "r+") as file:
-        cells = file["cells"].id
-        cells.links.move(b"paint", cells, b"..")
-        hostile.seal(file)
-    for command in (("verify",), *COMMANDS):
-        done = finished(command[0], run, *command[1:])
-        assert done.exit_code == 3, (command, done.output)
-        assert "is not a place in a record" in done.output
-    assert sorted(path.name for path in folder.iterdir()) == ["run"]
 
 
 def test_figures_that_some_systems_take_for_one_are_not_laid_over_each_other(
@@ -159,17 +127,11 @@ def test_links_and_devices_beside_a_record_are_not_followed(
     assert b"secret" not in b"".join(
         p.read_bytes() for p in Path("other").rglob("*") if p.is_file()
     )
-
-
-def test_a_folder_of_products_elsewhere_is_not_followed(
-    finished: Studio, folder: Path, tmp_path: Path
-) -> None:
-    run = hostile.changed(finished.folder / "first", folder / "run", lambda record: None)
     (run / "products").rename(tmp_path / "elsewhere")
     (run / "products").symlink_to(tmp_path / "elsewhere")
     done = finished("verify", run)
     assert done.exit_code == 3
-    assert "a link, a folder or a device in place of the published file" in done.output
+    assert done.output.count("a link, a folder or a device in place of the published file") == 3
     assert finished.json("show", run)["files"] == []
 
 
@@ -198,7 +160,6 @@ def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> No
     [
         (("report",), "figures"),
         (("export", "--to", "csv"), "export"),
-        (("export", "--to", "figures"), "export/figures"),
         (("export", "--to", "ro-crate"), "export/ro-crate"),
         (("export", "--embed"), "embedded"),
     ],
@@ -260,29 +221,6 @@ def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Pa
     assert not re.search("^verified: 9", "".join(outputs), re.MULTILINE)
 
 
-def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path) -> None:
-    def write(record: hostile.Record) -> None:
-        record.cell("paint")["metrics"] = [
-            {
-                "name": name,
-                "value": value,
-                "unit": unit,
-                "label": "",
-                "better": "",
-                "description": "",
-                "headline": False,
-                "counted_by": "",
-            }
-            for name, value, unit in (("=HYPERLINK(1)", -1.5, "@unit"), ("plain", 2.0, "1"))
-        ]
-
-    run = hostile.changed(finished.folder / "first", folder / "run", write)
-    assert finished("export", run, "--to", "csv", "-o", "csv").exit_code == 0
-    text = Path("csv/metrics.csv").read_text()
-    assert '"paint","paint","paint.plain","\'=HYPERLINK(1)",-1.5,"\'@unit"\n' in text
-    assert '"paint","paint","paint.plain","plain",2.0,"1"\n' in text
-
-
 def test_a_document_with_halves_of_letters_is_refused(finished: Studio, folder: Path) -> None:
     def write(record: hostile.Record) -> None:
         record.cell("paint")["params"] = {"odd": "a\ud800"}
@@ -307,34 +245,14 @@ def test_pictures_that_cannot_be_decoded_are_not_counted(finished: Studio, folde
     assert [path.name for path in Path("drawn/paint").iterdir()] == ["good.png"]
 
 
-def test_drawings_that_run_something_are_not_written(
-    finished: Studio, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    active = b'<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>'
-    monkeypatch.setattr(hostile, "PNG", active)
-    run = hostile.changed(
-        finished.folder / "first",
-        folder / "run",
-        lambda record: record.add_figure("paint", "active", "image/svg+xml"),
-    )
-    (run / "report.html").unlink()
-    for command in (("report", run), ("export", run, "--to", "figures", "-o", "drawn")):
-        done = finished(*command)
-        assert done.exit_code == 0, done.output
-    assert not [path for path in folder.rglob("*") if path.name == "active.svg"]
-
-
-@pytest.mark.parametrize(
-    "facts", [{"tools": [1], "code": {"framework": None}}, {"tools": {"numpy": {"\x1b[2J": [1]}}}]
-)
 def test_odd_facts_under_a_key_of_their_own_change_no_replay(
-    finished: Studio, folder: Path, facts: dict[str, object]
+    finished: Studio, folder: Path
 ) -> None:
-    run = hostile.changed(
-        finished.folder / "first",
-        folder / "run",
-        lambda record: record.rewrite_preimage("paint", **facts),
-    )
+    def write(record: hostile.Record) -> None:
+        record.rewrite_preimage("survey", tools=[1], code={"framework": None})
+        record.rewrite_preimage("paint", tools={"numpy": {"\x1b[2J": [1]}})
+
+    run = hostile.changed(finished.folder / "first", folder / "run", write)
     assert verify_run(run).findings == ()
     done = finished("replay", run, "-o", "again")
     assert done.exit_code == 0, done.output

@@ -8,7 +8,7 @@ import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from unittest.mock import DEFAULT, Mock
 
 import h5py
 import numpy as np
@@ -73,32 +73,17 @@ def executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Executed:
     return Executed(outcome, plan, workflow, tmp_path / "run", store)
 
 
-@pytest.mark.parametrize(("n_lost", "n_executed"), [(0, 1), (1, 2), (3, 4), (4, 4)])
+@pytest.mark.parametrize("n_lost", [0, 1, 3, 4])
 @pytest.mark.parametrize("at", ["execute", "write"])
-def test_what_the_store_lost_is_computed_again_three_times(
-    n_lost: int, n_executed: int, at: str
-) -> None:
-    attempts: list[int] = []
-
-    def lose(where: str) -> None:
-        if where == at and len(attempts) <= n_lost:
-            raise DamageError("the store lost it")
-
-    def execute() -> Any:
-        attempts.append(len(attempts))
-        lose("execute")
-        return attempts[-1]
-
-    def write(outcome: Any) -> Any:
-        lose("write")
-        return outcome
-
+def test_what_the_store_lost_is_computed_again_three_times(n_lost: int, at: str) -> None:
+    steps = {"execute": Mock(return_value="outcome"), "write": Mock(return_value="run")}
+    steps[at].side_effect = [*[DamageError("the store lost it")] * n_lost, DEFAULT]
     if n_lost == 4:
         with pytest.raises(DamageError):
-            executed_and_written(execute, write)
+            executed_and_written(**steps)
     else:
-        assert executed_and_written(execute, write) == (n_lost, n_lost)
-    assert len(attempts) == n_executed
+        assert executed_and_written(**steps) == ("outcome", "run")
+    assert steps["execute"].call_count == min(n_lost + 1, 4)
 
 
 def test_the_record_has_no_name_while_the_report_is_written(executed: Executed) -> None:
@@ -111,9 +96,15 @@ def test_the_record_has_no_name_while_the_report_is_written(executed: Executed) 
         # Nor does anybody else go on with the run meanwhile.
         assert is_running(run.folder)
 
-    executed.write(before_finish=look)
+    run = executed.write(before_finish=look)
     assert seen == [(False, 1)]
     assert (executed.folder / "run.h5").is_file()
+    # Copies do not share their bytes with the store.
+    [planes] = [path for path in run.files["survey"] if path.name == "planes.json"]
+    [stored, *_] = executed.store.published_files(run.cells["survey"].outputs["planes"].digest)
+    before = stored.read_bytes()
+    planes.write_text("edited", encoding="utf-8")
+    assert stored.read_bytes() == before
 
 
 def test_a_failing_report_leaves_the_run_unfinished_and_the_next_attempt_cleans_up(
@@ -170,61 +161,40 @@ def test_a_run_that_is_not_finished_opens_as_far_as_it_is(executed: Executed) ->
 
 @pytest.mark.parametrize(
     ("error_type", "expected"),
-    [("MethodError", ("failed", "MethodError")), ("CancelledStepError", ("skipped", NOT_YET))],
+    [
+        ("MethodError", ("failed", "MethodError", "failed")),
+        ("CancelledStepError", ("skipped", NOT_YET, "ok")),
+    ],
 )
 def test_an_unfinished_run_names_what_failed_and_not_what_was_interrupted(
-    executed: Executed, error_type: str, expected: tuple[str, str]
+    executed: Executed, error_type: str, expected: tuple[str, str, str]
 ) -> None:
     begin_run(executed.plan, executed.workflow, executed.folder, executed.store, "later")
     with Journal(executed.folder, executed.plan.name) as journal:
-        journal.write(
-            "finished",
-            address="paint",
-            key="0" * 64,
-            status="failed",
-            error="no paint",
-            error_type=error_type,
-        )
+        facts = {"key": "0" * 64, "status": "failed", "error": "no paint"}
+        journal.write("finished", address="paint", error_type=error_type, **facts)
     run = open_run(executed.folder)
-    assert (run.cells["paint"].status, run.cells["paint"].error_type) == expected
-    assert run.record.status == ("failed" if expected[0] == "failed" else "ok")
+    paint = run.cells["paint"]
+    assert (paint.status, paint.error_type, run.record.status) == expected
 
 
-def test_copies_do_not_share_their_bytes_with_the_store(executed: Executed) -> None:
-    run = executed.write()
-    [planes] = [path for path in run.files["survey"] if path.name == "planes.json"]
-    digest = run.cells["survey"].outputs["planes"].digest
-    [stored, *_] = executed.store.published_files(digest)
-    before = stored.read_bytes()
-    planes.write_text("edited", encoding="utf-8")
-    assert stored.read_bytes() == before
+def test_what_cannot_be_recorded_leaves_the_run_unfinished(executed: Executed) -> None:
+    def with_paint(**facts: object) -> Executed:
+        results = dict(executed.outcome.results)
+        results["paint"] = dataclasses.replace(results["paint"], **facts)
+        outcome = dataclasses.replace(executed.outcome, results=results)
+        return dataclasses.replace(executed, outcome=outcome)
 
-
-def test_what_the_store_lost_is_named(executed: Executed) -> None:
     figure = FigureRef(name="plan", caption="", media_type="image/png", sha256="0" * 64)
-    results = dict(executed.outcome.results)
-    results["paint"] = dataclasses.replace(results["paint"], figures=(figure,))
-    outcome = dataclasses.replace(executed.outcome, results=results)
     with pytest.raises(StoreError, match=r"needs \(the figure plan is damaged\)"):
-        dataclasses.replace(executed, outcome=outcome).write()
+        with_paint(figures=(figure,)).write()
+    # The disk refused a step.
+    refused = with_paint(status="failed", error_type="StoreError", error_message="I/O error")
+    with pytest.raises(StoreError, match=r"paint failed: I/O.* same command with -o .* continues"):
+        refused.write()
     shutil.rmtree(executed.store.objects)
     with pytest.raises(StoreError, match="has no intact product sha256:"):
         executed.write()
-    assert not (executed.folder / "run.h5").exists()
-
-
-def test_a_run_is_not_finished_in_which_the_disk_refused_a_step(executed: Executed) -> None:
-    refused = dataclasses.replace(
-        executed.outcome.results["paint"],
-        status="failed",
-        error_type="StoreError",
-        error_message="cannot write to the store: Input/output error",
-        exit_code=1,
-    )
-    results = {**executed.outcome.results, "paint": refused}
-    outcome = dataclasses.replace(executed.outcome, results=results)
-    with pytest.raises(StoreError, match=r"paint failed: .* the same command with -o .* continues"):
-        dataclasses.replace(executed, outcome=outcome).write()
     assert not (executed.folder / "run.h5").exists()
 
 
@@ -244,10 +214,9 @@ def test_what_a_photo_says_of_people_and_places_stays_in_the_photo(
     assert studio("run", "p.yaml", "-o", "run").exit_code == 0
     assert studio("export", "run", "--to", "ro-crate", "-o", "crate").exit_code == 0
     said = {"run.h5": _everything_in(tmp_path / "run" / "run.h5")}
-    for folder in ("run", "crate"):
-        for path in (tmp_path / folder).rglob("*"):
-            if path.is_file():
-                said[str(path)] = path.read_bytes()
+    for path in (*(tmp_path / "run").rglob("*"), *(tmp_path / "crate").rglob("*")):
+        if path.is_file():
+            said[str(path)] = path.read_bytes()
     assert b"Maker Model" in said["run.h5"]  # the log says which camera it was
     for text in (*secrets.values(), *serial.values()):
         assert not [name for name, content in said.items() if text.encode() in content], text
