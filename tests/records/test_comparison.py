@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.engine.store import Store
 from orthoflow.records.compare import Pair, compare_runs
 from orthoflow.records.open import open_run
-from orthoflow.records.runs import Run
 from tests.compared_runs import compared, number
-from tests.report_runs import HeldRun, cell, record
+from tests.report_runs import HeldRun, cell, record, without_products
 from tests.studios import Studio, open_studio
 
 
@@ -149,47 +149,32 @@ def test_the_workflow_is_compared_line_by_line(studio: Studio) -> None:
     assert [row["right"] for row in rates] == [None]
 
 
-def unembedded(run: Run) -> Run:
-    cells = tuple(
-        replace(
-            cell,
-            outputs={port: replace(out, embedded=False) for port, out in cell.outputs.items()},
-        )
-        for cell in run.record.cells
-    )
-    return replace(run, record=replace(run.record, cells=cells))
-
-
 def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: Studio) -> None:
-    left, right = (unembedded(open_run(studio.folder / name)) for name in ("first", "near"))
+    left, right = (without_products(open_run(studio.folder / name)) for name in ("first", "near"))
     assert {item.verdict for item in compare_runs(left, right).products} == {"not measured"}
     measured = compare_runs(left, right, stores=[Store(studio.folder / ".orthoflow")]).products
     assert {item.verdict for item in measured} == {"within tolerance"}
+
+
+def held(*cells: RecordedCell) -> HeldRun:
+    return HeldRun(path=Path("run.h5"), record=record(cells))
 
 
 def test_what_was_skipped_has_no_versions_to_differ_in() -> None:
     # Its method was loaded only where another dataset needed it.
     skipped = replace(cell("cloud", status="skipped", error_message="no scan"), seed=None)
     loaded = replace(skipped, result_version=1, determinism="exact", distribution="toys")
-    runs = [HeldRun(path=Path("run.h5"), record=record([one])) for one in (skipped, loaded)]
-    (row,) = compare_runs(*runs).cells
+    (row,) = compare_runs(held(skipped), held(loaded)).cells
     assert row.is_same
     assert str(row.right) == "skipped, cloud.toy, no scan"
-    runs = [
-        HeldRun(path=Path("run.h5"), record=record([replace(one, status="ok")]))
-        for one in (skipped, loaded)
-    ]
+    runs = (held(replace(one, status="ok")) for one in (skipped, loaded))
     (row,) = compare_runs(*runs).cells
     assert not row.is_same
 
 
 def _swept(**values: float) -> HeldRun:
     """A run of a step whose variants have a parameter each."""
-    cells = [
-        cell(f"plane@plane={name}", assignment={"plane": name}, params={"x": value}, seed=None)
-        for name, value in values.items()
-    ]
-    return HeldRun(path=Path("run.h5"), record=record(cells))
+    return held(*(cell(f"plane@plane={name}", params={"x": x}) for name, x in values.items()))
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run, published_state
 from orthoflow.records.write import with_files
 from tests.drawing_runs import WALL, write_drawing_run
+from tests.report_runs import without_products
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +47,6 @@ def test_rasters_are_made_of_the_products_and_go_away_again(alone: Run) -> None:
 
 
 def test_products_that_are_not_in_the_record_make_no_files(alone: Run) -> None:
-    cells = tuple(
-        replace(
-            cell,
-            outputs={port: replace(out, embedded=False) for port, out in cell.outputs.items()},
-        )
-        for cell in alone.record.cells
-    )
-    bare = replace(alone, record=replace(alone.record, cells=cells))
+    bare = without_products(alone)
     with with_files(bare) as found:
         assert found is bare
