@@ -13,6 +13,7 @@ from orthoflow_provenance.arrays import write_product_file
 from orthoflow_provenance.document import (
     JsonValue,
     Metric,
+    PayloadLike,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
@@ -69,7 +70,7 @@ class ProductShelf:
         self.folder = folder
         self.files: dict[str, Path] = {}
 
-    def put(self, payload: Given) -> str:
+    def put(self, payload: PayloadLike) -> str:
         path = self.folder / f"product-{len(self.files)}.h5"
         digest = write_product_file(path, payload)
         self.files[digest] = path

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -10,16 +14,13 @@ import pytest
 
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Payload, Tolerance
-from orthoflow.records.compare import RunProducts, product_distances
+from orthoflow.records.compare import ProductDistance, RunProducts, product_distances
+from tests.report_runs import HeldRun, cell, given, record
 
 
-def payload(version: int = 1, metadata: dict[str, Any] | None = None, **arrays: Any) -> Payload:
-    return Payload(
-        type_name="toy",
-        encoding_version=version,
-        metadata=metadata or {},
-        arrays={name: np.asarray(value) for name, value in arrays.items()},
-    )
+def payload(**arrays: Any) -> Payload:
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    return Payload(type_name="toy", encoding_version=1, metadata={}, arrays=arrays)
 
 
 class Toy:
@@ -40,32 +41,13 @@ class Catalog:
         return Toy
 
 
-class ToyRun:
-    def __init__(self, **outputs: Any) -> None:
-        self._payloads = {port: one for port, (one, _) in outputs.items()}
-        self.cells = {
-            "cell": SimpleNamespace(
-                outputs={
-                    port: SimpleNamespace(
-                        type_name=type_name,
-                        digest=f"{port}-{id(one)}" if one is not None else f"{port}-kept",
-                        encoding_version=1 if one is None else one.encoding_version,
-                        embedded=one is not None,
-                    )
-                    for port, (one, type_name) in outputs.items()
-                }
-            )
-        }
-
-    def payload(self, _address: str, port: str) -> Any:
-        return self._payloads[port]
-
-
-def compared(left: Any, right: Any, *, types: tuple[str, str] = ("toy", "toy")) -> Any:
-    sides = [
-        RunProducts(run=ToyRun() if one is ... else ToyRun(out=(one, kind)))  # type: ignore[arg-type]
-        for one, kind in zip((left, right), types, strict=True)
-    ]
+def compared(left: Payload, right: Payload | None, *, kind: str = "toy") -> ProductDistance:
+    sides = []
+    for one in (left, right):
+        out = replace(given("", "0", kind), digest=f"{id(one)}", embedded=one is not None)
+        held: Any = {("cell", "out"): SimpleNamespace(to_payload=partial(copy, one))}
+        told = record([cell("cell", outputs={"out": out})])
+        sides.append(RunProducts(run=HeldRun(path=Path("run.h5"), record=told, products=held)))
     (found,) = product_distances(*sides, ["cell"], Catalog())  # type: ignore[arg-type]
     return found
 
@@ -97,7 +79,7 @@ def test_what_cannot_be_had_is_not_measured() -> None:
     found = compared(payload(n=[1]), None)
     assert found.verdict == "not measured"
     assert "no record or available store" in found.reason
-    found = compared(payload(n=[1]), payload(n=[1]), types=("strange", "strange"))
+    found = compared(payload(n=[1]), payload(n=[1]), kind="strange")
     assert found.verdict == "not measured"
     assert found.reason == "the digests differ, and no product type strange"
 

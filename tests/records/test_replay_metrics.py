@@ -33,18 +33,15 @@ def run_of(*numbers: Metric) -> Run:
     return Run(path=PATH, record=record([wall, crack]))
 
 
-def told(recorded: Run, made: Run, verdicts: tuple[Verdict, Verdict]) -> tuple[ReplayedMetric, ...]:
+def told(
+    recorded: Run, made: Run, verdicts: tuple[Verdict, Verdict], *changed: str
+) -> tuple[ReplayedMetric, ...]:
     ports = (("wall", "walls"), ("crack", "found"))
-    return replayed_metrics(
-        recorded,
-        made,
-        [
-            ProductDistance(
-                cell=step, port=port, type_name="t", verdict=verdict, left="l", right="r"
-            )
-            for (step, port), verdict in zip(ports, verdicts, strict=True)
-        ],
-    )
+    distances = [
+        ProductDistance(cell=step, port=port, type_name="t", verdict=verdict, left="l", right="r")
+        for (step, port), verdict in zip(ports, verdicts, strict=True)
+    ]
+    return replayed_metrics(recorded, made, distances, changed)
 
 
 @pytest.mark.parametrize(
@@ -76,14 +73,7 @@ def test_numbers_behind_changed_code_are_its_doing(
     replayed: float, verdict: str, verdicts: tuple[Verdict, Verdict]
 ) -> None:
     recorded, made = (run_of(*metrics(rms_mm=value)) for value in (2.5, replayed))
-    distances = [
-        ProductDistance(cell=step, port=port, type_name="t", verdict=said, left="l", right="r")
-        for (step, port), said in zip(
-            (("wall", "walls"), ("crack", "found")), verdicts, strict=True
-        )
-    ]
-    changed = {recorded.cells["wall"].method}
-    [found] = replayed_metrics(recorded, made, distances, changed)
+    [found] = told(recorded, made, verdicts, recorded.cells["wall"].method)
     assert found.verdict == verdict
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pystac
@@ -27,18 +28,10 @@ EAST, NORTH = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 def orthoimages() -> Orthoimages:
     """A wall in its own plane, and a floor in UTM 32 near Munich."""
     corner = np.array([691_000.0, 5_334_000.0, 520.0])
-    wall = WallFrame(
-        origin_world=corner,
-        u_world=EAST,
-        v_world=-UP,
-        normal_world=SOUTH,
-        gsd_m=0.01,
-        width=60,
-        height=40,
-    )
+    shared: dict[str, Any] = {"origin_world": corner, "u_world": EAST}
+    wall = WallFrame(**shared, v_world=-UP, normal_world=SOUTH, gsd_m=0.01, width=60, height=40)
     floor = WallFrame(
-        origin_world=corner,
-        u_world=EAST,
+        **shared,
         v_world=-NORTH,
         normal_world=UP,
         gsd_m=0.02,

@@ -12,12 +12,12 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from orthoflow_provenance.document import Metric, PublishedFile, RecordedProduct
+from orthoflow_provenance.document import Metric, PublishedFile
 from orthoflow_provenance.record import write_record
 
 from orthoflow.errors import RecordError
 from orthoflow.products.inspections import Finding
-from orthoflow.records.runs import published_state, require_unchanged
+from orthoflow.records.runs import require_unchanged
 from orthoflow.records.verify import Verification, sealed_page, verify_run
 from tests.provenance_records import ProductShelf, sample_record
 from tests.report_runs import inspection_product
@@ -44,14 +44,6 @@ def folder(tmp_path: Path) -> Path:
     (products / "folder").mkdir()
     os.mkfifo(products / "pipe")
     return tmp_path
-
-
-def test_a_file_that_cannot_be_read_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuses(*_: object) -> None:
-        raise PermissionError(13, "denied")
-
-    monkeypatch.setattr("orthoflow.records.runs.open_below", refuses)
-    assert published_state(folder, published("products/same")) == "unreadable"
 
 
 def checked(folder: Path, *names: str) -> Verification:
@@ -116,7 +108,9 @@ def test_a_page_is_of_one_record_and_as_it_was_written(tmp_path: Path) -> None:
     assert not is_own()
 
 
-def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
+def test_only_what_the_record_vouches_for_is_used(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run: Any = SimpleNamespace(
         folder=folder,
         record=SimpleNamespace(
@@ -126,6 +120,10 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
     products = folder / "products"
     require_unchanged(run, products / "same")
     require_unchanged(run)
+
+    def refuses(*_: object) -> None:
+        raise PermissionError(13, "denied")
+
     for name, sentence in (
         ("folder", "is not listed in the record of the run, so it cannot be checked"),
         ("other", "other was changed after the run: the record states the digest"),
@@ -134,6 +132,9 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
     ):
         with pytest.raises(RecordError, match=sentence):
             require_unchanged(run, products / "same", products / name)
+    monkeypatch.setattr("orthoflow.records.runs.open_below", refuses)
+    with pytest.raises(RecordError, match="same cannot be read: unreadable"):
+        require_unchanged(run, products / "same")
 
 
 @pytest.mark.parametrize(
@@ -141,26 +142,24 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
     [
         ({"format": "colmap-db"}, "x.h5 is not a record of orthoflow: it does not name"),
         (
-            {"format": np.bytes_("colmap-db"), "format_version": np.bytes_("1"), "creator": "C"},
+            {"format": b"colmap-db", "format_version": b"1"},
             "x.h5 must be of format orthoflow-run, got 'colmap-db'",
         ),
         # What a later version writes may be outside this one's format.
         (
-            {
-                "format": np.bytes_("orthoflow-run"),
-                "format_version": np.bytes_("2.0"),
-                "creator": "C",
-            },
+            {"format": b"orthoflow-run", "format_version": b"2.0"},
             "x.h5 has format version '2.0', this program reads version ",
         ),
     ],
 )
 def test_a_file_of_another_program_or_version_cannot_be_checked(
-    tmp_path: Path, stated: dict[str, object], said: str
+    tmp_path: Path, stated: dict[str, str | bytes], said: str
 ) -> None:
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:
-        file.attrs.update(stated)
+        file.attrs["creator"] = "C"
+        for name, value in stated.items():
+            file.attrs[name] = np.bytes_(value) if isinstance(value, bytes) else value
     found = verify_run(path)
     assert found.findings[0].startswith(f"/: {said}")
     assert found.wrong == f"{path} cannot be checked"
@@ -184,18 +183,12 @@ def test_metrics_of_an_inspection_are_those_of_its_product(
         Finding(name="rmse_u_mm", value=1.25, unit="mm", wall=0),
         Finding(name="rmse_u_mm", value=2.5, unit="mm"),
     )
-    product = replace(inspection_product(), findings=findings).to_payload()
     shelf = ProductShelf(tmp_path)
-    digest = shelf.put(product)  # type: ignore[arg-type] # a payload as good as that of a test
+    digest = shelf.put(replace(inspection_product(), findings=findings).to_payload())
     base = sample_record("sha256:" + "c" * 64, digest)
-    output = RecordedProduct(
-        type_name="inspection", encoding_version=1, digest=digest, embedded=True
-    )
-    check = replace(
-        base.cells[1],
-        outputs={"inspection": output},
-        metrics=(Metric(name=name, value=value, unit=unit),),
-    )
+    output = replace(base.cells[1].outputs["walls"], type_name="inspection")
+    metrics = (Metric(name=name, value=value, unit=unit),)
+    check = replace(base.cells[1], outputs={"inspection": output}, metrics=metrics)
     record = replace(base, cells=(base.cells[0], check, base.cells[2]))
     write_record(tmp_path / "run.h5", record, shelf.find)
     found = verify_run(tmp_path)
