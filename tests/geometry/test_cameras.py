@@ -11,12 +11,16 @@ import pytest
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.camera_kernels import largest_radius, project_point
 from orthoflow.geometry.cameras import (
+    HALF_PIXEL,
     LensFreedom,
     ViewingCamera,
+    from_opencv,
     lens_values,
     linearised,
     looking_at,
+    opencv_matrix,
     stepped,
+    to_opencv,
 )
 from orthoflow.geometry.compiling import interpreted
 from orthoflow.geometry.frames import rotation_from_vector
@@ -52,11 +56,9 @@ def points(seed: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", seeds(6))
 def test_projection_is_opencvs_half_a_pixel_on(seed: int) -> None:
     viewer = camera(seed)
-    matrix = np.array([[viewer.fx, 0, viewer.cx - 0.5], [0, viewer.fy, viewer.cy - 0.5], [0, 0, 1]])
     rotation_vector, _ = cv2.Rodrigues(viewer.rotation)
-    expected, _ = cv2.projectPoints(
-        points(seed), rotation_vector, viewer.translation, matrix, viewer.distortion
-    )
+    lens = (opencv_matrix(viewer), viewer.distortion)
+    expected, _ = cv2.projectPoints(points(seed), rotation_vector, viewer.translation, *lens)
     found = viewer.project(points(seed))
     np.testing.assert_allclose(found[:, :2] - 0.5, expected[:, 0], atol=1e-8)  # pixels
 
@@ -226,3 +228,14 @@ def test_a_focal_length_grows_to_its_e_fold_in_one_step_at_most(
     moved = stepped(viewing, np.array([*np.zeros(6), logarithm]), LensFreedom(focal_sigma=0.1))
     assert moved.fx / viewing.fx == pytest.approx(np.exp(factor))
     assert moved.fy / viewing.fy == pytest.approx(np.exp(factor))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_first_pixels_centre_is_opencvs_origin(dtype: type[np.floating]) -> None:
+    ours = np.array([[HALF_PIXEL, HALF_PIXEL], [3.25, 700.75]], dtype=dtype)
+    theirs = to_opencv(ours)
+    np.testing.assert_array_equal(theirs, np.array([[0.0, 0.0], [2.75, 700.25]], dtype=dtype))
+    assert theirs.dtype == dtype
+    back = from_opencv(theirs)
+    np.testing.assert_array_equal(back, ours)
+    assert back.dtype == dtype

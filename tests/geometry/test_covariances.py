@@ -128,10 +128,10 @@ def test_what_neighbours_share_is_stated() -> None:
 
 
 def test_no_common_error_switches_from_nothing_to_all_of_it() -> None:
-    """Of one draw that is enlarged in steps of 0.03 mm, where the residuals begin to show it."""
-    sizes_m = np.linspace(0.00045, 0.00081, 13)
+    """Of one draw that is enlarged in steps of 0.06 mm, where the residuals begin to show it."""
+    sizes_m = np.linspace(0.00045, 0.00081, 7)
     stated = np.sqrt([drawn_resection(3, rough(sigma_m, 0.5), 200)[1] for sigma_m in sizes_m])
-    assert (stated[1:] / stated[:-1] < 1.25).all()
+    assert (stated[1:] / stated[:-1] < 1.4).all()
     assert stated[-1] > 1.5 * stated[0]
 
 
@@ -171,21 +171,19 @@ def shifted_photos(
 def test_photos_share_the_errors_of_places_but_not_their_own(shared_by: str) -> None:
     """Their shifts, correlated between photos as those of drawn errors scatter."""
     covariances, shifts = [], []
-    for seed in range(4):
+    among = np.array([0.0, 0.0, 1.0]) if shared_by == "depths" else np.ones(3)
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         places = rng.uniform([0.0, 0.0, 0.0], [6.0, 4.0, 0.2], (90, 3))
         fields = [rough(0.002, 0.45)(places, rng) for _ in range(N_PHOTOS)]
         errors = np.concatenate(fields if shared_by == "photos" else [fields[0]] * N_PHOTOS)
-        if shared_by == "depths":
-            errors = errors * [0.0, 0.0, 1.0]
-        points = shifted_photos(seed, errors, places)
+        points = shifted_photos(seed, errors * among, places)
         covariances.append(honest_covariance(points, 1.0))
-        for other in range(60):
+        for other in range(120):
             draw = np.random.default_rng([seed, other])
-            again = [rough(0.002, 0.45)(places, draw).mean(axis=0) for _ in range(N_PHOTOS)]
-            mean = np.array(again if shared_by == "photos" else [again[0]] * N_PHOTOS)
-            if shared_by == "depths":
-                mean = mean * [0.0, 0.0, 1.0]
+            n_drawn = N_PHOTOS if shared_by == "photos" else 1
+            again = [rough(0.002, 0.45)(places, draw).mean(axis=0) for _ in range(n_drawn)]
+            mean = np.broadcast_to(np.array(again) * among, (N_PHOTOS, 3))
             by = points.by_place.reshape(N_PHOTOS, -1, 2, 3)[:, 0]
             noise = draw.normal(size=(N_PHOTOS, 2)) / math.sqrt(90)
             shifts.append((np.einsum("kid,kd->ki", by, mean) + noise).ravel())

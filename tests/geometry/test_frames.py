@@ -1,4 +1,4 @@
-"""Rasters on walls: places there and back, distances, axes, and the grid over a rectangle."""
+"""Planes, rotations and rasters on walls: places there and back, distances, axes and angles."""
 
 from __future__ import annotations
 
@@ -8,10 +8,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.frames import WallFrame, frame_over, wall_axes
+from orthoflow.geometry import basis_from_up, up_vector
+from orthoflow.geometry.frames import (
+    UP_VECTORS,
+    Plane,
+    UpDirection,
+    WallFrame,
+    angle_between_deg,
+    cross_matrices,
+    cross_matrix,
+    frame_over,
+    omega_phi_deg,
+    plane_through,
+    rotation_from_vector,
+    signed_area,
+    wall_axes,
+)
 from tests import samples, scenes
+from tests.long_loops import seeds
 
 UP = np.array([0.0, 0.0, 1.0])
 # 0.5 x 0.3 m, its corner at (1, 2, 3); x is to the right, down is down, the viewer in the south.
@@ -93,11 +110,10 @@ def test_frames_have_the_same_cells_to_a_thousandth_of_one() -> None:
     [
         ({"gsd_m": 0.0}, "needs a positive cell size and at least one cell, got 0.0 m and 5 x 3"),
         ({"width": 0}, "at least one cell, got 0.1 m and 0 x 3"),
-        ({"height": -1}, "at least one cell, got 0.1 m and 5 x -1"),
+        ({"height": 0}, "at least one cell, got 0.1 m and 5 x 0"),
         ({"gsd_m": math.nan}, "needs a positive cell size"),
         ({"u_world": np.zeros(2)}, "an origin and axes of three numbers each"),
         ({"v_world": -FRAME.v_world}, "these axes mirror the image"),
-        ({"normal_world": -FRAME.normal_world}, "these axes mirror the image"),
     ],
 )
 def test_what_is_no_frame_is_refused(change: dict[str, object], sentence: str) -> None:
@@ -163,3 +179,145 @@ def test_a_rectangle_without_an_area_is_refused(flat: list[float]) -> None:
     corners = np.array([0 * right, down, down + right, right])
     with pytest.raises(GeometryError, match="the area of a rectangle must not be 0"):
         frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.1)
+
+
+# Two metres along (0.6, 0, 0.8).
+PLANE = Plane(normal=np.array([0.6, 0.0, 0.8]), offset_m=2.0)
+
+
+def test_distances_are_positive_on_the_side_of_the_normal() -> None:
+    points = np.array([[1.2, 7.0, 1.6], [0.0, 0.0, 0.0], [3.0, -1.0, 4.0]])
+    np.testing.assert_allclose(PLANE.distances_m(points), [0.0, -2.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(PLANE.flipped().distances_m(points), [0.0, 2.0, -3.0], atol=1e-12)
+
+
+def test_a_plane_is_turned_towards_who_looks() -> None:
+    assert PLANE.towards(np.array([3.0, 0.0, 4.0])) is PLANE
+    # Who stands in it sees it as it is.
+    assert PLANE.towards(np.array([2.0, 5.0, 1.0])) is PLANE
+    turned = PLANE.towards(np.zeros(3))
+    np.testing.assert_array_equal(turned.normal, -PLANE.normal)
+    assert turned.offset_m == -2.0
+
+
+@pytest.mark.parametrize(
+    ("normal", "is_plane"),
+    [
+        ([0.0, 0.0, 1.0], True),
+        ([0.0, 0.0, 1.0 + 0.9e-9], True),
+        ([0.0, 0.0, 1.0 + 1.1e-9], False),
+        ([0.0, 0.0, 1.0 - 1.1e-9], False),
+        ([0.0, 1.0], False),
+    ],
+)
+def test_a_normal_is_a_unit_vector(normal: list[float], is_plane: bool) -> None:
+    if is_plane:
+        Plane(normal=np.array(normal), offset_m=0.0)
+        return
+    with pytest.raises(GeometryError, match=r"needs a unit normal of shape \(3,\)"):
+        Plane(normal=np.array(normal), offset_m=0.0)
+
+
+@pytest.mark.parametrize("seed", seeds(3))
+def test_a_plane_runs_through_its_three_points_by_the_right_hand_rule(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0.0, 5.0, (3, 3))
+    plane = plane_through(points)
+    np.testing.assert_allclose(plane.distances_m(points), 0.0, atol=1e-9)
+    sides = np.array([points[1] - points[0], points[2] - points[0], plane.normal])
+    assert np.linalg.det(sides) > 0.0
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[0, 0, 0], [0, 0, 0], [0, 0, 0]],
+        [[0, 0, 0], [1, 0, 0], [2, 1e-9, 0]],
+        [[0, 0, 0], [1, 0, 0], [math.nan, 1, 0]],
+    ],
+)
+def test_points_on_a_line_span_no_plane(points: list[list[float]]) -> None:
+    with pytest.raises(GeometryError, match="three points must define a plane"):
+        plane_through(np.array(points, dtype=np.float64))
+
+
+def test_points_nearly_on_a_line_span_one() -> None:
+    # Of a triangle two metres long five micrometres high.
+    plane = plane_through(np.array([[0.0, 0.0, 0.0], [1.0, 5e-6, 0.0], [2.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(plane.normal, [0.0, 0.0, -1.0])
+
+
+@pytest.mark.parametrize("deg", [0.0, 1e-7, 30.0, 90.0, 179.999, 180.0])
+def test_angles_are_exact_near_none_and_near_a_half_turn(deg: float) -> None:
+    turn = math.radians(deg)
+    rotation = scenes.random_rotation(np.random.default_rng(1))
+    first = rotation @ np.array([1.0, 0.0, 0.0])
+    second = rotation @ np.array([math.cos(turn), math.sin(turn), 0.0])
+    assert angle_between_deg(first, second) == pytest.approx(deg, abs=1e-12, rel=1e-6)
+
+
+@pytest.mark.parametrize("omega_deg", [0.0, 45.0, 135.0, 200.0, 315.0, 359.0])
+@pytest.mark.parametrize("phi_deg", [-89.0, -30.0, 0.0, 60.0])
+def test_normals_have_a_direction_and_an_inclination(omega_deg: float, phi_deg: float) -> None:
+    omega, phi = math.radians(omega_deg), math.radians(phi_deg)
+    normal = np.array(
+        [math.cos(phi) * math.cos(omega), math.cos(phi) * math.sin(omega), math.sin(phi)]
+    )
+    found = omega_phi_deg(normal, UP)
+    assert found[0] % 360.0 == found[0]
+    assert (found[0] - omega_deg + 180.0) % 360.0 == pytest.approx(180.0, abs=1e-9)
+    assert found[1] == pytest.approx(phi_deg, abs=1e-9)
+
+
+def test_straight_up_is_ninety_degrees_though_rounding_goes_beyond() -> None:
+    assert omega_phi_deg(np.array([0.0, 0.0, 1.0 + 1e-12]), UP)[1] == 90.0
+    assert omega_phi_deg(np.array([0.0, 0.0, -1.0 - 1e-12]), UP)[1] == -90.0
+
+
+_L_SHAPE = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [1.0, 1.0], [1.0, 2.0], [0.0, 2.0]])
+
+
+def test_an_area_has_the_sign_of_its_turn() -> None:
+    assert signed_area(_L_SHAPE) == pytest.approx(4.0)
+    assert signed_area(_L_SHAPE[::-1]) == pytest.approx(-4.0)
+    assert signed_area(np.roll(_L_SHAPE, 2, axis=0) - np.array([7.0, 3.0])) == pytest.approx(4.0)
+    assert signed_area(_L_SHAPE[:2]) == 0.0
+
+
+ANGLES = [0.0, 1e-9, 0.9e-8, 1.1e-8, 1e-3, 1.0, 3.0, np.pi, 4.0]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_rotation_vectors_turn_about_themselves(angle: float) -> None:
+    vector = angle * np.array([0.48, -0.6, 0.64])
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(rotation_from_vector(vector), expected, atol=1e-15)
+
+
+def test_cross_matrices_multiply_like_the_cross_product() -> None:
+    first, second = np.random.default_rng(0).normal(size=(2, 7, 3))
+    found = np.einsum("nij,nj->ni", cross_matrices(first), second)
+    np.testing.assert_allclose(found, np.cross(first, second), atol=1e-14)
+    np.testing.assert_array_equal(cross_matrix(first[3]), cross_matrices(first)[3])
+
+
+@pytest.mark.parametrize("direction", UP_VECTORS, ids=str)
+def test_the_frame_of_an_up_direction_is_right_handed(direction: UpDirection) -> None:
+    basis = basis_from_up(up_vector(direction))
+    np.testing.assert_allclose(basis @ basis.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(basis) == pytest.approx(1.0)
+    np.testing.assert_array_equal(basis[2], up_vector(direction))
+    if direction == "z":
+        np.testing.assert_array_equal(basis, np.eye(3))
+
+
+@pytest.mark.parametrize("direction", UP_VECTORS, ids=str)
+def test_wall_axes_run_right_and_down_for_the_viewer(direction: UpDirection) -> None:
+    up = up_vector(direction)
+    normal = np.random.default_rng(0).normal(size=3)
+    normal -= 0.95 * (normal @ up) * up  # a wall that leans a little
+    normal /= np.linalg.norm(normal)
+    u, v = wall_axes(normal, up)
+    np.testing.assert_allclose(np.cross(u, v), -normal, atol=1e-12)
+    assert u @ up == pytest.approx(0.0, abs=1e-12)  # horizontal
+    assert v @ up < 0.0  # downwards

@@ -13,6 +13,7 @@ from scipy import ndimage
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.occluders import (
     Box,
+    Occluders,
     depth_buffer,
     occluders_in,
 )
@@ -38,6 +39,11 @@ def box() -> Box:
     return Box(low=LOW, high=HIGH, spacing_m=SPACING_M)
 
 
+def counts_at(found: Occluders, points: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray:
+    """How many points the voxels around points have."""
+    return found.around.counts[tuple(np.floor((points - low) / found.around.side_m).astype(int).T)]
+
+
 def expected_around(points: NDArray[np.float64]) -> NDArray[np.int64]:
     shape = np.ceil((HIGH - LOW) / SIDE_M).astype(int)
     cells = np.floor((points - LOW) / SIDE_M).astype(int)
@@ -50,17 +56,9 @@ def expected_around(points: NDArray[np.float64]) -> NDArray[np.int64]:
 def camera() -> ViewingCamera:
     """At the cloud's origin, looking up along z, turned a little."""
     turn = scenes.rotation_about(np.array([0.3, 0.9, 0.1]), 4.0)
-    return samples.camera(
-        turn,
-        ORIGIN,
-        fx=90.0,
-        fy=110.0,
-        cx=50.0,
-        cy=40.0,
-        distortion=np.array([0.01, 0.0, 0.001, 0.0, 0.0]),
-        width=100,
-        height=80,
-    )
+    lens = {"fx": 90.0, "fy": 110.0, "cx": 50.0, "cy": 40.0, "width": 100, "height": 80}
+    bent = np.array([0.01, 0.0, 0.001, 0.0, 0.0])
+    return samples.camera(turn, ORIGIN, distortion=bent, **lens)
 
 
 @pytest.mark.parametrize("seed", seeds(2))
@@ -76,13 +74,8 @@ def test_nothing_is_where_a_scanner_is_blind() -> None:
     points = points_m(0)
     station = np.array([0.1, 0.0, 2.4])
     beside = np.array([0.65, -0.5, 1.7])
-    found = occluders_in(
-        cloud_of(points, origin=tuple(ORIGIN)),
-        box(),
-        np.array([ORIGIN + station, ORIGIN + beside]),
-        n_least=4,
-        threads=1,
-    )
+    stations, cloud = ORIGIN + np.array([station, beside]), cloud_of(points, origin=tuple(ORIGIN))
+    found = occluders_in(cloud, box(), stations, n_least=4, threads=1)
     middles = LOW + SIDE_M * (np.indices(found.around.counts.shape).transpose(1, 2, 3, 0) + 0.5)
     expected = expected_around(points)
     for place in (station, beside):
@@ -110,8 +103,7 @@ def test_stray_points_of_a_dense_scan_hide_nothing_and_a_rod_does() -> None:
 
     def is_kept(stations: NDArray[np.float64] | None) -> NDArray[np.bool_]:
         found = occluders_in(cloud_of(points), before, stations, n_least=6, threads=1)
-        places = np.floor((points - before.low) / found.around.side_m).astype(int)
-        return found.around.counts[tuple(places.T)] >= found.n_least
+        return counts_at(found, points, before.low) >= found.n_least
 
     is_rod = (points[:, 0] == 1.5) & (np.abs(points[:, 1] - 0.5) < 0.003)
     is_wall = points[:, 0] == 3.0
@@ -135,8 +127,7 @@ def test_a_thinned_surface_close_to_its_station_stays() -> None:
     space = Box(low=np.array([0.0, -1.0, -1.0]), high=np.full(3, 1.0), spacing_m=0.0126)
     station = np.zeros((1, 3))
     found = occluders_in(cloud_of(np.vstack([wall, near])), space, station, n_least=6, threads=1)
-    places = np.floor((near - space.low) / found.around.side_m).astype(int)
-    assert (found.around.counts[tuple(places.T)] > 0).all()
+    assert (counts_at(found, near, space.low) > 0).all()
 
 
 def test_without_stations_few_points_that_are_spread_evenly_hide_nothing() -> None:
@@ -149,8 +140,7 @@ def test_without_stations_few_points_that_are_spread_evenly_hide_nothing() -> No
 
     def is_kept(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         found = occluders_in(cloud_of(points), space, None, n_least=6, threads=1)
-        places = np.floor(points / found.around.side_m).astype(int)
-        return found.around.counts[tuple(places.T)] >= found.n_least
+        return counts_at(found, points, space.low) >= found.n_least
 
     # Fewer of the voxels about an edge of the box lie in it, and share more pairs.
     is_inside = ((stray > 0.2) & (stray < 2.8)).all(axis=1)
@@ -175,10 +165,8 @@ def test_a_photo_sees_the_nearest_of_squares_as_large_as_the_gaps(scale: int) ->
     points = points_m(1)
     cloud = cloud_of(points, origin=tuple(ORIGIN))
     small = camera()
-    seen_by = replace(
-        small, fx=small.fx * scale, fy=small.fy * scale, cx=small.cx * scale, cy=small.cy * scale,
-        width=small.width * scale, height=small.height * scale,
-    )  # fmt: skip
+    sizes = ("fx", "fy", "cx", "cy", "width", "height")
+    seen_by = replace(small, **{name: scale * getattr(small, name) for name in sizes})
     n_least = 40
     occluders = occluders_in(cloud, box(), FAR, n_least=n_least, threads=3)
     found = depth_buffer(occluders, seen_by)
@@ -205,21 +193,16 @@ def test_a_photo_sees_the_nearest_of_squares_as_large_as_the_gaps(scale: int) ->
         np.minimum(part, np.float32(distance), out=part)
         n_drawn += 1
     assert 100 < n_drawn < 2_900
-    np.testing.assert_allclose(found.nearest, closed(nearest), rtol=1e-6)
-
-
-def closed(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
     lowest = ndimage.minimum_filter(nearest, 3, mode="nearest")
-    return ndimage.maximum_filter(lowest, 3, mode="nearest")
+    closed = ndimage.maximum_filter(lowest, 3, mode="nearest")
+    np.testing.assert_allclose(found.nearest, closed, rtol=1e-6)
 
 
 def test_what_is_at_the_camera_or_behind_it_hides_nothing() -> None:
     at = np.tile([[0.0, 0.0, 0.04], [0.0, 0.0, -0.5]], (50, 1))
     around = Box(low=np.full(3, -1.0), high=np.ones(3), spacing_m=0.1)
     level = replace(camera(), rotation=np.eye(3), translation=-ORIGIN, distortion=np.zeros(5))
-    cloud = cloud_of(at, origin=tuple(ORIGIN))
-    found = depth_buffer(occluders_in(cloud, around, None, n_least=2, threads=1), level)
-    assert np.isinf(found.nearest).all()
-    cloud = cloud_of(at + np.array([0.0, 0.0, 0.02]), origin=tuple(ORIGIN))
-    found = depth_buffer(occluders_in(cloud, around, None, n_least=2, threads=1), level)
-    assert found.nearest.min() == pytest.approx(0.06)
+    for shift_m, nearest_m in ((0.0, np.inf), (0.02, 0.06)):
+        cloud = cloud_of(at + np.array([0.0, 0.0, shift_m]), origin=tuple(ORIGIN))
+        found = depth_buffer(occluders_in(cloud, around, None, n_least=2, threads=1), level)
+        assert found.nearest.min() == pytest.approx(nearest_m)

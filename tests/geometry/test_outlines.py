@@ -1,14 +1,28 @@
-"""Outlines of a room: how near walls must come to join, and what is relief on another."""
+"""Where planes of a room meet, and outlines: how near walls must come to join, what is relief."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from orthoflow.errors import InputError
+from orthoflow.files.drawings.key_plans import outline_of, surfaces_of
 from orthoflow.geometry.frames import Plane
-from orthoflow.geometry.outlines import RoomOutline, room_outline
+from orthoflow.geometry.outlines import (
+    RoomOutline,
+    Surface,
+    corners_between,
+    edges_between,
+    line_of,
+    room_outline,
+)
+from tests import samples
+from tests.drawing_runs import CORNER, GAP_M, SIZE_M, box_planes, box_points
 
 UP = np.array([0.0, 0.0, 1.0])
 # 8 x 6 m, 3 m high; walls are seen from inside.
@@ -164,3 +178,109 @@ def test_walls_reach_up_to_a_ceiling_that_slopes(slope: float) -> None:
     np.testing.assert_allclose(top[:, 2], 3.0 + slope * top[:, 0], atol=1e-6)
     np.testing.assert_allclose(bottom[..., 2], 0.0, atol=1e-6)
     assert ring(corners * [1.0, 1.0, 0.0]) == CORNERS
+
+
+# Survey coordinates of 5e6 m have 1e-9 m in float64; solving a system loses a little.
+_EXACT_M = 1e-7
+
+
+def test_a_box_has_twelve_edges_each_as_long_as_both_planes_are_known() -> None:
+    edges = edges_between(surfaces_of(box_planes()))
+    lengths = sorted(edge.length_m for edge in edges)
+    expected = sorted(4 * [side - 2 * GAP_M for side in SIZE_M])
+    np.testing.assert_allclose(lengths, expected, atol=_EXACT_M)
+
+
+def test_a_box_has_eight_corners() -> None:
+    surfaces = surfaces_of(box_planes())
+    corners = corners_between(surfaces, edges_between(surfaces))
+    expected = box_points(np.array(list(product(*((0.0, side) for side in SIZE_M)))))
+    found = np.array([corner.point_world for corner in corners])
+    assert found.shape == (8, 3)
+    for point in expected:
+        assert np.linalg.norm(found - point, axis=1).min() < _EXACT_M
+
+
+def test_planes_that_end_far_from_each_other_have_no_edge() -> None:
+    surfaces = surfaces_of(box_planes())
+    assert edges_between(surfaces, reach_m=GAP_M - 0.01) == ()
+    assert len(edges_between(surfaces, reach_m=GAP_M + 0.01)) == 12
+
+
+def test_an_edge_alone_has_no_corner() -> None:
+    surfaces = surfaces_of(box_planes())
+    edges = edges_between(surfaces)
+    assert corners_between(surfaces, edges[:1]) == ()
+    # Nor do three of which two do not adjoin.
+    first = edges[0]
+    apart = [edge for edge in edges if first.first in (edge.first, edge.second)]
+    assert corners_between(surfaces, apart) == ()
+
+
+def test_nearly_parallel_planes_meet_nowhere() -> None:
+    up = Plane(normal=np.array([0.0, 0.0, 1.0]), offset_m=0.0)
+    for angle, meets in ((19.0, False), (21.0, True)):
+        radians = np.radians(angle)
+        other = Plane(normal=np.array([np.sin(radians), 0.0, np.cos(radians)]), offset_m=0.0)
+        assert (line_of(up, other) is not None) == meets
+
+
+def test_parts_of_a_plane_have_edges_of_their_own() -> None:
+    floor = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [6.0, 0.0, 0.0], [6.0, 4.0, 0.0]])
+
+    def part(begin: float, end: float) -> list[list[float]]:
+        return [[begin, 0, 2], [begin, 0, 0], [end, 0, 0], [end, 0, 2]]
+
+    surfaces = (
+        Surface(
+            plane=Plane(normal=np.array([0.0, 0.0, 1.0]), offset_m=0.0),
+            rectangles_world=floor[None],
+        ),
+        Surface(
+            plane=Plane(normal=np.array([0.0, 1.0, 0.0]), offset_m=0.0),
+            rectangles_world=np.array(
+                [part(0, 2), part(1.5, 2.5), part(4, 5), part(5.2, 5.29), part(5.5, 5.61)]
+            ),
+        ),
+    )
+    spans = sorted(sorted(edge.ends_world[:, 0].tolist()) for edge in edges_between(surfaces))
+    # Overlapping parts are one, and what is shorter than a hand is none.
+    np.testing.assert_allclose(spans, [[0.0, 2.5], [4.0, 5.0], [5.5, 5.61]])
+
+
+def test_a_room_whose_up_is_x_has_the_same_outline() -> None:
+    planes = box_planes()
+    turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    turned = [
+        Plane(normal=turn @ planes.normal[k], offset_m=float(planes.offset[k])) for k in range(6)
+    ]
+    outline = room_outline(turned, planes.corners @ turn.T, turn @ planes.up)
+    straight = outline_of(planes)
+    assert outline.closed == straight.closed == (True,)
+    assert straight.floor_m == pytest.approx(CORNER[2], abs=_EXACT_M)
+    found = np.array(outline.chains_world[0]) @ turn
+    x, y, _ = SIZE_M
+    expected = box_points(np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]], dtype=float))
+    assert len(expected) == len(found) == len(straight.chains_world[0])
+    for point in expected:
+        for chain in (found, straight.chains_world[0]):
+            assert np.linalg.norm(chain - point, axis=1).min() < _EXACT_M
+
+
+def test_more_planes_or_parts_than_a_drawing_bears_are_refused() -> None:
+    few = box_planes()
+    in_parts = replace(
+        few,
+        part_corners=np.repeat(few.corners[:1], 20_001, axis=0),
+        part_plane=np.zeros(20_001, np.int32),
+    )
+    many = samples.planes(
+        normal=np.repeat(few.normal[:1], 201, axis=0),
+        offset=np.repeat(few.offset[:1], 201),
+        corners=np.repeat(few.corners[:1], 201, axis=0),
+        names=("wall",) * 201,
+    )
+    for planes in (many, in_parts):
+        for work in (surfaces_of, outline_of):
+            with pytest.raises(InputError, match=r"planes of .* connected parts, at most"):
+                work(planes)

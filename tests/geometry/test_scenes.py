@@ -1,18 +1,26 @@
-"""Rays, colours and true orthoimages of simulated scenes, against algebra."""
+"""Rays, colours, paint and true orthoimages of simulated scenes, against algebra."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry import WallFrame, frame_over
-from orthoflow.geometry.scene_rays import Hits, points_on
+from orthoflow.geometry import WallFrame, frame_over, scene_rays
 from orthoflow.geometry.scene_views import Rendering, render, render_frame
-from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
+from orthoflow.geometry.scenes import (
+    Scene,
+    SurfaceRole,
+    TextureKind,
+    Viewers,
+    cell_states,
+    normals,
+    uniforms,
+)
 from tests import scenes
 from tests.long_loops import seeds
 from tests.scene_rays import cast, colours_at
@@ -282,10 +290,80 @@ def test_a_cell_on_an_edge_shows_both_sides_by_their_shares(n_sub: int) -> None:
         assert image.rgb[at][0] == pytest.approx(expected, abs=1e-3)
 
 
-def test_points_lie_where_their_rays_end() -> None:
-    starts = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
-    ways = np.array([[0.5, 1.0], [0.0, 1.0], [-0.5, 1.0]])
-    hits = Hits(t=np.array([4.0, np.inf]), rectangle=np.array([3, -1], dtype=np.int32))
-    np.testing.assert_array_equal(
-        points_on(starts, ways, hits), [[3.0, 1.0], [2.0, 2.0], [1.0, 3.0]]
-    )
+GOLDEN = 0x9E3779B97F4A7C15
+
+
+def test_draws_of_a_state_are_the_numbers_of_splitmix64_from_there() -> None:
+    bits = (0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F)
+    # Of the state itself, and of one that is a number further.
+    states = np.array([0, GOLDEN], dtype=np.uint64)
+    for draw in (0, 1):
+        expected = [(number >> 11) / 2.0**53 for number in bits[draw : draw + 2]]
+        np.testing.assert_array_equal(uniforms(states, draw), expected)
+
+
+def test_a_place_has_its_number_whatever_is_asked_with_it() -> None:
+    columns, rows = np.arange(-40, 60), np.arange(1000, 1070)
+    whole = uniforms(cell_states(columns[:, None], rows, 7), 3)
+    part = uniforms(cell_states(columns[10:12, None], rows[::-5], 7), 3)
+    np.testing.assert_array_equal(part, whole[10:12, ::-5])
+    assert np.mean(whole == uniforms(cell_states(columns[:, None], rows, 8), 3)) < 1e-3
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**62, -5])
+def test_numbers_are_fairly_distributed_and_draws_independent(seed: int) -> None:
+    states = cell_states(np.arange(400)[:, None], np.arange(500), seed).ravel()
+    n = states.size
+    even = uniforms(states, 0)
+    assert even.min() >= 0.0
+    assert even.max() < 1.0
+    counts = np.bincount((even * 20).astype(int), minlength=20)
+    # Five standard deviations of a count.
+    np.testing.assert_allclose(counts, n / 20, atol=5.0 * np.sqrt(n / 20))
+    bell = normals(states, 10)
+    assert bell.mean() == pytest.approx(0.0, abs=5.0 / np.sqrt(n))
+    assert bell.std() == pytest.approx(1.0, abs=5.0 / np.sqrt(2.0 * n))
+    assert np.mean(np.abs(bell) > 2.0) == pytest.approx(0.0455, abs=5.0 * np.sqrt(0.0455 / n))
+    together = np.corrcoef([even, bell, normals(states, 12), np.roll(bell, 1)])
+    np.testing.assert_allclose(together, np.eye(4), atol=5.0 / np.sqrt(n))
+
+
+SEED = 7
+
+
+@numba.njit
+def colour_at(kind: int, params: NDArray[np.float64], a: float, b: float) -> tuple[float, ...]:
+    """Parts of kernels have no way in from Python."""
+    return scene_rays.colour_at(kind, params, a, b)
+
+
+@pytest.mark.parametrize("kind", list(TextureKind))
+def test_colours_stay_within_what_a_photo_and_a_laser_tell(kind: TextureKind) -> None:
+    params = np.array([250.0, 5.0, 120.0, 0.9, 1.0, 0.2, 3.0, 0.5])
+    places = np.random.default_rng(SEED).uniform(0.0, 2.0, (400, 2))
+    shades = np.array([colour_at(int(kind), params, a, b) for a, b in places])
+    assert (shades[:, :3] >= 0.0).all()
+    assert (shades[:, :3] <= 255.0).all()
+    assert shades[:, 0].max() == 255.0
+    assert (shades[:, 3] >= 0.01).all()
+    assert (shades[:, 3] <= 1.0).all()
+    # Without contrast nothing but the ground is left.
+    plain = params * [1, 1, 1, 1, 0, 1, 1, 1]
+    ground = np.array([colour_at(int(kind), plain, a, b) for a, b in places])
+    np.testing.assert_allclose(ground, np.tile([250.0, 5.0, 120.0, 0.9], (400, 1)))
+
+
+@pytest.mark.parametrize("gap", [0.0, 1.0])
+def test_light_is_seen_by_eye_and_laser_alike_unless_there_is_a_gap(gap: float) -> None:
+    params = np.array([120.0, 120.0, 120.0, 0.5, 0.3, 0.2, 3.0, gap])
+    places = np.random.default_rng(SEED).uniform(0.0, 20.0, (2000, 2))
+    shades = np.array([colour_at(0, params, a, b) for a, b in places])
+    # Warmth takes from blue what it gives to red: their mean is the light alone.
+    light = (shades[:, 0] + shades[:, 2]) / 2.0 / 120.0 - 1.0
+    laser = shades[:, 3] / 0.5 - 1.0
+    if gap == 0.0:
+        np.testing.assert_allclose(laser, 0.9 * light, atol=1e-9)
+    else:
+        assert abs(np.corrcoef(light, laser)[0, 1]) < 0.5
+    warm = (shades[:, 0] - shades[:, 2]) / 2.0
+    np.testing.assert_allclose(shades[:, 1] / 120.0 - 1.0 - light, 0.3 * warm / 120.0, atol=1e-9)
