@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numba
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry import WallFrame, frame_over, scene_rays
-from orthoflow.geometry.scene_views import Rendering, render, render_frame
+from orthoflow.geometry.scene_views import Rendering, TrueOrthoimage, render, render_frame
 from orthoflow.geometry.scenes import (
     Scene,
     SurfaceRole,
@@ -84,6 +85,13 @@ def wall_frame(gsd_m: float = 0.05) -> WallFrame:
     return frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=gsd_m)
 
 
+def rendered(
+    scene: Scene, frame: WallFrame, buffers_m: tuple[float, float] = (0.1, 0.1), **more: Any
+) -> TrueOrthoimage:
+    front_m, behind_m = buffers_m
+    return render_frame(scene, frame, buffer_front_m=front_m, buffer_behind_m=behind_m, **more)
+
+
 def cell_u(frame: WallFrame) -> NDArray[np.float64]:
     """World x of the cells' centres, which for this wall is the direction of u."""
     return -2.0 + frame.gsd_m * (np.arange(frame.width) + 0.5)
@@ -140,7 +148,7 @@ def test_a_shift_and_a_turn_of_the_world_change_no_colour() -> None:
 
 def test_the_true_orthoimage_shows_the_first_surface_within_the_buffer() -> None:
     frame = wall_frame()
-    image = render_frame(wall_with_screen(), frame, buffer_front_m=0.5, buffer_behind_m=0.3)
+    image = rendered(wall_with_screen(), frame, (0.5, 0.3))
     x = cell_u(frame)
     z = 1.0 - frame.gsd_m * (np.arange(frame.height) + 0.5)
     in_niche = ((x > -1.5) & (x < -1.0))[None, :] & (np.abs(z) < 0.5)[:, None]
@@ -149,7 +157,7 @@ def test_the_true_orthoimage_shows_the_first_surface_within_the_buffer() -> None
 
 
 def test_surfaces_beyond_the_buffer_do_not_exist_for_the_true_orthoimage() -> None:
-    image = render_frame(wall_with_screen(), wall_frame(), buffer_front_m=1.5, buffer_behind_m=0.1)
+    image = rendered(wall_with_screen(), wall_frame(), (1.5, 0.1))
     x = cell_u(image.frame)
     on_screen = (x > 0.2) & (x < 0.6)
     assert np.all(image.rectangle[:, on_screen] == 2)
@@ -160,9 +168,7 @@ def test_surfaces_beyond_the_buffer_do_not_exist_for_the_true_orthoimage() -> No
 
 def test_a_screen_hides_from_a_viewer_just_its_shadow() -> None:
     viewers = Viewers(positions_world=np.array([[0.0, -2.0, 0.0]]), up=scenes.UP_Z)
-    image = render_frame(
-        wall_with_screen(), wall_frame(), buffer_front_m=0.5, buffer_behind_m=0.1, viewers=viewers
-    )
+    image = rendered(wall_with_screen(), wall_frame(), (0.5, 0.1), viewers=viewers)
     x = cell_u(image.frame)
     # The screen is half way to the wall: its shadow from 0.2..0.6 is twice as far, 0.4..1.2.
     shadow = (x > 0.4) & (x < 1.2)
@@ -177,9 +183,7 @@ def test_viewers_see_only_their_elevations() -> None:
     viewers = Viewers(
         positions_world=np.array([[-1.8, -1.0, 0.0]]), up=scenes.UP_Z, highest_elevation_deg=30.0
     )
-    image = render_frame(
-        wall_with_screen(), wall_frame(), buffer_front_m=0.1, buffer_behind_m=0.1, viewers=viewers
-    )
+    image = rendered(wall_with_screen(), wall_frame(), viewers=viewers)
     z = 1.0 - image.frame.gsd_m * (np.arange(image.frame.height) + 0.5)
     column = 3  # x = -1.825, 1.0003 m from the viewer
     limit = np.tan(np.radians(30.0)) * np.hypot(1.0, 0.025)
@@ -191,14 +195,9 @@ def test_a_part_of_a_true_orthoimage_is_that_part_of_the_whole() -> None:
     scene, frame = wall_with_screen(), wall_frame()
     rng = np.random.default_rng(4)
     coloured, judged = rng.random((2, *frame.shape)) < 0.4
-    whole, part = (
-        render(
-            scene,
-            frame,
-            Rendering(buffer_front_m=0.5, buffer_behind_m=0.3, viewers=viewers, **masks),
-        )
-        for masks in ({}, {"coloured": coloured, "judged": judged})
-    )
+    reach: dict[str, Any] = {"buffer_front_m": 0.5, "buffer_behind_m": 0.3, "viewers": viewers}
+    masks = {"coloured": coloured, "judged": judged}
+    whole, part = (render(scene, frame, Rendering(**reach, **some)) for some in ({}, masks))
     np.testing.assert_array_equal(part.depth_m, whole.depth_m)
     np.testing.assert_array_equal(part.rgb, np.where(coloured[:, :, None], whole.rgb, np.nan))
     np.testing.assert_array_equal(part.seen, whole.seen & judged)
@@ -234,9 +233,7 @@ def test_the_edge_of_a_surface_is_as_bright_as_its_middle(supersample: int) -> N
     scene = a_scene([upright(0.0, (-0.28, 2, -0.9, 1))], [])
     scene = replace(scene, texture_params=scene.texture_params * [1, 1, 1, 1, 0, 1, 1, 1])
     frame = wall_frame(0.25)
-    image = render_frame(
-        scene, frame, buffer_front_m=0.1, buffer_behind_m=0.1, supersample=supersample
-    )
+    image = rendered(scene, frame, supersample=supersample)
     # The wall begins in the seventh cell, left of its middle, and ends in the last row below it.
     shown = np.zeros(frame.shape, dtype=np.bool_)
     shown[:, 7:] = True
@@ -251,9 +248,7 @@ def test_straight_up_and_straight_down_are_seen(up: float) -> None:
     # Before the middle of a cell, which lies above its head or below its feet.
     viewers = Viewers(positions_world=np.array([[0.25, -2.0, 0.25]]), up=np.array([0.0, up, 0.0]))
     scene, frame = a_scene([WALL], []), wall_frame(0.5)
-    assert render_frame(
-        scene, frame, buffer_front_m=0.1, buffer_behind_m=0.1, viewers=viewers
-    ).seen.all()
+    assert rendered(scene, frame, viewers=viewers).seen.all()
 
 
 @pytest.mark.parametrize(("gap_m", "is_seen"), [(0.0003, True), (0.0008, False)])
@@ -261,9 +256,7 @@ def test_what_hides_a_wall_stands_half_a_millimetre_before_it(gap_m: float, is_s
     film = {**upright(-gap_m, (-2, 2, -1, 1)), "role": SurfaceRole.OBJECT}
     scene = a_scene([WALL, film], [])
     viewers = Viewers(positions_world=np.array([[0.0, -2.0, 0.0]]), up=scenes.UP_Z)
-    image = render_frame(
-        scene, wall_frame(0.5), buffer_front_m=1e-4, buffer_behind_m=0.1, viewers=viewers
-    )
+    image = rendered(scene, wall_frame(0.5), (1e-4, 0.1), viewers=viewers)
     assert (image.rectangle == 0).all()
     middle = image.seen[1:3, 3:5]
     assert (middle == is_seen).all()
@@ -284,9 +277,7 @@ def test_a_cell_on_an_edge_shows_both_sides_by_their_shares(n_sub: int) -> None:
         params = scene.texture_params * [1, 1, 1, 1, 0, 1, 1, 1]
         params[1, :3] = 100.0
         scene = replace(scene, texture_params=params)
-        image = render_frame(
-            scene, wall_frame(0.25), buffer_front_m=0.1, buffer_behind_m=0.1, supersample=n_sub
-        )
+        image = rendered(scene, wall_frame(0.25), supersample=n_sub)
         assert image.rgb[at][0] == pytest.approx(expected, abs=1e-3)
 
 
