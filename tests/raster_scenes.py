@@ -8,9 +8,10 @@ from tempfile import mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
+from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.geometry import wall_axes
-from orthoflow.products import Planes, PointCloud
+from orthoflow.products import Planes, PointCloud, Walls
 from orthoflow.sdk import StepContext
 from tests import samples
 
@@ -22,6 +23,20 @@ def context(folder: Path, *, cores: int = 2) -> StepContext:
     """A context with a scratch folder of its own, as each step has one."""
     scratch = Path(mkdtemp(dir=folder))
     return StepContext(rng=np.random.default_rng(7), cores=cores, scratch=scratch)
+
+
+def numbers(ctx: StepContext) -> dict[str, float]:
+    """The metrics that a step reported."""
+    return {metric.name: metric.value for metric in ctx.metrics}
+
+
+def rastered(
+    cloud: PointCloud, planes: Planes, folder: Path, *, cores: int = 2, **params: object
+) -> tuple[Walls, StepContext]:
+    """What `raster.grid` makes of a cloud, and what it reports."""
+    ctx = context(folder, cores=cores)
+    inputs = RasterGrid.In(cloud=cloud, planes=planes)
+    return RasterGrid().run(inputs, RasterGrid.Params.model_validate(params), ctx).walls, ctx
 
 
 @dataclass(frozen=True, kw_only=True)

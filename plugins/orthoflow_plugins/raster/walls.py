@@ -29,6 +29,17 @@ _BAND_CELLS: Final = 1 << 24
 _REACH_OF_OUTLIERS: Final = 32
 
 
+def bytes_needed(shapes: Sequence[tuple[int, int]], *, is_tin: bool = False) -> int:
+    """Estimate the memory needed to raster walls with these numbers of rows and columns."""
+    sizes = [rows * columns for rows, columns in shapes]
+    # Finished large walls are kept in files, and need the memory of one band while they are
+    # processed.
+    kept = _BYTES_KEPT * sum(size for size in sizes if size <= IN_MEMORY_CELLS)
+    if is_tin:
+        return kept + (_BYTES_WORKING + _BYTES_VERTEX) * max(sizes)
+    return kept + _BYTES_WORKING * min(max(sizes), _BAND_CELLS)
+
+
 def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None:
     """Raise an error if cells are too fine for the memory of the machine.
 
@@ -36,12 +47,7 @@ def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None
         MethodError: the rasters would not fit into memory.
     """
     sizes = [frame.width * frame.height for frame in frames]
-    # Finished large walls are kept in files, and need the memory of one band while they are
-    # processed.
-    kept = sum(size for size in sizes if size <= IN_MEMORY_CELLS)
-    needed = _BYTES_KEPT * kept + _BYTES_WORKING * min(max(sizes), _BAND_CELLS)
-    if is_tin:
-        needed = _BYTES_KEPT * kept + (_BYTES_WORKING + _BYTES_VERTEX) * max(sizes)
+    needed = bytes_needed([frame.shape for frame in frames], is_tin=is_tin)
     memory = psutil.virtual_memory().total
     # Cells are numbered with 32 bits.
     if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.products import PointCloud, SurfaceMask, Wall
 from tests import raster_scenes as scenes
@@ -19,9 +18,8 @@ SLOPE_M = 0.004
 
 
 def rastered(cloud: PointCloud, folder: Path, **params: object) -> Wall:
-    inputs = RasterGrid.In(cloud=cloud, planes=KNOWN.planes())
-    chosen = RasterGrid.Params.model_validate({"gsd_m": KNOWN.gsd_m, "buffer_m": 1.0} | params)
-    return RasterGrid().run(inputs, chosen, scenes.context(folder)).walls.walls[0]
+    more: dict[str, object] = {"gsd_m": KNOWN.gsd_m, "buffer_m": 1.0, **params}
+    return scenes.rastered(cloud, KNOWN.planes(), folder, **more)[0].walls[0]
 
 
 def depth_m(columns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -105,16 +103,19 @@ def test_a_depth_step_is_not_bridged(tmp_path: Path) -> None:
     assert set(known.round(4).tolist()) == {0.0, np.float32(0.1).item()}
 
 
-@pytest.mark.parametrize("change", ["no grid", "no steps", "no gaps"])
-def test_without_grid_or_reach_nothing_is_spanned(tmp_path: Path, change: str) -> None:
-    cloud = scanned(2.4)
-    params: dict[str, object] = {"surface": "topmost", "recover_gap_cells": 1}
-    if change == "no grid":
-        cloud = dataclasses.replace(cloud, row=None, column=None)
-    elif change == "no steps":
-        params["recover_scan_steps"] = 0
-    else:
-        params["recover_gap_cells"] = 0
+@pytest.mark.parametrize(
+    ("without", "reach"),
+    [
+        (("row", "column"), {}),
+        ((), {"recover_scan_steps": 0}),
+        ((), {"recover_gap_cells": 0}),
+    ],
+)
+def test_without_grid_or_reach_nothing_is_spanned(
+    tmp_path: Path, without: tuple[str, ...], reach: dict[str, object]
+) -> None:
+    cloud = dataclasses.replace(scanned(2.4), **dict.fromkeys(without))
+    params: dict[str, object] = {"surface": "topmost", "recover_gap_cells": 1, **reach}
     wall = rastered(cloud, tmp_path, **params)
     # Cells in the middle between four points, too far for a gap of one cell.
     assert np.mean(wall.mask[4:-4, 4:-4] == SurfaceMask.VOID) > 0.1

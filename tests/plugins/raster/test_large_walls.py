@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
-from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.geometry import bands
 from orthoflow.geometry.bands import count_cells, count_known, holds_cells
-from orthoflow.products import Layer, LayerMask, Layers
+from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, PointCloud, Walls
 from tests import inspect_scenes, ortho_scenes, raster_scenes
 from tests.long_loops import long_only
 from tests.plugins.ortho.test_direct import bare_walls
 from tests.raster_scenes import context
 
 BAND_CELLS = 1 << 17
-SHAPE = (1500, 2000)
+SHAPE = (1500, 1000)
 N_CELLS = SHAPE[0] * SHAPE[1]
 
 
@@ -60,26 +59,24 @@ def mapped(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
     return array.view(np.ndarray)
 
 
+def in_files(walls: Walls, folder: Path) -> Walls:
+    (wall,) = walls.walls
+    names = ("depth_m", "sigma_m", "count", "mask")
+    arrays = {name: mapped(folder / f"given_{name}", getattr(wall, name)) for name in names}
+    return dataclasses.replace(walls, walls=(dataclasses.replace(wall, **arrays),))
+
+
 def large_inputs(folder: Path, n: int = 7) -> DsmBackward.In:
     """The wall of `ortho_scenes` in cells of an nth, its rasters in files, and two photos."""
     where = ortho_scenes.frame()
     fine = dataclasses.replace(where, gsd_m=where.gsd_m / n, width=n * 320, height=n * 240)
     depths = np.repeat(np.repeat(ortho_scenes.depth_m(), n, axis=0), n, axis=1)
-    walls = ortho_scenes.walls(fine, depths)
-    wall = dataclasses.replace(
-        walls.walls[0],
-        **{
-            name: mapped(folder / f"given_{name}", getattr(walls.walls[0], name))
-            for name in ("depth_m", "sigma_m", "count", "mask")
-        },
-    )
+    walls = in_files(ortho_scenes.walls(fine, depths), folder)
     asides_m = (-0.7, 0.3)
+    photos = [ortho_scenes.rendered(aside_m=aside) for aside in asides_m]
+    cameras = [ortho_scenes.camera(where, aside_m=aside) for aside in asides_m]
     return DsmBackward.In(
-        walls=dataclasses.replace(walls, walls=(wall,)),
-        photos=ortho_scenes.photos(*(ortho_scenes.rendered(aside_m=aside) for aside in asides_m)),
-        cameras=ortho_scenes.cameras(
-            *(ortho_scenes.camera(where, aside_m=aside) for aside in asides_m)
-        ),
+        walls=walls, photos=ortho_scenes.photos(*photos), cameras=ortho_scenes.cameras(*cameras)
     )
 
 
@@ -104,36 +101,24 @@ def test_layers_are_painted_and_reported_without_memory_per_cell(
 
 @pytest.mark.usefixtures("small_bands")
 def test_walls_are_painted_from_a_cloud_without_memory_per_cell(tmp_path: Path) -> None:
-    known = raster_scenes.leaning_wall(shape=(4000, 1000))
-    places = np.random.default_rng(7).uniform([0, 0], [1000, 4000], (80_000, 2))
-    points = known.world(*places.T, np.zeros(len(places)))
-    intensity = places[:, 0].astype(np.float32) / 1000.0
-    cloud = raster_scenes.cloud_of(points, intensity=intensity)
+    known, cloud = tall_wall()
     small = bare_walls(raster_scenes.leaning_wall(shape=(40, 10)))
     ready = PointcloudDirect.In(walls=small, cloud=cloud)
     PointcloudDirect().run(ready, PointcloudDirect.Params(), context(tmp_path))  # compiled
-    (wall,) = bare_walls(known).walls
-    blank = {name: mapped(tmp_path / name, getattr(wall, name)) for name in ("mask", "depth_m")}
-    walls = dataclasses.replace(bare_walls(known), walls=(dataclasses.replace(wall, **blank),))
-    inputs = PointcloudDirect.In(walls=walls, cloud=cloud)
+    inputs = PointcloudDirect.In(walls=in_files(bare_walls(known), tmp_path), cloud=cloud)
     with peak_bytes() as peak:
-        (layer,) = (
-            PointcloudDirect()
-            .run(inputs, PointcloudDirect.Params(), context(tmp_path))
-            .layers.layers
-        )
+        found = PointcloudDirect().run(inputs, PointcloudDirect.Params(), context(tmp_path))
+        (layer,) = found.layers.layers
         # A layer holds nine bytes per cell, and the winners of a wall sixteen.
-        assert peak() < 4.0 * wall.mask.size, peak()
+        assert peak() < 4.0 * layer.mask.size, peak()
     assert holds_cells(layer.mask, LayerMask.PAINTED)
 
 
 def test_a_wall_that_no_photo_paints_lies_in_files(tmp_path: Path) -> None:
-    given = large_inputs(tmp_path)
+    given = large_inputs(tmp_path, 2)
     (wall,) = given.walls.walls
-    away = dataclasses.replace(
-        wall.frame,
-        origin_world=wall.frame.origin_world + 60.0 * wall.frame.u_world,
-    )
+    far = wall.frame.origin_world + 60.0 * wall.frame.u_world
+    away = dataclasses.replace(wall.frame, origin_world=far)
     both = (wall, dataclasses.replace(wall, frame=away, name="away"))
     walls = dataclasses.replace(given.walls, walls=both)
     inputs = DsmBackward.In(walls=walls, photos=given.photos, cameras=given.cameras)
@@ -143,6 +128,14 @@ def test_a_wall_that_no_photo_paints_lies_in_files(tmp_path: Path) -> None:
     for name in ("rgb", "mask", "quality"):
         assert isinstance(getattr(bare, name).base, np.memmap | mmap.mmap), name
     assert not bare.rgb.any()
+
+
+def tall_wall() -> tuple[raster_scenes.KnownWall, PointCloud]:
+    known = raster_scenes.leaning_wall(shape=(4000, 1000))
+    places = np.random.default_rng(7).uniform([0, 0], [1000, 4000], (80_000, 2))
+    points = known.world(*places.T, np.zeros(len(places)))
+    intensity = places[:, 0].astype(np.float32) / 1000.0
+    return known, raster_scenes.cloud_of(points, intensity=intensity)
 
 
 def large_layers(folder: Path, shape: tuple[int, int]) -> tuple[Layer, ...]:
@@ -155,23 +148,20 @@ def large_layers(folder: Path, shape: tuple[int, int]) -> tuple[Layer, ...]:
         mask[:, : shape[1] // 4] = LayerMask.OUTSIDE if k else LayerMask.PAINTED
         is_painted = mask == LayerMask.PAINTED
         rgb = rng.integers(1, 255, (*shape, 3), dtype=np.uint8) * is_painted[..., None]
-        layers.append(
-            Layer(
-                frame=inspect_scenes.frame(shape=shape),
-                wall=0,
-                source=f"photo {k}",
-                rgb=mapped(folder / f"{k}_rgb", rgb.astype(np.uint8)),
-                mask=mapped(folder / f"{k}_mask", mask),
-                quality=mapped(folder / f"{k}_quality", np.where(is_painted, quality, 0.0)),
-            )
-        )
+        arrays = {"rgb": rgb.astype(np.uint8), "mask": mask, "quality": quality * is_painted}
+        stored = {name: mapped(folder / f"{k}_{name}", values) for name, values in arrays.items()}
+        where = inspect_scenes.frame(shape=shape)
+        layers.append(Layer(frame=where, wall=0, source=f"photo {k}", **stored))
     return tuple(layers)
 
 
-def mosaic(layers: tuple[Layer, ...], folder: Path, **params: object) -> MosaicSeams.Out:
-    inputs = MosaicSeams.In(layers=Layers(layers=layers))
+def mosaic(
+    layers: tuple[Layer, ...], folder: Path, **params: object
+) -> tuple[Orthoimage, dict[str, float]]:
+    inputs, ctx = MosaicSeams.In(layers=Layers(layers=layers)), context(folder)
     chosen = MosaicSeams.Params.model_validate({"island_cells_min": 4} | params)
-    return MosaicSeams().run(inputs, chosen, context(folder))
+    (image,) = MosaicSeams().run(inputs, chosen, ctx).orthoimages.images
+    return image, raster_scenes.numbers(ctx)
 
 
 @pytest.mark.usefixtures("small_bands")
@@ -198,22 +188,18 @@ def crop(layer: Layer, n_rows: int) -> Layer:
 
 
 @pytest.mark.parametrize("seams", ["graph-cut", *long_only("best-view", "priority", "voronoi")])
-def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
+def test_bands_show_neither_in_mosaics_nor_in_their_metrics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seams: str
 ) -> None:
     layers = large_layers(tmp_path, (333, 270))
     params = {"seams": seams, "priority": ["photo 1"], "gains": "global"}
-    told = []
+    found = []
     for band_cells in (1 << 24, 270 * 70):
         monkeypatch.setattr(bands, "_BAND_CELLS", band_cells)
         for name in ("_BAND_CELLS", "_BALANCED_AT_ONCE"):
             monkeypatch.setattr(f"orthoflow_plugins.mosaic.joining.{name}", band_cells)
-        ctx = context(tmp_path)
-        inputs = MosaicSeams.In(layers=Layers(layers=layers))
-        chosen = MosaicSeams.Params.model_validate(params | {"island_cells_min": 4})
-        (image,) = MosaicSeams().run(inputs, chosen, ctx).orthoimages.images
-        told.append((image, ctx.metrics))
-    (whole, metrics), (banded, others) = told
+        found.append(mosaic(layers, tmp_path, **params))
+    (whole, metrics), (banded, others) = found
     assert metrics == others
     for name in ("rgb", "mask", "source"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))
@@ -221,13 +207,10 @@ def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
 
 @pytest.mark.usefixtures("small_bands")
 def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path) -> None:
-    known = raster_scenes.leaning_wall(shape=(4000, 1000))
-    places = np.random.default_rng(7).uniform([0, 0], [1000, 4000], (80_000, 2))
-    points = known.world(places[:, 0], places[:, 1], np.zeros(len(places)))
-    inputs = RasterGrid.In(cloud=raster_scenes.cloud_of(points), planes=known.planes())
-    params = RasterGrid.Params(gsd_m=known.gsd_m, buffer_m=0.3)
+    known, cloud = tall_wall()
+    params = {"gsd_m": known.gsd_m, "buffer_m": 0.3}
     with peak_bytes() as peak:
-        walls = RasterGrid().run(inputs, params, context(tmp_path)).walls
+        walls, _ = raster_scenes.rastered(cloud, known.planes(), tmp_path, **params)
         # A wall keeps 13 bytes per cell without colours, and a band has a fifteenth of the cells.
         assert peak() < 10.0 * walls.walls[0].mask.size, peak()
 

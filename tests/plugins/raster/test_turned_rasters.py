@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.products import PointCloud, SurfaceMask, Wall
 from tests import raster_scenes as scenes
@@ -59,9 +58,8 @@ def in_any_order(per_cell: float) -> Scattered:
 
 def rastered(scattered: Scattered, turn: Turn, folder: Path, **params: object) -> Wall:
     known, cloud = scattered.cloud(turn)
-    chosen = RasterGrid.Params.model_validate({"gsd_m": known.gsd_m} | params)
-    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
-    return RasterGrid().run(inputs, chosen, scenes.context(folder)).walls.walls[0]
+    walls, _ = scenes.rastered(cloud, known.planes(), folder, gsd_m=known.gsd_m, **params)
+    return walls.walls[0]
 
 
 def assert_turned(wall: Wall, turned: Wall, turn: Turn) -> None:
@@ -116,9 +114,8 @@ def test_what_a_raster_shows_is_where_it_is(
     places = scenes.points_apart(known.shape, cells, seed=round(100 * cells), in_rows=in_rows)
     shade = scenes.waves(*places.T).astype(np.float32)
     cloud = scenes.cloud_of(known.world(*places.T, np.zeros(len(places))), intensity=shade)
-    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
-    params = RasterGrid.Params.model_validate({"gsd_m": known.gsd_m, "surface": surface})
-    wall = RasterGrid().run(inputs, params, scenes.context(tmp_path)).walls.walls[0]
+    params: dict[str, object] = {"gsd_m": known.gsd_m, "surface": surface}
+    wall = scenes.rastered(cloud, known.planes(), tmp_path, **params)[0].walls[0]
     # A lattice of one scan may lie on one side of many cells of rules that take a point as it is.
     limit = 0.01 if surface == "median" else 0.02
     assert np.abs(scenes.shift_of_waves(wall.intensity)).max() < limit
