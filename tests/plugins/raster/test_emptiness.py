@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster.emptiness import Sight, emptiness_of
 from orthoflow_plugins.raster.extents import SampledPoints
-from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.diagnostics import Diagnostic
 from orthoflow.geometry.slabs import Slab
@@ -18,6 +17,7 @@ from tests import raster_scenes as scenes
 from tests import samples
 
 CODES = {"wall-behind-buffer", "wall-front-left-out", "wall-hidden", "wall-sparse", "wall-unseen"}
+CAUSES = ("behind", "before", "hidden", "sparse", "unseen")
 # A wall of 4 m x 3 m seen along +y, points 8 mm apart, cells of 2 cm; depth is -y.
 WALL = scenes.KnownWall(
     normal=np.array([0.0, -1.0, 0.0]),
@@ -50,22 +50,15 @@ def causes(
     cloud: PointCloud, folder: Path, **params: object
 ) -> tuple[dict[str, float], list[Diagnostic]]:
     """Share of empty cells by cause, and the codes that are reported."""
-    ctx = scenes.context(folder)
-    chosen = RasterGrid.Params.model_validate({"gsd_m": WALL.gsd_m, **params})
-    RasterGrid().run(RasterGrid.In(cloud=cloud, planes=WALL.planes()), chosen, ctx)
-    named = {metric.name: metric.value for metric in ctx.metrics}
-    shares = {
-        cause: named[f"void_{cause}_share"]
-        for cause in ("behind", "before", "hidden", "sparse", "unseen")
-    }
+    _, ctx = scenes.rastered(cloud, WALL.planes(), folder, **{"gsd_m": WALL.gsd_m, **params})
+    named = scenes.numbers(ctx)
+    shares = {cause: named[f"void_{cause}_share"] for cause in CAUSES}
     assert sum(shares.values()) == pytest.approx(named["void_share"], abs=1e-9)
     return shares, [one for one in ctx.diagnostics if one.code in CODES]
 
 
 def only(cause: str, share: float) -> dict[str, object]:
-    expected = dict.fromkeys(("behind", "before", "hidden", "sparse", "unseen"), 0.0) | {
-        cause: share
-    }
+    expected = dict.fromkeys(CAUSES, 0.0) | {cause: share}
     return {name: pytest.approx(value, abs=SHARE) for name, value in expected.items()}
 
 
@@ -77,10 +70,7 @@ def test_what_lies_behind_the_buffer_is_told_with_its_depth(tmp_path: Path) -> N
     (one,) = said
     assert (one.code, one.values["behind_m"]) == ("wall-behind-buffer", 1.3)
     assert "buffer_behind_m=1.3" in one.remedy
-
-
-def test_an_opening_that_shows_nothing_has_no_setting(tmp_path: Path) -> None:
-    wall = without(grid((0, 4), (0, 3)), (1.0, 2.5), (0.5, 2.0))
+    # An opening that shows nothing has no setting.
     shares, said = causes(scenes.cloud_of(wall), tmp_path)
     assert shares == only("unseen", 1.5 * 1.5 / 12.0)
     assert [(one.code, one.remedy) for one in said] == [("wall-unseen", "")]
@@ -127,14 +117,8 @@ def told(
         threads=1,
     )
     assert found.share == pytest.approx(VOID_SHARE)
-    shares = {
-        "behind": found.behind_share,
-        "before": found.before_share,
-        "hidden": found.hidden_share,
-        "sparse": found.sparse_share,
-        "unseen": found.unseen_share,
-    }
-    return {cause: share / VOID_SHARE for cause, share in shares.items() if share}
+    shares = {cause: getattr(found, f"{cause}_share") / VOID_SHARE for cause in CAUSES}
+    return {cause: share for cause, share in shares.items() if share}
 
 
 def in_each_tile(depth_m: float, count: int = 2) -> NDArray[np.float64]:

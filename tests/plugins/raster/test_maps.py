@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import select
 import socket
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from orthoflow_plugins.raster.frames import mapped
-from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.errors import MethodError
 from orthoflow.files.geotiff import read_raster
@@ -61,15 +59,15 @@ def test_whole_cells_reach_beyond_the_rectangle_alike_on_all_sides(tmp_path: Pat
     np.testing.assert_allclose(np.abs(off_m), np.tile([0.035, 0.045, 0.0], (4, 1)), atol=1e-9)
 
 
-def test_a_slightly_tilted_plane_is_a_map_and_a_tilted_one_is_not(tmp_path: Path) -> None:
+def test_only_level_planes_seen_from_above_are_maps(
+    tmp_path: Path,
+) -> None:
     assert placed(level(0.01), tmp_path)[0].map_crs == "site"
     frame, warnings = placed(level(0.1), tmp_path)
     assert frame.map_crs is None
     assert "floor 1 is tilted by 5.7 deg" in warnings[0]
     assert "applies to no raster" in warnings[1]
-
-
-def test_a_ceiling_is_no_map(tmp_path: Path) -> None:
+    # Nor is a ceiling.
     frame, warnings = placed(level(down=True), tmp_path)
     assert frame.map_crs is None
     assert "none of the planes is level and seen from above" in warnings[0]
@@ -110,9 +108,7 @@ def test_a_map_reads_back_to_where_it_lies(tmp_path: Path) -> None:
         np.random.default_rng(1).uniform([0, 0, -0.01], [4.03, 3.01, 0.01], (20_000, 3))
         + SURVEY_SHIFT_M
     )
-    inputs = RasterGrid.In(cloud=cloud, planes=replace(level(), tolerance_m=0.05))
-    params = RasterGrid.Params(gsd_m=GSD, crs="EPSG:2100")
-    walls = RasterGrid().run(inputs, params, scenes.context(tmp_path)).walls
+    walls, _ = scenes.rastered(cloud, level(), tmp_path, gsd_m=GSD, crs="EPSG:2100")
     publish_walls(walls, tmp_path, "digest")
     raster = read_raster(tmp_path / "wall_0_depth.tif")
     assert 'AUTHORITY["EPSG","2100"]' in raster.crs_wkt

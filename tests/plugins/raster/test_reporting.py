@@ -15,34 +15,28 @@ from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext
 from tests import samples
+from tests.raster_scenes import context, numbers
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture
 def ctx(tmp_path: Path) -> StepContext:
-    return StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-
-
-def metrics_of(ctx: StepContext) -> dict[str, float]:
-    return {metric.name: metric.value for metric in ctx.metrics}
+    return context(tmp_path)
 
 
 def wall(
     count: list[list[int]], *, name: str = "wall 0", mask: list[list[int]] | None = None
 ) -> Wall:
     counts = np.array(count, dtype=np.uint32)
-    rows, columns = counts.shape
-    frame = samples.facing_south(0.005, columns, rows)
-    states = (counts > 0).astype(np.uint8) if mask is None else np.array(mask, dtype=np.uint8)
-    return Wall(
-        frame=frame,
-        plane_index=0,
+    states = counts > 0 if mask is None else np.array(mask)
+    return samples.wall(
+        samples.facing_south(0.005, counts.shape[1], counts.shape[0]),
         name=name,
         depth_m=np.where(states == SurfaceMask.VOID, np.nan, 0.0).astype(np.float32),
         sigma_m=np.where(counts > 1, 0.001 * counts, np.nan).astype(np.float32),
         count=counts,
-        mask=states,
+        mask=states.astype(np.uint8),
     )
 
 
@@ -50,7 +44,7 @@ def test_walls_are_told_in_numbers(ctx: StepContext) -> None:
     first = wall([[0, 1, 3], [5, 2, 0]], mask=[[2, 1, 1], [1, 1, 0]])
     second = wall([[0, 0], [7, 1]])
     reporting.report(ctx, [first, second], 0.0042, UP)
-    assert metrics_of(ctx) == {
+    assert numbers(ctx) == {
         "n_walls": 2.0,
         # The first one looks south.
         "omega_deg": pytest.approx(270.0),
@@ -119,11 +113,8 @@ def test_walls_that_another_shows_are_reported_with_the_setting_of_their_step(
     names = ("wall 0", "wall 1", "wall 2", "wall 3")
     reporting.warn_of_covered(ctx, names, {1: 0, 2: 0})
     reporting.warn_of_covered(ctx, names, {})
-    (told,) = ctx.diagnostics
-    assert told.code == "wall-includes-others"
-    assert told.values["included"] == "wall 1, wall 2"
-
-    assert told.remedy.startswith("{step}.skip_covered=false")
+    (said,) = ctx.diagnostics
+    assert (said.code, said.values["included"]) == ("wall-includes-others", "wall 1, wall 2")
 
 
 def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(ctx: StepContext) -> None:
@@ -132,7 +123,7 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(ctx: StepC
         [wall([[1, 1, 1]]), wall([[1]])],
         [emptiness(behind=0.04, unseen=0.05), emptiness(hidden=0.08)],
     )
-    assert metrics_of(ctx) == pytest.approx(
+    assert numbers(ctx) == pytest.approx(
         {
             "void_behind_share": 0.03,
             "void_before_share": 0.0,
@@ -143,11 +134,6 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(ctx: StepC
     )
     # Less than a tenth of either is not worth words.
     assert ctx.warnings == []
-
-
-def told(ctx: StepContext) -> dict[str, object]:
-    """Share of each cause that is reported, by code."""
-    return {one.code: one.values["share"] for one in ctx.diagnostics}
 
 
 def test_what_stands_before_a_wall_is_left_out_and_what_stands_on_a_floor_is_not(
