@@ -1,4 +1,4 @@
-"""Walls of a room: which slab each takes points from, and which is nearest to a point."""
+"""Clouds, walls, openings and check points: their parts, and what is refused."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.products import Layers, Wall, Walls
+from orthoflow.errors import ProductError
+from orthoflow.geometry.slabs import BOXED_POINTS
+from orthoflow.products import CheckPoints, Layers, PointCloud, Wall, Walls
 from tests import samples
+from tests.drawing_runs import box_openings
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -103,3 +106,86 @@ def test_layers_say_how_people_call_their_walls() -> None:
     layers = Layers(layers=(), names=("west",), plane_indices=(4, 6))
     assert [layers.number(wall) for wall in range(3)] == [4, 6, 2]
     assert [layers.name(wall) for wall in range(3)] == ["west", "wall 6", "wall 2"]
+
+
+@pytest.mark.parametrize(("n_more", "n_boxes"), [(0, None), (1, 17)])
+def test_a_cloud_of_few_blocks_has_no_boxes(n_more: int, n_boxes: int | None) -> None:
+    places = np.arange(16 * BOXED_POINTS + n_more, dtype=np.float32)
+    cloud = PointCloud(
+        origin=np.zeros(3), x=places, y=-places, z=np.zeros_like(places), up=np.array([0, 0, 1.0])
+    )
+    if n_boxes is None:
+        assert cloud.boxes_m is None
+        return
+    assert cloud.boxes_m is not None
+    assert len(cloud.boxes_m) == n_boxes
+    first, last = cloud.boxes_m[0], cloud.boxes_m[-1]
+    np.testing.assert_array_equal(first[:, 0], [0, BOXED_POINTS - 1])
+    np.testing.assert_array_equal(first[:, 1], [1 - BOXED_POINTS, 0])
+    np.testing.assert_array_equal(last[:, 0], [places[-1], places[-1]])
+
+
+def test_points_keep_their_ids_through_several_selections() -> None:
+    x, y, z = np.random.default_rng(3).normal(size=(3, 8)).astype(np.float32)
+    whole = PointCloud(
+        origin=np.array([4e6, 5e6, 0.0]), up=np.array([0.0, 0.0, 1.0]), x=x, y=y, z=z, intensity=x
+    )
+    places = np.array([5, 1, 3])
+    twice = whole.selected(places).selected(np.array([True, False, True]))
+    assert twice.point_id is not None
+    assert twice.intensity is not None
+    np.testing.assert_array_equal(twice.point_id, [5, 3])
+    np.testing.assert_array_equal(twice.points_world(), whole.points_world(places[[0, 2]]))
+    np.testing.assert_array_equal(twice.intensity, x[[5, 3]])
+
+
+def points_of(**changes: object) -> CheckPoints:
+    given: dict[str, object] = {
+        "names": ("a", "b", "c"),
+        "points_world": np.zeros((3, 3)),
+        "classes": ("", "", ""),
+        "wall": np.zeros(3, dtype=np.int32),
+        "pixels_wall": np.zeros((3, 2)),
+        "places_m": np.zeros((3, 2)),
+        "shown_world": np.zeros((3, 3)),
+    }
+    return CheckPoints(**{**given, **changes})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["points_world", "wall", "pixels_wall", "places_m", "shown_world"])
+def test_check_points_have_a_row_each(name: str) -> None:
+    right = getattr(points_of(), name)
+    assert len(points_of().names) == len(right)
+    for wrong in (right[:2], np.concatenate([right, right], axis=right.ndim - 1)):
+        with pytest.raises(ProductError, match=f"checkpoints.*{name}"):
+            points_of(**{name: wrong})
+    with pytest.raises(ProductError, match="3 names, but 2 classes"):
+        points_of(classes=("", ""))
+
+
+def test_what_it_is_is_said_in_a_line() -> None:
+    (opening,) = box_openings().openings
+    assert opening.said == "niche 0.250 m deep, 0.80 x 1.20 m"
+    assert replace(opening, kind="through", depth_m=0.1).said == "through, 0.80 x 1.20 m"
+
+
+def test_the_error_of_all_sides_counts_those_that_were_seen() -> None:
+    (opening,) = box_openings().openings
+    assert opening.edge_sigma_m == pytest.approx(np.sqrt((9 + 2.25 + 9) / 3) * 1e-3)
+    assert replace(opening, side_sigma_m=np.full(4, np.nan)).edge_sigma_m is None
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"outline_world": np.zeros((3, 3))}, "opening.outline_world must have shape"),
+        ({"side_source": np.zeros(3, dtype=np.uint8)}, "opening.side_source must have shape"),
+        ({"outline_m": np.full((4, 2), np.nan)}, "at least 3 corners with coordinates below"),
+        ({"kind": "hole"}, "must be one of through, niche, no data, got 'hole'"),
+        ({"side_source": np.full(4, 9, dtype=np.uint8)}, "opening.side_source must be at most 2"),
+    ],
+    ids=["corners", "sides", "not finite", "kind", "source"],
+)
+def test_what_does_not_go_together_is_refused(change: dict[str, object], said: str) -> None:
+    with pytest.raises(ProductError, match=said):
+        replace(box_openings().openings[0], **change)  # type: ignore[arg-type] # wrong on purpose
