@@ -1,9 +1,11 @@
 """Fuzzing of readers: each case in a process that may die, watched for time, memory and writes.
 
-A reader may return something or refuse; anything else is a finding. Cases follow from (target,
+A reader may return something or refuse; anything else is a finding. Cases follow from (group,
 seed, number), so that one that failed can be repeated:
 
-    ORTHOFLOW_FUZZ_SEED=3 ORTHOFLOW_FUZZ_CASE=1729 python -m pytest tests/fuzz -k las
+    ORTHOFLOW_FUZZ_SEED=3 ORTHOFLOW_FUZZ_CASE=1729 python -m pytest tests/fuzz -k scans
+
+Targets of a group take turns in one process: what is loaded, compiled or opened once is paid once.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -40,8 +42,8 @@ MAX_CPU_S: Final = 5.0
 MAX_WALL_S: Final = 60.0
 MAX_MEMORY_MIB: Final = 1536.0
 _MAX_FINDINGS: Final = 20
-# Libraries leak where they fail: libE57 half a megabyte for each file.
-_MAX_PER_PROCESS: Final = 500
+# Libraries leak where they fail: libE57 half a megabyte for each of its files.
+_MAX_PER_PROCESS: Final = 4000
 _OWN: Final = frozenset({"seeds", "case", "findings", "output"})
 
 
@@ -85,7 +87,7 @@ class Finding:
 
 @dataclass(kw_only=True)
 class Outcome:
-    """What came of fuzzing a target: cases that ran, those refused, and what is to be mended."""
+    """What came of fuzzing a group: cases that ran, those refused, and what is to be mended."""
 
     name: str
     seed: int
@@ -108,20 +110,22 @@ class Outcome:
         return "\n".join(lines)
 
 
-def target_named(name: str) -> Target:
-    """Return the target of an import string such as `tests.fuzz.readers:LAS`."""
-    module, _, attribute = name.partition(":")
-    found: Target = getattr(import_module(module), attribute)
+def targets_of(group: str) -> Sequence[Target]:
+    """Return the targets of an import string such as `tests.fuzz.readers:SCANS`."""
+    module, _, attribute = group.partition(":")
+    found: Sequence[Target] = getattr(import_module(module), attribute)
     return found
 
 
-def write_case(name: str, seed: int, case: int, seeds: Path, folder: Path) -> Path:
-    """Write the file of a case."""
-    rng = Random(f"{name}/{seed}/{case}")
-    contents = _contents(seeds)
+def write_case(group: str, seed: int, case: int, seeds: Path, folder: Path) -> Path:
+    """Write the file of a case; `seeds` has a folder for each target."""
+    rng = Random(f"{group}/{seed}/{case}")
+    targets = targets_of(group)
+    number = case % len(targets)
+    contents = _contents(seeds / str(number))
     chosen = rng.choice(list(contents))
     path = folder / chosen
-    path.write_bytes(target_named(name).mutate(contents[chosen], rng, list(contents.values())))
+    path.write_bytes(targets[number].mutate(contents[chosen], rng, list(contents.values())))
     return path
 
 
@@ -131,28 +135,31 @@ def _contents(seeds: Path) -> Mapping[str, bytes]:
 
 
 def fuzz(
-    name: str,
+    group: str,
     folder: Path,
     *,
     seed: int = SEED,
     budget_s: float = BUDGET_S,
     most_cases: int = N_CASES,
 ) -> Outcome:
-    """Fuzz a target until the time is over or all cases have run.
+    """Fuzz a group of targets until the time is over or all cases have run.
 
     Args:
-        name: import string of the target.
+        group: import string of the targets.
         folder: takes seeds and findings; must be empty.
         seed: of the cases.
-        budget_s: seconds, beginning when the seeds have been read.
-        most_cases: end earlier after so many, unless 0.
+        budget_s: seconds for each target, beginning when the seeds have been read.
+        most_cases: of each target; end earlier after so many, unless 0.
     """
     for part in ("seeds", "case", "findings"):
         (folder / part).mkdir(parents=True)
-    target_named(name).seeds(folder / "seeds")
-    outcome = Outcome(name=name, seed=seed)
-    first, most = (int(CASE), 1) if CASE else (0, most_cases or sys.maxsize)
-    left_s = budget_s
+    targets = targets_of(group)
+    for number, target in enumerate(targets):
+        (folder / "seeds" / str(number)).mkdir()
+        target.seeds(folder / "seeds" / str(number))
+    outcome = Outcome(name=group, seed=seed)
+    first, most = (int(CASE), 1) if CASE else (0, most_cases * len(targets) or sys.maxsize)
+    left_s = budget_s * len(targets)
     while left_s > 0.0 and outcome.n_cases < most and len(outcome.findings) < _MAX_FINDINGS:
         count = min(_MAX_PER_PROCESS, most - outcome.n_cases)
         left_s -= _fuzz_in_process(outcome, folder, first + outcome.n_cases, count, left_s)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
+from random import Random
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+import pycolmap
+from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow_plugins.read.checkpoints import ReadCheckpoints
 from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from orthoflow_plugins.read.photos import ReadPhotos
 from orthoflow_plugins.read.scan import ReadScan
+from orthoflow_plugins.read.ties import ReadTies
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
@@ -28,22 +32,37 @@ from orthoflow.engine.results import (
     result_to_json,
 )
 from orthoflow.engine.store import Store, list_results
+from orthoflow.files.colmap import write_colmap_model
 from orthoflow.files.drawings.sheet_contents import read_title_block
+from orthoflow.files.e57_images import count_e57_images
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
-from orthoflow.files.images import encode_webp, shrunk_webp
+from orthoflow.files.images import encode_jpeg, encode_png, encode_webp, shrunk_webp
 from orthoflow.files.photo_files import damage, focal_length, icc_profile, read_exif
+from orthoflow.files.publishing import publish_cameras
 from orthoflow.files.sidecars import frame_json, write_json
 from orthoflow.geometry import WallFrame
-from orthoflow.products import CheckPoints, InputFiles
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    CheckPoints,
+    InputFiles,
+    Intrinsics,
+    Photo,
+    Photos,
+    Product,
+)
 from orthoflow.sdk import Method
 from orthoflow.testing.trials import Trial, run_trial
 from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.draft import draft_workflow, recognised
 from orthoflow.workflow.expand import expand_cells
 from orthoflow.workflow.source import shipped_workflows
 from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 from tests import photo_files, samples, scan_files
+from tests.files import test_metashape as agisoft
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import (
+    mutate_bytes,
     mutate_e57,
     mutate_json,
     mutate_png,
@@ -53,10 +72,10 @@ from tests.fuzz.mutation import (
 from tests.report_runs import environment
 from tests.scan_cases import CASES, Draw
 
-_N: Final = 40
+N_POINTS: Final = 40
 
 
-def _read_with(method: type[Method], files: InputFiles, **more: InputFiles) -> object:
+def _read_with(method: type[Method], files: InputFiles, **more: Product) -> object:
     trial = Trial(method=method, inputs={"files": files, **more})
     return run_trial(trial, files.paths[0].parent / "scratch", draws=False).digests
 
@@ -79,71 +98,55 @@ def _read_part(path: Path) -> object:
     return run_trial(trial, path.parent / "scratch", draws=False).digests
 
 
-def _points() -> NDArray[np.float64]:
-    return np.random.default_rng(1).uniform(-5.0, 5.0, (_N, 3)).round(4)
-
-
-def _rgb() -> NDArray[np.int64]:
-    return np.random.default_rng(2).integers(0, 256, (_N, 3))
-
-
-def _intensity() -> NDArray[np.int64]:
-    return np.random.default_rng(3).integers(0, 65536, _N)
-
-
-def _e57_files(folder: Path) -> None:
-    red, green, blue = _rgb().T
-    colours = {"colorRed": red, "colorGreen": green, "colorBlue": blue}
-    grid = {"rowIndex": np.arange(_N) % 8, "columnIndex": np.arange(_N) // 8}
-    whole = {
-        "fields": scan_files.cartesian(_points(), intensity=_intensity(), **colours, **grid),
-        "rotation": (0.8, 0.0, 0.0, 0.6),
-        "translation": (1.0, 2.0, 3.0),
-        "intensity_limits": (0.0, 65535.0),
-        "rgb_limit": 255,
+def _spherical_files(folder: Path) -> None:
+    fields = {
+        "sphericalRange": np.linspace(1.0, 9.0, N_POINTS),
+        "sphericalAzimuth": np.linspace(-3.0, 3.0, N_POINTS),
+        "sphericalElevation": np.linspace(-1.0, 1.0, N_POINTS),
+        "sphericalInvalidState": np.arange(N_POINTS) % 2,
+        "rowIndex": np.arange(N_POINTS) % 8,
+        "columnIndex": np.arange(N_POINTS) // 8,
     }
-    spherical = {
-        "sphericalRange": np.linspace(1.0, 9.0, _N),
-        "sphericalAzimuth": np.linspace(-3.0, 3.0, _N),
-        "sphericalElevation": np.linspace(-1.0, 1.0, _N),
-        "sphericalInvalidState": np.arange(_N) % 2,
-    }
-    scan_files.write_e57(folder / "two.e57", [whole, {"fields": scan_files.cartesian(_points())}])
-    scan_files.write_e57(folder / "spherical.e57", [{"fields": spherical}])
+    pose = {"rotation": (0.8, 0.0, 0.0, 0.6), "translation": (1.0, 2.0, 3.0)}
+    scan_files.write_e57(folder / "spherical.e57", [{"fields": fields, **pose}])
 
 
 def _las_files(folder: Path) -> None:
-    for name in ("plain.las", "packed.laz"):
-        scan_files.write_las(folder / name, _points(), intensity=_intensity(), rgb=_rgb())
-    scan_files.write_las(folder / "bare.las", _points(), withheld=np.arange(_N) % 5 == 0)
+    points = np.random.default_rng(1).uniform(-5.0, 5.0, (N_POINTS, 3))
+    scan_files.write_las(folder / "a.las", points, withheld=np.arange(N_POINTS) % 5 == 0)
 
 
 def _copc_files(folder: Path) -> None:
     rng = np.random.default_rng(2)
     levels = [
-        {(0, 0, 0): rng.uniform(0.1, 7.9, (_N, 3))},
-        {(0, 0, 0): rng.uniform(0.1, 3.9, (_N, 3)), (1, 0, 1): rng.uniform(4.1, 7.9, (_N, 3))},
+        {(0, 0, 0): rng.uniform(0.1, 7.9, (N_POINTS, 3))},
+        {(0, 0, 0): rng.uniform(0.1, 3.9, (9, 3)), (1, 0, 1): rng.uniform(4.1, 7.9, (9, 3))},
     ]
     scan_files.write_copc(folder / "two.laz", levels)
     (folder / "two.las").unlink()
 
 
-def _cases(*names: str) -> Callable[[Path], None]:
-    """Writes small files of `scan_cases`, four of each, as the seeds draw them."""
+def _cases(*names: str, more: Callable[[Path], None] | None = None) -> Callable[[Path], None]:
+    """Writes small files of `scan_cases`, three of each, as the seeds draw them."""
 
     def write(folder: Path) -> None:
-        for name, seed in product(names, range(4)):
+        for name, seed in product(names, range(3)):
             with tempfile.TemporaryDirectory() as made:
-                case = CASES[name](Draw(seed, Path(made), n_points=_N))
+                case = CASES[name](Draw(seed, Path(made), n_points=N_POINTS))
                 for k, path in enumerate(case.paths):
                     shutil.copy(path, folder / f"{name}_{seed}_{k}{path.suffix}")
+        if more is not None:
+            more(folder)
 
     return write
 
 
-_TEXTS: Final = ("csv_named", "text_units", "text_not_a_number", "text_normals", "pts_two_scanners")
-E57 = Target(seeds=_e57_files, read=_read_scan, mutate=mutate_e57)
-LAS = Target(seeds=_las_files, read=_read_scan)
+E57 = Target(
+    seeds=_cases("e57_colour_invalid", "e57_scan_without", more=_spherical_files),
+    read=_read_scan,
+    mutate=mutate_e57,
+)
+LAS = Target(seeds=_cases("las_feet", "las_extra_intensity", more=_las_files), read=_read_scan)
 COPC = Target(seeds=_copc_files, read=_read_part)
 PLY = Target(
     seeds=_cases("ply_lists", "comment_units", "points_at_one_place"),
@@ -152,7 +155,14 @@ PLY = Target(
 )
 PCD = Target(seeds=_cases("pcd_names"), read=_read_scan, mutate=mutate_text)
 PTX = Target(seeds=_cases("ptx_scans"), read=_read_scan, mutate=mutate_text)
-TEXT = Target(seeds=_cases(*_TEXTS), read=_read_scan, mutate=mutate_text)
+TEXT = Target(
+    seeds=_cases(
+        "csv_named", "text_units", "text_not_a_number", "text_normals", "pts_two_scanners"
+    ),
+    read=_read_scan,
+    mutate=mutate_text,
+)
+SCANS: Final = (E57, LAS, COPC, PLY, PCD, PTX, TEXT)
 
 
 # Photos, and other pictures -----------------------------------------------------------------------
@@ -171,24 +181,21 @@ def _exif() -> bytes:
     return photo_files.exif_block({**main}, {**inner})
 
 
-def _photo_files(folder: Path, *kinds: str) -> None:
+def _photo_files(kind: str, folder: Path) -> None:
     image, exif = photo_files.picture(), _exif()
     made = {
         "jpg": photo_files.jpeg(image, exif),
         "png": photo_files.png(image, exif),
         "tif": photo_files.tiff(image, orientation=6),
     }
-    photo_files.write(folder, {f"a.{kind}": made[kind] for kind in kinds})
+    (folder / f"a.{kind}").write_bytes(made[kind])
 
 
 def _read_photo(path: Path) -> object:
-    return _read_with(ReadPhotos, _files(path))
-
-
-def _read_exif(path: Path) -> object:
     encoded = path.read_bytes()
     exif = read_exif(encoded)
-    return exif.camera, focal_length(exif, 64, 48), icc_profile(encoded), damage(encoded)
+    told = exif.camera, focal_length(exif, 64, 48), icc_profile(encoded), damage(encoded)
+    return told, _read_with(ReadPhotos, _files(path))
 
 
 def _figure_files(folder: Path) -> None:
@@ -201,10 +208,9 @@ def _read_figure(path: Path) -> object:
     return shrunk_webp(path.read_bytes(), path.name, longest_side_px=32)
 
 
-JPEG = Target(seeds=lambda folder: _photo_files(folder, "jpg"), read=_read_photo)
-PNG = Target(seeds=lambda folder: _photo_files(folder, "png"), read=_read_photo, mutate=mutate_png)
-TIFF = Target(seeds=lambda folder: _photo_files(folder, "tif"), read=_read_photo)
-EXIF = Target(seeds=lambda folder: _photo_files(folder, "jpg", "png", "tif"), read=_read_exif)
+JPEG = Target(seeds=partial(_photo_files, "jpg"), read=_read_photo)
+PNG = Target(seeds=partial(_photo_files, "png"), read=_read_photo, mutate=mutate_png)
+TIFF = Target(seeds=partial(_photo_files, "tif"), read=_read_photo)
 FIGURE = Target(seeds=_figure_files, read=_read_figure)
 
 
@@ -250,6 +256,202 @@ SIDECAR = Target(
 GEOTIFF = Target(seeds=lambda folder: _write_image(folder / "wall.tif"), read=_read_geotiff)
 
 
+_WIDTH, _HEIGHT = 64, 48
+_PHOTOS: Final = ("a.jpg", "b.jpg")
+PHOTOS: Final = Photos(
+    photos=tuple(Photo(name=name, width=_WIDTH, height=_HEIGHT, encoded=b"") for name in _PHOTOS)
+)
+
+# Cameras ------------------------------------------------------------------------------------------
+
+_OF_FIRST, _OF_SECOND = 'sensor_id="0"', 'sensor_id="1"'
+_METASHAPE: Final = agisoft.document(
+    sensors=agisoft.sensor_of(agisoft.TERMS)
+    + '<sensor id="1" label="360" type="spherical"><resolution width="256" height="128"/></sensor>',
+    chunk="<components><component id='0'><transform><rotation>1 0 0 0 1 0 0 0 1</rotation>"
+    "<translation>4e5 5e6 100</translation><scale>1.5</scale></transform></component></components>",
+    cameras=agisoft.posed("a.jpg", more=' component_id="0"')
+    + f"<group>{agisoft.posed('b.jpg').replace(_OF_FIRST, _OF_SECOND)}</group>",
+).replace('width="640" height="480"', 'width="64" height="48"')
+_BUNDLER: Final = (
+    "# Bundle file v0.3\n2 0\n60.5 -0.1 0.01\n1 0 0\n0 1 0\n0 0 1\n0.5 1.5 2.5\n" + 5 * "0 0 0\n"
+)
+_REALITYCAPTURE: Final = (
+    "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    "a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
+    "b.jpg,2.5,2.5,3.5,-90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
+)
+
+
+def _given() -> Cameras:
+    lens = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=60.5, fy=61.0, cx=31.5, cy=24.0)
+    first = Camera(
+        photo=_PHOTOS[0],
+        status="ok",
+        intrinsics=lens,
+        rotation_camera_from_world=np.eye(3),
+        translation_camera_from_world=np.array([1.0, 2.0, 3.0]),
+        sigma_wall_m=0.002,
+    )
+    return Cameras(cameras=(first, Camera(photo=_PHOTOS[1], status="no wall is recognised in it")))
+
+
+def _camera_files(folder: Path) -> None:
+    publish_cameras(_given(), folder, "sha256:0")
+    write_colmap_model(folder, _given())
+    pycolmap.Reconstruction(str(folder)).write_binary(str(folder))
+    for suffix in ("txt", "bin"):
+        (folder / f"points3D.{suffix}").unlink()
+    (folder / "metashape.xml").write_text(_METASHAPE)
+    (folder / "bundle.out").write_text(_BUNDLER)
+    (folder / "list.txt").write_text("walls/a.jpg 0 60.5\nwalls/b.jpg\n")
+    (folder / "list.csv").write_text(_REALITYCAPTURE)
+
+
+# What must lie beside a file for it to be read.
+_TOGETHER: Final = (
+    ("cameras.txt", "images.txt", "rigs.txt", "frames.txt"),
+    ("cameras.bin", "images.bin", "rigs.bin", "frames.bin"),
+    ("bundle.out", "list.txt"),
+)
+
+
+def _read_cameras(path: Path) -> object:
+    paths = [path]
+    for name in next((names for names in _TOGETHER if path.name in names), ()):
+        if name != path.name:
+            paths.append(path.with_name(name))
+            paths[-1].write_bytes(_sound()[name])
+    return _read_with(ReadCameras, _files(*paths), photos=PHOTOS)
+
+
+@cache
+def _sound() -> Mapping[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        _camera_files(Path(folder))
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def _mutate_cameras(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    if b"\0" in content:
+        return mutate_bytes(content, rng, others)
+    is_json = content.startswith(b"{") and rng.random() < 0.7
+    return (mutate_json if is_json else mutate_text)(content, rng, others)
+
+
+CAMERAS = Target(seeds=_camera_files, read=_read_cameras, mutate=_mutate_cameras)
+
+
+# Photos in E57 files ------------------------------------------------------------------------------
+
+_NUMBERS: Final = {
+    "imageWidth": _WIDTH,
+    "imageHeight": _HEIGHT,
+    "focalLength": 0.03,
+    "pixelWidth": 5e-4,
+    "pixelHeight": 6e-4,
+    "principalPointX": 33.5,
+    "principalPointY": 22.25,
+}
+
+
+def _e57_photo_files(folder: Path) -> None:
+    picture = photo_files.picture(_WIDTH, _HEIGHT)
+    points = np.random.default_rng(1).uniform(0.0, 1.0, (5, 3))
+    fields = scan_files.cartesian(points)
+    pose = {"rotation": (0.8, 0.0, 0.0, 0.6), "translation": (1.0, 2.0, 3.0)}
+    sphere = {
+        "imageWidth": 64,
+        "imageHeight": 32,
+        "pixelWidth": 2.0 * np.pi / 64,
+        "pixelHeight": np.pi / 32,
+    }
+    jpeg, png, other = (
+        encode_jpeg(picture),
+        encode_png(photo_files.picture(64, 32)),
+        encode_png(picture),
+    )
+    images = [
+        {"kind": "pinhole", "name": "north", "content": jpeg, "numbers": _NUMBERS, **pose},
+        {"kind": "spherical", "content": png, "numbers": sphere, **pose},
+        {"kind": "visualReference", "content": other},
+    ]
+    scan_files.write_e57(folder / "room.e57", [{"fields": fields}], images)
+
+
+def _read_e57_photos(path: Path) -> object:
+    """Count them, read them as photos, and their cameras."""
+    count_e57_images(path)
+    trial = Trial(method=ReadPhotos, inputs={"files": _files(path)})
+    photos = run_trial(trial, path.parent / "scratch", draws=False).outputs["photos"]
+    return _read_with(ReadCameras, _files(path), photos=photos)
+
+
+E57_PHOTOS = Target(seeds=_e57_photo_files, read=_read_e57_photos, mutate=mutate_e57)
+
+
+# Masks --------------------------------------------------------------------------------------------
+
+
+def _mask_files(folder: Path) -> None:
+    ring = [[4.5, 4], [30, 4], [30, 20.25], [4.5, 20.25], [4.5, 4]]
+    hole = [[10, 8], [12, 8], [12, 10], [10, 8]]
+    shapes = [
+        {"type": "Polygon", "coordinates": [ring, hole]},
+        {"type": "MultiPolygon", "coordinates": [[ring], [hole]]},
+    ]
+    features = [
+        {"type": "Feature", "properties": {"photo": name, "note": 1}, "geometry": shape}
+        for name, shape in zip(("a.jpg", "*.jp?"), shapes, strict=True)
+    ]
+    content = {"type": "FeatureCollection", "features": features}
+    (folder / "masks.geojson").write_text(json.dumps(content))
+    used = np.full((_HEIGHT, _WIDTH), 255, np.uint8)
+    used[:10] = 0
+    (folder / "a_mask.png").write_bytes(encode_png(used))
+
+
+def _read_mask(path: Path) -> object:
+    """Read photos with it; `drawn_seams` of `mosaic` read polygons in the same way."""
+    folder = path.parent / "photos"
+    folder.mkdir()
+    photo = photo_files.jpeg(photo_files.picture(_WIDTH, _HEIGHT))
+    photo_files.write(folder, dict.fromkeys(_PHOTOS, photo))
+    return _read_with(ReadPhotos, _files(*(folder / name for name in _PHOTOS)), masks=_files(path))
+
+
+def _mutate_mask(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    return (mutate_json if content.startswith(b"{") else mutate_png)(content, rng, others)
+
+
+MASKS = Target(seeds=_mask_files, read=_read_mask, mutate=_mutate_mask)
+
+
+# Folders that a workflow is drafted for -----------------------------------------------------------
+
+
+def _folder_files(folder: Path) -> None:
+    _camera_files(folder)
+    for name in ("images.txt", "images.bin", "bundle.out", "list.txt"):
+        (folder / name).unlink()
+    (folder / "ties.csv").write_text(_TIES)
+    (folder / "points.csv").write_text("name,x,y,z\np1,1.0,2.0,3.0\n")
+    (folder / "calibration.yaml").write_text(
+        'cameras: {"*": {width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}}\n'
+    )
+    (folder / "scan.xyz").write_text("1.5 2.5 3.5 0.5\n4.5 5.5 6.5 0.25\n")
+    photo_files.write(folder, {"a.jpg": photo_files.jpeg(photo_files.picture())})
+
+
+def _draft(path: Path) -> object:
+    """Draft for the file, with a scan and a name from nowhere beside it."""
+    path.with_name("room.xyz").write_text("1.5 2.5 3.5 0.5\n4.5 5.5 6.5 0.25\n")
+    return draft_workflow(recognised([path.parent]), path.with_name("workflow.yaml"), None).text
+
+
+FOLDER = Target(seeds=_folder_files, read=_draft, mutate=_mutate_cameras)
+
+
 # Calibration, check points, workflows -------------------------------------------------------------
 
 _CALIBRATION: Final = """\
@@ -278,9 +480,19 @@ attic;a.laz;photos;;;;
 _POINT_LINES: Final = "A;1.5;2.5;3.5\nB;-1.5;2.5;3.25\n"
 
 
-def _checkpoint_files(folder: Path) -> None:
+_TIES: Final = """\
+# photo, then pixels as OpenCV counts them
+photo,u_px,v_px,x,y,z,sigma_px
+a.jpg,10.5,20.5,1.0,2.0,3.0,0.5
+b.jpg,0,47.5,-1e2,2.5,0.001,
+"a.jpg",63.5,0,0,0,0,2
+"""
+
+
+def _point_files(folder: Path) -> None:
     (folder / "points.csv").write_text(_CHECKPOINTS)
     (folder / "lines.txt").write_text(_POINT_LINES)
+    (folder / "ties.csv").write_text(_TIES)
 
 
 _TITLE_BLOCK: Final = """\
@@ -298,12 +510,26 @@ def _read_calibration(path: Path) -> object:
     return _read_with(ReadPhotos, _files(photo), calibration=_files(path))
 
 
-def _read_checkpoints(path: Path) -> object:
+def _read_points(path: Path) -> object:
+    if path.name == "ties.csv":
+        return _read_with(ReadTies, _files(path), photos=PHOTOS)
     return _read_with(ReadCheckpoints, _files(path))
 
 
+_WORKFLOW: Final = """\
+orthoflow: 1
+inputs: {scan: {}, photos: {optional: true}}
+steps:
+  cloud: {use: read.scan, in: {files: inputs.scan}, params: {up: z}}
+  shots: {use: read.photos, in: {files: inputs.photos}}
+  plane: {use: plane.hough2d, in: {cloud: cloud.cloud}}
+  wall: {use: raster.grid, in: {cloud: cloud.cloud, planes: plane.planes}}
+"""
+
+
 def _workflow_files(folder: Path) -> None:
-    for name in ("photos-on-scan", "plane-methods", "plane-benchmark"):
+    (folder / "small.yaml").write_text(_WORKFLOW)
+    for name in ("plane-methods", "plane-benchmark"):
         (folder / f"{name}.yaml").write_bytes(shipped_workflows()[name].read_bytes())
 
 
@@ -318,14 +544,17 @@ def _read_workflow(path: Path) -> object:
 
 
 def _read_rooms(path: Path) -> object:
-    workflow = load_workflow("photos-on-scan", _catalog(), datasets=str(path))
+    small = path.with_name("small.yaml")
+    small.write_text(_WORKFLOW)
+    workflow = load_workflow(small, _catalog(), datasets=str(path))
     return len(expand_cells(workflow, _catalog())), resolved_json(workflow)
 
 
 def _resolved_files(folder: Path) -> None:
-    for name in ("photos-on-scan", "plane-methods", "plane-benchmark"):
-        workflow = load_workflow(shipped_workflows()[name], _catalog())
-        (folder / f"{name}.json").write_text(resolved_json(workflow))
+    _workflow_files(folder)
+    for path in list(folder.iterdir()):
+        path.with_suffix(".json").write_text(resolved_json(load_workflow(path, _catalog())))
+        path.unlink()
 
 
 def _read_resolved(path: Path) -> object:
@@ -338,7 +567,7 @@ CALIBRATION = Target(
     read=_read_calibration,
     mutate=mutate_yaml,
 )
-CHECKPOINTS = Target(seeds=_checkpoint_files, read=_read_checkpoints, mutate=mutate_text)
+POINTS = Target(seeds=_point_files, read=_read_points, mutate=mutate_text)
 TITLE_BLOCK = Target(
     seeds=lambda folder: (folder / "block.yaml").write_text(_TITLE_BLOCK),
     read=read_title_block,
@@ -376,24 +605,25 @@ def _result() -> CellResult:
     )
 
 
-def _read_result(path: Path) -> object:
-    store = Store(path.parent / "store")
+def _store_files(folder: Path) -> None:
+    (folder / "result.json").write_text(result_to_json(_result()))
+    note = '{"type": "checkpoints", "size_bytes": 5000, "publisher": ""}'
+    (folder / "object.json").write_text(note)
+
+
+def _read_stored(path: Path) -> object:
+    """Read a result, or the notes beside a product, which is put again."""
+    store, content = Store(path.parent / "store"), path.read_bytes()
     with store.in_use():
-        (store.results / f"{_KEY}.json").write_bytes(path.read_bytes())
-        (store.folder / "digests.json").write_bytes(path.read_bytes())
+        if path.name == "object.json":
+            ref = store.put_product(_product())
+            folder = store.objects / ref.digest.removeprefix("sha256:")
+            (folder / path.name).write_bytes(content)
+            return store.product_file(ref.digest), store.put_product(_product())
+        (store.results / f"{_KEY}.json").write_bytes(content)
+        (store.folder / "digests.json").write_bytes(content)
         store.file_digests().digest(path)
         return store.result(_KEY), list_results(store), store.earlier_results("make.range")
-
-
-def _read_object(path: Path) -> object:
-    """Read the notes beside a product, then put the product again."""
-    store = Store(path.parent / "store")
-    product = _product()
-    with store.in_use():
-        ref = store.put_product(product)
-        folder = store.objects / ref.digest.removeprefix("sha256:")
-        (folder / "object.json").write_bytes(path.read_bytes())
-        return store.product_file(ref.digest), store.put_product(product)
 
 
 def _product() -> CheckPoints:
@@ -441,19 +671,10 @@ def _read_journal(path: Path) -> object:
         return journal.finished_keys
 
 
-RESULT = Target(
-    seeds=lambda folder: (folder / "result.json").write_text(result_to_json(_result())),
-    read=_read_result,
-    mutate=mutate_json,
-)
-OBJECT = Target(
-    seeds=lambda folder: (folder / "object.json").write_text(
-        '{"type": "checkpoints", "size_bytes": 5000, "publisher": ""}'
-    ),
-    read=_read_object,
-    mutate=mutate_json,
-)
+STORED = Target(seeds=_store_files, read=_read_stored, mutate=mutate_json)
 PRODUCT = Target(seeds=_product_files, read=_read_product)
 JOURNAL_FILE = Target(seeds=_journal_files, read=_read_journal, mutate=mutate_text)
 
-NAMES: Final = tuple(name for name, value in globals().items() if isinstance(value, Target))
+PICTURES: Final = (JPEG, PNG, TIFF, FIGURE, SIDECAR, GEOTIFF, E57_PHOTOS, MASKS)
+TABLES: Final = (CAMERAS, POINTS, CALIBRATION, TITLE_BLOCK, FOLDER)
+WORKFLOWS: Final = (WORKFLOW, ROOMS, RESOLVED, STORED, PRODUCT, JOURNAL_FILE)

@@ -16,17 +16,17 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
-from tests.fuzz.harness import MAX_WALL_S, target_named, write_case
+from tests.fuzz.harness import MAX_WALL_S, targets_of, write_case
 
 # Address space beyond what is taken when reading begins: what asks for more gets a MemoryError.
 _ADDRESS_SPACE: Final = 4 << 30
 
 
 def read_cases(
-    name: str, seed: int, first: int, count: int, folder: Path, budget_s: float, sender: Connection
+    group: str, seed: int, first: int, count: int, folder: Path, budget_s: float, sender: Connection
 ) -> None:
     """Read cases until the time is over, and send what becomes of each as (kind, text)."""
-    target, case_folder, seeds = target_named(name), folder / "case", folder / "seeds"
+    targets, case_folder, seeds = targets_of(group), folder / "case", folder / "seeds"
     os.chdir(case_folder)
     # As a step has it, whose TMPDIR is its scratch folder.
     tempfile.tempdir = str(case_folder)
@@ -38,15 +38,17 @@ def read_cases(
     for number in (signal.SIGPROF, signal.SIGALRM):
         faulthandler.register(number, 2, chain=True)
     # What is loaded, compiled or opened once is no case's cost.
-    for sound in sorted(seeds.iterdir()):
-        _empty(case_folder)
-        target.read(Path(shutil.copy(sound, case_folder)))
+    for number, target in enumerate(targets):
+        for sound in sorted((seeds / str(number)).iterdir()):
+            _empty(case_folder)
+            target.read(Path(shutil.copy(sound, case_folder)))
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + _ADDRESS_SPACE,) * 2)
     end = time.monotonic() + budget_s
     for case in range(first, first + count):
         _empty(case_folder)
-        path = write_case(name, seed, case, seeds, case_folder)
+        target = targets[case % len(targets)]
+        path = write_case(group, seed, case, seeds, case_folder)
         sender.send(("case", str(case)))
         os.truncate(2, 0)
         with suppress(OSError):

@@ -12,8 +12,8 @@ import sys
 import tarfile
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from random import Random
 from typing import Final
@@ -25,7 +25,6 @@ from tests.fuzz.hostile_files import TEXTS, changed_json, damage_bytes, damage_s
 from tests.studios import Studio, open_studio
 from tests.workshop_runs import WORKSHOP
 
-Damage = Callable[[Path, Random], None]
 Command = tuple[str, ...]
 
 MAX_CPU_S: Final = 5.0  # of a command
@@ -63,15 +62,15 @@ def _pack(folder: Path, archive: Path) -> None:
         stream.add(folder, ".")
 
 
-def _write_record(archive: Path, *, is_crate: bool) -> None:
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        studio = open_studio(Path(folder), patch)
+def _write_archives(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as made, pytest.MonkeyPatch.context() as patch:
+        studio = open_studio(Path(made), patch)
         (studio.folder / "n.txt").write_text("1.5")
         studio.run("first", "--input", "number=n.txt", "--embed")
-        if is_crate:
-            done = studio("export", "first", "--to", "ro-crate", "-o", "crate")
-            assert done.exit_code == 0, done.output
-        _pack(studio.folder / ("crate" if is_crate else "first"), archive)
+        done = studio("export", "first", "--to", "ro-crate", "-o", "crate")
+        assert done.exit_code == 0, done.output
+        _pack(studio.folder / "first", folder / "record.tar")
+        _pack(studio.folder / "crate", folder / "crate.tar")
 
 
 def with_damage(content: bytes, random: Random, _: Sequence[bytes]) -> bytes:
@@ -81,9 +80,11 @@ def with_damage(content: bytes, random: Random, _: Sequence[bytes]) -> bytes:
 # Cases --------------------------------------------------------------------------------------------
 
 
-def _read_damaged(damage: Damage, commands: Sequence[Command], path: Path) -> None:
+def _read_damaged(path: Path) -> None:
     """Unpack, damage, and run two commands; all of them on what is sound."""
     _install_workshop()
+    is_crate = path.name == "crate.tar"
+    commands = CRATE_COMMANDS if is_crate else RECORD_COMMANDS
     folder = path.parent
     _, mark, number = path.read_bytes().rpartition(MARK)
     run, original = folder / "out" / "run", folder / "first"
@@ -95,7 +96,10 @@ def _read_damaged(damage: Damage, commands: Sequence[Command], path: Path) -> No
     (folder / "secret.txt").write_text(SECRET)
     random = Random(number)
     if mark:
-        damage(run, random)
+        if is_crate:
+            _damage_crate(run, random)
+        else:
+            random.choice((damage_bytes, damage_structure))(run / "run.h5", random)
         commands = (random.choice(commands),)
     before = surroundings(folder)
     codes = [check_command(Studio(folder), command, run) for command in (("verify",), *commands)]
@@ -195,22 +199,12 @@ def _put_link(path: Path, random: Random) -> None:
         path.symlink_to(random.choice(targets))
 
 
-def _in_record(damage: Damage) -> Damage:
-    return lambda run, random: damage(run / "run.h5", random)
-
-
-def _target(damage: Damage, commands: Sequence[Command], *, is_crate: bool = False) -> Target:
-    return Target(
-        seeds=lambda folder: _write_record(folder / "first.tar", is_crate=is_crate),
-        read=partial(_read_damaged, damage, commands),
+RECORDS: Final = (
+    Target(
+        seeds=_write_archives,
+        read=_read_damaged,
         mutate=with_damage,
         refusals=(RefusedError,),
         max_cpu_s=3 * MAX_CPU_S,
-    )
-
-
-RECORD_BYTES = _target(_in_record(damage_bytes), RECORD_COMMANDS)
-RECORD_STRUCTURE = _target(_in_record(damage_structure), RECORD_COMMANDS)
-CRATE = _target(_damage_crate, CRATE_COMMANDS, is_crate=True)
-
-NAMES: Final = ("RECORD_BYTES", "RECORD_STRUCTURE", "CRATE")
+    ),
+)

@@ -24,7 +24,7 @@ from orthoflow.files.sidecars import frame_json
 from tests import scan_files
 from tests.fuzz import readers
 from tests.fuzz.e57_pages import LogicalE57, e57_of, logical_of
-from tests.fuzz.harness import MAX_CPU_S, Target, target_named
+from tests.fuzz.harness import MAX_CPU_S, Target
 
 _CORPUS: Final = Path(__file__).parent / "corpus"
 _STEPS: Final = "orthoflow: 1\nsteps:\n  room: {use: simulate.room}\n"
@@ -48,12 +48,13 @@ def _sidecar(**changed: object) -> bytes:
     return json.dumps({**frame_json(readers._frame()), **changed}).encode()
 
 
-def _e57(change: Callable[[LogicalE57], bytes]) -> Callable[[Path], bytes]:
-    def content(folder: Path) -> bytes:
-        readers.E57.seeds(folder)
-        return change(logical_of((folder / "two.e57").read_bytes()))
+def _sound_e57(folder: Path) -> bytes:
+    fields = scan_files.cartesian(np.arange(12.0).reshape(4, 3))
+    return scan_files.write_e57(folder / "a.e57", [{"fields": fields}]).read_bytes()
 
-    return content
+
+def _e57(change: Callable[[LogicalE57], bytes]) -> Callable[[Path], bytes]:
+    return lambda folder: change(logical_of(_sound_e57(folder)))
 
 
 def _with_xml(old: bytes, new: bytes) -> Callable[[Path], bytes]:
@@ -61,8 +62,7 @@ def _with_xml(old: bytes, new: bytes) -> Callable[[Path], bytes]:
 
 
 def _wrong_checksum(folder: Path) -> bytes:
-    readers.E57.seeds(folder)
-    content = bytearray((folder / "two.e57").read_bytes())
+    content = bytearray(_sound_e57(folder))
     content[1022] ^= 1
     return bytes(content)
 
@@ -81,8 +81,8 @@ def _large_png(folder: Path) -> bytes:
 
 def _las(change: Callable[[bytearray], None]) -> Callable[[Path], bytes]:
     def content(folder: Path) -> bytes:
-        readers.LAS.seeds(folder)
-        changed = bytearray((folder / "bare.las").read_bytes())
+        points = np.arange(120.0).reshape(40, 3)
+        changed = bytearray(scan_files.write_las(folder / "a.las", points).read_bytes())
         change(changed)
         return bytes(changed)
 
@@ -133,7 +133,7 @@ KNOWN: Final = {
         "expected at most 1000 entries, got 2001"),
     "a merge loop": ("CALIBRATION", "c.yaml", "cameras:\n  a: &a\n    <<: *a\n    width: 1\n",
         "contains itself"),
-    "100,001 check points": ("CHECKPOINTS", "p.csv", "a,1,2,3\n" * 100_001,
+    "100,001 check points": ("POINTS", "p.csv", "a,1,2,3\n" * 100_001,
         "more than 100000 points: split it"),
     # Sidecars.
     "deep JSON": ("SIDECAR", "wall.json", "[" * 50_000, "not valid JSON, it is nested"),
@@ -219,7 +219,7 @@ def test_a_small_file_costs_little_and_is_refused_with_the_reason(
     path.parent.mkdir()
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(OrthoflowError, match=re.compile(words, re.DOTALL)) as refused:
-        _read(target_named(f"tests.fuzz.readers:{name}"), path)
+        _read(getattr(readers, name), path)
     assert len(str(refused.value)) < 50_000
 
 
@@ -230,7 +230,7 @@ def _made(folder: Path) -> Path:
 
 @pytest.mark.parametrize("path", sorted(_CORPUS.glob("*/*")), ids=lambda path: path.stem)
 def test_what_once_failed_is_refused(path: Path, tmp_path: Path) -> None:
-    target = target_named(f"tests.fuzz.readers:{path.parent.name.upper()}")
+    target: Target = getattr(readers, path.parent.name.upper())
     copied = tmp_path / path.name
     copied.write_bytes(path.read_bytes())
     with pytest.raises(InputError):
@@ -244,7 +244,7 @@ def test_records_behind_the_points_of_a_las_file_are_not_read(n_bytes: int, tmp_
     struct.pack_into("<QI", content, 235, len(content), 1)
     content += struct.pack("<H16sHQ32s", 0, b"orthoflow", 1, n_bytes, b"") + bytes(10)
     (tmp_path / "a.las").write_bytes(content)
-    assert len(scan_files.read_points(tmp_path / "a.las")) == 32  # eight are withheld
+    assert len(scan_files.read_points(tmp_path / "a.las")) == 40
 
 
 def test_pictures_that_an_e57_only_claims_to_hold_are_not_read(tmp_path: Path) -> None:
@@ -261,8 +261,6 @@ def test_pictures_that_an_e57_only_claims_to_hold_are_not_read(tmp_path: Path) -
 
 
 def test_the_results_of_a_store_full_of_brackets_are_no_results(tmp_path: Path) -> None:
-    for name, target in (("result.json", readers.RESULT), ("object.json", readers.OBJECT)):
-        folder = tmp_path / name
-        folder.mkdir()
-        (folder / name).write_bytes(b"[" * 50_000)
-        target.read(folder / name)
+    for name in ("result.json", "object.json"):
+        (tmp_path / name).write_bytes(b"[" * 50_000)
+        readers.STORED.read(tmp_path / name)
