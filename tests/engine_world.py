@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import multiprocessing.util
 import os
-import signal
+import shutil
 import sys
 import tempfile
 import time
@@ -15,10 +15,9 @@ from dataclasses import dataclass, field
 from importlib.metadata import PathDistribution
 from importlib.util import cache_from_source
 from multiprocessing import forkserver
-from multiprocessing.context import ForkServerProcess
-from multiprocessing.reduction import DupFd
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import cast
 
 import pytest
 
@@ -34,8 +33,8 @@ from orthoflow.records.runs import Run
 from orthoflow.records.write import executed_and_written
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
-from tests.engine_mischief import MISCHIEF, NAMES
-from tests.engine_toys import HOOKS, MAKES, PRODUCTS, WORKS
+
+TOYS = Path(__file__).parent / "toys"
 
 
 @dataclass
@@ -114,11 +113,17 @@ def toy_world(folder: Path) -> Iterator[World]:
         install_toys(site)
     sys.path.insert(0, str(site))
     forget_toys()
+    preload_for_toys()
     try:
         yield World(folder=folder, site=site)
     finally:
         sys.path.remove(str(site))
         forget_toys()
+
+
+def preload_for_toys() -> None:
+    """Let servers of steps that this process starts load what toys need, which is no compiler."""
+    local.PRELOADED[:] = ["orthoflow.engine.worker"]
 
 
 def digests(outcome: RunOutcome) -> dict[str, str]:
@@ -131,52 +136,13 @@ def digests(outcome: RunOutcome) -> dict[str, str]:
     }
 
 
-@dataclass
-class Coordinator:
-    """A process that runs a workflow, which tests may stop.
-
-    Attributes:
-        process: it, forked from one that has loaded all that it needs.
-        stdout: what it says, "ready" before the run.
-    """
-
-    process: ForkServerProcess
-    stdout: BinaryIO
-
-    @property
-    def pid(self) -> int:
-        assert self.process.pid is not None
-        return self.process.pid
-
-    @property
-    def returncode(self) -> int | None:
-        return self.process.exitcode
-
-    def kill(self) -> None:
-        self.process.kill()
-
-    def send_signal(self, number: signal.Signals) -> None:
-        os.kill(self.pid, number)
-
-    def communicate(self, timeout: float | None = None) -> str:
-        """Wait for its end; what it said since it was read last."""
-        self.process.join(timeout)
-        assert self.process.exitcode is not None
-        with self.stdout:
-            return self.stdout.read().decode()
-
-
-def start_coordinator(world: World, steps: str, into: str) -> Coordinator:
-    """Run a workflow in a process of its own, which tests may kill."""
+def start_coordinator(world: World, steps: str, into: str) -> BaseProcess:
+    """Run a workflow in a process of its own, which tests may stop; it writes to `<into>.said`."""
     start_fork_server()
     context = multiprocessing.get_context("forkserver")
-    reading, writing = os.pipe()
-    with os.fdopen(writing, "wb") as said:
-        process = context.Process(
-            target=_coordinate, args=(world.folder, steps, into, DupFd(said.fileno()))
-        )
-        process.start()
-    return Coordinator(process, os.fdopen(reading, "rb"))
+    process = context.Process(target=_coordinate, args=(world.folder, steps, into))
+    process.start()
+    return process
 
 
 def start_fork_server(*modules: str) -> None:
@@ -195,12 +161,8 @@ def start_fork_server(*modules: str) -> None:
 
 def install_toys(site: Path) -> None:
     """Write the toy plugin with its metadata, as an installer does."""
-    package = site / "toy_plugin"
-    package.mkdir(parents=True)
-    files = {"hooks": HOOKS, "products": PRODUCTS, "makes": MAKES, "works": WORKS, "__init__": ""}
-    files |= {"mischief": MISCHIEF, "mischief_names": f"MISCHIEF = {NAMES}"}
-    for name, text in files.items():
-        (package / f"{name}.py").write_text(text)
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(TOYS / "toy_plugin", site / "toy_plugin", ignore=ignored)
     info = site / "toy_plugin-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-plugin\nVersion: 1.0\n")
@@ -232,24 +194,16 @@ def has_ended(process_id: int) -> bool:
     return False
 
 
-# Any: what multiprocessing hands descriptors over with has no public type.
-def _coordinate(folder: Path, steps: str, into: str, said: Any) -> None:
+def _coordinate(folder: Path, steps: str, into: str) -> None:
     """Run a workflow as a process of its own that has started in its own session."""
     os.setsid()
-    # Toys need no compiler.
-    local.PRELOADED[:] = ["orthoflow.engine.worker"]
-    descriptor = said.detach()
-    for stream in (1, 2):
-        os.dup2(descriptor, stream)
-    os.close(descriptor)
+    with (folder / f"{into}.said").open("wb") as said:
+        for stream in (1, 2):
+            os.dup2(said.fileno(), stream)
     with toy_world(folder) as world:
-        sys.stdout.write("ready\n")
-        sys.stdout.flush()
         try:
             outcome = world.run(steps, into=into)
         except OrthoflowError as error:
             sys.stdout.write(f"{type(error).__name__}: {error}\n")
             sys.exit(error.exit_code)
-        for address, result in outcome.failed.items():
-            sys.stdout.write(f"{address}: {result.error_message}\n{result.log}\n")
         sys.exit(outcome.exit_code)

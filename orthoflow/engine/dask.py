@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
 
 
-# File in the folder of a task; the task stops when the file appears.
-CANCEL_FILE: Final = "cancel"
 _ATTEMPT: Final = "attempt-"
 _POLL_S: Final = 0.1
 _LOOK_S: Final = 1.0
@@ -96,7 +94,7 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
     executor = LocalExecutor(Capacity.of_jobs(1, task.cores), forward)
     with closing(executor):
         executor.start(own)
-        return result_to_json(_result(executor, home, worker, name))
+        return result_to_json(_result(executor, worker, name))
 
 
 def describe_loss(who: str, times: int) -> str:
@@ -105,7 +103,7 @@ def describe_loss(who: str, times: int) -> str:
     return f"{who} was given up: {lost}; see the logs of the workers"
 
 
-def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> CellResult:
+def _result(executor: LocalExecutor, worker: Worker, name: str) -> CellResult:
     next_look_s, is_stopping = 0.0, False
     while True:
         for result in executor.poll(_POLL_S).values():
@@ -113,7 +111,7 @@ def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> C
         if is_stopping or time.monotonic() < next_look_s:
             continue
         next_look_s = time.monotonic() + _LOOK_S
-        if (home / CANCEL_FILE).exists() or _is_given_up(worker, name):
+        if _is_given_up(worker, name):
             is_stopping = True
             executor.cancel()
 
@@ -136,8 +134,6 @@ _CONNECT_S: Final = 15.0
 # Time to wait for the first worker, for a lost scheduler, and after all workers are lost.
 _PATIENCE_S: Final = 60.0
 _WATCH_S: Final = 2.0
-# Steps have 5 s to stop, and their workers are notified within one second.
-_STOPPING_S: Final = 20.0
 _CLOSE_S: Final = 5.0
 # Switches off frequent polling: by default, each worker profiles its thread 100 times a second and
 # checks its event loop 50 times a second.
@@ -175,7 +171,7 @@ class DaskExecutor:
         self._running: dict[str, tuple[Task, Future[str]]] = {}
         self._messages: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
         self._topic = f"orthoflow-{uuid.uuid4().hex}"
-        self._stop_at: float | None = None
+        self._is_cancelled = False
         self._capacity = capacity
         self._looked = self._with_workers = time.monotonic()
         self._client = _client(self._address, capacity)
@@ -232,22 +228,18 @@ class DaskExecutor:
                     self._listen(address, event)
         ends = {address: self._end(address) for address in ended if address in self._running}
         self._watch()
-        if self._stop_at is not None and time.monotonic() > self._stop_at:
-            ends |= {address: self._give_up(address) for address in tuple(self._running)}
         return ends
 
     def cancel(self) -> None:
-        """Ask all tasks to stop; give up those that do not respond within 20 s."""
-        self._stop_at = time.monotonic() + _STOPPING_S
-        for task, _ in self._running.values():
-            with suppress(OSError):
-                (Path(task.folder) / CANCEL_FILE).touch()
-
-    def close(self) -> None:
-        """Release all tasks still running; their workers stop them by themselves."""
+        """End all tasks; their workers notice within a second, and stop the processes."""
+        self._is_cancelled = True
         for _, future in self._running.values():
             with suppress(Exception):
                 future.cancel()
+
+    def close(self) -> None:
+        """Release all tasks still running; their workers stop them by themselves."""
+        self.cancel()
         cluster = self._client.cluster
         # Suppress Dask's messages about lost connections: they are expected here.
         with suppress(Exception):
@@ -263,15 +255,11 @@ class DaskExecutor:
         write_whole(Path(task.log), result.log.encode())
         return result
 
-    def _give_up(self, address: str) -> CellResult:
-        task, future = self._running.pop(address)
-        future.cancel()
-        return failed_result(task, _cancelled(task))
-
     def _result(self, task: Task, future: Future[str]) -> CellResult:
         if future.status in ("cancelled", "lost"):
-            if self._stop_at is not None:
-                return failed_result(task, _cancelled(task))
+            if self._is_cancelled:
+                interrupted = CancelledStepError(f"step {task.address} was interrupted")
+                return failed_result(task, interrupted)
             raise self._lost()
         try:
             return result_from_json(future.result(timeout=_PATIENCE_S), f"result of {task.address}")
@@ -397,7 +385,3 @@ def _capacity(workers: Mapping[str, Any]) -> Capacity:
         for facts, own in zip(workers.values(), cores, strict=True)
     )
     return Capacity(n_tasks=n_tasks, n_cores=sum(cores), cores_of_one=max(1, *cores), share=share)
-
-
-def _cancelled(task: Task) -> CancelledStepError:
-    return CancelledStepError(f"step {task.address} was interrupted")

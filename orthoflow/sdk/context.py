@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import os
 import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import wraps
 from pathlib import Path
-from typing import Final, Literal, ParamSpec, Protocol
+from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -39,31 +37,7 @@ _MOST_METRICS: Final = 20_000
 _MOST_FIGURES: Final = 2_000
 _MOST_DIAGNOSTICS: Final = 1_000
 _LARGEST_FIGURE: Final = 64 << 20
-_SAID_WHERE: Final = re.compile(r" \([^()]+:\d+\)$")
-_Given = ParamSpec("_Given")
 _HEAD_BYTES: Final = 16  # signature of an image file
-
-
-def _names_the_line(report: Callable[_Given, None]) -> Callable[_Given, None]:
-    """Add the source line of the call to errors about a report."""
-
-    @wraps(report)
-    def located(*args: _Given.args, **kwargs: _Given.kwargs) -> None:
-        try:
-            report(*args, **kwargs)
-        except ProductError as error:
-            frame = inspect.currentframe()
-            # Skip frames of this module and methods of subclasses of this context.
-            while frame and (
-                frame.f_code.co_filename == __file__ or args[0] is frame.f_locals.get("self")
-            ):
-                frame = frame.f_back
-            if frame is None or _SAID_WHERE.search(str(error)):
-                raise
-            where = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
-            raise ProductError(f"{error} ({where})") from error
-
-    return located
 
 
 class Drawing(Protocol):
@@ -139,7 +113,6 @@ class StepContext:
     _named: set[str] = field(default_factory=set)
     _n_diagnostics: int = 0
 
-    @_names_the_line
     def metric(self, name: str, value: float, unit: str) -> None:
         """Report a metric of the result.
 
@@ -167,7 +140,6 @@ class StepContext:
             raise ProductError(f"metric {name} must be finite, got {number}: leave it out instead")
         self.metrics.append(Metric(name=name, value=number, unit=unit))
 
-    @_names_the_line
     def figure(
         self, name: str, content: bytes | Callable[[], bytes] | Drawing, caption: str = ""
     ) -> None:
@@ -226,7 +198,6 @@ class StepContext:
         """Write a line to the log of the step."""
         self.listen(StepEvent(kind="log", text=one_line(text)))
 
-    @_names_the_line
     def report(self, spec: DiagnosticSpec, *, subject: str = "", **values: object) -> None:
         """Report a diagnostic, which is shown on the terminal, in the record and in the report.
 

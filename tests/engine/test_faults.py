@@ -28,7 +28,8 @@ inputs:
   numbers: {files: numbers.txt}
 steps:
   scan: {use: make.survey, in: {files: inputs.numbers}}
-  sketch: {use: thin.sketch, in: {scan: scan.scan}}
+  means: {use: thin.means, in: {scan: scan.scan}}
+  dots: {use: work.draws, in: {numbers: means.numbers}}
 """
 # What one of each kind of fault befalls: a first run, one that goes on, exports, a clean-up.
 RUN = ("run", "toy.yaml", "--executor", "inline")

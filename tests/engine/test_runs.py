@@ -9,10 +9,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.environment import environment
-from orthoflow.engine.journal import (
-    CellReported,
-    CellStarted,
-)
+from orthoflow.engine.journal import CellReported, CellStarted
 from orthoflow.engine.scheduler import execute
 from orthoflow.sdk.context import StepEvent
 from tests.engine_world import World, digests
@@ -25,18 +22,11 @@ steps:
 """
 
 
-def one(method: str, params: str = "{}") -> str:
+def doing(code: str) -> str:
     return (
-        f"steps: {{a: {{use: make.range}}, "
-        f"b: {{use: work.{method}, in: {{numbers: a.numbers}}, params: {params}}}}}"
+        "steps: {a: {use: make.range}, b: {use: work.does, in: {numbers: a.numbers}, "
+        f"params: {{code: {json.dumps(code)}}}}}}}"
     )
-
-
-def journal(world: World, folder: str = "run") -> list[dict[str, object]]:
-    return [
-        json.loads(line)
-        for line in (world.folder / folder / "journal.jsonl").read_text().splitlines()
-    ]
 
 
 def test_both_executors_and_all_job_counts_give_the_same_digests(world: World) -> None:
@@ -49,13 +39,11 @@ def test_both_executors_and_all_job_counts_give_the_same_digests(world: World) -
     assert {result.run_id for result in local.results.values()} == {local.run_id}
 
 
-def test_the_environment_holds_versions_but_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = json.dumps(dataclasses.asdict(environment(2)))
+def test_the_environment_holds_versions_but_nobody() -> None:
     found = environment(2)
     assert found.threads == 2
-    assert isinstance(found.packages, dict)
     assert "numpy" in found.packages
-    assert str(Path.home()) not in text
+    assert str(Path.home()) not in json.dumps(dataclasses.asdict(found))
     assert found.id == environment(2).id != environment(1).id
 
 
@@ -93,26 +81,25 @@ compare: {design: product}
     assert (outcome.cached, outcome.resumed) == ({}, frozenset())
 
 
-def test_everything_a_step_says_is_in_its_log(world: World) -> None:
-    outcome = world.run(one("chatty"))
-    log = outcome.results["b"].log
-    assert "on stdout\n" in log
-    assert "on stderr  with NUL\n" in log
-    assert "a line of log\n" in log
-    assert (world.folder / "run" / "logs" / "b.log").read_text() == log.replace(" \0", " ") or (
-        "\0" in (world.folder / "run" / "logs" / "b.log").read_text()
-    )
-    line = StepEvent(kind="log", text="a line of log")
-    assert CellReported(address="b", event=line) in world.events
-
-
-def test_progress_is_passed_on_while_a_step_runs(world: World) -> None:
-    world.run(one("slow", "{steps: 12}"))
-    fractions = [
-        event.event.fraction
+def test_what_a_step_says_is_in_its_log_and_passed_on_while_it_runs(world: World) -> None:
+    code = """
+print("on stdout")
+os.write(2, b"on stderr \\0 with NUL\\n")
+ctx.log("a line of log")
+for k in range(12):
+    ctx.progress(k / 12)
+    time.sleep(0.05)
+"""
+    outcome = world.run(doing(code))
+    assert outcome.results["b"].log == "on stdout\non stderr  with NUL\na line of log\n"
+    assert "\0" in (world.folder / "run" / "logs" / "b.log").read_text()
+    reported = [
+        event.event
         for event in world.events
         if isinstance(event, CellReported) and event.address == "b"
     ]
+    assert StepEvent(kind="log", text="a line of log") in reported
+    fractions = [event.fraction for event in reported if event.kind == "progress"]
     assert len(fractions) >= 3
     assert fractions == sorted(fractions)
     order = [type(event).__name__ for event in world.events if getattr(event, "address", "") == "b"]
@@ -120,9 +107,16 @@ def test_progress_is_passed_on_while_a_step_runs(world: World) -> None:
     assert order[-1] == "CellFinished"
 
 
+THREADS = """
+names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
+print(os.environ["NUMBA_CACHE_DIR"], os.getcwd(), ctx.scratch)
+values = np.array([ctx.cores, *[float(os.environ[name]) for name in names]])
+"""
+
+
 @pytest.mark.parametrize(("jobs", "cores"), [(2, 2), (8, 1)])
 def test_threads_are_fixed_before_any_library_loads(world: World, jobs: int, cores: int) -> None:
-    outcome = world.run(one("threads"), cores=4, jobs=jobs)
+    outcome = world.run(doing(THREADS), cores=4, jobs=jobs)
     assert world.values(outcome, "b") == [float(cores)] * 5
     numba, where, scratch = outcome.results["b"].log.split()
     assert not numba.startswith(str(world.folder))
@@ -155,14 +149,11 @@ def test_results_of_code_that_changed_during_the_run_are_not_kept(world: World) 
 # Run folders --------------------------------------------------------------------------------------
 
 
-def test_a_forced_step_that_this_run_has_computed_is_not_computed_twice(world: World) -> None:
+def test_a_run_that_goes_on_computes_nothing_twice_and_removes_what_a_killed_one_left(
+    world: World,
+) -> None:
     first = world.run(CHAIN, executor="inline", force=("second",))
+    (world.store.scratch / "dead-run" / "task").mkdir(parents=True)
     second = world.run(CHAIN, executor="inline", force=("second",))
     assert second.results == first.results
-
-
-def test_left_overs_of_killed_runs_are_removed(world: World) -> None:
-    world.run(CHAIN, executor="inline")
-    (world.store.scratch / "dead-run" / "task").mkdir(parents=True)
-    world.run(CHAIN, into="again", executor="inline")
     assert list(world.store.scratch.iterdir()) == []
