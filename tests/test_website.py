@@ -67,7 +67,7 @@ def test_the_reference_has_every_method_product_metric_and_command(
     assert {
         "| `rmse_[uv]_mm` | error along ..., RMS | mm | lower is better | inspect.truth |",
         "| `rms_mm` | check points, RMS | mm | lower is better | inspect.checkpoints |",
-        "| `scale_ppm` | scale, from 1 | ppm |  | register.similarity |",
+        "| `scale_ppm` | deviation of the scale from 1 | ppm |  | register.similarity |",
         "| `peak_rss_mib` | memory | MiB | lower is better | all |",
     } <= set(pages["metrics"].splitlines())
     # What a product consists of, and what its numbers stand for.

@@ -75,7 +75,7 @@ from orthoflow.untrusted_text import Value, csv_text
 _LONGEST_SOURCE: Final = 100
 ERROR_CONTENT: Final = (
     "expected error of a point measured in the orthoimage, one standard deviation along u and "
-    "along v, metres, by pose, depth and parallax between photos; NaN = not assessed"
+    "along v, metres, due to pose, depth and parallax between photos; NaN = not assessed"
 )
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
 TIE_COLUMNS: Final = (
@@ -241,7 +241,7 @@ def _write_layers(
             "mask": mask_meanings(LAYER_MASK_MEANINGS),
             "bits": 8 * layer.rgb.itemsize,
             "mask_counts": _counts(layer.mask),
-            "dataset_mask": "255 where the mask is painted (1), else 0",
+            "dataset_mask": "255 where the mask is covered (1), else 0",
             "product_digest": digest,
         }
         write_json(folder / f"{stem}.json", frame_json(layer.frame) | about)
@@ -280,8 +280,8 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
             "pixel_convention": PIXEL_CONVENTION,
             "camera_axes": "x right, y down, z forward; X_camera = R X_world + t, metres",
             "errors": "one standard deviation; sigma_wall_mm: expected error on the wall due to "
-            "the orientation; sigma0_px: a priori error of a pixel coordinate of a control tie, "
-            "times the standard deviation of unit weight",
+            "the orientation; sigma0_px: error of a pixel coordinate of a control tie, its a "
+            "priori value times the standard deviation of unit weight",
             "cameras": {camera.photo: _camera_json(camera) for camera in product.cameras},
             "product_digest": digest,
         },
@@ -375,7 +375,7 @@ def _write_ortho_sidecars(
         "bits": 8 * image.rgb.itemsize,
         "mask": mask_meanings(ORTHO_MASK_MEANINGS),
         "mask_counts": _counts(image.mask),
-        "dataset_mask": "255 where the mask is painted (1, 5) or filled (2), else 0",
+        "dataset_mask": "255 where the mask is covered (1, 5) or filled (2), else 0",
         "mask_raster": f"{stem}_mask.tif",
         "accuracy": accuracy_json(image),
         "product_digest": digest,

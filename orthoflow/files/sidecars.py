@@ -36,18 +36,18 @@ SURFACE_MASK_MEANINGS: Final[dict[SurfaceMask, str]] = {
 }
 LAYER_MASK_MEANINGS: Final[dict[LayerMask, str]] = {
     LayerMask.OUTSIDE: "outside: the source does not show this cell",
-    LayerMask.PAINTED: "painted: the source shows this cell",
+    LayerMask.PAINTED: "covered: the source shows this cell",
     LayerMask.OCCLUDED: "occluded: an object is in front of it",
     LayerMask.NO_SURFACE: "no surface: the scan has no surface here",
 }
 ORTHO_MASK_MEANINGS: Final[dict[OrthoMask, str]] = {
-    OrthoMask.NONE: "none: no source covers this cell",
-    OrthoMask.PAINTED: "painted: a source shows this cell",
+    OrthoMask.NONE: "none: no source shows this cell",
+    OrthoMask.PAINTED: "covered: a photo or the scan gives its colour",
     OrthoMask.FILLED: "filled: inpainted from neighbouring cells",
     OrthoMask.OCCLUDED: "occluded: hidden in every source",
     OrthoMask.NO_SURFACE: "no surface: the scan has no surface here",
-    OrthoMask.CONTRADICTED: "contradicted: painted by one photo alone, and the scan has another "
-    "colour here",
+    OrthoMask.CONTRADICTED: "contradicted: covered by a single photo, whose colour differs from "
+    "that of the scan",
 }
 
 

@@ -34,7 +34,7 @@ class WallDescription(BaseModel):
         expected_mm_median: expected error of a point measured in the image, one standard deviation,
             median over the image; None if it was not checked.
         expected_mm_p95: the same, exceeded in 5 % of the image.
-        n_check_points: number of withheld tie points on this wall; 0 if there is no image.
+        n_withheld_ties: number of withheld tie points on this wall; 0 if there is no image.
         orthoimage: path of the GeoTIFF, relative to the file with this description.
     """
 
@@ -52,7 +52,7 @@ class WallDescription(BaseModel):
     height_of_top_m: float | None = None
     expected_mm_median: NonNegativeFloat | None = None
     expected_mm_p95: NonNegativeFloat | None = None
-    n_check_points: NonNegativeInt = 0
+    n_withheld_ties: NonNegativeInt = 0
     orthoimage: str | None = None
 
     @property
@@ -62,7 +62,7 @@ class WallDescription(BaseModel):
             return Phrase(key="not_checked")
         errors = {"median": self.expected_mm_median, "high": self.expected_mm_p95}
         texts: dict[str, object] = {name: f"{error_mm:.1f}" for name, error_mm in errors.items()}
-        return Phrase(key="expected_error", values=texts | {"count": f"{self.n_check_points:,}"})
+        return Phrase(key="expected_error", values=texts | {"count": f"{self.n_withheld_ties:,}"})
 
     @property
     def objection(self) -> Phrase | None:
@@ -79,8 +79,10 @@ class WallDescription(BaseModel):
         parts = [self.accuracy.text()]
         if self.painted_share is not None:
             parts.insert(0, f"{self.width_m:.2f} x {self.height_m:.2f} m")
-            parts.insert(1, f"{self.painted_share:.0%} painted")
-        return "; ".join([*parts, *([] if self.recommended else [f"not advised: {self.reason}"])])
+            parts.insert(1, f"{self.painted_share:.0%} covered")
+        return "; ".join(
+            [*parts, *([] if self.recommended else [f"not recommended: {self.reason}"])]
+        )
 
 
 def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
@@ -108,12 +110,12 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
         for kind in ("median", "p95")
     )
     is_of_photos = path.with_name(path.name.replace("_ortho.tif", "_error.tif")).exists()
-    reason = f"{painted:.0%} painted"
+    reason = f"{painted:.0%} covered"
     if painted < _MIN_PAINTED_SHARE:
         is_recommended, reason = False, f"only {reason}"
     elif is_of_photos and median is None:
         is_recommended = False
-        reason += ", accuracy not checked: no tie point lies on this wall"
+        reason += ", accuracy not checked: there is no tie point on this wall"
     else:
         is_recommended = True
         reason += "" if median is None else f", expected error {median:.1f} mm"
@@ -132,7 +134,7 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
         height_of_top_m=_number(sidecar.get("height_of_top_m")),
         expected_mm_median=median,
         expected_mm_p95=high,
-        n_check_points=int(_number(accuracy.get("n_check_points")) or 0),
+        n_withheld_ties=int(_number(accuracy.get("n_check_points")) or 0),
         orthoimage=path.name,
     )
 

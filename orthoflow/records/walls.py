@@ -161,10 +161,12 @@ class UncountedPoints:
     Attributes:
         cell: address of the inspection that failed; empty if no inspection uses check points.
         sentence: end of a sentence about unmeasured accuracy, with the reason.
+        phrase: the same without the reason, which has no translation, for drawings.
     """
 
     cell: str
     sentence: str
+    phrase: Phrase
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,6 +223,9 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
     return UncountedPoints(
         cell=looking[0][0].address if looking else "",
         sentence=f"although {n_points} {were} given: {why}",
+        phrase=Phrase(
+            key="points_unusable" if looking else "points_unused", values={"count": f"{n_points:,}"}
+        ),
     )
 
 
@@ -431,18 +436,12 @@ def _check_kind(kind: str, path: Path) -> None:
 def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) -> WallResult:
     """Add findings of inspections, or a note that the orthoimage's accuracy is unknown."""
     if not measured and "ortho" in wall.rasters:
-        unmeasured = _unmeasured(run)
-        is_stated = {"expected_error", "not_checked"} & {phrase.key for phrase in wall.accuracy}
-        if not is_stated or unmeasured.key == "unmeasured_given":
-            measured = (unmeasured,)
+        uncounted = uncounted_points(run)
+        if uncounted is not None:
+            measured = (uncounted.phrase,)
+        elif not {"expected_error", "not_checked"} & {phrase.key for phrase in wall.accuracy}:
+            measured = (Phrase(key="unmeasured"),)
     return replace(wall, accuracy=(*wall.accuracy, *measured))
-
-
-def _unmeasured(run: Run) -> Phrase:
-    uncounted = uncounted_points(run)
-    if uncounted is None:
-        return Phrase(key="unmeasured")
-    return Phrase(key="unmeasured_given", values={"why": uncounted.sentence})
 
 
 def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[Phrase]:

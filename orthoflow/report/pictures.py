@@ -222,8 +222,8 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
 def _states(image: Orthoimage) -> str:
     """Return the shares of the cell states, which add up to 100 %."""
     words = {
-        OrthoMask.PAINTED: "painted",
-        OrthoMask.CONTRADICTED: "painted from a single photo that contradicts the scan",
+        OrthoMask.PAINTED: "covered",
+        OrthoMask.CONTRADICTED: "covered by a single photo that contradicts the scan",
         OrthoMask.FILLED: "interpolated from neighbours",
         OrthoMask.NO_SURFACE: "without scan points nearby",
         OrthoMask.OCCLUDED: "hidden in every photo",

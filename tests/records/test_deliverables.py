@@ -84,7 +84,7 @@ def test_walls_are_ranked_with_what_speaks_for_and_against_them(tmp_path: Path) 
         (2, "wall", False),
     ]
     by_number = {wall["number"]: wall for wall in found}
-    assert by_number[0]["reason"] == "70% painted, expected error 2.1 mm"
+    assert by_number[0]["reason"] == "70% covered, expected error 2.1 mm"
     assert by_number[0]["expected_mm_median"] == pytest.approx(2.1)
     assert by_number[0]["orthoimage"] == "mosaic/wall_0_ortho.tif"
     assert (tmp_path / by_number[0]["orthoimage"]).exists()

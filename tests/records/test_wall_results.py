@@ -45,11 +45,11 @@ def test_an_inspection_says_how_exact_a_wall_is_by_findings_on_it() -> None:
     found = {"check": own, "truth": every, "half": half, "first": first}
     assert [said.text() for said in module._accuracy(found, 3)] == [
         "measured: RMSE horizontal 1.2 mm, vertical 2.0 mm (check points: 6)",
-        "measured with depth: RMS 3.0 mm, largest 9.0 mm",
+        "measured in 3D: RMS 3.0 mm, largest 9.0 mm",
     ]
     # What was found of all walls together says nothing of one.
     (first_said,) = module._accuracy(found, 0)
-    assert first_said.text("de") == "gemessen: RMSE seitlich 4,0 mm, in der Höhe 5,0 mm"
+    assert first_said.text("de") == "gemessen: RMSE horizontal 4,0 mm, vertikal 5,0 mm"
 
 
 def checkpoints(count: int) -> CheckPoints:
@@ -68,25 +68,32 @@ def looking(**more: object) -> RecordedCell:
 
 
 @pytest.mark.parametrize(
-    ("count", "check", "said"),
+    ("count", "check", "said", "drawn"),
     [
         (3, looking(status="failed", error_message="none was found: P0 (57 m left of wall 0)"),
-         ", although 3 check points were given: none was found: P0 (57 m left of wall 0)"),
-        (1, cell("check"), ", although 1 check point was given: no step used them"),
-        (3, looking(), ": surveyed check points would show"),
+         "although 3 check points were given: none was found: P0 (57 m left of wall 0)",
+         "Kontrollpunkte: 3, keiner verwendbar (siehe Bericht)"),
+        (1, cell("check"), "although 1 check point was given: no step used them",
+         "Kontrollpunkte: 1, von keinem Schritt verwendet"),
     ],
-    ids=["none counted", "not looked for", "counted on another wall"],
+    ids=["none counted", "not looked for"],
 )  # fmt: skip
 def test_given_check_points_are_not_asked_for_again(
-    count: int, check: RecordedCell, said: str
+    count: int, check: RecordedCell, said: str, drawn: str
 ) -> None:
     points = {"points": given("", "c", "checkpoints")}
     # Those of the simulated room were given by nobody.
     room = cell("room", method="simulate.room", outputs=points)
     survey = cell("survey", method="read.checkpoints", outputs=points)
-    run = held(room, survey, check, products={("survey", "points"): checkpoints(count)})
-    assert module._unmeasured(run).text().startswith(f"accuracy not checked{said}")
-    assert "surveyed check points would show" in module._unmeasured(held(room)).text()
+    products = {("survey", "points"): checkpoints(count)}
+    found = module.uncounted_points(held(room, survey, check, products=products))
+    assert found is not None
+    assert (found.sentence, found.phrase.text("de")) == (
+        said,
+        f"Genauigkeit nicht geprüft; {drawn}",
+    )
+    for others in ((), (survey, looking())):
+        assert module.uncounted_points(held(room, *others, products=products)) is None
 
 
 @pytest.mark.parametrize(

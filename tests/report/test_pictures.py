@@ -98,7 +98,7 @@ def test_the_baseline_is_shown_down_to_its_cells() -> None:
 def test_an_orthoimage_says_what_became_of_its_cells() -> None:
     one, _ = orthoimage_pictures(run(orthoimages(), orthoimages()))
     assert one.caption == (
-        "12.00 x 3.00 m at 10 mm, 1200 x 300 cells, of which 85.0 % painted, 10.0 % interpolated "
+        "12.00 x 3.00 m at 10 mm, 1200 x 300 cells, of which 85.0 % covered, 10.0 % interpolated "
         "from neighbours, 2.0 % hidden in every photo, 3.0 % outside all oriented photos"
     )
     assert (one.title, one.name, one.wall, one.number) == ("wall 4 (plane=fine)", "wall 4", 0, 4)

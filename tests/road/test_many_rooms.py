@@ -45,5 +45,5 @@ def test_the_page_compares_the_detectors_over_the_rooms(shell: Shell) -> None:
     page = (shell.folder / "run" / "report.html").read_text()
     assert "2 of 2 datasets are complete" in page
     assert "Over all datasets" in page
-    assert "check: direction of the main plane, error" in page
+    assert "check: direction error of the main plane" in page
     assert {path.stem for path in (shell.folder / "run" / "pages").iterdir()} == set(ROOMS)

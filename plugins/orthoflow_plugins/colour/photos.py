@@ -32,7 +32,7 @@ class ColourPhotos(Method):
     result_version: ClassVar[int] = 2
     determinism = "loose"
     metrics = (
-        MetricSpec("coloured_share", label="points with a colour"),
+        MetricSpec("coloured_share", label="share of points with a colour"),
         MetricSpec("n_photos", label="photos"),
     )
     citations: ClassVar[tuple[str, ...]] = (
@@ -46,7 +46,7 @@ class ColourPhotos(Method):
         """The colour of points that no photo sees."""
 
         unseen: Literal["drop", "grey"] = Field(
-            "drop", description="Drop points that no photo sees, or colour them in medium grey."
+            "drop", description="Remove points that no photo shows, or colour them medium grey."
         )
 
     class In(Ports):

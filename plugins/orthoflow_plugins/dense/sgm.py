@@ -71,8 +71,8 @@ class DenseSgm(Method):
         spacing_m: float = Field(
             0.0,
             ge=0.0,
-            description="Only one point of each pair is kept per cube of this side length; 0 keeps "
-            "one point per pixel.",
+            description="Each pair of photos keeps one point per cube of this side length; 0 "
+            "keeps one per pixel.",
         )
         up: UpDirection = Field("z", description="World direction that is up.")
 

@@ -115,14 +115,12 @@ class InspectCheckpoints(Method):
     class Params(MethodParams):
         """How points without a measured position are found."""
 
-        search_m: float = Field(
-            0.03, gt=0.0, le=1.0, description="Radius within which a point is searched."
-        )
+        search_m: float = Field(0.03, gt=0.0, le=1.0, description="Search radius for a point.")
         target_radius_m: float = Field(
             0.04,
             gt=0.0,
             le=1.0,
-            description="Radius of the quadrant targets, or of the part to use.",
+            description="Radius of the quadrant targets, or of the part of them to use.",
         )
 
     class In(Ports):

@@ -43,14 +43,18 @@ DISPLACEMENTS: Final = (
     MetricSpec("mean_[xy]_mm", label="displacement along {0}, mean"),
     lower("nmad_[xy]_mm", label="typical displacement along {0} (NMAD)"),
     MetricSpec("max_[xy]_mm", label="largest displacement along {0}"),
-    MetricSpec("beyond_2rmse_[xy]_share", label="share beyond twice the RMS along {0}"),
-    MetricSpec("beyond_2rmse_any_share", label="share beyond twice the RMS along u or v"),
+    MetricSpec(
+        "beyond_2rmse_[xy]_share", label="share of displacements beyond twice the RMS along {0}"
+    ),
+    MetricSpec(
+        "beyond_2rmse_any_share", label="share of displacements beyond twice the RMS along u or v"
+    ),
     MetricSpec("p95_mm", label="displacement, 95th percentile"),
 )
 LENGTHS: Final = (
     MetricSpec("n_lengths", label="distances compared"),
-    lower("length_error_rms_share", label="relative error of a distance, RMS"),
-    lower("length_error_max_share", label="relative error of a distance, largest"),
+    lower("length_error_rms_share", label="relative error of distances, RMS"),
+    lower("length_error_max_share", label="relative error of distances, largest"),
 )
 CHECK_TABLE: Final = (
     MetricSpec("n_found", label="check points found"),
@@ -60,15 +64,21 @@ CHECK_TABLE: Final = (
     MetricSpec("mean_shift_share", label="mean shift divided by the RMS"),
     MetricSpec("n_outliers_once", label="outliers, rule applied once"),
     MetricSpec("n_outliers_iterated", label="outliers, rule iterated"),
-    MetricSpec("n_outliers_iterated_capped", label="outliers, rule iterated to the cap"),
+    MetricSpec("n_outliers_iterated_capped", label="outliers, rule iterated up to the cap"),
     lower("rms_after_once_mm", label="RMS without outliers, rule applied once"),
     lower("rms_after_iterated_mm", label="RMS without outliers, rule iterated"),
-    lower("rms_after_iterated_capped_mm", label="RMS without outliers, rule iterated to the cap"),
+    lower(
+        "rms_after_iterated_capped_mm", label="RMS without outliers, rule iterated up to the cap"
+    ),
 )
 IMAGE_QUALITY: Final = (
-    higher("completeness", label="painted or filled share of the scanned surface", headline=True),
+    higher(
+        "completeness",
+        label="share of the scanned surface that is covered or filled",
+        headline=True,
+    ),
     MetricSpec("n_edges", label="edges whose sharpness was measured"),
-    MetricSpec("edge_width_cells", label="width of an edge"),
+    MetricSpec("edge_width_cells", label="edge width"),
     MetricSpec("mtf50_per_cell", label="sharpness (MTF50)"),
     MetricSpec("filled_share", label="cells filled from neighbours"),
     lower("stretch_share", label="cells smeared over steep relief"),

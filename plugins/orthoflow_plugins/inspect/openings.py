@@ -54,18 +54,20 @@ class InspectOpenings(Method):
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_true_openings", label="true openings"),
-        higher("n_found_openings", label="true openings that were found"),
-        lower("n_false_openings", label="outlines without a true opening"),
+        higher("n_found_openings", label="true openings found"),
+        lower("n_false_openings", label="false openings"),
         higher("opening_iou_mean", label="IoU with the true openings, mean"),
         higher("opening_iou_min", label="IoU with the true openings, smallest"),
-        lower("opening_depth_error_max_mm", label="error of an opening's depth, largest"),
-        lower("side_rmse_mm", label="error of sides, RMS"),
-        MetricSpec("side_mean_mm", label="error of sides, mean (+: too large)"),
-        MetricSpec("side_max_mm", label="error of sides, largest"),
-        lower("side_rmse_cells", label="error of sides, RMS"),
+        lower("opening_depth_error_max_mm", label="depth error of an opening, largest"),
+        lower("side_rmse_mm", label="position error of opening sides, RMS"),
+        MetricSpec(
+            "side_mean_mm", label="position error of opening sides, mean (+: opening too large)"
+        ),
+        MetricSpec("side_max_mm", label="position error of opening sides, largest"),
+        lower("side_rmse_cells", label="position error of opening sides, RMS"),
         MetricSpec(
             "side_error_over_sigma",
-            label="error of sides divided by the predicted one",
+            label="position error of opening sides divided by the predicted error",
             better="one",
         ),
         lower("n_stray_sides", label="sides without a true side nearby"),

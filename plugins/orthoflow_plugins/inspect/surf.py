@@ -85,15 +85,15 @@ class InspectSurf(Method):
         MetricSpec("n_walls_inspected", label="walls inspected"),
         *of_walls(
             (
-                MetricSpec("n_pairs", label="pairs compared"),
+                MetricSpec("n_pairs", label="key point pairs"),
                 MetricSpec("n_key_points", label="key points of the orthoimage"),
                 MetricSpec("n_key_points_intensity", label="key points of the intensity"),
-                MetricSpec("matched_kept_share", label="matches kept"),
-                MetricSpec("floor_n_pairs", label="pairs compared, intensity with itself"),
+                MetricSpec("matched_kept_share", label="share of matches kept"),
+                MetricSpec("floor_n_pairs", label="key point pairs, intensity with itself"),
                 lower("surf_rmse_[xy]_mm", label="displacement along {0} by SURF, RMS"),
                 MetricSpec(
                     "surf_beyond_2rmse_[xy]_share",
-                    label="share beyond twice the RMS along {0} by SURF",
+                    label="share of displacements beyond twice the RMS along {0} by SURF",
                 ),
                 MetricSpec(
                     "surf_floor_rmse_[xy]_mm",
@@ -116,8 +116,8 @@ class InspectSurf(Method):
 
         unfit: Literal["refuse", "warn"] = Field(
             "refuse",
-            description="refuse: fail if there is no laser intensity or too few pairs; warn: "
-            "continue without this inspection.",
+            description="If there is no laser intensity or there are too few pairs: refuse "
+            "fails, warn continues without this inspection.",
         )
 
     class In(Ports):

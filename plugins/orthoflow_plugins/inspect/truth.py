@@ -100,41 +100,46 @@ _OF_WALLS: Final = (
     MetricSpec("mean_[uv]_mm", label="shift along {0}, mean"),
     lower("nmad_[uv]_mm", label="typical error along {0} (NMAD)", headline=True),
     MetricSpec("p99_[uv]_mm", label="error along {0}, 99th percentile"),
-    lower("step_rmse_[uv]_mm", label="error along {0} beside depth steps, RMS"),
-    lower("patch_rmse_[uv]_mm", label="error along {0} from patches, RMS"),
-    MetricSpec("patch_mean_[uv]_mm", label="shift along {0} from patches"),
+    lower("step_rmse_[uv]_mm", label="error along {0} near depth steps, RMS"),
+    lower("patch_rmse_[uv]_mm", label="error along {0} by patch matching, RMS"),
+    MetricSpec("patch_mean_[uv]_mm", label="shift along {0} by patch matching, mean"),
     MetricSpec("n_patches", label="patches compared with the truth"),
     MetricSpec("displaced_share", label="cells displaced by more than one cell"),
-    MetricSpec("depth_median_mm", label="shift of the depth, median"),
-    lower("depth_nmad_mm", label="typical error of the depth (NMAD)"),
+    MetricSpec("depth_median_mm", label="depth error, median"),
+    lower("depth_nmad_mm", label="typical depth error (NMAD)"),
     lower(
         "depth_rmse_mm",
-        label="error of the depth, RMS",
+        label="depth error, RMS",
         headline=True,
-        description="cells at edges have two depths and dominate; depth_nmad_mm is typical",
+        description="dominated by cells at edges, which have two depths; depth_nmad_mm describes "
+        "the others",
     ),
-    lower("depth_step_rmse_mm", label="error of the depth beside steps, RMS"),
-    MetricSpec("depth_within_3sigma", label="depths within three predicted standard deviations"),
-    lower("colour_rmse_grey", label="error of the colour, RMS"),
-    lower("filled_colour_rmse_grey", label="error of the colour of filled cells, RMS"),
-    lower("step_colour_rmse_grey", label="error of the colour beside depth steps, RMS"),
-    MetricSpec("gross_colour_share", label="cells with a grossly wrong colour"),
+    lower("depth_step_rmse_mm", label="depth error near depth steps, RMS"),
+    MetricSpec(
+        "depth_within_3sigma", label="share of depths within three predicted standard deviations"
+    ),
+    lower("colour_rmse_grey", label="colour error, RMS"),
+    lower("filled_colour_rmse_grey", label="colour error of filled cells, RMS"),
+    lower("step_colour_rmse_grey", label="colour error near depth steps, RMS"),
+    MetricSpec("gross_colour_share", label="cells with a gross colour error"),
     MetricSpec("ghost_colour_share", label="cells with the colour of an occluder"),
     lower("ghost_share", label="share of the cells that show an occluder"),
     higher(
         "completeness",
-        label="painted share of the visible surface, without filled cells",
+        label="share of the visible surface that is covered, without filled cells",
         headline=True,
     ),
-    higher("completeness_filled", label="painted or filled share of the visible surface"),
+    higher("completeness_filled", label="share of the visible surface that is covered or filled"),
     higher(
         "completeness_seen_by_both",
-        label="painted share of the surface seen by a station and a photo",
+        label="covered share of the surface visible from a station and a photo",
         headline=True,
     ),
-    MetricSpec("unseen_painted_share", label="painted cells whose surface no station sees"),
-    MetricSpec("n_traced", label="cells traced back to their photo"),
-    lower("far_source_share", label="cells coloured from a wrong position"),
+    MetricSpec(
+        "unseen_painted_share", label="covered cells whose surface is visible from no station"
+    ),
+    MetricSpec("n_traced", label="cells traced back to their source photo"),
+    lower("far_source_share", label="share of cells coloured from a wrong position"),
     MetricSpec("n_ghost_cells", label="cells that show an occluder"),
     MetricSpec(
         "within_1_sigma_share", label="cells whose error is within the predicted standard deviation"
@@ -146,9 +151,9 @@ _OF_WALLS: Final = (
 )
 # Metrics of planes, which do not need orthoimages.
 _OF_PLANES: Final = (
-    lower("plane_angle_deg", label="direction of the main plane, error", headline=True),
-    lower("plane_offset_mm", label="position of the main plane, error", headline=True),
-    MetricSpec("plane_corner_max_mm", label="largest error of the main plane at its corners"),
+    lower("plane_angle_deg", label="direction error of the main plane", headline=True),
+    lower("plane_offset_mm", label="position error of the main plane", headline=True),
+    MetricSpec("plane_corner_max_mm", label="error of the main plane at its corners, largest"),
 )
 NOT_COMPARED: Final = DiagnosticSpec(
     code="truth-not-compared",
@@ -208,20 +213,20 @@ class InspectTruth(Method):
             MetricSpec("n_misoriented", label="accepted photos with a wrong pose"),
             MetricSpec(
                 "pose_error_over_sigma",
-                label="true error divided by the predicted one",
+                label="true pose error divided by the predicted error",
                 better="one",
                 counted_by="n_oriented",
             ),
             lower(
                 "pose_wall_rms_mm",
-                label="true error of the photos on the wall, RMS",
+                label="true orientation error on the wall, RMS",
                 counted_by="n_oriented",
             ),
             *(
                 MetricSpec(name, label=f"{label}, {which}", counted_by="n_oriented")
                 for part, unit, label in (
                     ("centre", "mm", "error of the projection centre"),
-                    ("wall", "mm", "true error of a photo on the wall"),
+                    ("wall", "mm", "true orientation error on the wall"),
                     ("rotation", "deg", "error of the viewing direction"),
                 )
                 for name, which in (
@@ -229,25 +234,25 @@ class InspectTruth(Method):
                     (f"pose_{part}_median_{unit}", "median"),
                 )
             ),
-            lower("match_wrong_share", label="matches that are wrong"),
+            lower("match_wrong_share", label="share of wrong matches"),
             lower(
                 "match_wrong_share_own_wall",
-                label="matches with the photo's own wall that are wrong",
+                label="share of wrong matches with the wall that the photo shows",
             ),
-            MetricSpec("n_ties_kept", label="ties that the orientation kept"),
-            lower("tie_wrong_share", label="kept ties that are wrong"),
-            lower("tie_error_median_cells", label="error of a kept tie, median"),
+            MetricSpec("n_ties_kept", label="ties kept by the orientation"),
+            lower("tie_wrong_share", label="share of wrong ties among those kept"),
+            lower("tie_error_median_cells", label="error of the kept ties, median"),
         ),
         *_needing(
             ("planes",),
             MetricSpec("true_planes", label="true planes"),
-            higher("true_planes_found", label="true planes that were found", headline=True),
+            higher("true_planes_found", label="true planes found", headline=True),
             higher("main_found", unit="yes/no", label="main wall found", headline=True),
         ),
-        MetricSpec("worst_plane_angle_deg", label="direction of the worst plane, error"),
-        MetricSpec("worst_plane_offset_mm", label="position of the worst plane, error"),
+        MetricSpec("worst_plane_angle_deg", label="direction error of the worst plane"),
+        MetricSpec("worst_plane_offset_mm", label="position error of the worst plane"),
         MetricSpec(
-            "worst_plane_corner_max_mm", label="largest error of the worst plane at its corners"
+            "worst_plane_corner_max_mm", label="error of the worst plane at its corners, largest"
         ),
         *_needing(
             ("labels",),

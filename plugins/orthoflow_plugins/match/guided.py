@@ -66,7 +66,9 @@ class MatchGuided(Method):
             counted_by="n_photos_matched",
         ),
         MetricSpec(
-            "sigma_px_median", label="predicted sigma of a tie per axis, median", better="lower"
+            "sigma_px_median",
+            label="predicted standard deviation of a tie per axis, median",
+            better="lower",
         ),
         MetricSpec("n_by_hand", label="ties measured by hand"),
     )
@@ -85,9 +87,9 @@ class MatchGuided(Method):
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: only the mask of markiewicz2015. Each SIFT key point (OpenCV's "
-            "defaults) in the part of a wall that the photo shows is matched once with its best "
-            "match in the photo; of the other parameters, only `ratio` is used.",
+            description="paper: as in markiewicz2015; each SIFT key point (OpenCV's defaults) in "
+            "the part of a wall that the photo shows is matched with its nearest neighbour "
+            "in the photo. Of the other parameters, only `ratio` is used.",
         )
         ratio: float | None = Field(
             default=None,

@@ -76,9 +76,9 @@ class FaceByPhotos(Method):
     id: ClassVar[str] = "face.photos"
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
-        MetricSpec("n_planes_guessed", label="planes whose side was checked with photos"),
-        MetricSpec("n_planes_seen", label="planes whose side was decided by photos"),
-        MetricSpec("n_planes_turned", label="planes turned to the photos"),
+        MetricSpec("n_planes_guessed", label="planes whose front side was checked with photos"),
+        MetricSpec("n_planes_seen", label="planes whose front side was determined from photos"),
+        MetricSpec("n_planes_turned", label="planes flipped to face the photos"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Lowe 2004, Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",

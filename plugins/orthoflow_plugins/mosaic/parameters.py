@@ -20,9 +20,9 @@ class SeamsParams(MethodParams):
     )
     gains: Literal["none", "global"] = Field(
         "global",
-        description="none: colours are those of the photos, and the next two parameters have no "
-        "effect; global: if photos differ, the light of each is multiplied by a factor per "
-        "channel so that overlaps agree.",
+        description="none: the colours of the photos are not changed, and the next two "
+        "parameters have no effect; global: if photos differ, the linear intensities of each "
+        "are multiplied by a factor per channel, so that overlaps agree.",
     )
     local_balance: bool = Field(
         default=True,

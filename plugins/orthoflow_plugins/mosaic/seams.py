@@ -73,9 +73,9 @@ _CAUSE_LEAST: Final = 0.01
 CONTRADICTED: Final = DiagnosticSpec(
     code="photo-against-scan",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are shown by a single photo that contradicts the "
-    "colour of the scan: the orthoimage may show a passer-by",
-    remedy="take a second photo of this area, or use the input seams",
+    text="{subject}: {share:.1%} of its cells come from a single photo that contradicts the "
+    "colours of the scan: the orthoimage may show a passer-by",
+    remedy="take another photo of this area, or exclude the photo there with the input seams",
     rank_by="share",
 )
 PLAIN: Final = DiagnosticSpec(
@@ -89,7 +89,7 @@ UNCHECKED: Final = DiagnosticSpec(
     code="accuracy-not-checked",
     severity="note",
     text="{subject}: the accuracy of its orthoimage is unknown, since no photo has a tie on it",
-    remedy="measure points of this wall in a photo (input ties), or take a photo that shows it "
+    remedy="measure points on this wall in a photo (input ties), or take a photo that shows it "
     "together with a wall that has ties",
 )
 EMPTY_IMAGE: Final = DiagnosticSpec(
@@ -135,7 +135,7 @@ class MosaicSeams(Method):
         MetricSpec("n_orthoimages", label="orthoimages"),
         MetricSpec("n_sources", label="photos used"),
         MetricSpec("none_share", label="empty cells"),
-        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("painted_share", label="covered cells"),
         MetricSpec("filled_share", label="cells filled from neighbours"),
         MetricSpec("occluded_share", label="cells hidden from every photo"),
         MetricSpec("no_surface_share", label="cells without a surface"),
@@ -143,13 +143,14 @@ class MosaicSeams(Method):
         MetricSpec("gain_max", label="largest gain of a photo"),
         MetricSpec("lens_loss_share", label="vignetting, largest"),
         MetricSpec("seam_share", label="cells along seams"),
-        MetricSpec("seam_on_depth_edge_share", label="seams on depth edges"),
+        MetricSpec("seam_on_depth_edge_share", label="share of seam cells on depth edges"),
         MetricSpec(
             "seam_step_rms_grey", label="brightness difference at seams, RMS", better="lower"
         ),
-        MetricSpec("seam_step_mean_delta_e", label="colour difference at seams, mean"),
+        MetricSpec("seam_step_mean_delta_e", label="colour difference at seams (Delta E), mean"),
         MetricSpec(
-            "seam_step_untouched_delta_e", label="colour difference at seams before balancing, mean"
+            "seam_step_untouched_delta_e",
+            label="colour difference at seams before balancing (Delta E), mean",
         ),
         MetricSpec("n_overlap_patches", label="patches compared where photos overlap"),
         MetricSpec(
@@ -163,7 +164,9 @@ class MosaicSeams(Method):
             better="lower",
         ),
         MetricSpec("outvoted_share", label="cells whose colour contradicts the other photos"),
-        MetricSpec("contradicted_share", label="cells of a single photo that contradict the scan"),
+        MetricSpec(
+            "contradicted_share", label="cells from a single photo that contradicts the scan"
+        ),
         # Metrics of all walls with an accuracy.
         MetricSpec(
             "expected_mm_median",

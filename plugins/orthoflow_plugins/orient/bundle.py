@@ -122,9 +122,11 @@ class OrientColmapBundle(Method):
     result_version: ClassVar[int] = 3
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,
-        MetricSpec("n_photo_points", label="points seen in several photos"),
-        MetricSpec("photo_tie_rmse_px", label="ties between photos, RMS", better="lower"),
-        MetricSpec("sigma0", label="sigma of unit weight"),
+        MetricSpec("n_photo_points", label="tie points visible in several photos"),
+        MetricSpec(
+            "photo_tie_rmse_px", label="tie points between photos, RMS residual", better="lower"
+        ),
+        MetricSpec("sigma0", label="standard deviation of unit weight (sigma0)"),
         MetricSpec("redundancy", label="redundancy of the adjustment"),
     )
     citations: ClassVar[tuple[str, ...]] = (

@@ -64,22 +64,23 @@ ORIENTATION_METRICS: Final = (
     MetricSpec("n_oriented", label="photos oriented", better="higher", headline=True),
     MetricSpec("n_refused", label="photos refused"),
     MetricSpec("n_ties", label="ties"),
-    MetricSpec("n_control", label="control points"),
-    MetricSpec("n_check", label="check points"),
+    MetricSpec("n_control", label="ties used as control"),
+    MetricSpec("n_check", label="withheld ties"),
     MetricSpec("rejected_share", label="share of rejected ties"),
-    *_median_and_worst("control_rmse_px", "control points, RMS per axis"),
-    *_median_and_worst("check_rmse_px", "check points, RMS per axis"),
+    *_median_and_worst("control_rmse_px", "ties used as control, RMS residual per axis"),
+    *_median_and_worst("check_rmse_px", "withheld ties, RMS residual per axis"),
     *_median_and_worst(
         "check_rmse_mm",
-        "check points, RMS per axis on the wall",
+        "withheld ties, RMS residual per axis on the wall",
         is_headline=True,
-        description="mean over both axes of the photo; it may be larger along one axis of the wall",
+        description="mean over both axes of the photo; the error along one axis of the wall may "
+        "be larger",
     ),
     *_median_and_worst(
         "sigma_wall_mm",
         "expected error of the orientation on the wall",
         is_headline=True,
-        description="relative to the scan; errors of depth and scan add to it",
+        description="relative to the scan, so errors of the scan and its depths are not included",
     ),
 )
 """Metrics of all orientation methods."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 VISIBILITY_OFF: Final = DiagnosticSpec(
     code="visibility-not-tested",
     severity="warning",
-    text="visibility none: cells also take their colours from photos in which they are hidden",
+    text="visibility is none: cells also take colours from photos in which they are hidden",
 )
 
 
@@ -47,14 +47,14 @@ class DsmBackward(Method):
     id: ClassVar[str] = "ortho.dsm-backward"
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
-        MetricSpec("n_layers", label="photos projected onto walls"),
-        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("n_layers", label="layers (one per photo and wall)"),
+        MetricSpec("painted_share", label="covered cells"),
         MetricSpec("occluded_share", label="cells hidden from the photos"),
         MetricSpec("photo_gsd_mm", label="photo pixel size on the wall"),
-        MetricSpec("obliquity_deg", label="obliquity of the views"),
-        MetricSpec("occluders_s", label="time of the occlusion test", better="lower"),
-        MetricSpec("decoding_s", label="time of decoding photos", better="lower"),
-        MetricSpec("painting_s", label="time of painting", better="lower"),
+        MetricSpec("obliquity_deg", label="angle of incidence"),
+        MetricSpec("occluders_s", label="time for the occlusion test", better="lower"),
+        MetricSpec("decoding_s", label="time for decoding photos", better="lower"),
+        MetricSpec("painting_s", label="time for resampling the colours", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.7, 4.4)",

@@ -45,11 +45,11 @@ class DsmForward(Method):
     id: ClassVar[str] = "ortho.dsm-forward"
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
-        MetricSpec("n_layers", label="photos projected onto walls"),
-        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("n_layers", label="layers (one per photo and wall)"),
+        MetricSpec("painted_share", label="covered cells"),
         MetricSpec("filled_share", label="cells filled from neighbours"),
-        MetricSpec("occluders_s", label="time of the occlusion test", better="lower"),
-        MetricSpec("painting_s", label="time of painting", better="lower"),
+        MetricSpec("occluders_s", label="time for the occlusion test", better="lower"),
+        MetricSpec("painting_s", label="time for resampling the colours", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.7)",
@@ -62,8 +62,8 @@ class DsmForward(Method):
             default=1,
             ge=0,
             le=20,
-            description="Gaps between pixels are filled if no disc of this radius fits into "
-            "them; 0 fills none.",
+            description="Gaps between projected pixels are filled if no disc of this radius fits "
+            "into them; 0 fills none.",
         )
 
     In = PhotosOnWalls

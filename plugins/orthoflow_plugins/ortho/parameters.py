@@ -48,7 +48,8 @@ class BackwardParams(VisibilityParams):
         ge=0,
         le=20,
         description=(
-            "Cells this close to a hidden patch are not painted, since edges are blurred there."
+            "Cells this close to a hidden area take no colour from the photo, because its edges "
+            "are blurred."
         ),
     )
 
@@ -67,31 +68,34 @@ class DirectParams(MethodParams):
     )
     colouring: Literal["topmost", "centre", "gaussian", "median"] = Field(
         default="topmost",
-        description="Colour of a cell: topmost: of its topmost point; centre: of the point of the "
-        "topmost surface nearest to the cell centre; gaussian: mean over that surface, weighted by "
-        "the distance from the centre; median: of its five highest points.",
+        description="Source of a cell's colour. topmost: the point nearest to the viewer; "
+        "centre: of the points on the surface nearest to the viewer, the one nearest to the "
+        "cell centre; gaussian: mean over that surface, weighted by the distance from the "
+        "cell centre; median: of the five points nearest to the viewer.",
     )
     skip_below_grey: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="Points darker than this in all channels count as points without a colour, "
-        "which many files store as black: they keep their depth and colour no cell. 1: pure "
-        "black; 10: also almost black; 0: none. By default, pure black points are ignored if they "
-        "are specks: at most a tenth of all points, and more than the almost black points.",
+        description="Points darker than this in all channels are treated as having no colour, "
+        "which many files store as black: they keep their depth, but give no cell its "
+        "colour. 1: pure black; 10: also almost black; 0: none. By default, pure black "
+        "points are ignored if they are specks: at most a tenth of all points, and more than "
+        "the almost black points.",
     )
     balance_scans: bool = Field(
         default=True,
-        description="Balance the colours of scans that differ in brightness or white balance "
-        "where they overlap on the walls.",
+        description="Balance the colours of scans that differ in brightness or white balance in "
+        "their overlaps on the walls.",
     )
     inpaint: Inpainting = Field(
         default="between",
-        description="How gaps are filled: between: interpolated between the painted cells "
-        "around them; telea, navier-stokes: by OpenCV, as in skarlatos2012; none.",
+        description="How gaps are filled. between: interpolated between the covered cells around "
+        "them; telea, navier-stokes: inpainted by OpenCV, as in skarlatos2012; none: not at "
+        "all.",
     )
     inpaint_radius_px: float = Field(
         default=3.0,
         gt=0,
         le=100,
-        description="Radius from which a gap takes its colour; with between, gaps without a "
-        "painted cell within the radius stay void.",
+        description="Radius within which a gap takes its colour; with between, gaps without a "
+        "covered cell within this radius remain empty.",
     )

@@ -89,11 +89,11 @@ class PointcloudDirect(Method):
     id: ClassVar[str] = "ortho.pointcloud-direct"
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
-        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("painted_share", label="covered cells"),
         MetricSpec("filled_share", label="cells filled from neighbours"),
         MetricSpec("void_share", label="cells without a colour"),
-        MetricSpec("projection_s", label="time of the projection", better="lower"),
-        MetricSpec("filling_s", label="time of the filling", better="lower"),
+        MetricSpec("projection_s", label="time for the projection", better="lower"),
+        MetricSpec("filling_s", label="time for filling gaps", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         (

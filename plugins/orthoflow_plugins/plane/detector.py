@@ -22,39 +22,45 @@ Materials = Mapping[str, tuple[float, float]]
 # Metrics of every detector.
 DETECTOR_METRICS: Final = (
     MetricSpec("n_planes", label="planes found"),
-    MetricSpec("thinning", label="points per point used in the search"),
-    MetricSpec("labelled_share", label="points that lie on a plane"),
-    MetricSpec("first_share", label="points that lie on the first plane"),
-    MetricSpec("tolerance_m", label="distance to a plane within which points belong to it"),
-    MetricSpec("fit_tolerance_m", label="distance to a plane within which points decide its fit"),
-    MetricSpec("noise_mm", label="noise of the scan across its surfaces"),
-    MetricSpec("detection_s", label="time of the detection", better="lower"),
+    MetricSpec("thinning", label="points of the cloud per point used in the search"),
+    MetricSpec("labelled_share", label="share of points on a plane"),
+    MetricSpec("first_share", label="share of points on the first plane"),
+    MetricSpec("tolerance_m", label="maximum distance of points that belong to a plane"),
+    MetricSpec("fit_tolerance_m", label="maximum distance of points used to fit a plane"),
+    MetricSpec("noise_mm", label="scan noise normal to the surfaces"),
+    MetricSpec("detection_s", label="detection time", better="lower"),
     MetricSpec("first_plane_s", label="time to the first plane", better="lower"),
-    MetricSpec("next_plane_s", label="time of each further plane", better="lower"),
-    MetricSpec("detection_cpu_s", label="processor time of the detection", better="lower"),
-    MetricSpec("first_plane_cpu_s", label="processor time to the first plane", better="lower"),
-    MetricSpec("next_plane_cpu_s", label="processor time of each further plane", better="lower"),
+    MetricSpec("next_plane_s", label="time per further plane", better="lower"),
+    MetricSpec("detection_cpu_s", label="CPU time of the detection", better="lower"),
+    MetricSpec("first_plane_cpu_s", label="CPU time to the first plane", better="lower"),
+    MetricSpec("next_plane_cpu_s", label="CPU time per further plane", better="lower"),
     MetricSpec(
         "rms_mm",
-        label="points to the first plane, RMS",
+        label="distance of points from the first plane, RMS",
         headline=True,
-        description="the relief of the wall counts in full: it is no error of the image",
+        description="includes the relief of the wall, so it is not an error of the image",
     ),
-    MetricSpec("fit_rms_mm", label="points to the first plane, RMS of those fitted"),
+    MetricSpec("fit_rms_mm", label="distance of the fitted points from the first plane, RMS"),
     MetricSpec("omega_deg", label="direction of the first normal (omega)"),
     MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
     MetricSpec("offset_m", label="offset of the first plane"),
     MetricSpec("r_m", label="distance of the first plane (r)"),
     MetricSpec(
-        "sigma_angle_deg", label="stated sigma of the first plane's direction", better="lower"
+        "sigma_angle_deg",
+        label="predicted standard deviation of the first plane's direction",
+        better="lower",
     ),
     MetricSpec(
-        "sigma_offset_mm", label="stated sigma of the first plane's position", better="lower"
+        "sigma_offset_mm",
+        label="predicted standard deviation of the first plane's position",
+        better="lower",
     ),
-    MetricSpec("n_independent", label="independent points behind the stated sigmas"),
-    MetricSpec("skewness", label="skewness of the distances to the first plane"),
-    MetricSpec("excess_kurtosis", label="excess kurtosis of the distances to the first plane"),
-    MetricSpec("within_[123]_sigma", label="distances to the first plane within {0} sigma"),
+    MetricSpec("n_independent", label="effective number of independent points on the first plane"),
+    MetricSpec("skewness", label="skewness of the distances from the first plane"),
+    MetricSpec("excess_kurtosis", label="excess kurtosis of the distances from the first plane"),
+    MetricSpec(
+        "within_[123]_sigma", label="share of distances from the first plane within {0} sigma"
+    ),
     MetricSpec("raw_omega_deg", label="direction of the first normal (omega); before the fit"),
     MetricSpec("raw_phi_deg", label="inclination of the first normal (phi); before the fit"),
     MetricSpec("raw_r_m", label="distance of the first plane (r); before the fit"),
@@ -68,12 +74,14 @@ DETECTOR_METRICS: Final = (
         label="position against the fitted plane; before the fit",
         better="lower",
     ),
-    MetricSpec("thickest_mm", label="thickness of the cloud where it is thickest"),
+    MetricSpec("thickest_mm", label="largest thickness of the cloud"),
     MetricSpec("thickness_mm", label="thickness of the cloud on the first plane"),
     MetricSpec(
-        "thickness_width_mm", label="width that holds 95 % of the distances to the first plane"
+        "thickness_width_mm", label="width that contains 95 % of the distances from the first plane"
     ),
-    MetricSpec("thickness_scan_steps", label="thickness over the point spacing on the first plane"),
+    MetricSpec(
+        "thickness_scan_steps", label="thickness on the first plane divided by the point spacing"
+    ),
     MetricSpec("scan_step_mm", label="point spacing on the first plane, without relief"),
 )
 PAPER: Final = (
@@ -127,8 +135,8 @@ class DetectorParams(MethodParams):
     )
     exact: bool = Field(
         default=False,
-        description="Keep walls exactly vertical and floors exactly level instead of fitting their "
-        "tilt.",
+        description="Constrain walls to be exactly vertical and floors to be exactly level "
+        "instead of fitting their tilt.",
     )
     n_planes_max: int = Field(100, ge=1, le=100, description="Maximum number of planes.")
     min_area_m2: float = Field(
@@ -138,7 +146,7 @@ class DetectorParams(MethodParams):
         "are smaller. It is reduced for a cloud without a face of at least 50 times this area.",
     )
     min_share: float = Field(
-        0.001, gt=0.0, lt=1.0, description="Minimum share of all points on a plane."
+        0.001, gt=0.0, lt=1.0, description="Minimum share of all points that a plane must contain."
     )
     stop_unclassified_share: float = Field(
         0.0,

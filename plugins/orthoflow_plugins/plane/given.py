@@ -149,8 +149,8 @@ class GivenPlane(Method):
             ge=0.0,
             lt=1.0,
             description="Connected parts that cover a smaller share of the area of all parts are "
-            "treated as stray points and excluded from the rectangle; 0 keeps all parts except "
-            "single echoes.",
+            "treated as stray points and excluded from the rectangle; 0 keeps all parts "
+            "except isolated points.",
         )
 
         @model_validator(mode="after")

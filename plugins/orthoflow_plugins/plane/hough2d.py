@@ -82,24 +82,29 @@ class Hough2d(Method):
         """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         cell_m: float = Field(
-            0.02, gt=0.0, le=1.0, description="Side of a cell of the plan and of a distance bin."
+            0.02,
+            gt=0.0,
+            le=1.0,
+            description="Size of the cells of the plan and of the distance bins.",
         )
         angle_step_deg: float = Field(
-            1.0, ge=0.1, le=15.0, description="Step between the directions of lines."
+            1.0, ge=0.1, le=15.0, description="Angle between successive line directions."
         )
         accumulator: Literal["counts", "unit", "canny"] = Field(
             "counts",
-            description="Votes of a cell: its number of points, one, or one if it is on an edge "
-            "of the density.",
+            description="Votes of a cell. counts: its number of points; unit: one; canny: one if "
+            "it is on an edge of the point density, otherwise none.",
         )
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
-            description="Score of a line: its votes minus those of the emptier side, refined with "
-            "finer angles and bins, or only the votes of its bin, as in markiewicz2015.",
+            description="Score of a line. contrast: its votes minus those on its emptier side, "
+            "refined with finer angles and bins; votes: only the votes of its bin, as in "
+            "markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
             "cells",
-            description="Positions that vote: cells of the plan, or single points of the sample.",
+            description="Positions that vote. cells: cells of the plan; raw: single points of "
+            "the sample.",
         )
 
         @model_validator(mode="after")

@@ -90,7 +90,7 @@ class Region(Method):
         *DETECTOR_METRICS,
         MetricSpec("n_regions", label="regions grown"),
         MetricSpec("neighbourhood_mm", label="radius of a neighbourhood"),
-        MetricSpec("cell_mm", label="side of a surface cell"),
+        MetricSpec("cell_mm", label="cell size"),
         MetricSpec("normal_scatter_deg", label="scatter of the normals"),
     )
     citations = (
@@ -105,7 +105,9 @@ class Region(Method):
         """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         preset: Literal["none", "paper"] = Field(
-            "none", description="Default values: those of this table, or those of markiewicz2015."
+            "none",
+            description="Default values of the other parameters: those of this table, or "
+            "those of markiewicz2015.",
         )
         neighbourhood: Literal["cube", "radius", "knn"] = Field(
             "cube",

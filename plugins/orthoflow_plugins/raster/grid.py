@@ -96,10 +96,10 @@ class RasterGrid(Method):
         MetricSpec("omega_deg", label="direction of the first normal (omega)"),
         MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
         MetricSpec("area_m2", label="area of the first wall's raster"),
-        MetricSpec("gsd_mm", label="side of a cell"),
-        MetricSpec("n_points_inside", label="points within the walls"),
+        MetricSpec("gsd_mm", label="cell size"),
+        MetricSpec("n_points_inside", label="points used for the walls"),
         MetricSpec("points_per_cell", label="points per cell"),
-        MetricSpec("depth_noise_mm", label="noise of the depths"),
+        MetricSpec("depth_noise_mm", label="depth noise"),
         MetricSpec("scan_step_mm", label="point spacing on the first wall"),
         MetricSpec(
             "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
@@ -109,10 +109,14 @@ class RasterGrid(Method):
         MetricSpec("void_*_share", label="cells without a depth, by cause"),
         MetricSpec("empty*_share", label="cells without a depth, by cause"),
         MetricSpec("measured_share", label="cells with a measured depth"),
-        MetricSpec("recovered_share", label="cells recovered between measured ones"),
-        MetricSpec("intensity_cosine_power", label="intensity over the angle, power"),
-        MetricSpec("intensity_range_power", label="intensity over the distance, power"),
-        MetricSpec("intensity_scale_spread", label="intensity between stations, spread"),
+        MetricSpec("recovered_share", label="cells interpolated between measured ones"),
+        MetricSpec(
+            "intensity_cosine_power", label="intensity model: exponent of the cosine of incidence"
+        ),
+        MetricSpec("intensity_range_power", label="intensity model: exponent of the range"),
+        MetricSpec(
+            "intensity_scale_spread", label="intensity model: spread of the scales between stations"
+        ),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.4, 4.2)",

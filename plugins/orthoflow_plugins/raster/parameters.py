@@ -19,7 +19,7 @@ class RasterParams(MethodParams):
     gsd_m: float = Field(
         default=0.005,
         gt=0,
-        description="Side of a cell; should not be smaller than the point spacing.",
+        description="Cell size; it should not be smaller than the point spacing.",
     )
     buffer_m: float | None = Field(
         default=None,

@@ -65,7 +65,8 @@ class ReadCameras(Method):
             better="lower",
             counted_by="n_oriented",
             headline=True,
-            description="relative to the scan; errors of depth and scan add to it",
+            description="relative to the scan, so errors of the scan and its depths are not "
+            "included",
         ),
     )
     citations: ClassVar[tuple[str, ...]] = (

@@ -32,8 +32,8 @@ class ReadCheckpoints(Method):
     determinism = "exact"
     metrics = (
         MetricSpec("n_points", label="check points"),
-        MetricSpec("n_measured", label="check points measured in pictures"),
-        MetricSpec("extent_[xyz]_m", label="extent along {0} of the world"),
+        MetricSpec("n_measured", label="check points measured in images"),
+        MetricSpec("extent_[xyz]_m", label="extent along the world's {0} axis"),
     )
     citations: ClassVar[tuple[str, ...]] = ()
 

@@ -42,7 +42,7 @@ class ReadOrthoimage(Method):
     determinism = "exact"
     metrics = (
         MetricSpec("n_orthoimages", label="orthoimages"),
-        MetricSpec("painted_share", label="cells painted"),
+        MetricSpec("painted_share", label="covered cells"),
     )
     citations: ClassVar[tuple[str, ...]] = ()
 

@@ -134,7 +134,7 @@ class ReadPhotos(Method):
         MetricSpec("n_photos", label="photos"),
         MetricSpec("n_calibrated", label="photos with a calibration"),
         MetricSpec("n_exif_focal", label="photos with a focal length in EXIF"),
-        MetricSpec("megapixels", label="megapixels in all"),
+        MetricSpec("megapixels", label="megapixels in total"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "CIPA DC-008, Exchangeable image file format for digital still cameras, Exif",

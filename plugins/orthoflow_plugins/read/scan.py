@@ -68,17 +68,18 @@ class ReadScan(Method):
         MetricSpec("n_stations", label="stations"),
         MetricSpec("n_invalid", label="points that the scanner marks as invalid"),
         MetricSpec("n_not_finite", label="points without finite coordinates"),
-        MetricSpec("n_withheld", label="points withheld"),
-        MetricSpec("n_points_left_out", label="points of the files that are not used"),
-        MetricSpec("n_left_out_*", label="points of the files that are not used: {0}"),
-        MetricSpec("extent_[xyz]_m", label="extent along {0} of the world"),
-        MetricSpec("thickness_mm", label="thickness of the cloud in pieces of about 10 cm"),
+        MetricSpec("n_withheld", label="points marked as withheld"),
+        MetricSpec("n_points_left_out", label="points in the files that are not used"),
+        MetricSpec("n_left_out_*", label="points in the files that are not used: {0}"),
+        MetricSpec("extent_[xyz]_m", label="extent along the world's {0} axis"),
+        MetricSpec("thickness_mm", label="thickness of the cloud in patches of about 10 cm"),
         MetricSpec(
-            "thickness_width_mm", label="width that holds 95 % of the distances to the first plane"
+            "thickness_width_mm",
+            label="width that contains 95 % of the distances from the first plane",
         ),
         MetricSpec("thickness_scan_steps", label="thickness divided by the point spacing"),
         MetricSpec("scan_step_mm", label="point spacing"),
-        MetricSpec("scans_apart_mm", label="distance between scans"),
+        MetricSpec("scans_apart_mm", label="distance between scans on the same surface"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "ASTM E2807, E57 file format for 3D imaging data exchange",
@@ -88,7 +89,7 @@ class ReadScan(Method):
     class Params(MethodParams):
         """Parameters that are not in the files."""
 
-        up: UpDirection = Field("z", description="World direction that is up in the files.")
+        up: UpDirection = Field("z", description="Axis of the files that points up.")
         unit: Unit | None = Field(
             None,
             description="Unit of the files' coordinates, which overrides the files; None: the unit "
@@ -96,9 +97,9 @@ class ReadScan(Method):
         )
         view_from: tuple[float, float, float] | None = Field(
             None,
-            description="Position of a viewer, [x, y, z], world metres (unit applied); "
-            "distinguishes the front of a wall from its back if the files have no scanner "
-            "positions.",
+            description="Position of a viewer, [x, y, z], in world metres (after unit is "
+            "applied); it distinguishes the front of a wall from its back if the files "
+            "contain no scanner positions.",
         )
         columns: str | tuple[str, ...] | None = Field(
             None,
@@ -119,8 +120,9 @@ class ReadScan(Method):
 
         box: tuple[Corner, Corner] | None = Field(
             None,
-            description="Lowest and highest corner, [[x, y, z], [x, y, z]], world metres (after "
-            "unit was applied): points outside are left out, those on its faces are kept.",
+            description="Lowest and highest corner of a box, [[x, y, z], [x, y, z]], in world "
+            "metres (after unit is applied): points outside are left out, those on its faces "
+            "are kept.",
         )
         gsd_m: float | None = Field(
             None,

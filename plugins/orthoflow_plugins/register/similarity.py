@@ -36,12 +36,14 @@ class RegisterSimilarity(Method):
     determinism = "loose"
     metrics = (
         MetricSpec("n_pairs", label="pairs of points"),
-        MetricSpec("sigma0_mm", label="sigma of a point's coordinate"),
-        MetricSpec("rms_mm", label="residuals of the pairs, RMS", better="lower", headline=True),
+        MetricSpec("sigma0_mm", label="standard deviation of a coordinate"),
+        MetricSpec(
+            "rms_mm", label="residuals of the point pairs, RMS", better="lower", headline=True
+        ),
         MetricSpec("max_mm", label="largest residual"),
         MetricSpec("scale", label="scale of the transformation"),
-        MetricSpec("scale_ppm", label="scale, from 1"),
-        MetricSpec("left_out_rms_mm", label="each point left out once, RMS", better="lower"),
+        MetricSpec("scale_ppm", label="deviation of the scale from 1"),
+        MetricSpec("left_out_rms_mm", label="leave-one-out residuals, RMS", better="lower"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Umeyama 1991, doi:10.1109/34.88573 (least squares of a similarity)",
@@ -56,7 +58,7 @@ class RegisterSimilarity(Method):
 
         with_scale: bool = Field(
             default=True,
-            description="Estimate a scale, for clouds from photos; a scanner's is 1.",
+            description="Also estimate the scale, for clouds from photos; for laser scans it is 1.",
         )
         up: UpDirection = Field(
             default="z", description="Direction that is up in the system of the control."

@@ -64,9 +64,9 @@ _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_
 NO_CLOUD: Final = DiagnosticSpec(
     code="openings-without-cloud",
     severity="warning",
-    text="without the cloud an opening cannot be distinguished from a place "
-    "that furniture hides, nor an open one from one without returns",
-    remedy="wire the cloud to {step}",
+    text="without the cloud, openings cannot be distinguished from areas hidden by furniture, "
+    "nor open ones from those without returns",
+    remedy="connect the cloud to {step}",
 )
 OTHER_SURFACE: Final = DiagnosticSpec(
     code="wall-behind-its-plane",
@@ -77,8 +77,8 @@ OTHER_SURFACE: Final = DiagnosticSpec(
 OTHER_CELLS: Final = DiagnosticSpec(
     code="orthoimage-of-other-cells",
     severity="warning",
-    text="{subject}: its orthoimage has other cells than its depth, so sides are "
-    "measured from depth alone",
+    text="{subject}: the cells of its orthoimage differ from those of its depth raster, so sides "
+    "are measured from depth alone",
     remedy="use the same gsd_m for both",
 )
 
@@ -110,8 +110,8 @@ class SegmentOpenings(Method):
         MetricSpec("n_no_data", label="openings without returns"),
         MetricSpec("openings_area_m2", label="area of the openings"),
         MetricSpec("openings_share", label="share of the walls that is open"),
-        MetricSpec("side_sigma_mm", label="stated error of a side, median"),
-        MetricSpec("image_side_share", label="sides that a photo placed"),
+        MetricSpec("side_sigma_mm", label="predicted standard deviation of a side, median"),
+        MetricSpec("image_side_share", label="share of sides located in the orthoimage"),
         MetricSpec("n_unbounded", label="open areas rejected by border or shape"),
     )
     citations: ClassVar[tuple[str, ...]] = (
@@ -132,7 +132,7 @@ class SegmentOpenings(Method):
             default=0.25,
             gt=0.0,
             le=100.0,
-            description="Side of a square that fits into an opening.",
+            description="Side of the smallest square that must fit into an opening.",
         )
         area_least_m2: float = Field(
             default=0.1, gt=0.0, le=10_000.0, description="Smallest area of an opening."

@@ -71,11 +71,13 @@ class SimulateRoom(Method):
         MetricSpec("n_true_planes", label="true planes"),
         MetricSpec("main_wall_points", label="points on the main wall"),
         MetricSpec("outlier_share", label="simulated outliers"),
-        MetricSpec("photo_gsd_mm", label="size of a photo's pixel on the wall"),
-        MetricSpec("photo_megapixels", label="megapixels in all"),
-        MetricSpec("photo_obliquity_max_deg", label="most oblique view of a photo"),
+        MetricSpec("photo_gsd_mm", label="photo pixel size on the wall"),
+        MetricSpec("photo_megapixels", label="megapixels in total"),
+        MetricSpec(
+            "photo_obliquity_max_deg", label="largest angle between optical axis and wall normal"
+        ),
         MetricSpec("scan_step_median_mm", label="point spacing on the main wall, median"),
-        MetricSpec("scan_step_p90_mm", label="point spacing on the main wall, 90 % are below"),
+        MetricSpec("scan_step_p90_mm", label="point spacing on the main wall, 90th percentile"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (the kind of room)",
@@ -88,110 +90,116 @@ class SimulateRoom(Method):
             0.0042,
             gt=0.0,
             le=0.5,
-            description="Spacing of a station's points on the main wall, right before the station.",
+            description="Point spacing on the main wall, directly in front of the station.",
         )
         panorama_step_m: float | None = Field(
             None,
             gt=0.0,
             le=0.5,
-            description="The same for the panoramas, which cover the rest of the room; three times "
-            "as coarse unless given.",
+            description="The same for the panoramas, which cover the rest of the room; by "
+            "default three times scan_step_m.",
         )
         n_stations: int = Field(2, ge=1, le=4, description="Number of scanner stations.")
         noise_m: float = Field(
             0.0015,
             ge=0.0,
             le=0.1,
-            description="Standard deviation of a range at 3 m, normal to a plain wall.",
+            description="Range noise (one standard deviation) at 3 m and normal incidence on a "
+            "plain wall.",
         )
         registration_error_m: float = Field(
             0.0,
             ge=0.0,
             le=0.1,
-            description="Standard deviation of each coordinate of where a station is taken to be.",
+            description="Registration error of a station: standard deviation of each coordinate "
+            "of its position.",
         )
         bending_m: float = Field(
             0.0,
             ge=0.0,
             le=0.5,
-            description="How far the cloud is bent 5 m from the middle of the room, as clouds of "
-            "SLAM and of photos are.",
+            description="Bending of the cloud: displacement 5 m from the middle of the room, as "
+            "in clouds from SLAM or photos.",
         )
         shared_noise_m: float = Field(
             0.0,
             ge=0.0,
             le=0.1,
-            description="Standard deviation of each coordinate that neighbouring points have in "
-            "common, as in clouds from photos.",
+            description="Standard deviation of the coordinate error that neighbouring points "
+            "share, as in clouds from photos.",
         )
         shared_noise_length_m: float = Field(
-            1.0, gt=0.0, le=50.0, description="Distance over which shared_noise_m changes."
+            1.0, gt=0.0, le=50.0, description="Correlation length of the shared error."
         )
         colour_noise_grey: float = Field(
-            2.0, ge=0.0, le=50.0, description="Standard deviation of a point's colour."
+            2.0, ge=0.0, le=50.0, description="Colour noise of the points (one standard deviation)."
         )
         outlier_share: float = Field(
-            0.004, ge=0.0, le=0.5, description="Share of points at a random distance."
+            0.004, ge=0.0, le=0.5, description="Share of points at a random range."
         )
         beam_m: float = Field(
             0.003,
             ge=0.0,
             le=0.05,
-            description="Diameter of the laser spot; distances mix at edges. 0 mixes none.",
+            description="Diameter of the laser spot, which causes mixed points at edges; 0: no "
+            "mixed points.",
         )
         relief_scale: float = Field(
             1.0,
             ge=0.0,
             le=2.0,
-            description="Scale of all mouldings; 1 gives 2 to 15 cm, 0 none.",
+            description="Scale of the relief of all mouldings: 1 gives 2 to 15 cm, 0 a flat wall.",
         )
         decoration: Literal["designed", "drawn"] = Field(
             "designed",
-            description="drawn: cornices, pilasters, niches, panels and doors set back differ from "
-            "seed to seed, relief up to 0.3 m, recesses up to 0.45 m.",
+            description="designed: a fixed wall; drawn: random cornices, pilasters, niches, "
+            "panels and recessed doors, with relief up to 0.3 m and recesses up to 0.45 m.",
         )
         design_seed: int | None = Field(
             default=None,
             ge=0,
-            description="Which of the drawn rooms, so that datasets have rooms of their own; "
-            "by default the seed of the workflow. Scanning errors do not depend on it.",
+            description="Seed of a drawn room, which gives each dataset its own room; by default "
+            "the seed of the workflow. Scanning errors do not depend on it.",
         )
         obstacle: bool = Field(
-            default=True, description="An object stands free 0.6 m before the main wall."
+            default=True, description="Place an object 0.6 m in front of the main wall."
         )
         spectral_gap: SpectralGap = Field(
             "easy",
-            description="none: the laser sees the painted patterns; hard: mostly other ones; "
-            "inverted: it falls where red rises, with wet patches and retro-reflecting spots.",
+            description="How the laser intensity relates to the colours. none: it shows the "
+            "painted patterns; easy: mostly these; hard: mostly other patterns; inverted: it "
+            "decreases where red increases, with wet patches and retroreflective spots.",
         )
         spectral_inversion_share: float | None = Field(
             None,
             ge=0.0,
             le=1.0,
-            description="Share of the inverted contrast in what the laser sees; by default 1 for "
-            "`inverted`, else 0. Gains, signs and powers are drawn per material.",
+            description="Share of the inverted contrast in the laser intensity; by default 1 for "
+            "`inverted`, else 0. Gains, signs and exponents are random for each material.",
         )
         textile_share: float | None = Field(
             None,
             ge=0.0,
             le=MOST_TEXTILE,
-            description="Share of the main wall covered by cloth with one repeated motif; by "
-            "default 0.095 of the designed wall and none of a drawn one.",
+            description="Share of the main wall covered by cloth with a repeated motif; by "
+            "default 0.095 for the designed wall and 0 for a drawn one.",
         )
         n_plaques: int = Field(
             0,
             ge=0,
             le=40,
-            description="Plaques of 12 to 45 cm on a drawn main wall, 2 to 15 cm thick, so that "
-            "it has corners for check points at edges; fewer where there is no place.",
+            description="Number of plaques, 12 to 45 cm wide and 2 to 15 cm thick, on a drawn "
+            "main wall, which provide corners for check points at edges; fewer if there is "
+            "no room for them.",
         )
         photo_layout: PhotoLayout = Field(
             "none",
-            description="quick: 6 photos of the main wall; variant1: 8 photos of whole walls, 4 "
-            "walls; variant2: a block of 18 over the main wall, 70 % and 50 % overlap.",
+            description="none: no photos; quick: 6 photos of the main wall; variant1: 8 photos "
+            "that show whole walls, of four walls; variant2: a block of 18 photos of the "
+            "main wall with 70 % forward and 50 % side overlap.",
         )
         photo_gsd_m: float = Field(
-            0.002, gt=0.0, le=0.1, description="Side of a photo's pixel on the wall."
+            0.002, gt=0.0, le=0.1, description="Photo pixel size on the wall."
         )
         photo_obliquity_deg: float = Field(
             12.0,
@@ -200,44 +208,56 @@ class SimulateRoom(Method):
             description="Largest intended angle between optical axis and wall normal.",
         )
         photo_noise_grey: float = Field(
-            1.5, ge=0.0, le=50.0, description="Standard deviation of a pixel's colour."
+            1.5,
+            ge=0.0,
+            le=50.0,
+            description="Image noise (one standard deviation of a pixel value).",
         )
         photo_vignetting_share: float = Field(
-            0.1, ge=0.0, le=0.9, description="Share of the light lost in the corners of a photo."
+            0.1,
+            ge=0.0,
+            le=0.9,
+            description="Vignetting: share of the light lost in the corners of a photo.",
         )
         photo_exposure_share: float = Field(
             0.0,
             ge=0.0,
             le=0.9,
-            description="Photos get between 1 less and 1 plus this times the light.",
+            description="Largest relative change of exposure between photos: each gets 1 - this "
+            "to 1 + this times the light.",
         )
         n_passers_by: int = Field(
             0,
             ge=0,
             le=20,
-            description="People who walk before the main wall while photos are taken: each stands "
-            "elsewhere in every photo, or is not there. The scan knows nothing of them.",
+            description="Number of people who walk in front of the main wall while photos are "
+            "taken: in each photo, each of them is at another position or absent. The scan "
+            "does not contain them.",
         )
         photo_supersample: int = Field(
-            2, ge=1, le=8, description="A pixel is the mean of so many rays squared."
+            2,
+            ge=1,
+            le=8,
+            description="Rays per pixel along each axis; a pixel is the mean of all its rays.",
         )
-        calibrated: bool = Field(default=True, description="The camera's calibration is known.")
+        calibrated: bool = Field(default=True, description="Return the calibration of the camera.")
         check_points_most: int = Field(
             24,
             ge=1,
-            description="Check points on the main wall, at most so many on flat parts and as many "
-            "on vertical edges.",
+            description="Maximum number of check points on flat parts of the main wall, and "
+            "likewise on vertical edges.",
         )
         up: UpDirection = Field("z", description="World direction that is up.")
         geometry: Literal["designed", "drawn"] = Field(
             "designed",
-            description="drawn: directions, leans and distances of all planes, where the stations "
-            "stand and how the room is turned differ from seed to seed, so that nothing lies on "
-            "the steps of a search.",
+            description="designed: a fixed room; drawn: random directions, tilts and distances "
+            "of all planes, station positions and rotation of the room, so that nothing "
+            "coincides with the steps of a search.",
         )
-        turn_deg: float = Field(0.0, description="Turns the room about up, degrees.")
+        turn_deg: float = Field(0.0, description="Rotation of the room about the up axis.")
         shift_world_m: tuple[float, float, float] = Field(
-            (0.0, 0.0, 0.0), description="World position of the room's origin, survey coordinates."
+            (0.0, 0.0, 0.0),
+            description="World position of the room's origin, such as survey coordinates.",
         )
 
         @model_validator(mode="after")

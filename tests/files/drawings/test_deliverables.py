@@ -196,9 +196,9 @@ def test_every_export_states_the_same_of_a_wall(tmp_path: Path) -> None:
     (wall,) = room_results(open_run(run)).walls
     assert wall.about is not None
     assert wall.about.sentence == (
-        "3.80 x 2.30 m; 97% painted; expected error of a point measured in this image: median "
-        "2.0 mm, 95 % below 2.0 mm (one standard deviation, relative to the scan and without its "
-        "errors, from orientation, depth and parallax; withheld tie points on this wall: 12)"
+        "3.80 x 2.30 m; 97% covered; expected error of a point measured in this image: median "
+        "2.0 mm, 95 % below 2.0 mm (one standard deviation, relative to the scan and excluding "
+        "its errors, due to orientation, depth and parallax; withheld tie points on this wall: 12)"
     )
     for target, file in (
         ("qgis", "walls.qgs"),

@@ -110,7 +110,7 @@ def test_a_sheet_says_what_the_record_says(run: Path, sheet: pdfplumber.page.Pag
     for said in (
         *("Sala Łukowa", "1:50", "21-017", "wall 2", "sheet 1 of 1"),
         "measured: RMSE horizontal 0.7 mm, vertical 1.4 mm",
-        "reference plane: 4,000 points, RMS distance 2.0 mm (relief included)",
+        "reference plane: 4,000 points, RMS distance 2.0 mm (including relief)",
         "colours as scanned",
         "grid 0.5 m",
         # Letters that stand upright come from below.
@@ -164,8 +164,8 @@ def test_the_accuracy_of_a_wall_is_by_evidence_on_that_wall(
     (wall,) = room_results(photographed(open_run(run))).walls
     expected = (
         "expected error of a point measured in this image: median 2.0 mm, 95 % below 2.0 mm (one "
-        "standard deviation, relative to the scan and without its errors, from orientation, depth "
-        "and parallax; withheld tie points on this wall: 12)"
+        "standard deviation, relative to the scan and excluding its errors, due to orientation, "
+        "depth and parallax; withheld tie points on this wall: 12)"
     )
     assert wall.accuracy[0].text() == (expected if has_ties else "accuracy not checked")
     # What is stated is not said to be unknown; numbers of the photos are of all walls together.

@@ -125,10 +125,10 @@ def test_a_cut_that_meets_nothing_is_refused() -> None:
 @pytest.mark.parametrize(
     ("kind", "crs", "direction"),
     [
-        ("plan", None, "y: axis of the scan; north is not known"),
-        ("plan", "site", "y: axis of the scan; north is not known"),
+        ("plan", None, "y: axis of the scan; north unknown"),
+        ("plan", "site", "y: axis of the scan; north unknown"),
         ("plan", "EPSG:25832", "N: grid north"),
-        ("section", "EPSG:25832", "key plan: section line in red, seen along the arrow"),
+        ("section", "EPSG:25832", "key plan: section line in red, arrow = viewing direction"),
     ],
 )
 def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
@@ -158,7 +158,7 @@ def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
         lengths = [math.hypot(c["x1"] - c["x0"], c["y1"] - c["y0"]) for c in thick]
         longest_mm = 1000 * max(one.length_m for one in section.lines) / 50
         assert min(abs(one / POINTS_PER_MM - longest_mm) for one in lengths) < 0.01
-    slab = f"cut slice {1e3 * section.slab_m:.0f} mm thick"
+    slab = f"slice {1e3 * section.slab_m:.0f} mm thick"
     for said in ("1:50", kind.title(), slab, "sheet 1 of 1", "record sha256", direction):
         assert said in words, said
 

@@ -493,7 +493,7 @@ def test_the_scale_at_which_cells_print_finely_is_a_usual_one(run: Path, tmp_pat
     ("language", "said"),
     [
         ("en", ("reference plane: 4,000 points", "RMSE horizontal 0.7 mm", "niche 0.80 x 1.20 m")),
-        ("de", ("Bezugsebene aus 4.000 Punkten", "RMSE seitlich 0,7 mm", "Nische 0,80 x 1,20 m")),
+        ("de", ("Bezugsebene: 4.000 Punkte", "RMSE horizontal 0,7 mm", "Nische 0,80 x 1,20 m")),
         ("fr", ("référence : 4 000 points", "RMSE en largeur 0,7 mm", "niche 0,80 x 1,20 m")),
     ],
 )
@@ -513,8 +513,8 @@ def test_numbers_have_the_separators_of_the_language(
     assert ("+101.80" if language == "en" else "+101,80") in letters
     if language == "de":
         for part in (
-            "zu erwartender Fehler eines in diesem Bild gemessenen Punktes 2,0 mm",
-            "relativ zum Scan und ohne dessen Fehler",
+            "erwarteter Fehler eines in diesem Bild gemessenen Punktes: Median 2,0 mm",
+            "bezogen auf den Scan und ohne dessen Fehler",
             "zurückgehaltene Verknüpfungspunkte auf dieser Wand: 1.288",
         ):
             assert part in text, part
@@ -526,8 +526,8 @@ def test_numbers_have_the_separators_of_the_language(
 @pytest.mark.parametrize(
     ("share", "has_ties", "said", "note"),
     [
-        (0.35, True, "only 35% painted", "nur 35 % dieses Bildes haben Farben"),
-        (0.60, False, "no tie point lies", "auf dieser Wand liegt kein Verknüpfungspunkt"),
+        (0.35, True, "only 35% covered", "nur 35 % dieses Bildes sind abgedeckt"),
+        (0.60, False, "there is no tie point", "auf dieser Wand liegt kein Verknüpfungspunkt"),
         (0.60, True, "", ""),
     ],
 )
