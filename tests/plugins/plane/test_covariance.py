@@ -140,11 +140,6 @@ def room_ratios(seed: int, folder: Path) -> list[list[float]]:
     return found
 
 
-def test_stated_sigmas_of_scanned_rooms_are_their_errors(tmp_path: Path) -> None:
-    # Six planes and three numbers each: the spread of their root mean square is a sixth.
-    assert 0.5 < float(np.sqrt(np.mean(np.square(room_ratios(4, tmp_path))))) < 1.7
-
-
 @pytest.mark.long
 def test_stated_sigmas_of_fifty_rooms_are_their_errors(tmp_path: Path) -> None:
     found = [item for seed in range(50) for item in room_ratios(seed, tmp_path)]

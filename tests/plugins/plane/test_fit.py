@@ -23,16 +23,6 @@ def raster_of(plane: Plane, low_m: tuple[float, float], shape: tuple[int, int]) 
     return SurfaceRaster(plane=plane, axes=axes, low_m=np.array(low_m), cell_m=0.1, shape=shape)
 
 
-@pytest.mark.parametrize(
-    ("tolerance_m", "fit_tolerance_m", "tolerances"),
-    [(0.08, 0.02, (0.08, 0.04, 0.02)), (0.05, 0.05, (0.05,)), (0.05, 0.08, (0.05,))],
-)
-def test_tolerances_shrink_by_equal_factors(
-    tolerance_m: float, fit_tolerance_m: float, tolerances: tuple[float, ...]
-) -> None:
-    assert fit.shrinking_tolerances(tolerance_m, fit_tolerance_m) == pytest.approx(tolerances)
-
-
 RASTER = raster_of(FLOOR, (2.0, -1.0), (20, 30))
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from orthoflow_plugins.plane.detector import Candidate, Constraint
 from orthoflow_plugins.plane.fit import FoundPlane
 from orthoflow_plugins.plane.search import (
-    Claim,
     Search,
     find_planes,
     fit_to_all,
@@ -49,21 +48,6 @@ def surface(truth: Rectangle) -> Candidate:
 def wall(n_points: int = 8_000, *, half_m: tuple[float, float] = (2.0, 1.0)) -> Rectangle:
     """At y = 2, upright."""
     return Rectangle("wall", (0, 2, 0), (half_m[0], 0, 0), (0, 0, half_m[1]), n_points)
-
-
-@pytest.mark.parametrize(("miss_m", "lean"), [(0.0, 0.01), (0.03, 0.0), (-0.03, 0.01)])
-def test_a_candidate_is_moved_to_the_surface_near_it(miss_m: float, lean: float) -> None:
-    search = search_in(prepared(sampled((wall(), FAR))))
-    found = verify(proposed((0.0, 1.0, lean), 2.0 + miss_m, "vertical"), search)
-    assert found is not None
-    assert found.raster.plane.offset_m == pytest.approx(2.0, abs=2e-4)
-    assert angle_between_deg(found.raster.plane.normal, np.array(ALONG_Y)) < 0.02
-    sizes = np.diff(found.support.bounds_m.reshape(2, 2), axis=1)[:, 0]
-    np.testing.assert_allclose(sizes, [4.0, 2.0], atol=0.25)
-    # What is taken is the wall, and within the tolerance.
-    search.claim(Claim.of(found.raster, found.support, TOLERANCE_M))
-    assert (search.claims[:8_000] == 0).mean() > 0.99
-    assert (search.claims[8_000:] == -1).all()
 
 
 def barrel(radius_m: float) -> NDArray[np.float64]:

@@ -187,31 +187,6 @@ def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
     )
 
 
-@pytest.mark.parametrize("layout", ["pixel", "band", "alpha", "tiles"])
-def test_sixteen_bits_are_read_in_every_layout(
-    tmp_path: Path, read: PhotoReader, layout: str
-) -> None:
-    deep = np.random.default_rng(1).integers(0, 65536, (3, 40, 60)).astype(np.uint16)
-    bands = np.concatenate([deep, deep[:1] | 0x8000]) if layout == "alpha" else deep
-    options: dict[str, object] = {"interleave": "band" if layout == "band" else "pixel"}
-    options |= {"alpha": "yes"} if layout == "alpha" else {}
-    tiles = {"tiled": True, "blockxsize": 32, "blockysize": 32, "compress": "zstd"}
-    options |= tiles if layout == "tiles" else {}
-    with rasterio.open(
-        tmp_path / "a.tif",
-        "w",
-        driver="GTiff",
-        height=40,
-        width=60,
-        count=len(bands),
-        dtype="uint16",
-        photometric="RGB",
-        transform=Affine.scale(0.5),
-        **options,
-    ) as file:
-        file.write(bands)
-    (photo,) = read(tmp_path / "a.tif")
-    np.testing.assert_array_equal(decode_levels(photo.encoded), np.moveaxis(deep, 0, 2))
 
 
 def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: PhotoReader) -> None:

@@ -150,17 +150,6 @@ def test_up_is_told_and_nothing_is_turned(tmp_path: Path, read: ScanReader, up: 
     np.testing.assert_allclose(cloud.points_world(), POINTS, atol=1e-6)
 
 
-def test_finite_points_beyond_any_survey_are_named(tmp_path: Path, read: ScanReader) -> None:
-    points = POINTS.copy()
-    points[5] = (0.5, 1e30, -2.0)
-    points[9, 0] = -2e9
-    points[11, 0] = np.nan
-    cloud = read(write_text(tmp_path / "a.xyz", points))
-    assert len(cloud) == 397
-    assert (
-        "a.xyz, scan 0: 2 points are farther than 1e+09 m from the origin, the first at 0.5 1e+30 "
-        "-2, and were left out"
-    ) in read.warnings
 
 
 def test_rounded_coordinates_and_a_scan_of_less_than_a_metre_are_warned_of(
@@ -361,14 +350,3 @@ def test_real_scans_come_out_whole(
     assert ("luminance of the colours" in read.warnings) == ("lion" in name)
 
 
-def test_the_pump_is_seen_from_its_origin_on_its_grid(shared_data: Path, read: ScanReader) -> None:
-    cloud = read(shared_data / "pump-e57/pumpAVisualReferenceImage.e57")
-    np.testing.assert_array_equal(cloud.stations, [[0.0, 0.0, 0.0]])
-    assert cloud.stations_source == "file"
-    assert cloud.row is not None
-    assert cloud.column is not None
-    assert (int(cloud.row.max()), int(cloud.column.max())) == (1073, 344)
-    assert cloud.intensity is not None
-    assert (float(cloud.intensity.min()), float(cloud.intensity.max())) == pytest.approx(
-        (0.3838, 0.6984), abs=1e-4
-    )

@@ -84,28 +84,6 @@ def overlap(one: Extent, other: Extent) -> bool:
     )
 
 
-def test_cornices_are_up_to_three_even_steps_up_to_the_ceiling() -> None:
-    counts: Counter[int] = Counter()
-    heights_m = []
-    for found in all_drawn():
-        steps = [item for item in found.stone if is_cornice(item[1])]
-        counts[len(steps)] += 1
-        if not steps:
-            continue
-        height_m = SHOWN[3] - steps[0][1][2]
-        heights_m.append(height_m)
-        for number, (depth, extent) in enumerate(steps):
-            assert depth == pytest.approx(steps[-1][0] * (number + 1) / len(steps))
-            low = SHOWN[3] - height_m * (1.0 - number / len(steps))
-            assert extent[2] == pytest.approx(low)
-            # On behind the ceiling, where nobody sees it end.
-            assert extent[3] == pytest.approx(FULL[3])
-    assert set(counts) == {0, 1, 2, 3}
-    # Each as likely: 75 of 300, give or take 7.5.
-    assert min(counts.values()) > 40
-    # Low ones and high ones, and some between: a sixth of the wall at most.
-    assert min(heights_m) < 0.15
-    assert 0.4 < max(heights_m) < 0.5
 
 
 def test_relief_and_recesses_are_as_deep_as_the_family_says() -> None:
