@@ -17,6 +17,7 @@ from tests.plane_scenes import ROOM, Rectangle, cloud_of, detect, sampled
 SURVEY = (634512.347, 486215.781, 112.193)
 # The wall at y = -2, and the floor.
 TRIPLE: dict[str, Any] = {"points": ((-3.0, -2.0, -1.5), (3.0, -2.0, -1.5), (0.0, -2.0, 1.5))}
+FAR: dict[str, Any] = {"normal": (0.0, 1.0, 0.0), "offset_m": 10.0}
 TWO: tuple[dict[str, Any], ...] = (TRIPLE, {"horizontal": True, "height_m": -1.5})
 
 
@@ -91,18 +92,9 @@ def test_contradicting_parameters_are_refused(params: dict[str, object], message
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        (
-            {"points": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))},
-            "three points that define a plane",
-        ),
-        (
-            {"normal": (0.0, 1.0, 0.0), "offset_m": 10.0},
-            r"no point .* within 0.15 m .* between -12.0\d\d m and",
-        ),
-        (
-            {"planes": (TRIPLE, {"normal": (0.0, 1.0, 0.0), "offset_m": 10.0})},
-            r"planes\[1\]: no point of the cloud is within",
-        ),
+        ({"points": ((0, 0, 0), (1, 1, 1), (2, 2, 2))}, "three points that define a plane"),
+        (FAR, r"no point .* within 0.15 m .* between -12.0\d\d m and"),
+        ({"planes": (TRIPLE, FAR)}, r"planes\[1\]: no point of the cloud is within"),
     ],
 )
 def test_planes_without_points_are_refused(

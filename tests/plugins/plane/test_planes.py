@@ -1,7 +1,8 @@
-"""Sides, names, rectangles and deviations of planes, from stations and points that are known."""
+"""Sides, names, rectangles, deviations and thickness of planes that are known."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +20,13 @@ from orthoflow_plugins.plane.planes import (
     side_of_remaining,
     side_of_stations,
 )
+from orthoflow_plugins.plane.ransac import Ransac
+from pydantic import ValidationError
 
+from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow.products import Planes
+from orthoflow.products import Planes, PointCloud
+from tests import plane_scenes
 from tests.plane_scenes import cloud_of, detect, prepared
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -280,3 +285,77 @@ def test_relief_shows_as_skewness_and_heavy_tails_and_evenness_as_light_ones() -
     # Few points or a single bin have no distribution.
     assert shape_of(rng.normal(0.0, 0.002, 50)) is None
     assert shape_of(np.full(1000, 1e-4)) is None
+
+
+# A wall of 6 x 3 m at y = 2, seen from the middle of a room.
+STATION = np.array([[0.0, 0.0, 0.0]])
+N_POINTS = 90_000
+
+
+def wall(noise_m: NDArray[np.float64] | float, *, bow_m: float = 0.0) -> NDArray[np.float64]:
+    rng = np.random.default_rng(0)
+    x, z = rng.uniform(-3.0, 3.0, N_POINTS), rng.uniform(-1.5, 1.5, N_POINTS)
+    y = 2.0 + bow_m * (x / 3.0) ** 2 + rng.normal(0.0, 1.0, N_POINTS) * noise_m
+    return np.column_stack([x, y, z])
+
+
+def measured(cloud: PointCloud, folder: Path, **params: object) -> tuple[Any, dict[str, float]]:
+    out, ctx = plane_scenes.detect(Ransac, cloud, folder, **params)
+    return out.planes, {metric.name: metric.value for metric in ctx.metrics}
+
+
+@pytest.mark.parametrize(("noise_m", "bow_m"), [(0.001, 0.0), (0.001, 0.006), (0.004, 0.006)])
+def test_thickness_is_the_noise_and_not_the_bow(
+    noise_m: float, bow_m: float, tmp_path: Path
+) -> None:
+    _, metrics = measured(cloud_of(wall(noise_m, bow_m=bow_m), stations=STATION), tmp_path)
+    # 50 points in a tile, 90 000 in all: half a percent; a bow of 6 mm slopes little in a tile.
+    assert metrics["thickness_mm"] == pytest.approx(1000.0 * noise_m, rel=0.03)
+    assert metrics["thickness_width_mm"] == pytest.approx(3.92 * 1000.0 * noise_m, rel=0.03)
+    assert metrics["thickest_mm"] == metrics["thickness_mm"]
+    step_mm = 1000.0 * np.sqrt(18.0 / N_POINTS)
+    assert metrics["scan_step_mm"] == pytest.approx(step_mm, rel=0.03)
+    assert metrics["thickness_scan_steps"] == pytest.approx(1000.0 * noise_m / step_mm, rel=0.05)
+
+
+@pytest.mark.usefixtures("charts")
+def test_materials_have_a_thickness_each_on_the_plane_and_along_a_row(tmp_path: Path) -> None:
+    fabric = wall(0.0)[:, 0] > 0.0
+    intensity = np.where(fabric, 0.2, 0.8) + np.random.default_rng(1).normal(0, 0.02, N_POINTS)
+    cloud = dataclasses.replace(
+        cloud_of(wall(np.where(fabric, 0.004, 0.001))),
+        intensity=intensity.astype(np.float32),
+        # Row 3 of the second scan has most points.
+        row=np.repeat([*range(30), 3], [2900] * 30 + [3000]).astype(np.uint32),
+        scan=np.repeat([0, 1], [2900 * 30, 3000]).astype(np.uint16),
+        column=np.zeros(N_POINTS, dtype=np.uint32),
+    )
+    names = {"fabric": (0.0, 0.5), "plaster": (0.5, 1.0)}
+    planes, _ = measured(cloud, tmp_path, materials=names)
+    thickness, row = planes.thickness[0], planes.scan_row
+    for spreads, rel in ((thickness.material, 0.05), (row.material, 0.15)):
+        assert [item.name for item in spreads] == ["fabric", "plaster"]
+        assert spreads[0].sigma_m == pytest.approx(0.004, rel=rel)
+        assert spreads[1].sigma_m == pytest.approx(0.001, rel=rel)
+    assert (row.row, row.scan, row.n_points) == (3, 1, 3000)
+    # Without numbers of scans a row is one of all scans; without rows there is none.
+    blind = dataclasses.replace(cloud, scan=None)
+    assert measured(blind, tmp_path)[0].scan_row.n_points == 5900
+    assert measured(dataclasses.replace(blind, row=None), tmp_path)[0].scan_row is None
+    with pytest.raises(MethodError, match="omit materials"):
+        measured(cloud_of(wall(0.002)), tmp_path, materials=names)
+
+
+@pytest.mark.parametrize(
+    ("materials", "message"),
+    [
+        ({"a": (0.2, 0.2)}, "intensities of a must ascend between 0 and 1, got 0.2 and 0.2"),
+        ({"a": (0.1, 1.1)}, "must ascend"),
+        ({"b": (0.2, 0.5), "a": (0.0, 0.3)}, "intensities of b begin at 0.2, below 0.3 where"),
+    ],
+)
+def test_materials_that_overlap_or_fall_are_refused(
+    materials: dict[str, tuple[float, float]], message: str
+) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Ransac.Params.model_validate({"materials": materials})

@@ -141,6 +141,3 @@ def test_rows_and_columns_are_lines_over_the_fullest_wall() -> None:
     assert 26 <= full_rows.sum() <= 27
     assert full_columns.sum() == 23
     assert set(np.diff(np.flatnonzero(full_rows))) <= {22, 23}
-
-
-# --- the sheet ---

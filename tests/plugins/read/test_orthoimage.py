@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.surf import InspectSurf
 from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from rasterio.transform import Affine
@@ -76,29 +75,6 @@ def test_a_foreign_image_lies_where_its_transform_says_and_is_inspected(tmp_path
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["rmse_x_mm"] < 1.0
     assert metrics["rmse_y_mm"] < 1.0
-
-
-def test_check_points_are_measured_in_a_foreign_image(tmp_path: Path) -> None:
-    (image,) = read(tmp_path, *foreign(tmp_path))
-    places = np.array([[20.0, 15.0], [90.5, 100.25], [150.0, 60.0]])
-    off = np.array([0.5, -1.0])
-    points = inspect_scenes.points_at(
-        image.frame.world_from_wall(places), pixels=places + off, classes=("flat",) * 3
-    )
-    ctx = scenes.context(tmp_path)
-    inputs = InspectCheckpoints.In(
-        checkpoints=points,
-        walls=inspect_scenes.walls(),
-        orthoimages=Orthoimages(images=(image,)),
-    )
-    out = InspectCheckpoints().run(inputs, InspectCheckpoints.Params(), ctx)
-    np.testing.assert_allclose(
-        out.inspection.displacement_m, np.tile(0.008 * off, (3, 1)), atol=1e-9
-    )
-    metrics = {metric.name: metric.value for metric in ctx.metrics}
-    # The part of the wall that it covers is shown as a whole.
-    assert metrics["completeness"] == 1.0
-    assert metrics["filled_share"] == 0.0
 
 
 def test_our_own_files_need_no_frame_beside_them(tmp_path: Path) -> None:

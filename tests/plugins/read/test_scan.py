@@ -1,19 +1,26 @@
-"""`read.scan`: one cloud in metres from files in any unit, and honest words on what limits it."""
+"""`read.scan`: one cloud in metres from files in any unit, block by block, and its scales."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.read import scales
+from orthoflow_plugins.read.assembly import CloudAssembly, rounding_m
+from orthoflow_plugins.read.scales import ColourScale, IntensityScale, choose_scales, normalise
 from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.errors import InputError, StoreError
+from orthoflow.files.points.scan_file import PointBlock, PointField, Scan, ScanFile
 from orthoflow.products import PointCloud
+from orthoflow.sdk import StepContext
 from tests import scan_files
 from tests.method_runs import Reader
 
@@ -148,8 +155,6 @@ def test_up_is_told_and_nothing_is_turned(tmp_path: Path, read: ScanReader, up: 
     expected["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     np.testing.assert_array_equal(cloud.up, expected)
     np.testing.assert_allclose(cloud.points_world(), POINTS, atol=1e-6)
-
-
 
 
 def test_rounded_coordinates_and_a_scan_of_less_than_a_metre_are_warned_of(
@@ -350,3 +355,265 @@ def test_real_scans_come_out_whole(
     assert ("luminance of the colours" in read.warnings) == ("lion" in name)
 
 
+FIELDS: tuple[PointField, ...] = ("intensity", "rgb", "grid")
+HERE = np.array([634_512.25, 486_215.5, 101.75])
+
+
+def block(seed: int, n: int, *, scan: int = 0, **more: object) -> PointBlock:
+    rng = np.random.default_rng(seed)
+    plain: dict[str, object] = {
+        "points": HERE + rng.uniform(-5.0, 5.0, (n, 3)),
+        "scan": scan,
+        "n_read": n,
+        "intensity": rng.uniform(0.0, 2048.0, n).astype(np.float32),
+        "rgb": rng.integers(0, 256, (n, 3)).astype(np.uint8),
+        "row": rng.integers(0, 3000, n),
+        "column": rng.integers(0, 3000, n),
+    }
+    return PointBlock(**(plain | more))  # type: ignore[arg-type]
+
+
+def file(
+    name: str,
+    *blocks: PointBlock,
+    fields: Sequence[PointField] = FIELDS,
+) -> ScanFile:
+    n_scans = max(one.scan for one in blocks) + 1
+    return ScanFile(
+        name=name,
+        format_name="toy",
+        n_most=sum(len(one.points) for one in blocks),
+        scans=[Scan(fields=frozenset(fields)) for _ in range(n_scans)],
+        read=lambda: iter(blocks),
+    )
+
+
+def context(folder: Path, progress: list[tuple[float, str]] | None = None) -> StepContext:
+    heard = [] if progress is None else progress
+    return StepContext(
+        rng=np.random.default_rng(0),
+        cores=1,
+        scratch=folder,
+        listen=lambda event: heard.append((event.fraction, event.text)),
+    )
+
+
+def metres(unit_m: float = 1.0) -> Callable[[Scan], NDArray[np.float64]]:
+    return lambda scan: np.full(3, unit_m)
+
+
+def assembled(
+    folder: Path, *files: ScanFile, unit_m: float = 1.0, box_m: NDArray[np.float64] | None = None
+) -> CloudAssembly:
+    folder.mkdir(exist_ok=True)
+    growing = CloudAssembly(context(folder), list(files), metres(unit_m), box_m)
+    for one in files:
+        growing.add_file(one)
+    return growing
+
+
+def dirtied(clean: PointBlock) -> PointBlock:
+    """A block with each kind of point that cannot be used."""
+    points = clean.points.copy()
+    points[3, 1] = np.nan
+    points[5, 2] = np.inf
+    points[7, 0] = -2e9
+    points[8, 2] = 1e9
+    assert clean.intensity is not None
+    intensity = clean.intensity.copy()
+    intensity[0], intensity[1] = np.nan, np.inf
+    return replace(clean, points=points, intensity=intensity)
+
+
+@pytest.mark.parametrize("unit_m", [1.0, 0.001])
+@pytest.mark.parametrize("has_box", [False, True])
+def test_what_comes_in_blocks_is_what_there_is(
+    tmp_path: Path, unit_m: float, *, has_box: bool
+) -> None:
+    first, second, third = block(1, 40), dirtied(block(2, 30, scan=1)), block(3, 20)
+    blocks = [replace(one, points=one.points / unit_m) for one in (first, second, third)]
+    box_m = np.array([HERE - 2.0, HERE + 4.0]) if has_box else None
+    found = assembled(
+        tmp_path, file("a", *blocks[:2]), file("b", blocks[2]), unit_m=unit_m, box_m=box_m
+    )
+    points = np.vstack([one.points for one in blocks]) * unit_m
+    usable = (np.abs(points) < 1e9).all(axis=1)
+    inside = usable.copy()
+    if box_m is not None:
+        with np.errstate(invalid="ignore"):
+            inside &= ((points >= box_m[0]) & (points <= box_m[1])).all(axis=1)
+    assert 0 < inside.sum() <= usable.sum() == len(points) - 4
+    of_first = np.arange(len(points)) < 40
+    own = inside[of_first]
+    # Whole metres near the first points that are kept.
+    origin = np.floor(np.median(points[of_first][own], axis=0))
+    np.testing.assert_array_equal(found.origin, origin)
+    assert found.n_points == inside.sum()
+    expected = (points[inside] - origin).astype(np.float32)
+    np.testing.assert_array_equal(np.column_stack(found.offsets), expected)
+    for name in ("row", "column", "intensity"):
+        values = np.concatenate([getattr(one, name) for one in blocks])[inside]
+        np.testing.assert_array_equal(found.array(name), values)
+    np.testing.assert_array_equal(
+        found.array("rgb"), np.vstack([one.rgb for one in blocks if one.rgb is not None])[inside]
+    )
+    scans = np.repeat([0, 1, 2], [40, 30, 20])
+    np.testing.assert_array_equal(found.array("scan"), scans[inside])
+    for scan, count in enumerate(found.counts):
+        mine = scans == scan
+        assert (count.n_read, count.n_kept) == (mine.sum(), inside[mine].sum())
+        assert count.left_out["outside_box"] == np.count_nonzero(usable[mine] & ~inside[mine])
+        np.testing.assert_array_equal(scans[inside][count.start : count.stop], scan)
+    assert [count.left_out["not_finite"] for count in found.counts] == [0, 2, 0]
+    assert [count.left_out["too_far"] for count in found.counts] == [0, 2, 0]
+    assert found.counts[1].first_far_m == pytest.approx(tuple(points[47]))
+
+
+def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_path: Path) -> None:
+    lost = block(
+        1, 4, points=np.full((4, 3), np.nan), n_read=9, left_out={"invalid": 3, "withheld": 2}
+    )
+    with pytest.raises(InputError) as caught:
+        assembled(tmp_path, file("a", lost))
+    assert str(caught.value) == (
+        "a contains no usable points: of 9, left out are 3 invalid, 2 withheld, 4 not finite; "
+        "export it again"
+    )
+
+
+def test_more_points_than_a_header_states_are_refused(tmp_path: Path) -> None:
+    short = replace(file("a", block(1, 10), block(2, 10)), n_most=19)
+    with pytest.raises(InputError, match=r"^a contains more points than its header declares$"):
+        assembled(tmp_path, short)
+    exact = replace(short, n_most=20)
+    assert assembled(tmp_path / "exact", exact).n_points == 20
+
+
+# --- how coordinates are rounded ---
+
+
+@pytest.mark.parametrize("step", [0.005, 0.01, 0.02, 0.05, 0.1, 0.5, 1.0, 100.0, 0.0078125, 8.0])
+def test_a_coarse_step_is_found(step: float) -> None:
+    rng = np.random.default_rng(7)
+    rounded = step * rng.integers(0, 1000, (3000, 3)) + 12.0 * step
+    assert rounding_m(rounded, 1.0) == pytest.approx(step)
+    if step in (0.005, 0.01, 0.02, 0.05, 0.1, 0.5):
+        # In millimetres as well, in which half a metre is the coarsest that is looked for.
+        assert rounding_m(1000.0 * rounded, 0.001) == pytest.approx(step)
+
+
+Range = tuple[float, float]
+
+
+@pytest.mark.parametrize(
+    ("seen", "stated", "intensity_max", "scale"),
+    [
+        ((2.0, 9.0), (0.0, 10.0), 50.0, (0.0, 50.0, "intensity_max")),
+        ((2.0, 9.0), (0.0, 10.0), None, (0.0, 10.0, "stated")),
+        # A millionth beyond is rounding, more than that is another scale.
+        ((0.0, 10.000_005), (0.0, 10.0), None, (0.0, 10.0, "stated")),
+        ((-0.000_005, 10.0), (0.0, 10.0), None, (0.0, 10.0, "stated")),
+        ((0.0, 10.000_02), (0.0, 10.0), None, (0.0, 10.000_02, "data")),
+        ((-0.000_02, 10.0), (0.0, 10.0), None, (-0.000_02, 10.0, "data")),
+        # Limits of which the data take less than a quarter are those of the sensor.
+        ((0.0, 2.49), (0.0, 10.0), None, (0.0, 2.49, "data")),
+        ((0.0, 2.51), (0.0, 10.0), None, (0.0, 10.0, "stated")),
+        ((2.0, 9.0), None, None, (2.0, 9.0, "data")),
+        ((7.0, 7.0), None, None, (0.0, 7.0, "data")),
+        ((-7.0, -7.0), None, None, (-7.0, 0.0, "data")),
+    ],
+)
+def test_a_scan_has_the_users_scale_the_one_it_states_or_that_of_its_data(
+    seen: Range, stated: Range | None, intensity_max: float | None, scale: tuple[float, float, str]
+) -> None:
+    (found,) = choose_scales([seen], [stated], intensity_max)
+    assert found is not None
+    assert (found.low, found.high, found.rule) == scale
+    assert found.stated == (stated if scale[2] == "data" else None)
+
+
+def test_each_scan_is_scaled_by_its_own_limits_and_similar_ones_together() -> None:
+    ranges = [(0.1, 0.9), (7000.0, 60000.0), None, (0.0, 255.0), (5.0, 200.0), (-2048.0, 2047.0)]
+    stated = [(0.0, 1.0), (0.0, 65535.0), (0.0, 1.0), None, None, None]
+    scales = choose_scales(ranges, stated, None)
+    assert scales[2] is None
+    assert [(scale.low, scale.high) for scale in scales if scale is not None] == [
+        *((0.0, 1.0), (0.0, 65535.0), (0.0, 255.0), (0.0, 255.0), (-2048.0, 2047.0)),
+    ]
+
+
+def test_intensities_go_from_nought_to_one_and_what_lies_beyond_is_clipped_and_counted() -> None:
+    scale = IntensityScale(low=10.0, high=30.0, rule="data")
+    values = np.array([10.0, 20.0, 30.0, 5.0, 40.0, np.nan, np.inf, -np.inf])
+    values = values.astype(np.float32)
+    assert normalise(values, scale) == 2
+    np.testing.assert_array_equal(values, [0.0, 0.5, 1.0, 0.0, 1.0, np.nan, np.nan, np.nan])
+    # A millionth beyond is not worth counting.
+    near = np.array([30.0 + 1e-5, 10.0 - 1e-5], dtype=np.float64).astype(np.float32)
+    assert normalise(near, scale) == 0
+    np.testing.assert_array_equal(near, [1.0, 0.0])
+
+
+def test_intensity_that_is_the_grey_of_the_colours_is_told_by_either_grey() -> None:
+    rng = np.random.default_rng(1)
+    rgb = rng.integers(0, 256, (500, 3), dtype=np.uint8)
+    luma, mean = (rgb @ [0.299, 0.587, 0.114]).astype(np.float32), rgb.mean(axis=1)
+    for grey in (luma, mean.astype(np.float32), 3.0 * luma + 5.0, np.rint(luma)):
+        assert (scales.correlation_with_grey(grey, rgb) or 0.0) > 0.999
+    assert scales.correlation_with_grey(rng.random(500).astype(np.float32), rgb) is None
+    # A scene of two colours correlates with any intensity, but for what lies beyond roundings.
+    rgb = np.where(rng.random((500, 1)) < 0.5, 200, 50).astype(np.uint8).repeat(3, axis=1)
+    laser = rgb[:, 0] / 255.0 + rng.normal(0.0, 0.005, 500)
+    assert scales.correlation_with_grey(laser.astype(np.float32), rgb) is None
+
+
+def stored(*blocks: np.ndarray, limit: float | None = None) -> tuple[list[list[int]], str | None]:
+    count = sum(map(len, blocks))
+    into = np.zeros((count, 3), dtype=np.uint8)
+    scale = ColourScale(into, limit)
+    for block in blocks:
+        scale.add(block)
+    return into.tolist(), scale.scale
+
+
+def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
+    unit = np.array([[0.0, 0.5, 1.0]], dtype=np.float32)
+    byte = np.array([[0.0, 128.0, 255.0]], dtype=np.float32)
+    word = np.array([[0, 128 * 257, 255 * 256]], dtype=np.uint16)
+    assert stored(unit) == ([[0, 128, 255]], "0..1")
+    assert stored(byte) == ([[0, 128, 255]], "8 bit")
+    assert stored(word) == ([[0, 128, 255]], "16 bit")
+    # Zeros and ones are full brightness until a block says that they are of 255.
+    ones = np.array([[0.0, 1.0, 1.0]], dtype=np.float32)
+    assert stored(ones) == ([[0, 255, 255]], "0..1")
+    assert stored(ones, byte) == ([[0, 1, 1], [0, 128, 255]], "8 bit")
+    # What was below 256 of 65536 is all but black.
+    assert stored(byte, word) == ([[0, 0, 1], [0, 128, 255]], "16 bit")
+    assert stored(word, byte) == ([[0, 128, 255], [0, 0, 0]], "16 bit")
+    assert stored(byte, unit) == ([[0, 128, 255], [0, 0, 1]], "8 bit")
+
+
+@pytest.mark.parametrize(
+    ("largest", "limit", "expected", "scale"),
+    [
+        (1.0, 1.0, [0, 102, 255], "0..1"),
+        (255.0, 255.0, [0, 102, 255], "8 bit"),
+        (65535.0, 65535.0, [0, 102, 255], "16 bit"),
+        (1023.0, 1023.0, [0, 102, 255], "stated limit"),
+        (1023.0, None, [0, 102, 255], "10 bit"),
+        (4095.0, None, [0, 102, 255], "12 bit"),
+        (4095.0, 1023.0, [0, 102, 255], "12 bit"),
+        # What does not fit its limit is read as what it is.
+        (255.0, 1.0, [0, 102, 255], "8 bit"),
+        (255.0, 65535.0, [0, 102, 255], "8 bit"),
+        (65535.0, 255.0, [0, 102, 255], "16 bit"),
+    ],
+)
+def test_a_stated_limit_is_full_brightness_where_data_fit_it(
+    largest: float, limit: float | None, expected: list[int], scale: str
+) -> None:
+    block = np.array([[0.0, 0.4 * largest, largest]])
+    assert stored(block, limit=limit) == ([expected], scale)
+    colours = ColourScale(np.zeros((1, 3), dtype=np.uint8), limit)
+    colours.add(block)
+    assert colours.misfit == (limit if limit != largest else None)

@@ -1,19 +1,23 @@
-"""`simulate.room`: what it scans is where the truth says it is."""
+"""`simulate.room`: what it scans is where the truth says it is, and what it reports."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.simulate.room import SimulateRoom
+from orthoflow_plugins.simulate import deliverables
+from orthoflow_plugins.simulate.room import SimulateRoom, _turn_about_up
 
-from orthoflow.files.images import decode_image
-from orthoflow.geometry import UpDirection
+from orthoflow.files.images import decode_image, encode_png
+from orthoflow.geometry import UpDirection, basis_from_up
 from orthoflow.geometry.scenes import TextureKind
-from orthoflow.products import PointCloud, Truth
+from orthoflow.products import Photo, Photos, PointCloud, Truth
 from orthoflow.sdk import StepContext
-from tests import scenes
+from tests import samples, scenes
+from tests.plane_scenes import cloud_of
 from tests.scene_rays import cast, colours_at
 
 COARSE = {"scan_step_m": 0.06, "panorama_step_m": 0.18}
@@ -82,6 +86,15 @@ def test_points_planes_and_colours_are_those_of_the_scene_in_any_world(
     # A grey level for rounding; a micrometre of float32 may cross a painted edge now and then.
     wrong = np.abs(rgb - cloud.rgb[chosen]).max(axis=1) > 1.0
     assert wrong.mean() < 0.002
+    # The panorama of the first station: columns from the room's first axis on, rows from below.
+    first = np.flatnonzero(cloud.scan == 0)
+    rays = cloud.points_world(first) - cloud.stations[0]
+    rays = rays @ basis_from_up(cloud.up).T @ _turn_about_up(turn_deg)
+    azimuth = (np.arctan2(rays[:, 1], rays[:, 0]) + 1e-3) % (2.0 * np.pi) - 1e-3
+    elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1])) + np.radians(62.0)
+    for angle, number in ((azimuth, cloud.column[first]), (elevation, cloud.row[first])):
+        step = angle @ number / (number.astype(float) @ number)
+        np.testing.assert_allclose(angle, step * number, atol=2e-6)
     counts = np.bincount(truth.labels[truth.labels >= 0], minlength=len(planes))
     np.testing.assert_array_equal(planes.n_points, counts)
     assert (np.diff(counts) <= 0).all()
@@ -214,3 +227,44 @@ def test_a_design_has_a_seed_of_its_own_and_errors_have_that_of_the_cell(tmp_pat
     assert not np.array_equal(rooms[1, 7].cloud.x[:1000], rooms[2, 7].cloud.x[:1000])
     with pytest.raises(ValueError, match="design_seed 7 draws a room, but decoration is designed"):
         SimulateRoom.Params(design_seed=7)
+
+
+@pytest.mark.parametrize("step_m", [0.005, 0.02])
+def test_the_step_of_a_square_grid_is_its_spacing(step_m: float) -> None:
+    at = np.arange(step_m / 2, 2.0, step_m)
+    u, v = (grid.ravel() for grid in np.meshgrid(at, at))
+    # Some points of another plane before it.
+    beside = np.column_stack([u[:50], np.full(50, -0.3), v[:50]])
+    cloud = cloud_of(np.vstack([np.column_stack([u, np.zeros(u.size), v]), beside]))
+    planes = samples.planes(
+        normal=np.array([[0.0, -1.0, 0.0]]),
+        offset=np.zeros(1),
+        corners=np.array([[[0.0, 0, 2], [0, 0, 0], [2, 0, 0], [2, 0, 2]]]),
+        n_points=np.array([u.size]),
+        names=("wall",),
+    )
+    truth: Any = SimpleNamespace(planes=planes, labels=np.repeat([0, -1], [u.size, 50]))
+    step = deliverables.measured_step(truth, cloud, 0)
+    assert step == pytest.approx((step_m, step_m), rel=1e-6)
+
+
+@pytest.mark.usefixtures("charts")
+def test_photos_are_reported_by_their_shots(tmp_path: Path) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    shots: Any = tuple(
+        SimpleNamespace(taken=SimpleNamespace(gsd_m=gsd_m, obliquity_deg=obliquity))
+        for gsd_m, obliquity in ((0.002, 5.0), (0.004, 30.0))
+    )
+    picture = encode_png(np.full((480, 640, 3), 90, dtype=np.uint8))
+    photos = [Photo(name=name, encoded=picture, width=640, height=480) for name in "ab"]
+    deliverables.report_photos(Photos(photos=tuple(photos)), shots, context)
+    assert {metric.name: metric.value for metric in context.metrics} == {
+        "n_photos": 2.0,
+        "photo_megapixels": pytest.approx(2 * 0.3072),
+        "photo_gsd_mm": pytest.approx(3.0),
+        "photo_obliquity_max_deg": 30.0,
+    }
+    assert [figure.name for figure in context.figures] == ["photos"]
+    silent = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    deliverables.report_photos(Photos(photos=()), (), silent)
+    assert (silent.metrics, silent.figures) == ([], [])

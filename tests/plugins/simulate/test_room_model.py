@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.simulate.building import Extent, SceneDraft
+from orthoflow_plugins.simulate.building import (
+    Extent,
+    Paint,
+    SceneDraft,
+    Side,
+    Surface,
+    TruePlane,
+    wall_side,
+)
 from orthoflow_plugins.simulate.room_model import (
     CEILING_M,
     DESIGNED,
     MOST_TEXTILE,
     Room,
     build_room,
-    main_wall_axes,
+    draw_wall,
 )
+from orthoflow_plugins.simulate.room_model import GILT as PANEL
+from orthoflow_plugins.simulate.room_model import OAK as DOOR
+from orthoflow_plugins.simulate.room_model import STUCCO as RELIEF
 
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from tests.scene_rays import cast
@@ -95,11 +108,6 @@ def test_no_wall_is_quite_square_to_the_next_and_the_main_one_leans() -> None:
         angle = np.degrees(np.arccos(one.normal @ other.normal))
         off = min(abs(angle - 90.0), abs(angle - 180.0))
         assert 0.05 < off < 1.5
-    axes = main_wall_axes()
-    np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-12)
-    np.testing.assert_allclose(axes[0], main.axis_a)
-    assert axes[1] @ -main.normal > 0.999
-    assert axes[1, 2] == 0.0
 
 
 @pytest.mark.parametrize("name", WALLS)
@@ -155,3 +163,203 @@ def test_cloth_covers_as_much_of_the_main_wall_as_asked(share: float) -> None:
         # Over the skirting and under the cornice.
         assert cloth[2] >= -1.32
         assert cloth[3] <= 1.3
+
+
+PAINT = Paint(kind=TextureKind.PLAIN, rgb=(10.0, 20.0, 30.0), reflectance=0.4)
+EXTENT: Extent = (-0.5, 1.0, 0.25, 0.75)
+Corner = tuple[float, ...]
+
+
+def a_wall() -> Side:
+    return wall_side(SceneDraft(), omega_deg=102.0, phi_deg=0.8, distance_m=2.4)
+
+
+def corners_of(surface: Surface) -> NDArray[np.float64]:
+    a0, a1, b0, b1 = surface.extent
+    return np.array(
+        [
+            surface.centre + a * surface.axis_a + b * surface.axis_b
+            for a in (a0, a1)
+            for b in (b0, b1)
+        ]
+    )
+
+
+def on_wall(side: Side, surface: Surface) -> frozenset[Corner]:
+    """Corners of a rectangle: right, up and before the wall, metres."""
+    off = corners_of(surface) - side.foot
+    axes = np.stack([side.axis_a, side.axis_b, side.normal])
+    return frozenset(tuple(np.round(corner, 9) + 0.0) for corner in off @ axes.T)
+
+
+def cuboid(extent: Extent, low_m: float, high_m: float) -> dict[str, frozenset[Corner]]:
+    """Faces of a box along a wall, each as its corners."""
+    a0, a1, b0, b1 = extent
+    corners = list(itertools.product((a0, a1), (b0, b1), (low_m, high_m)))
+    places = {"left": (0, a0), "right": (0, a1), "low": (1, b0), "high": (1, b1)}
+    ends = {"back": (2, low_m), "front": (2, high_m)}
+    return {
+        name: frozenset(corner for corner in corners if corner[axis] == value)
+        for name, (axis, value) in {**places, **ends}.items()
+    }
+
+
+SIDES = ("left", "right", "low", "high")
+
+
+def test_a_box_is_closed_but_for_its_back() -> None:
+    side = a_wall()
+    side.box(EXTENT, 0.1, PAINT)
+    faces = cuboid(EXTENT, 0.0, 0.1)
+    found = [on_wall(side, surface) for surface in side.draft.surfaces]
+    assert len(found) == 5
+    assert set(found) == {faces[name] for name in (*SIDES, "front")}
+    assert {surface.role for surface in side.draft.surfaces} == {SurfaceRole.RELIEF}
+    assert {surface.plane for surface in side.draft.surfaces} == {-1}
+
+
+def test_bars_are_a_frame_without_gap_or_overlap() -> None:
+    side = a_wall()
+    side.bars(EXTENT, 0.1, 0.02, PAINT, base_m=0.01)
+    fronts = side.draft.surfaces[::5]
+    assert len(side.draft.surfaces) == 20
+    inner = (-0.4, 0.9, 0.35, 0.65)
+    area = sum((e[1] - e[0]) * (e[3] - e[2]) for e in (front.extent for front in fronts))
+    assert area == pytest.approx(1.5 * 0.5 - 1.3 * 0.3)
+    rng = np.random.default_rng(1)
+    for a, b in rng.uniform([-0.6, 0.15], [1.1, 0.85], (200, 2)):
+        covered = sum(e[0] < a < e[1] and e[2] < b < e[3] for e in (f.extent for f in fronts))
+        is_out = EXTENT[0] < a < EXTENT[1] and EXTENT[2] < b < EXTENT[3]
+        is_in = inner[0] < a < inner[1] and inner[2] < b < inner[3]
+        assert covered == (is_out and not is_in)
+    for front in fronts:
+        assert all(corner[2] == pytest.approx(0.03) for corner in on_wall(side, front))
+
+
+def test_a_recess_leads_from_the_wall_to_its_back_and_needs_a_hole_of_its_size() -> None:
+    side = a_wall()
+    plane = side.true_plane("niche", EXTENT, -0.25)
+    assert side.recess(EXTENT, 0.25, PAINT, plane=plane) == EXTENT
+    faces = cuboid(EXTENT, -0.25, 0.0)
+    back, *rims = side.draft.surfaces
+    assert on_wall(side, back) == faces["back"]
+    assert {on_wall(side, rim) for rim in rims} == {faces[name] for name in SIDES}
+    assert len(rims) == 4
+    assert (back.plane, {rim.plane for rim in rims}) == (0, {-1})
+    assert {surface.role for surface in (back, *rims)} == {SurfaceRole.RECESS}
+    (true,) = side.draft.planes
+    assert true.name == "niche"
+    np.testing.assert_allclose(true.plane.distances_m(corners_of(back)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(true.plane.normal, side.normal)
+    # From the top left for the viewer, counter-clockwise.
+    a0, a1, b0, b1 = EXTENT
+    expected = [
+        side.foot - 0.25 * side.normal + a * side.axis_a + b * side.axis_b
+        for a, b in ((a0, b1), (a0, b0), (a1, b0), (a1, b1))
+    ]
+    np.testing.assert_allclose(true.outline, expected, atol=1e-12)
+    assert side.true_plane("next", EXTENT) == 1
+    np.testing.assert_allclose(
+        side.draft.planes[1].plane.distances_m(side.foot[None]), 0.0, atol=1e-12
+    )
+
+
+FULL: Extent = (-2.9, 2.9, -1.6, 1.7)
+SHOWN: Extent = (-2.7, 2.7, -1.5, 1.6)
+N_WALLS = 300
+GROUND = Paint(TextureKind.PLAIN, (1.0, 0.0, 0.0), 0.5)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A wall taken apart: depth and extent of what lies along it, by paint, and its holes."""
+
+    side: Side
+    wall: Surface
+    planes: list[TruePlane]
+    stone: list[tuple[float, Extent]]
+    panels: list[tuple[float, Extent]]
+    recesses: list[tuple[float, Extent, Paint]]
+
+
+def drawn(seed: int) -> Drawn:
+    side = wall_side(SceneDraft(), omega_deg=90.0, phi_deg=0.0, distance_m=2.0)
+    draw_wall(side, "wall", GROUND, SHOWN[:2], np.random.default_rng(seed))
+    (wall,) = [item for item in side.draft.surfaces if item.role == SurfaceRole.WALL]
+
+    def along(role: SurfaceRole) -> list[tuple[float, Surface]]:
+        return [
+            (float((item.centre - side.foot) @ side.normal), item)
+            for item in side.draft.surfaces
+            if item.role == role and abs(float(item.axis_b @ side.normal)) < 0.5
+        ]
+
+    relief_of = along(SurfaceRole.RELIEF)
+    return Drawn(
+        side=side,
+        wall=wall,
+        planes=side.draft.planes,
+        stone=[(depth, item.extent) for depth, item in relief_of if item.paint is RELIEF],
+        panels=[(depth, item.extent) for depth, item in relief_of if item.paint is PANEL],
+        recesses=[(depth, item.extent, item.paint) for depth, item in along(SurfaceRole.RECESS)],
+    )
+
+
+@cache
+def all_drawn() -> tuple[Drawn, ...]:
+    return tuple(drawn(seed) for seed in range(N_WALLS))
+
+
+def is_cornice(extent: Extent) -> bool:
+    return extent[:2] == FULL[:2]
+
+
+def overlap(one: Extent, other: Extent) -> bool:
+    return (
+        one[0] < other[1] - 1e-9
+        and other[0] < one[1] - 1e-9
+        and one[2] < other[3] - 1e-9
+        and other[2] < one[3] - 1e-9
+    )
+
+
+def test_relief_and_recesses_are_as_deep_as_the_family_says() -> None:
+    outwards = np.array([depth for found in all_drawn() for depth, _ in found.stone])
+    niches = np.array([-d for w in all_drawn() for d, _, paint in w.recesses if paint is GROUND])
+    doors = np.array([-d for w in all_drawn() for d, _, paint in w.recesses if paint is DOOR])
+    # Up to 0.3 m before the wall and 0.45 m behind it, and nearly that now and then.
+    assert 0.28 < outwards.max() <= 0.3
+    assert 0.4 < doors.max() <= 0.45
+    assert 0.31 < niches.max() <= 0.35
+    assert doors.min() >= 0.05
+    assert niches.min() >= 0.05
+    assert min(doors.min(), niches.min()) < 0.07
+    assert {round(d, 9) for found in all_drawn() for d, _ in found.panels} == {0.03}
+
+
+def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:
+    kinds: Counter[str] = Counter()
+    for found in all_drawn():
+        holes = list(found.wall.holes)
+        assert holes == [extent for _, extent, _ in found.recesses]
+        whole, *planes = found.planes
+        assert whole.name == "wall"
+        assert found.wall.plane == 0
+        assert len({plane.name for plane in planes}) == len(planes) == len(holes)
+        for plane, (depth, extent, paint) in zip(planes, found.recesses, strict=True):
+            kind = plane.name.split(" in ")[0]
+            assert (kind == "niche") == (paint is GROUND)
+            assert kind in {"niche", "door"}
+            assert plane.name.split(" in ")[1].startswith("wall ")
+            expected = depth + float(whole.plane.distances_m(found.side.foot[None])[0])
+            assert float(whole.plane.distances_m(plane.outline)[0]) == pytest.approx(expected)
+            kinds[kind] += 1
+            # A door begins under the floor, a niche stands on a sill.
+            sill = extent[2] - SHOWN[2]
+            assert sill == pytest.approx(-0.1) if kind == "door" else 0.3 <= sill <= 0.7
+            assert extent[1] - extent[0] <= 1.3
+        kinds["panel"] += len(found.panels) // 4
+        for one, other in pairwise(holes):
+            assert not overlap(one, other)
+    # Each kind as likely; the fourth is bare.
+    assert max(kinds.values()) < 1.6 * min(kinds.values())

@@ -1,14 +1,14 @@
-"""How wrong the simulated scanner measures: noise, outliers and mixed distances, by algebra."""
+"""Where the simulated scanner stands and how wrong it measures, by algebra."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.simulate.room_model import main_wall_axes
 from orthoflow_plugins.simulate.scanning import (
     SPOILT,
     Errors,
@@ -16,12 +16,13 @@ from orthoflow_plugins.simulate.scanning import (
     Scanner,
     Sweep,
     laser_reflectance,
-    scan_scene,
+    planned_sweeps,
     shared_errors,
+    station_positions,
 )
 
+from orthoflow.geometry import Plane
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
-from tests.raster_scenes import context
 
 NOISE_M = 0.002
 SIDE = 200
@@ -171,52 +172,6 @@ def test_distances_mix_where_the_spot_falls_on_two_surfaces() -> None:
         np.testing.assert_allclose(distance[side & ~mixed], own_m, rtol=5e-6)
 
 
-def test_scans_follow_each_other_without_the_rays_that_met_nothing(tmp_path: Path) -> None:
-    # A square of 2 m at 3 m; the second scan stands a metre nearer and to the left of the middle.
-    sweeps = [
-        Sweep(
-            station=np.array([0.0, 0.0, 0.0]),
-            azimuth=-0.4,
-            elevation=-0.45,
-            step=0.05,
-            n_columns=20,
-            n_rows=14,
-            seed=3,
-        ),
-        Sweep(
-            station=np.array([1.0, 0.5, 0.0]),
-            azimuth=-0.9,
-            elevation=-0.2,
-            step=0.1,
-            n_columns=15,
-            n_rows=6,
-            seed=4,
-        ),
-    ]
-    found = scan_scene(surface(3.0), sweeps, NO_ERRORS, context(tmp_path))
-    expected = []
-    for number, sweep in enumerate(sweeps):
-        for column in range(sweep.n_columns):
-            for row in range(sweep.n_rows):
-                azimuth = sweep.azimuth + column * sweep.step
-                elevation = sweep.elevation + row * sweep.step
-                away = 3.0 - sweep.station[0]
-                y = sweep.station[1] + away * math.tan(azimuth)
-                z = sweep.station[2] + away * math.tan(elevation) / math.cos(azimuth)
-                if max(abs(y), abs(z)) < 1.0:
-                    expected.append((number, column, row, 3.0, y, z))
-    numbers = np.array(expected)
-    assert 50 < len(numbers) < 20 * 14 + 15 * 6 - 50
-    points = found.points
-    got = [found.scan, found.column, found.row, points.x, points.y, points.z]
-    np.testing.assert_allclose(np.column_stack(got), numbers, atol=1e-6)
-    np.testing.assert_array_equal(found.stations, [sweep.station for sweep in sweeps])
-    assert {len(array) for array in (points.intensity, points.rgb, points.rectangle)} == {
-        len(numbers)
-    }
-    assert not points.rectangle.any()
-
-
 @pytest.mark.parametrize("length_m", [0.5, 2.0])
 def test_neighbouring_points_share_an_error_of_the_stated_size_and_reach(length_m: float) -> None:
     rng = np.random.default_rng(1)
@@ -293,3 +248,45 @@ def test_wet_patches_are_darker_and_spots_blind() -> None:
     np.testing.assert_array_equal(alone, values[some])
     other = laser_reflectance(MATERIALS, rectangle, points, colours, 1.0, 4)
     assert not np.array_equal(other, values)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("n_stations", [1, 4])
+def test_panoramas_close_and_detail_scans_just_hold_the_main_wall(n_stations: int) -> None:
+    along, towards = main_wall_axes()
+    # Four metres before the origin, 6 x 3 m, off the middle.
+    middle = 4.0 * towards + 0.3 * along
+    outline = np.array(
+        [middle + a * along + h * UP for a, h in ((-3, 1.6), (-3, -1.4), (3, -1.4), (3, 1.6))]
+    )
+    wall = Plane(normal=-towards, offset_m=-4.0)
+    seeds = np.arange(100, 110)
+    sweeps = planned_sweeps(station_positions(n_stations), (0.05, 0.02), wall, outline, seeds)
+    assert [sweep.seed for sweep in sweeps] == list(range(100, 100 + 2 * n_stations))
+    forward = math.atan2(towards[1], towards[0])
+    shares = np.linspace(0.0, 1.0, 201)[:, None]
+    rim = np.concatenate(
+        [a + shares * (b - a) for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True)]
+    )
+    for k, station in enumerate(station_positions(n_stations)):
+        panorama, detail = sweeps[2 * k : 2 * k + 2]
+        distance_m = 4.0 - station @ towards
+        for sweep, step_m in ((panorama, 0.05), (detail, 0.02)):
+            np.testing.assert_array_equal(sweep.station, station)
+            assert sweep.step == pytest.approx(step_m / distance_m)
+        assert panorama.azimuth == 0.0
+        assert panorama.elevation == pytest.approx(math.radians(-62.0))
+        assert 0.0 <= 2.0 * math.pi - panorama.n_columns * panorama.step < panorama.step
+        assert 0.0 <= math.radians(124.0) - panorama.n_rows * panorama.step < panorama.step
+        rays = rim - station
+        azimuths = np.arctan2(rays[:, 1], rays[:, 0]) - forward
+        azimuths = forward + (azimuths + math.pi) % (2.0 * math.pi) - math.pi
+        elevations = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
+        for seen, first, n_steps in (
+            (azimuths, detail.azimuth, detail.n_columns),
+            (elevations, detail.elevation, detail.n_rows),
+        ):
+            assert first == pytest.approx(seen.min(), abs=1e-3)
+            assert -1e-3 < first + n_steps * detail.step - seen.max() < 1.001 * detail.step + 1e-3
