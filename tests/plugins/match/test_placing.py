@@ -1,14 +1,26 @@
-"""Photos are placed by where edges run, whichever side of them the laser sees brighter."""
+"""Photos are placed by where edges run, and confirm each other's places."""
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from orthoflow_plugins.match.placing import Placed, places_of
-from orthoflow_plugins.match.structures import wall_structure
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.match.key_points import PairingParams, PhotoPairs, pair_photo, wall_features
+from orthoflow_plugins.match.placing import Placed, confirmed, places_of
+from orthoflow_plugins.match.structures import (
+    WallStructure,
+    likely_places,
+    structure_of,
+    wall_structure,
+)
+from orthoflow_plugins.match.ties import TiePiece
 
-from orthoflow.files.images import decode_image, encode_png
+from orthoflow.files.images import decode_image, encode_png, photo_grey
 from orthoflow.products import Photo, Wall
 from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
@@ -62,3 +74,166 @@ def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
 def test_a_wall_that_shows_nothing_places_no_photo() -> None:
     blind = replace(patchy_wall(), intensity=None)
     assert places_of(0, PHOTO, [wall_structure(blind)]) == []
+
+
+SCENE = ms.textured_wall(1)
+WALLS = mw.walls(1)
+CAMERAS = [
+    ms.camera_before(SCENE),
+    ms.camera_before(SCENE, centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
+    ms.camera_before(SCENE, centre=(1.5, -2.4, 0.9), towards=(1.4, 0.0, 1.1)),
+]
+
+
+PHOTOS = ms.photos(
+    *(ms.photo_of(SCENE, camera, name=f"{nth}.png") for nth, camera in enumerate(CAMERAS))
+)
+ON_WALLS = (WALLS.walls, [wall_structure(wall) for wall in WALLS.walls])
+NEAR = pytest.approx(0.0, abs=1e-9)
+
+
+def place(
+    photo: int, *, aside_m: float = 0.0, share: float = 0.3, is_clear: bool = False
+) -> Placed:
+    """A place of a photo, the right one or so far to the right of it."""
+    camera = CAMERAS[photo].shifted(-aside_m * SCENE.frame.u_world)
+    frame = SCENE.frame
+    cells = np.stack(np.meshgrid(np.arange(100.0, 400.0, 30.0), np.arange(60.0, 280.0, 30.0)), -1)
+    points = frame.world_from_wall(cells.reshape(-1, 2), np.zeros(cells[..., 0].size))
+    piece = TiePiece(
+        photo=photo,
+        wall=0,
+        pixels_photo=camera.project(points)[:, :2],
+        points_world=points,
+        sigma_px=np.ones(len(points)),
+        sigma_m=np.full(len(points), 0.01),
+    )
+    return Placed(
+        piece=piece, camera=camera, lead=6.0, share=share, radius_px=30.0, is_clear=is_clear
+    )
+
+
+def paired(photo: int) -> PhotoPairs:
+    """What key points of a photo show of the wall."""
+    features = [wall_features(WALLS.walls[0], PairingParams().max_features)]
+    return pair_photo(photo_grey(PHOTOS.photos[photo]), features, PairingParams())
+
+
+def chosen(
+    places: dict[int, Sequence[Placed]], recognised: Mapping[int, PhotoPairs] | None = None
+) -> dict[int, float]:
+    """Metres that the chosen places are aside, by photo."""
+    found = confirmed(PHOTOS, places, recognised or {}, ON_WALLS)
+    return {
+        k: float((place.camera.centre_world - CAMERAS[k].centre_world)[0])
+        for k, place in found.items()
+    }
+
+
+def test_places_that_agree_are_taken_if_one_of_them_is_clear() -> None:
+    assert chosen({0: [place(0, is_clear=True)], 1: [place(1)]}) == {0: NEAR, 1: NEAR}
+    assert chosen({0: [place(0)], 1: [place(1)]}) == {}
+    assert chosen({k: [place(k)] for k in range(3)}) == {0: NEAR, 1: NEAR, 2: NEAR}
+
+
+def test_a_place_that_no_photo_confirms_is_not_taken_however_clear_it_is() -> None:
+    assert chosen({0: [place(0, is_clear=True)]}) == {}
+    wrong = place(0, aside_m=0.3, share=0.6, is_clear=True)
+    assert chosen({0: [wrong], 1: [place(1, is_clear=True)]}) == {}
+
+
+def test_photos_that_are_wrong_together_lose_to_one_that_key_points_recognise() -> None:
+    wrong = [place(k, aside_m=0.3, share=0.6, is_clear=True) for k in range(2)]
+    assert chosen({0: wrong[:1], 1: wrong[1:]}) == {
+        k: pytest.approx(0.3, abs=1e-9) for k in range(2)
+    }
+    both = {0: [wrong[0], place(0)], 1: [wrong[1]]}
+    assert chosen(both, {2: paired(2)}) == {0: NEAR}
+
+
+def test_key_points_that_agree_by_chance_do_not_keep_a_photo_from_its_place() -> None:
+    right = paired(2)
+    (pair,) = right.pairs
+    assert pair.homography is not None
+    shift = np.array([[1.0, 0.0, 120.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    wrong = replace(right, pairs=(replace(pair, homography=shift @ pair.homography),))
+    places = {k: [place(k)] for k in range(3)}
+    assert chosen(places, {2: wrong}) == dict.fromkeys(range(3), NEAR)
+    # Where the others confirm its key points, these stay.
+    assert chosen(places, {2: right}) == {0: NEAR, 1: NEAR}
+    # Where no photo has a place there is nothing to choose.
+    assert chosen({0: (), 2: ()}, {1: right}) == {}
+
+
+def picture(height: int, width: int) -> NDArray[np.float32]:
+    """Blocks of 7 pixels in greys of their own."""
+    blocks = np.random.default_rng(3).uniform(0.0, 1.0, (height // 7 + 1, width // 7 + 1))
+    wide = np.kron(blocks, np.ones((7, 7)))[:height, :width, None]
+    return np.ascontiguousarray(wide, dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def wall() -> Wall:
+    return ms.walls_of(ms.textured_wall(1)).walls[0]
+
+
+@pytest.fixture(scope="module")
+def structure(wall: Wall) -> WallStructure:
+    found = wall_structure(wall)
+    assert found is not None
+    return found
+
+
+def test_edges_are_the_same_whichever_side_is_brighter_and_turn_with_the_picture() -> None:
+    grey, known = picture(120, 120), np.ones((120, 120), dtype=np.bool_)
+    upright = structure_of(grey, known).values
+    np.testing.assert_allclose(structure_of(1.0 - grey, known).values, upright, atol=1e-4)
+    turned = structure_of(np.ascontiguousarray(np.rot90(grey)), known).values
+    # A quarter turn is half a turn of doubled angles, and a whole one of fourfold ones.
+    signs = np.array([-1.0, -1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(turned, np.rot90(upright) * signs, atol=1e-4)
+    # Each place tells where edges run, not how strong they are: vectors of length one at most.
+    lengths = np.linalg.norm(upright, axis=2)
+    assert lengths.max() < 1.0
+    assert np.median(lengths) == pytest.approx(1.0 / 1.3, abs=0.01)
+
+
+def test_what_is_not_known_and_its_border_has_no_structure() -> None:
+    known = np.ones((80, 90), dtype=np.bool_)
+    known[20:40, 30:60] = False
+    found = structure_of(picture(80, 90), known)
+    void = np.zeros_like(known)
+    void[19:41, 29:61] = True
+    np.testing.assert_array_equal(found.known == 0.0, void)
+    assert not found.values[void].any()
+    assert (np.linalg.norm(found.values[~void], axis=1) > 0.0).mean() > 0.99
+
+
+def test_a_piece_of_the_wall_lies_where_it_was_taken_from(
+    wall: Wall, structure: WallStructure
+) -> None:
+    assert wall.intensity is not None
+    rows, columns = wall.frame.shape
+    top, left, height, width = rows // 4, columns // 3, rows // 2, columns // 2
+    grey = np.rint(255 * np.clip(np.nan_to_num(wall.intensity, nan=0.5), 0.0, 1.0)).astype(np.uint8)
+    # Inverted: edges stay where they are.
+    cut = 255 - grey[top : top + height, left : left + width]
+    places = likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=3)
+    assert 1 < len(places) <= 3
+    for one, other in itertools.combinations(places, 2):
+        apart_m = np.hypot(*(one.centre_m - other.centre_m))
+        # The same place at a neighbouring scale is no other one.
+        assert apart_m > 0.25 * one.width_m or abs(math.log(one.width_m / other.width_m)) > 0.25
+    best = places[0]
+    leads = [place.lead for place in places]
+    assert leads == sorted(leads, reverse=True)
+    cell_m, fine_m = structure.wall.frame.gsd_m, wall.frame.gsd_m
+    truth_m = fine_m * np.array([left + 0.5 * width, top + 0.5 * height])
+    # Sizes are tried in steps of a tenth, and parts may slip by 3 % of the width.
+    slip_m = 0.03 * best.width_m + cell_m
+    assert best.width_m == pytest.approx(fine_m * width, rel=0.06)
+    assert np.abs(best.centre_m - truth_m).max() < slip_m
+    np.testing.assert_allclose(best.parts_photo.mean(axis=0), 0.5, atol=0.01)
+    np.testing.assert_allclose(np.ptp(best.parts_photo, axis=0), 0.5, atol=0.02)
+    expected_m = fine_m * (np.array([left, top]) + best.parts_photo * [width, height])
+    assert np.abs(best.parts_m - expected_m).max() < slip_m

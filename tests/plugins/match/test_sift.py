@@ -1,19 +1,25 @@
-"""Matching photos with walls: exact neighbours, unbiased key points, and plain refusals."""
+"""Matching photos with walls: unbiased ties, colours that the laser sees otherwise, hand ties."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.match.guided import MatchGuided
+from orthoflow_plugins.match.key_points import mixed
 from orthoflow_plugins.match.pictures import points_on_wall
 from orthoflow_plugins.match.sift import MatchSift
 
-from orthoflow.files.images import encode_png
-from orthoflow.products import Photo, TieRole, Walls
+from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image, encode_png
+from orthoflow.products import Photo, TieRole, Ties, Walls
 from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
+from tests import samples
 from tests.method_runs import run
 
 SCENE = ms.textured_wall(1)
@@ -85,3 +91,164 @@ def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertaint
     assert flat[1][0] < (0.01 if n_even else 0.7 * ms.GSD_M)
     edge = points_on_wall(sparse, np.array([[300.1, 80.7]]))
     assert edge[1][0] > 0.05
+
+
+HAND_SCENE = ms.textured_wall(0)
+HAND_CAMERA = ms.camera_before(HAND_SCENE, centre=(1.3, -2.6, 1.1))
+
+
+PHOTOS = ms.photos(ms.photo_of(HAND_SCENE, HAND_CAMERA))
+WALLS = mw.walls(0)
+
+
+def measured(*names: str) -> Ties:
+    count = len(names)
+    return samples.ties(
+        np.arange(2.0 * count).reshape(count, 2),
+        photo_names=("stranger.png", "a.png"),
+        photo=np.array([("stranger.png", "a.png").index(name) for name in names], dtype=np.int32),
+        wall=np.full(count, -1, np.int32),
+        points_world=np.array([[0.5 + 0.1 * k, 0.3, 1.0] for k in range(count)]),
+        sigma_px=np.ones(count),
+        sigma_m=np.full(count, 0.002),
+        by_hand=np.ones(count, np.uint8),
+    )
+
+
+def sift(folder: Path, walls: Walls, hand: Ties | None) -> Ties:
+    return mw.ties_of(MatchSift, folder, {"photos": PHOTOS, "walls": walls, "hand": hand})
+
+
+def test_ties_by_hand_stand_behind_those_that_are_found(tmp_path: Path) -> None:
+    alone = sift(tmp_path, WALLS, None)
+    assert alone.by_hand is None
+    hand = measured("a.png", "stranger.png", "a.png")
+    both = sift(tmp_path, WALLS, hand)
+    count = len(alone.photo)
+    np.testing.assert_array_equal(both.pixels_photo[:count], alone.pixels_photo)
+    np.testing.assert_array_equal(both.pixels_photo[count:], hand.pixels_photo[[0, 2]])
+    np.testing.assert_array_equal(both.points_world[count:], hand.points_world[[0, 2]])
+    assert both.photo_names == ("a.png",)
+    np.testing.assert_array_equal(both.photo[count:], [0, 0])
+    np.testing.assert_array_equal(both.wall[count:], [0, 0])
+    np.testing.assert_array_equal(both.by_hand, [0] * count + [1, 1])
+
+
+def test_a_tie_by_hand_lies_on_the_nearest_wall(tmp_path: Path) -> None:
+    (wall,) = WALLS.walls
+    beside = replace(wall.frame, origin_world=wall.frame.origin_world + np.array([5.0, 0, 0]))
+    behind = replace(wall.frame, origin_world=wall.frame.origin_world + np.array([0, 1.0, 0]))
+    walls = replace(
+        WALLS,
+        walls=tuple(replace(wall, frame=f, intensity=None) for f in (behind, beside, wall.frame)),
+    )
+    hand = measured("a.png", "a.png", "a.png")
+    hand = replace(hand, points_world=np.array([[1.0, 0.9, 1], [5.5, 0.2, 1], [1.0, 0.3, 1]]))
+    np.testing.assert_array_equal(sift(tmp_path, walls, hand).wall, [0, 1, 2])
+
+
+def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
+    bare = replace(WALLS, walls=tuple(replace(wall, intensity=None) for wall in WALLS.walls))
+    with pytest.raises(MethodError, match="neither intensity nor colour"):
+        sift(tmp_path, bare, None)
+    inputs = {"photos": PHOTOS, "walls": bare, "hand": measured("a.png", "a.png")}
+    cameras = {"cameras": ms.cameras(ms.oriented(HAND_CAMERA))}
+    for method, more in ((MatchSift, {}), (MatchGuided, cameras)):
+        ctx = mw.context(tmp_path)
+        ties = run(method, ctx, {**inputs, **more}).ties
+        np.testing.assert_array_equal(ties.by_hand, [1, 1])
+        assert len(ties.walls) == 1
+        assert [each.code for each in ctx.diagnostics] == ["scan-without-texture"]
+
+
+# The middle of its picture, which holds key points enough.
+CAMERA = replace(
+    ms.camera_before(ms.textured_wall(1)), width=630, height=448, cx=0.5 * 630, cy=0.5 * 448
+)
+
+
+def sifted(photo: Photo, walls: Walls, folder: Path) -> Ties:
+    return mw.ties_of(MatchSift, folder, {"photos": ms.photos(photo), "walls": walls})
+
+
+def grey_of(seed: int) -> NDArray[np.uint8]:
+    """The wall of one texture as a camera sees it; all textures lie on the same relief."""
+    return decode_image(ms.photo_of(ms.textured_wall(seed), CAMERA).encoded, "a.png")[:, :, 0]
+
+
+def photo_with(rgb: NDArray[np.uint8]) -> Photo:
+    return replace(ms.photo_of(ms.textured_wall(1), CAMERA), encoded=encode_png(rgb))
+
+
+def wall_with(red: float, green: float) -> Walls:
+    """The wall as a laser sees it that answers so to the textures 1 (red) and 2 (green)."""
+    both = [mw.walls(seed) for seed in (1, 2)]
+    first, second = (each.walls[0].intensity for each in both)
+    assert first is not None
+    assert second is not None
+    intensity = (0.5 + red * (first - 0.45) + green * (second - 0.45)).astype(np.float32)
+    return replace(both[0], walls=(replace(both[0].walls[0], intensity=intensity),))
+
+
+def test_a_photo_is_found_in_the_mixture_that_the_laser_sees(tmp_path: Path) -> None:
+    rgb = np.stack([grey_of(1), grey_of(2), grey_of(1)], axis=-1)
+    ties = sifted(photo_with(rgb), wall_with(0.6, -0.6), tmp_path)
+    assert right(ties) > 150
+    assert right(ties) > 0.9 * (ties.role != TieRole.REJECTED).sum()
+    assert picture_of(ties) == "red less green"
+
+
+def test_a_negative_is_found_in_a_photo_without_colours(tmp_path: Path) -> None:
+    photo = ms.photo_of(ms.textured_wall(1), CAMERA)
+    ties = sifted(photo, wall_with(-1.0, 0.0), tmp_path)
+    assert right(ties) > 500
+    assert picture_of(ties) != "grey"
+
+
+def test_a_photo_of_something_else_gets_no_ties_in_any_mixture(tmp_path: Path) -> None:
+    rgb = np.stack([grey_of(seed) for seed in (3, 4, 5)], axis=-1)
+    ties = sifted(photo_with(rgb), wall_with(1.0, 0.0), tmp_path)
+    assert (ties.role != TieRole.REJECTED).sum() == 0
+
+
+def right(ties: Ties) -> int:
+    """Ties within two cells of where the true camera sees their points."""
+    kept = ties.role != TieRole.REJECTED
+    return int((np.linalg.norm(mw.off_px(ties, CAMERA)[kept], axis=1) < 4.0).sum())
+
+
+def picture_of(ties: Ties) -> str:
+    """Which picture of the photo was matched."""
+    return ties.details["photos"]["a.png"]["picture"]  # type: ignore[call-overload,index,return-value]
+
+
+# --- which mixtures are tried, and which one is taken ---
+
+
+@pytest.mark.parametrize(("levels", "shows"), [(7, False), (9, True)])
+def test_a_mixture_of_hardly_any_contrast_shows_nothing(levels: int, *, shows: bool) -> None:
+    ramp = np.rint(np.linspace(100, 100 + levels, 400)).astype(np.uint8)
+    rgb = np.stack([np.full((40, 400), 50), *[np.tile(ramp, (40, 1))] * 2], axis=-1)
+    found = mixed(rgb.astype(np.uint8), "green less red")
+    assert (found is not None) is shows
+    if found is not None:
+        assert (found.min(), found.max()) == (0, 255)
+        assert (np.diff(found[0].astype(int)) >= 0).all()
+
+
+BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
+
+
+@pytest.mark.long
+def test_photos_of_repeating_windows_are_oriented_where_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    courtyard = import_module("courtyard")
+    built = courtyard.courtyard(2, 4, coarser=2.0)
+    n_facades, errors = courtyard.oriented(built, coarser=2.0)
+    assert n_facades == 4
+    assert [error.status for error in errors] == ["ok"] * 4
+    assert not any(error.is_wrong for error in errors)
+    # A window farther would be 1.9 m.
+    assert max(error.centre_m for error in errors) < 0.05

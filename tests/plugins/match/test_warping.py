@@ -1,13 +1,22 @@
-"""A photo laid into walls by a pose: where cells appear, what hides them, what is too flat."""
+"""Photos projected onto walls by a pose, and photos found by what others show."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match import warping
+from numpy.typing import NDArray
+from orthoflow_plugins.match import tracing, warping
+from orthoflow_plugins.match.displacements import Displacements
+from orthoflow_plugins.match.tracing import (
+    lens_of,
+    painted_walls,
+    pose_of_most,
+)
 from orthoflow_plugins.match.warping import Projection
 
 from orthoflow.files.images import encode_png
@@ -15,7 +24,10 @@ from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.occluders import occluders_before
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Photo, PointCloud, Wall
+from orthoflow.testing import photographed as ms
 from tests import samples
+from tests.scenes import SURVEY_SHIFT_M
+from tests.tied_photos import SCENE, photo, seen_by
 
 GSD_M = 0.01
 
@@ -193,3 +205,129 @@ def test_a_wall_far_from_where_coordinates_begin_appears_as_any_other() -> None:
     assert far is not None
     np.testing.assert_allclose(far.u, near.u, atol=1e-3)
     assert warping.project_walls(camera_at(y_m=y_m + 2.0), [wall_at(y_m)]) == [None]
+
+
+def displacements(shifts: NDArray[np.float64]) -> Displacements:
+    rows, columns = np.divmod(np.arange(len(shifts)), 5)
+    return Displacements(
+        places=np.column_stack([8 * columns, 8 * rows]).astype(np.intp),
+        shift_cells=np.asarray(shifts, dtype=np.float64),
+        score=np.ones(len(shifts)),
+        sigma_cells=np.full(len(shifts), 0.1),
+    )
+
+
+def test_a_displacement_agrees_with_the_median_of_its_neighbours() -> None:
+    shifts = np.tile([2.0, -1.0], (25, 1))
+    shifts[12] += [0.5, 0.0]
+    assert tracing.agrees_around(displacements(shifts)).all()
+    shifts[12] += [0.2, 0.0]
+    assert np.flatnonzero(~tracing.agrees_around(displacements(shifts))).tolist() == [12]
+    shifts[12] = [2.0, -1.7]
+    assert np.flatnonzero(~tracing.agrees_around(displacements(shifts))).tolist() == [12]
+
+
+def test_where_neighbours_do_not_agree_nothing_is_believed() -> None:
+    rng = np.random.default_rng(2)
+    assert not tracing.agrees_around(displacements(rng.uniform(-20, 20, (25, 2)))).any()
+    # A spread of half a cell lets more than a cell pass.
+    loose = np.random.default_rng(3).uniform(-0.9, 0.9, (25, 2))
+    assert tracing.agrees_around(displacements(loose)).sum() >= 24
+
+
+def test_three_displacements_are_too_few_to_agree() -> None:
+    assert not tracing.agrees_around(displacements(np.zeros((3, 2)))).any()
+    assert tracing.agrees_around(displacements(np.zeros((4, 2)))).all()
+    assert tracing.agrees_around(displacements(np.zeros((0, 2)))).shape == (0,)
+
+
+def test_values_between_cells_are_bilinear_and_unknown_beyond_them() -> None:
+    raster = np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0], [20.0, 21.0, np.nan]], np.float32)
+    at = np.array([[0.25, 0.5], [1.0, 0.0], [0.0, 0.75], [1.5, 0.5]])
+    np.testing.assert_allclose(warping.between(raster, at), [5.25, 1.0, 7.5, 6.5])
+    beside = np.array([[-0.1, 0.5], [0.5, -0.1], [2.0, 0.5], [0.5, 2.0], [1.5, 1.5]])
+    assert np.isnan(warping.between(raster, beside)).all()
+    product = np.array([[0.0, 0.0], [0.0, 8.0]], np.float32)
+    np.testing.assert_allclose(warping.between(product, np.array([[0.5, 0.25]])), [1.0])
+
+
+VIEW = ms.camera_before(SCENE)
+
+
+OLD = {"old.png": ms.oriented(replace(VIEW, fx=1000.0, fy=1000.0), name="old.png")}
+
+
+@pytest.mark.parametrize(
+    ("exif_px", "is_known"),
+    [(None, True), (1000.0, True), (920.0, True), (1100.0, True), (905.0, False), (1120.0, False)],
+)
+def test_a_lens_is_taken_from_a_photo_of_the_same_size_and_nearly_the_same_focal_length(
+    exif_px: float | None, is_known: bool
+) -> None:
+    found = lens_of(photo(name="new.png", exif_focal_px=exif_px), OLD, ms.photos())
+    assert (found is not None) == is_known
+    if found is not None:
+        assert found.fx == 1000.0
+
+
+def test_a_lens_that_contradicts_exif_is_that_of_photos_with_the_same_exif() -> None:
+    old, new = (photo(name=name, exif_focal_px=500.0) for name in ("old.png", "new.png"))
+    found = lens_of(new, OLD, ms.photos(old, new))
+    assert found is not None
+    assert found.fx == 1000.0
+
+
+def view_of(
+    grey: float, part: tuple[slice, slice], size: float, *, unknown: tuple[int, int] | None = None
+) -> Any:
+    """A photo that shows one grey in a part of the first of two walls, so large."""
+    projection = SimpleNamespace(part=part, pixels_per_cell=size)
+    shown = np.full((part[0].stop - part[0].start, part[1].stop - part[1].start), grey, np.float32)
+    if unknown is not None:
+        shown[unknown] = np.nan
+    return SimpleNamespace(
+        projections=[projection, None], on_wall=lambda _index, _projection: shown
+    )
+
+
+def test_of_photos_the_one_that_shows_a_place_largest_paints_it() -> None:
+    walls = [samples.wall(samples.facing_south(0.01, 30, 20)) for _ in range(2)]
+    small = view_of(100.0, (slice(0, 20), slice(0, 30)), 0.5)
+    large = view_of(200.0, (slice(0, 10), slice(5, 15)), 2.0, unknown=(3, 2))
+    middle = view_of(50.0, (slice(5, 15), slice(0, 30)), 1.0)
+    expected = np.full((20, 30), 100.0)
+    expected[5:15] = 50.0
+    expected[:10, 5:15] = 200.0
+    # What the largest does not know is the next one's.
+    expected[3, 7] = 100.0
+    for order in ((small, middle, large), (large, small, middle)):
+        first, second = painted_walls(order, walls)  # type: ignore[arg-type]
+        assert first[0].intensity is not None
+        np.testing.assert_allclose(first[0].intensity, expected / 255.0, atol=1e-6)
+        assert first[1] is not None
+        assert second[1] is None
+        assert second[0].intensity is not None
+        assert np.isnan(second[0].intensity).all()
+
+
+# The lens of the view, its pose forgotten.
+LENS = replace(VIEW, rotation=np.eye(3), translation=np.zeros(3))
+
+
+def test_the_pose_is_the_one_that_most_points_agree_with() -> None:
+    seen = seen_by(VIEW, 80)
+    points, wrong = seen.points_world + SURVEY_SHIFT_M, seen.pixels_photo.copy()
+    wrong[:32] = np.random.default_rng(5).uniform([0, 0], [900, 640], (32, 2))
+    found = pose_of_most(wrong, points, LENS, 2.0)
+    assert found is not None
+    np.testing.assert_allclose(found.centre_world, VIEW.centre_world + SURVEY_SHIFT_M, atol=2e-3)
+    np.testing.assert_allclose(found.project(points)[:, :2], seen.pixels_photo, atol=0.5)
+    assert (found.fx, found.cx) == (VIEW.fx, VIEW.cx)
+
+
+@pytest.mark.parametrize(("n_right", "is_found"), [(23, False), (24, True)])
+def test_two_dozen_points_must_agree_with_a_pose(n_right: int, is_found: bool) -> None:
+    seen = seen_by(VIEW, 40)
+    pixels = seen.pixels_photo.copy()
+    pixels[n_right:] = np.random.default_rng(6).uniform([0, 0], [900, 640], (40 - n_right, 2))
+    assert (pose_of_most(pixels, seen.points_world, LENS, 0.5) is not None) == is_found

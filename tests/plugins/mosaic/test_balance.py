@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import balance as balancing
+from orthoflow_plugins.mosaic import balance as module
 from orthoflow_plugins.mosaic.balance import (
     Balance,
     Exposures,
@@ -17,13 +18,13 @@ from orthoflow_plugins.mosaic.balance import (
     estimate,
     with_seams,
 )
-from orthoflow_plugins.mosaic.blocks import BlockLight, Blocks, block_light, inside, pairs
+from orthoflow_plugins.mosaic.blocks import BlockLight, Blocks, block_light, common, inside, pairs
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from scipy.ndimage import map_coordinates
 
 from orthoflow.geometry.cameras import looking_at
-from orthoflow.geometry.levels import light_of_levels, lit
-from orthoflow.products import Camera, Intrinsics, Layer, Layers, Orthoimages, Walls
+from orthoflow.geometry.levels import light_of_levels, lit, lit_shares
+from orthoflow.products import Camera, Intrinsics, Layer, LayerMask, Layers, Orthoimages, Walls
 from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
 
@@ -349,3 +350,182 @@ def test_radii_are_told_from_the_middle_of_the_photo(*, has_depths: bool) -> Non
         # 400 x 300 pixels: 250 from the middle to a corner, beyond which nothing is painted.
         wanted = min(1.0, float(np.hypot(*(pixel - [200.0, 150.0]))) / 250.0)
         assert found.values[row, column] == pytest.approx(wanted, abs=1e-5)
+
+
+def light(rows: slice, columns: slice, seed: int, unknown: float = 0.0) -> BlockLight:
+    rng = np.random.default_rng(seed)
+    shape = (rows.stop - rows.start, columns.stop - columns.start)
+    logs = rng.normal(-1.0, 0.5, (*shape, 3)).astype(np.float32)
+    logs[rng.random(shape) < unknown] = np.nan
+    return BlockLight(box=(rows, columns), log_light=logs)
+
+
+def radii(of: BlockLight, seed: int, lens: int) -> Radii:
+    values = np.random.default_rng(seed).uniform(0.0, 1.0, of.log_light.shape[:2])
+    return Radii(values=values.astype(np.float32), lens=lens)
+
+
+LIGHTS = [
+    light(slice(0, 9), slice(0, 12), 1, 0.2),
+    light(slice(3, 14), slice(5, 20), 2, 0.2),
+    light(slice(2, 7), slice(8, 30), 3),
+    # Beside all others.
+    light(slice(40, 44), slice(0, 4), 4),
+]
+RADII: list[Radii | None] = [radii(LIGHTS[0], 5, 1), None, radii(LIGHTS[2], 6, 0), None]
+
+
+def some_exposures(seed: int) -> Exposures:
+    rng = np.random.default_rng(seed)
+    return Exposures(
+        exposures=rng.normal(size=(4, 3)),
+        lenses=rng.normal(size=(2, 2)),
+        nodes=rng.normal(size=(4, 4, 4, 3)),
+    )
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(index: int) -> None:
+    found = some_exposures(7)
+    logs = found.logs(index, LIGHTS[index], RADII[index])
+    rows, columns = LIGHTS[index].log_light.shape[:2]
+    places = np.linspace(0.0, 1.0, 4)
+    for row, column in ((0, 0), (4, 7), (rows - 1, columns - 1)):
+        down, across = (row + 0.5) / rows, (column + 0.5) / columns
+        for channel in range(3):
+            sides = [np.interp(across, places, side) for side in found.nodes[index, :, :, channel]]
+            wanted = found.exposures[index, channel] + np.interp(down, places, sides)
+            seen = RADII[index]
+            if seen is not None:
+                square = float(seen.values[row, column]) ** 2
+                wanted += found.lenses[1] @ [square, square**2]
+            assert logs[row, column, channel] == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize(("n_shared", "n_taken"), [(3, 0), (4, 4), (200, 200), (300, 200)])
+def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_taken: int) -> None:
+    one = light(slice(0, 1), slice(0, n_shared), 1)
+    other = light(slice(0, 1), slice(0, n_shared + 5), 2)
+    overlaps = module._overlaps([one, other])
+    assert sum(len(item.apart) for item in overlaps) == n_taken
+    if n_taken:
+        columns = overlaps[0].places[0][:, 1]
+        # Evenly, from end to end.
+        assert (columns[0], columns[-1]) == (0, n_shared - 1)
+        assert set(np.diff(columns)) <= {n_shared // n_taken, -(-n_shared // n_taken)}
+
+
+def two(apart: NDArray[np.float64], n_columns: int = 40) -> list[BlockLight]:
+    """Two layers over the same blocks; the second is brighter by so much, in logarithms."""
+    box = (slice(0, 10), slice(0, n_columns))
+    logs = np.random.default_rng(3).normal(-1.0, 0.4, (10, n_columns, 3))
+    pair = (logs, logs + apart)
+    return [BlockLight(box=box, log_light=one.astype(np.float32)) for one in pair]
+
+
+def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
+    # From left to right by a tenth, once as much on either side of the middle.
+    slope = np.linspace(-0.05, 0.05, 40)[None, :, None]
+    lights = two(np.broadcast_to(slope, (10, 40, 3)))
+    found = estimate(lights, [None, None])
+    added = found.logs(0, lights[0], None) - found.logs(1, lights[1], None)
+    np.testing.assert_allclose(added, np.broadcast_to(slope, added.shape), atol=0.015)
+    flat = estimate(lights, [None, None], is_local=False)
+    left = flat.logs(0, lights[0], None) - flat.logs(1, lights[1], None)
+    assert np.abs(left).max() < 0.01
+
+
+SMALL_SHAPE = (40, 60)
+BLOCKS = Blocks.over(SMALL_SHAPE, 10)
+
+
+def light_of(levels: NDArray[np.generic], highest: int) -> NDArray[np.float64]:
+    """As IEC 61966-2-1 has it, cell by cell."""
+    share = np.asarray(levels, dtype=np.float64) / highest
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+def lit_layer(rgb: NDArray[np.generic], mask: NDArray[np.uint8] | None = None) -> Layer:
+    return samples.layer(SMALL_SHAPE if mask is None else mask, rgb=rgb)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("gain", [0.25, 1.0, 1.7])
+def test_light_is_multiplied_and_clipped(dtype: type[np.unsignedinteger], gain: float) -> None:
+    highest = int(np.iinfo(dtype).max)
+    colours = np.random.default_rng(1).integers(0, highest + 1, (500, 3)).astype(dtype)
+    colours[:2] = [[0, 0, 0], [highest] * 3]
+    logs = np.full((500, 3), np.log(gain), np.float32)
+    found = lit(colours, logs)
+    assert found.dtype == dtype
+    light = np.clip(gain * light_of(colours, highest), 0.0, 1.0)
+    level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    # Rounded to whole levels, of 16 bits to about one.
+    limit = 0.51 if dtype is np.uint8 else 1.5
+    assert np.abs(found - highest * level).max() <= limit
+    shares = lit_shares(colours / highest, logs)
+    np.testing.assert_allclose(shares, level, atol=2e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_blocks_have_the_mean_light_of_what_a_layer_paints_wholly(
+    dtype: type[np.unsignedinteger],
+) -> None:
+    highest = int(np.iinfo(dtype).max)
+    rng = np.random.default_rng(2)
+    rgb = rng.integers(highest // 4, highest // 2, (*SMALL_SHAPE, 3)).astype(dtype)
+    mask = np.full(SMALL_SHAPE, LayerMask.PAINTED, np.uint8)
+    # Nothing in the outermost blocks, and a cell is missing in one within.
+    mask[:10] = mask[:, 50:] = LayerMask.OCCLUDED
+    mask[25, 15] = LayerMask.NO_SURFACE
+    found = block_light(lit_layer(rgb, mask), BLOCKS)
+    assert found.box == (slice(1, 4), slice(0, 5))
+    for row, column in np.ndindex(3, 5):
+        part = np.s_[10 * row + 10 : 10 * row + 20, 10 * column : 10 * column + 10]
+        is_missing = (row, column) == (1, 1)
+        assert found.is_known[row, column] == (not is_missing)
+        if is_missing:
+            assert np.isnan(found.log_light[row, column]).all()
+        else:
+            wanted = np.log(light_of(rgb[part], highest).mean(axis=(0, 1)))
+            np.testing.assert_allclose(found.log_light[row, column], wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize(("level", "is_said"), [(9, False), (10, True), (245, True), (246, False)])
+@pytest.mark.parametrize("channel", [0, 2])
+@pytest.mark.parametrize("scale", [1, 257])
+def test_black_and_white_say_nothing(
+    level: int, channel: int, scale: int, *, is_said: bool
+) -> None:
+    rgb = np.full((*SMALL_SHAPE, 3), 100, np.uint16 if scale > 1 else np.uint8) * scale
+    # One channel is enough.
+    rgb[..., channel] = level * scale
+    found = block_light(lit_layer(rgb), BLOCKS)
+    assert found.is_known.all() == is_said
+    assert found.is_known.any() == is_said
+
+
+@pytest.mark.parametrize(("n_white", "is_said"), [(5, True), (6, False)])
+def test_a_twentieth_of_a_block_may_be_white(n_white: int, *, is_said: bool) -> None:
+    rgb = np.full((*SMALL_SHAPE, 3), 100, np.uint8)
+    # Of the hundred cells of the first block.
+    rgb[0, :n_white] = 255
+    found = block_light(lit_layer(rgb), BLOCKS)
+    assert found.is_known[0, 0] == is_said
+    assert found.is_known.sum() == 24 - (not is_said)
+
+
+# --- boxes ---
+
+
+def box(*sides: int) -> tuple[slice, slice]:
+    return slice(sides[0], sides[1]), slice(sides[2], sides[3])
+
+
+def test_boxes_share_what_lies_in_both() -> None:
+    assert common(box(0, 5, 2, 9), box(3, 8, 0, 4)) == box(3, 5, 2, 4)
+    assert common(box(0, 5, 2, 9), box(1, 2, 3, 4)) == box(1, 2, 3, 4)
+    # Beside each other, or in a corner, they share nothing.
+    assert common(box(0, 5, 2, 9), box(5, 8, 2, 9)) is None
+    assert common(box(0, 5, 2, 9), box(0, 5, 9, 12)) is None
+    assert inside(box(3, 5, 4, 6), box(1, 9, 4, 9)) == box(2, 4, 0, 2)

@@ -1,13 +1,24 @@
-"""Who paints each cell: states, preferences and islands, against loops over cells."""
+"""Who paints each cell: states, preferences, islands and cuts, and how well photos agree."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic import joining as module
+from orthoflow_plugins.mosaic import agreement, blocks, graph_cut, joining
+from orthoflow_plugins.mosaic.agreement import (
+    count_seams,
+    is_seam,
+    overlaps_of,
+    seam_steps,
+)
+from orthoflow_plugins.mosaic.blocks import Blocks, depth_edges, depth_edges_in
 from orthoflow_plugins.mosaic.joining import (
     NOBODY,
     best_views,
@@ -18,6 +29,7 @@ from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import in_memory
+from orthoflow.geometry.levels import lit_shares
 from orthoflow.products import Layer, LayerMask, OrthoMask
 from tests import samples
 from tests.long_loops import seeds
@@ -78,7 +90,7 @@ def test_a_cell_is_painted_by_the_best_of_those_that_know_most_of_it() -> None:
 
 
 def test_ranks_become_states_of_the_orthoimage() -> None:
-    mask, source = module.joined(
+    mask, source = joining.joined(
         LAYERS[:3],
         LAYERS[3:],
         PLAIN,
@@ -197,9 +209,9 @@ def test_bands_decide_islands_as_the_whole_does(
     layers = [layer(30 + k, painted=0.8, has_filled=False) for k in range(3)]
     options = PLAIN.model_copy(update={"island_cells_min": cells_min})
     given = {"drawn": None, "wall": None, "balance": None, "allocate": in_memory}
-    mask, source = module.joined(layers, [], options, **given)  # type: ignore[arg-type]
-    monkeypatch.setattr(module, "_BAND_CELLS", SHAPE[1])
-    banded = module.joined(layers, [], options, **given)  # type: ignore[arg-type]
+    mask, source = joining.joined(layers, [], options, **given)  # type: ignore[arg-type]
+    monkeypatch.setattr(joining, "_BAND_CELLS", SHAPE[1])
+    banded = joining.joined(layers, [], options, **given)  # type: ignore[arg-type]
     np.testing.assert_array_equal(banded[0], mask)
     np.testing.assert_array_equal(banded[1], source)
     if cells_min == 1:
@@ -215,7 +227,7 @@ def test_bands_decide_islands_as_the_whole_does(
 def test_each_cell_has_the_colour_of_its_layer(
     monkeypatch: pytest.MonkeyPatch, band_cells: int, *, is_deep: bool
 ) -> None:
-    monkeypatch.setattr(module, "_BAND_CELLS", band_cells)
+    monkeypatch.setattr(joining, "_BAND_CELLS", band_cells)
     rng = np.random.default_rng(6)
     layers = [
         replace(one, rgb=rng.integers(0, 256, (*SHAPE, 3)).astype(np.uint8)) for one in LAYERS[:2]
@@ -224,7 +236,7 @@ def test_each_cell_has_the_colour_of_its_layer(
         deep = rng.integers(0, 65536, (*SHAPE, 3)).astype(np.uint16)
         layers[1] = replace(layers[1], rgb=deep)
     source = rng.integers(-1, 2, SHAPE).astype(np.int16)
-    rgb = module.coloured(layers, source, None, allocate=in_memory)
+    rgb = joining.coloured(layers, source, None, allocate=in_memory)
     assert rgb.dtype == (np.uint16 if is_deep else np.uint8)
     assert not rgb[source == NOBODY].any()
     np.testing.assert_array_equal(rgb[source == 1], layers[1].rgb[source == 1])
@@ -235,12 +247,12 @@ def test_each_cell_has_the_colour_of_its_layer(
 
 def test_layers_of_a_wall_share_its_raster() -> None:
     one, other = layer(40, source="a.jpg"), layer(41, source="b.jpg")
-    module.require_one_raster([one, other], "wall 0")
+    joining.require_one_raster([one, other], "wall 0")
     moved = replace(other, frame=replace(other.frame, gsd_m=0.02))
     # Any of them, not only the second.
     for layers in ([one, moved], [one, other, moved]):
         with pytest.raises(MethodError) as caught:
-            module.require_one_raster(layers, "wall 0")
+            joining.require_one_raster(layers, "wall 0")
         assert str(caught.value) == (
             "the layers a.jpg and b.jpg of wall 0 have different rasters: all layers must be "
             "made from the same walls"
@@ -248,8 +260,8 @@ def test_layers_of_a_wall_share_its_raster() -> None:
     with pytest.raises(
         MethodError, match=r"^priority refers to c\.jpg, but the layers are of a\.jpg, b"
     ):
-        module.require_sources([other, one], ["b.jpg", "c.jpg"])
-    module.require_sources([other, one], ["b.jpg"])
+        joining.require_sources([other, one], ["b.jpg", "c.jpg"])
+    joining.require_sources([other, one], ["b.jpg"])
 
 
 def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
@@ -261,9 +273,300 @@ def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
     large = samples.layer(mask)
     options = PLAIN.model_copy(update={"seams": "voronoi"})
     (whole,) = preferences([large], options)
-    monkeypatch.setattr(module, "_BAND_CELLS", shape[0] * shape[1] // 8)
+    monkeypatch.setattr(joining, "_BAND_CELLS", shape[0] * shape[1] // 8)
     (reduced,) = preferences([large], options)
     rows = slice(0, shape[0])
     # Every third cell: what is painted may end two cells beside.
     np.testing.assert_allclose(reduced(rows), whole(rows), atol=3.0)
     np.testing.assert_array_equal(reduced(slice(31, 60)), reduced(rows)[31:60])
+
+
+def test_means_of_blocks_do_not_hang_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(1).normal(size=(48, 70))
+    of = Blocks.over((48, 70), 10)
+    monkeypatch.setattr(blocks, "row_bands", lambda _: [slice(0, 2), slice(2, 3), slice(3, 5)])
+    found = blocks.block_means(lambda rows: values[rows], of)
+    for row, column in np.ndindex(of.shape):
+        cells = of.cells((slice(row, row + 1), slice(column, column + 1)))
+        assert found[row, column] == pytest.approx(values[cells].mean())
+
+
+def test_depth_edges_of_some_rows_are_those_of_the_whole() -> None:
+    depth_m = np.random.default_rng(2).choice([0.0, 0.02, 0.05], (12, 7)).astype(np.float32)
+    one = depth_edges(depth_m)
+    # On either side of an edge: right and down, left and up.
+    either = one | depth_edges(depth_m[::-1, ::-1])[::-1, ::-1]
+    for parts in ((0, 12), (0, 1, 5, 12), (0, 3, 4, 11, 12)):
+        found = [
+            depth_edges_in(depth_m, slice(start, stop)) for start, stop in itertools.pairwise(parts)
+        ]
+        np.testing.assert_array_equal(np.concatenate(found), either)
+
+
+def test_a_depth_edge_is_a_step_of_more_than_three_centimetres_right_or_down() -> None:
+    depth_m = np.zeros((4, 5), dtype=np.float32)
+    depth_m[:, 3:] = 0.031
+    depth_m[2:, 0] = -0.029
+    expected = np.zeros((4, 5), dtype=np.bool_)
+    expected[:, 2] = True
+    np.testing.assert_array_equal(depth_edges(depth_m), expected)
+    depth_m[2:, 0] = -0.031
+    expected[1, 0] = expected[2:, 0] = True
+    np.testing.assert_array_equal(depth_edges(depth_m), expected)
+
+
+def scene(edges: tuple[float, float] = (0.0, 0.0)) -> graph_cut._Scene:
+    """Two layers of two cells: grey 0.2 and 0.5 in the first, 0.2 and 0.9 in the second cell."""
+    colours = np.array([[[0.2, 0.2]], [[0.5, 0.9]]], dtype=np.float32)
+    return graph_cut._Scene(
+        colours=np.repeat(colours[..., None], 3, axis=3),
+        views=np.zeros((2, 1, 2)),
+        edges=np.array([edges]),
+    )
+
+
+def cost(of: graph_cut._Scene, one: int, other: int) -> float:
+    p, q = np.array([0]), np.array([1])
+    (found,) = graph_cut._seam_cost(of, p, q, np.array([one]), np.array([other]))
+    return float(found)
+
+
+def test_a_seam_costs_differences_on_both_sides_its_length_and_depth_edges() -> None:
+    plain = cost(scene(), 0, 1)
+    assert plain == cost(scene(), 1, 0) == pytest.approx(1000 * (0.3 + 0.7 + 0.01))
+    assert cost(scene(), 0, 0) == cost(scene(), 1, 1) == 0.0
+    # A depth edge on either side makes it dear.
+    for edges in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+        assert cost(scene(edges=edges), 0, 1) == plain + 1000 * sum(edges)
+    # Where only one layer paints no difference is seen.
+    half = scene()
+    half.views[1, 0, 0] = graph_cut._FORBIDDEN
+    assert cost(half, 0, 1) == pytest.approx(1000 * (0.7 + 0.01))
+
+
+def test_a_layer_takes_over_what_it_shows_better_for_less_than_the_seam() -> None:
+    # Both show the same; the second is the better one in the right half of a row of ten.
+    colours = np.full((2, 1, 10, 3), 0.5, dtype=np.float32)
+    views = np.zeros((2, 1, 10))
+    views[0, 0, 5:], views[1, 0, :5] = 0.1, 0.1
+    flat = graph_cut._Scene(colours=colours, views=views, edges=np.zeros((1, 10)))
+    labels = graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1)
+    assert labels.tolist() == [[0] * 5 + [1] * 5]
+    # For one cell that is better by less than the length of its two seams nothing moves.
+    views[0] = 0.0
+    views[0, 0, 4], views[1] = 0.015, 0.1
+    views[1, 0, 4] = 0.0
+    assert not graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1).any()
+
+
+# --- the smaller picture ---
+
+
+def two_layers(shape: tuple[int, int], greys: tuple[int, int]) -> list[Any]:
+    """Two layers of even greys, the second half as good, with nothing in its first two columns."""
+    found = []
+    for grey, quality in zip(greys, (2.0, 1.0), strict=True):
+        mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
+        if quality == 1.0:
+            mask[:, :2] = LayerMask.OUTSIDE
+        found.append(
+            SimpleNamespace(
+                frame=SimpleNamespace(shape=shape),
+                rgb=np.full((*shape, 3), grey, dtype=np.uint8),
+                mask=mask,
+                quality=np.full(shape, quality, dtype=np.float32),
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_blocks_have_the_mean_colour_of_what_is_painted_as_it_is_balanced(
+    dtype: type[np.unsignedinteger],
+) -> None:
+    rng = np.random.default_rng(3)
+    highest = int(np.iinfo(dtype).max)
+    layers = two_layers((4, 6), (0, 0))
+    for layer in layers:
+        layer.rgb = rng.integers(0, highest // 2, (4, 6, 3)).astype(dtype)
+        layer.mask[1, 3:] = layer.mask[3, 5] = LayerMask.OCCLUDED
+        layer.rgb[layer.mask != LayerMask.PAINTED] = 0
+    blocks_of = Blocks.over((4, 6), 2)
+    means = np.zeros((2, 2, 3, 3))
+    for k, row, column in np.ndindex(2, 2, 3):
+        part = np.s_[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
+        known = layers[k].rgb[part][layers[k].mask[part] == LayerMask.PAINTED]
+        means[k, row, column] = known.mean(axis=0) / highest if len(known) else 0.0
+    plain = graph_cut._reduced(layers, None, blocks_of, None)
+    np.testing.assert_allclose(plain.colours, means, atol=1e-6)
+    # Each in the cell in the middle of its block.
+    balance: Any = SimpleNamespace(
+        log_gains=lambda k, rows, columns: (
+            (0.1 * k + 0.2 * rows - 0.1 * columns)[:, None] * np.ones(3)
+        )
+    )
+    balanced = graph_cut._reduced(layers, None, blocks_of, balance)
+    for k, row, column in np.ndindex(2, 2, 3):
+        gain = np.full((1, 3), 0.1 * k + 0.2 * (2 * row + 1) - 0.1 * (2 * column + 1))
+        wanted = lit_shares(means[k, row, column][None], gain)[0]
+        np.testing.assert_allclose(balanced.colours[k, row, column], wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "small"), [((100, 300), (100, 300)), ((200, 300), (100, 150)), ((8, 9), (8, 9))]
+)
+def test_cuts_are_made_on_some_ten_thousand_cells_that_a_layer_paints(
+    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], small: tuple[int, int]
+) -> None:
+    monkeypatch.setattr(graph_cut, "_expanded", lambda _scene, labels, _alpha: labels)
+    layers = two_layers(shape, (9, 9))
+    for layer in layers:
+        layer.mask[:, -2:] = LayerMask.OUTSIDE
+    labels = graph_cut.cut_labels(layers, None)
+    assert labels.small.shape == small
+    # What is left where nothing moves: the better one everywhere, none where none paints.
+    assert not labels.small[:, :-2].any()
+    assert (labels.in_rows(slice(0, 2)).shape, labels.small[0, -1]) == ((2, shape[1]), -1)
+
+
+PATCHED = (150, 210)
+
+
+def plain_layer(
+    quality: NDArray[np.float64] | float = 1.0,
+    *,
+    rgb: NDArray[np.uint8] | None = None,
+    mask: NDArray[np.uint8] | None = None,
+    shape: tuple[int, int] = PATCHED,
+) -> Layer:
+    plain = samples.layer(shape if mask is None else mask)
+    values = np.where(plain.mask == LayerMask.PAINTED, quality, 0.0).astype(np.float32)
+    return replace(plain, rgb=plain.rgb if rgb is None else rgb, quality=values)
+
+
+# --- patches ---
+
+
+def test_the_two_best_layers_of_a_patch_are_those_that_paint_all_of_it() -> None:
+    rng = np.random.default_rng(1)
+    layers = []
+    for _ in range(4):
+        mask = np.full(PATCHED, LayerMask.PAINTED, dtype=np.uint8)
+        # A single cell of some patches is missing.
+        for row, column in rng.integers(0, (128, 192), (3, 2)):
+            mask[row, column] = LayerMask.OCCLUDED
+        layers.append(plain_layer(rng.uniform(0.5, 1.0, PATCHED), mask=mask))
+    # Patches of 64 cells, as many as there is room for.
+    wanted = []
+    for row in (0, 64):
+        for column in (0, 64, 128):
+            part = np.s_[row : row + 64, column : column + 64]
+            means = {
+                k: float(one.quality[part].mean(dtype=np.float64))
+                for k, one in enumerate(layers)
+                if (one.mask[part] == LayerMask.PAINTED).all()
+            }
+            best = sorted(means, key=lambda k: -means[k])
+            if len(best) >= 2:
+                wanted.append((row, column, best[0], best[1]))
+    assert 2 < len(wanted) <= 6
+    assert agreement._pairs(layers, of_all_pairs=False) == wanted
+    assert agreement._pairs(layers[:1], of_all_pairs=False) == []
+    small = [plain_layer(shape=(63, 300)), plain_layer(shape=(63, 300))]
+    assert agreement._pairs(small, of_all_pairs=False) == []
+    three = [plain_layer(shape=(64, 64))] * 3
+    assert len(agreement._pairs(three, of_all_pairs=False)) == 1
+    assert len(agreement._pairs(three, of_all_pairs=True)) == 3
+
+
+def texture(spread_grey: float) -> NDArray[np.float64]:
+    """Blurred noise of 64 x 64 cells whose standard deviation is given, and some cells beside."""
+    noise = np.random.default_rng(2).normal(size=(64, 70))
+    blurred = cv2.GaussianBlur(noise, (0, 0), 1.0)
+    part = blurred[:, :64]
+    return 120.0 + spread_grey * (blurred - part.mean()) / part.std()
+
+
+@pytest.mark.parametrize(("spread_grey", "n_found"), [(2.5, 0), (4.0, 1), (30.0, 1)])
+def test_flat_patches_tell_no_displacement(spread_grey: float, n_found: int) -> None:
+    whole = np.rint(texture(spread_grey)).astype(np.uint8)
+    pair = [plain_layer(rgb=np.dstack([whole[:, k : k + 64]] * 3), shape=(64, 64)) for k in (0, 2)]
+    found = overlaps_of(pair).shifts_cells
+    assert len(found) == n_found
+    if n_found:
+        np.testing.assert_allclose(found, [[-2.0, 0.0]], atol=0.4)
+
+
+def peak(pair: list[NDArray[np.uint8]]) -> float:
+    window = cv2.createHanningWindow((64, 64), cv2.CV_32F)
+    first, second = (part.astype(np.float32) for part in pair)
+    return float(cv2.phaseCorrelate(first, second, window)[1])
+
+
+def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
+    rng = np.random.default_rng(4)
+    one = rng.integers(0, 256, (64, 64)).astype(np.uint8)
+    told: dict[str, int] = {}
+    # The same patch with more and more of others mixed in.
+    for weight in np.linspace(0.5, 1.0, 41):
+        other = rng.integers(0, 256, one.shape)
+        pair = [one, np.rint((1.0 - weight) * one + weight * other).astype(np.uint8)]
+        layers = [plain_layer(rgb=np.dstack([part] * 3), shape=(64, 64)) for part in pair]
+        if 0.16 < peak(pair) < 0.28:
+            told["fifth"] = len(overlaps_of(layers).photos)
+        elif 0.07 < peak(pair) < 0.14:
+            told["tenth"] = len(overlaps_of(layers).photos)
+    assert told == {"fifth": 1, "tenth": 0}
+
+
+def test_two_hundred_patches_are_enough() -> None:
+    shape = (64, 64 * 240)
+    row = np.rint(texture(30.0)[:, :64]).astype(np.uint8)
+    same = plain_layer(rgb=np.dstack([np.tile(row, (1, 240))] * 3), shape=shape)
+    found = overlaps_of([same, same]).shifts_cells
+    assert len(found) == 200
+    np.testing.assert_allclose(found, 0.0, atol=0.05)
+
+
+# --- seams ---
+
+
+def sources(seed: int, shape: tuple[int, int] = (11, 9)) -> NDArray[np.int16]:
+    return np.random.default_rng(seed).integers(-1, 3, shape).astype(np.int16)
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 11, 1024])
+@pytest.mark.parametrize("seed", seeds(2))
+def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
+    monkeypatch: pytest.MonkeyPatch, seed: int, at_once: int
+) -> None:
+    monkeypatch.setattr(agreement, "_ROWS_AT_ONCE", at_once)
+    source = sources(seed)
+    rows, columns = source.shape
+    before: dict[int, list[tuple[int, int]]] = {0: [], 1: []}
+    for row, column in np.ndindex(source.shape):
+        for axis, (r, c) in enumerate(((row + 1, column), (row, column + 1))):
+            is_there = r < rows and c < columns
+            pair = {int(source[row, column]), int(source[r, c])} if is_there else set()
+            if len(pair) == 2 and -1 not in pair:
+                before[axis].append((row, column))
+    seam = np.zeros(source.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        found = agreement._before_seams(source, axis)
+        assert sorted(zip(*(part.tolist() for part in found), strict=True)) == before[axis]
+        seam[tuple(np.array(before[axis]).T)] = True
+    np.testing.assert_array_equal(is_seam(source), seam)
+    depth_m = np.random.default_rng(seed).uniform(0.0, 0.06, source.shape).astype(np.float32)
+    n_edges = np.count_nonzero(seam & depth_edges(depth_m))
+    assert count_seams(source, depth_m) == (seam.sum(), n_edges)
+    assert count_seams(source, None) == (seam.sum(), 0)
+
+
+def test_black_and_white_are_a_hundred_apart() -> None:
+    source = np.array([[0, 1]], dtype=np.int16)
+    pair = [
+        plain_layer(rgb=np.full((1, 2, 3), value, np.uint8), shape=(1, 2)) for value in (0, 255)
+    ]
+    grey, delta_e = seam_steps(source, pair)
+    assert grey.tolist() == pytest.approx([-255.0])
+    assert delta_e.tolist() == pytest.approx([100.0], abs=1e-3)

@@ -1,4 +1,4 @@
-"""`mosaic.seams`: one layer passes through, of several the best paints each cell."""
+"""`mosaic.seams`: one layer passes through, of several the best paints each cell, by each rule."""
 
 from __future__ import annotations
 
@@ -15,15 +15,29 @@ from orthoflow_plugins.mosaic import seams
 from orthoflow_plugins.mosaic.agreement import count_seams
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
-from orthoflow.errors import MethodError
+from orthoflow.errors import InputError, MethodError
 from orthoflow.files.drawing import plane_ink
+from orthoflow.files.drawings.geojson import write_seams_geojson
 from orthoflow.files.geotiff import read_raster
 from orthoflow.files.images import decode_image
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame, frame_over
-from orthoflow.products import Camera, Cameras, Layer, LayerMask, Layers, Orthoimages, OrthoMask
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    InputFiles,
+    Layer,
+    LayerMask,
+    Layers,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    Wall,
+    Walls,
+)
+from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
-from tests import samples
+from tests.turns import OTHER_TURNS, TURNS, Turn
 
 
 def frame(shape: tuple[int, int] = (6, 8)) -> WallFrame:
@@ -347,3 +361,227 @@ def test_an_orthoimage_of_one_tone_is_reported(tmp_path: Path, rgb: int, tone: s
     (found,) = [one for one in ctx.diagnostics if one.code == "orthoimage-of-one-tone"]
     assert f"is {tone}" in found.text
     assert "dark.jpg" in found.text
+
+
+WIDE = (40, 120)
+
+
+def layer(
+    name: str, columns: tuple[int, int], rgb: NDArray[np.uint8] | int, quality: float = 1.0
+) -> Layer:
+    """A layer that paints some columns of the wall."""
+    colour = np.broadcast_to(np.asarray(rgb, dtype=np.uint8), (*WIDE, 3))
+    return inspect_scenes.painted_layer(name, slice(*columns), colour, quality)
+
+
+def joined_wide(
+    folder: Path, *layers: Layer, walls: Walls | None = None, **params: object
+) -> tuple[Orthoimage, dict[str, float], dict[str, object]]:
+    ctx = scenes.context(folder)
+    out = MosaicSeams().run(
+        MosaicSeams.In(layers=Layers(layers=layers), walls=walls),
+        MosaicSeams.Params.model_validate({"island_cells_min": 1, "gains": "none"} | params),
+        ctx,
+    )
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    return out.orthoimages.images[0], metrics, dict(out.orthoimages.details)
+
+
+def seam_columns(image: Orthoimage) -> NDArray[np.int64]:
+    """First column of the second source in each row."""
+    return np.argmax(image.source == 1, axis=1)
+
+
+def textures() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two pictures that agree in columns 64 to 67 only."""
+    rng = np.random.default_rng(4)
+    one, other = (rng.integers(0, 256, (*WIDE, 3)).astype(np.uint8) for _ in range(2))
+    other[:, 64:68] = one[:, 64:68]
+    return one, other
+
+
+def test_a_graph_cut_runs_where_the_photos_agree(tmp_path: Path) -> None:
+    one, other = textures()
+    left, right = layer("left", (0, 100), one), layer("right", (20, 120), other)
+    image, cut, _ = joined_wide(tmp_path, left, right, seams="graph-cut")
+    columns = seam_columns(image)
+    assert ((columns >= 65) & (columns <= 67)).all()
+    assert cut["seam_step_rms_grey"] == 0.0
+    assert cut["seam_step_mean_delta_e"] == 0.0
+    assert (image.source[:, :65] == 0).all()
+    _, middle, _ = joined_wide(tmp_path, left, right, seams="voronoi")
+    assert middle["seam_step_rms_grey"] > 40.0
+
+
+def test_a_graph_cut_keeps_off_depth_edges(tmp_path: Path) -> None:
+    left, right = layer("left", (0, 100), 10), layer("right", (20, 120), 10)
+    depth = np.zeros(WIDE, dtype=np.float32)
+    depth[:, 60:63] = 0.1
+    wall = inspect_scenes.walls().walls[0]
+    small = {
+        field.name: getattr(wall, field.name)[: WIDE[0], : WIDE[1]]
+        for field in dataclasses.fields(Wall)
+        if isinstance(getattr(wall, field.name), np.ndarray)
+    }
+    stepped = dataclasses.replace(
+        wall, frame=left.frame, **(small | {"depth_m": depth, "intensity": None})
+    )
+    walls = dataclasses.replace(inspect_scenes.walls(), walls=(stepped,))
+    _, cut, _ = joined_wide(tmp_path, left, right, walls=walls, seams="graph-cut")
+    assert cut["seam_on_depth_edge_share"] == 0.0
+    # The first photo is better up to where it ends, and that is where the edge is moved to.
+    depth[:] = 0.0
+    depth[:, 100:] = 0.1
+    _, best, _ = joined_wide(tmp_path, left, right, walls=walls)
+    assert best["seam_on_depth_edge_share"] == 1.0
+
+
+SHAPE = (41, 58)
+
+
+def layers() -> Layers:
+    return layers_and_walls(SHAPE, TURNS[0])[0]
+
+
+def joined_drawn(folder: Path, *files: Path, **params: object) -> Orthoimage:
+    inputs = MosaicSeams.In(
+        layers=layers(), seams=InputFiles(name="seams", paths=files) if files else None
+    )
+    chosen = MosaicSeams.Params.model_validate({"island_cells_min": 1, "gains": "none"} | params)
+    return MosaicSeams().run(inputs, chosen, scenes.context(folder)).orthoimages.images[0]
+
+
+def drawn(folder: Path, *areas: tuple[str, list[list[float]]], wall: object = 0) -> Path:
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"photo": photo, "wall": wall},
+            "geometry": {"type": "Polygon", "coordinates": [[*ring, ring[0]]]},
+        }
+        for photo, ring in areas
+    ]
+    path = folder / "drawn.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return path
+
+
+@pytest.mark.parametrize("seams", ["best-view", "voronoi", "graph-cut"])
+def test_written_seams_give_the_same_mosaic_whatever_the_rule(tmp_path: Path, seams: str) -> None:
+    first = joined_drawn(tmp_path, seams="priority", priority=["photo 2", "photo 1"])
+    assert len(np.unique(first.source)) >= 2
+    path = tmp_path / "wall_0_seams.geojson"
+    write_seams_geojson(path, first)
+    again = joined_drawn(tmp_path, path, seams=seams)
+    np.testing.assert_array_equal(again.source, first.source)
+    assert (joined_drawn(tmp_path, seams=seams).source == first.source).mean() < 0.8
+
+
+def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = joined_drawn(tmp_path)
+    gsd_m = before.frame.gsd_m
+    # Rows 5 to 19 and columns 10 to 39; X to the right, Y upwards from the top-left corner.
+    ring = [[10.2, -5.2], [39.8, -5.2], [39.8, -19.8], [10.2, -19.8]]
+    path = drawn(tmp_path, ("photo 1", [[x * gsd_m, y * gsd_m] for x, y in ring]))
+    after = joined_drawn(tmp_path, path)
+    area = np.s_[5:20, 10:40]
+    paints = layers().layers[1].mask[area] == 1
+    assert paints.any()
+    assert (after.source[area] == np.where(paints, 1, before.source[area])).all()
+    outside = np.ones(SHAPE, dtype=np.bool_)
+    outside[4:21, 9:41] = False
+    np.testing.assert_array_equal(after.source[outside], before.source[outside])
+    shown = after.mask == OrthoMask.PAINTED
+    own = np.choose(after.source[..., None].clip(0), [layer.rgb for layer in layers().layers])
+    np.testing.assert_array_equal(after.rgb[shown], own[shown])
+    # Bands do not show.
+    monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", 1)
+    np.testing.assert_array_equal(joined_drawn(tmp_path, path).source, after.source)
+    # Another wall's polygons change nothing.
+    other = drawn(tmp_path, ("photo 1", [[0.0, 0.0], [1.0, 0.0], [1.0, -1.0]]), wall=3)
+    np.testing.assert_array_equal(joined_drawn(tmp_path, other).source, before.source)
+
+
+@pytest.mark.parametrize(
+    ("photo", "wall", "said"),
+    [
+        ("photo 9", 0, "refer to the photo photo 9, but the layers are of photo 0, photo 1"),
+        ("photo 1", "west", 'needs the property "wall", the number of a wall; got'),
+    ],
+)
+def test_seams_that_fit_no_layer_are_refused(
+    tmp_path: Path, photo: str, wall: object, said: str
+) -> None:
+    path = drawn(tmp_path, (photo, [[0.0, 0.0], [1.0, 0.0], [1.0, -1.0]]), wall=wall)
+    with pytest.raises(InputError, match=said):
+        joined_drawn(tmp_path, path)
+
+
+def layers_and_walls(shape: tuple[int, int], turn: Turn) -> tuple[Layers, Walls]:
+    import cv2
+
+    rng = np.random.default_rng(3)
+    frame = inspect_scenes.frame(shape=turn.shape(shape))
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    layers = []
+    for k, (at_row, at_column) in enumerate(rng.uniform(0.2, 0.8, (3, 2)) * shape):
+        distance = np.hypot(rows - at_row, columns - at_column)
+        is_painted = distance < 0.6 * max(shape)
+        grey = cv2.GaussianBlur(rng.normal(0.0, 1.0, (*shape, 3)), (0, 0), 3.0)
+        rgb = np.clip(128.0 + 300.0 * grey + 10.0 * k, 0, 255).astype(np.uint8)
+        quality = np.where(is_painted, 1.0 / (1.0 + distance), 0.0).astype(np.float32)
+        layers.append(
+            Layer(
+                frame=frame,
+                wall=0,
+                source=f"photo {k}",
+                rgb=turn.raster(np.where(is_painted[..., None], rgb, np.uint8(0))),
+                mask=turn.raster(
+                    np.where(is_painted, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8)
+                ),
+                quality=turn.raster(quality),
+            )
+        )
+    is_near = np.hypot(rows - 0.5 * shape[0], columns - 0.4 * shape[1]) < 0.2 * min(shape)
+    depth_m = np.where(is_near, np.float32(0.05), np.float32(0.0))
+    wall = samples.wall(
+        frame, depth_m=turn.raster(depth_m), mask=np.ones(frame.shape, dtype=np.uint8)
+    )
+    walls = samples.walls(wall, buffer_m=0.1)
+    return Layers(layers=tuple(layers), names=("wall 0",)), walls
+
+
+def joined_turned(shape: tuple[int, int], turn: Turn, folder: Path, **params: object) -> Orthoimage:
+    layers, walls = layers_and_walls(shape, turn)
+    chosen = MosaicSeams.Params.model_validate(params)
+    inputs = MosaicSeams.In(layers=layers, walls=walls)
+    return MosaicSeams().run(inputs, chosen, scenes.context(folder)).orthoimages.images[0]
+
+
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
+@pytest.mark.parametrize(
+    ("seams", "shape"),
+    [
+        ("best-view", (41, 58)),
+        ("voronoi", (41, 58)),
+        ("priority", (41, 58)),
+        ("graph-cut", (41, 58)),
+        # Cut at half and a third of the size, which does not go into the sides.
+        ("graph-cut", (205, 170)),
+    ],
+)
+def test_turned_layers_are_joined_along_turned_seams(
+    tmp_path: Path, seams: str, shape: tuple[int, int], turn: Turn
+) -> None:
+    params = {
+        "seams": seams,
+        "priority": ["photo 2"] if seams == "priority" else [],
+        "gains": "none",
+    }
+    image = joined_turned(shape, TURNS[0], tmp_path, **params)
+    turned = joined_turned(shape, turn, tmp_path, **params)
+    assert len(np.unique(image.source)) >= 3
+    np.testing.assert_array_equal(turned.source, turn.raster(image.source))
+    np.testing.assert_array_equal(turned.mask, turn.raster(image.mask))
+    np.testing.assert_array_equal(turned.rgb, turn.raster(image.rgb))

@@ -1,26 +1,39 @@
-"""How exact ties should be before any pose, which may be chance, and whose calibration is wrong."""
+"""Lens, ties and pose of a single photo: what is known before, withheld, rejected, refused."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.orient import photos
+from orthoflow_plugins.orient import pose as lenses
 from orthoflow_plugins.orient.pnp import estimate_by_opencv
 from orthoflow_plugins.orient.pose import (
     Estimate,
     OrientParams,
+    Sharing,
     estimate_pose,
     expected_px,
+    image_cells,
     robust_start,
     unit_deviation,
     without_chance,
 )
 
+from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.resection import SeenPoints
+from orthoflow.geometry.resection import (
+    SeenPoints,
+    adjust,
+    misfit,
+    predicted_covariances,
+)
+from orthoflow.products import Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
+from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
 from tests.tied_photos import SCENE, photo, seen_by, tied
 
@@ -196,3 +209,255 @@ def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: 
     assert found.agreeing[~wrong].mean() > 0.98
     assert found.agreeing[wrong].mean() < 0.2
     np.testing.assert_array_equal(found.agreeing, found.fit.normalised <= found.limit)
+
+
+CALIBRATED = Intrinsics(
+    width=600, height=400, fx=510.0, fy=512.0, cx=303.0, cy=197.0,
+    distortion=(-0.1, 0.02, 1e-4, 2e-4, 0.0),
+)  # fmt: skip
+OF_EXIF = [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+FREE = ("focal", "aspect", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+def lens_photo(name: str = "a.jpg", size: tuple[int, int] = (600, 400), **known: Any) -> Photo:
+    return Photo(name=name, encoded=b"", width=size[0], height=size[1], **known)
+
+
+def oriented(*focal_px: float) -> list[ViewingCamera]:
+    camera = ms.camera_before(ms.photographed_scene())
+    return [replace(camera, fx=focal, fy=focal) for focal in focal_px]
+
+
+def test_exif_is_believed_to_a_twentieth_and_tried_a_little_shorter_and_longer() -> None:
+    prior = lenses.lens_prior(lens_photo(exif_focal_px=500.0))
+    assert [guess.fx for guess in (prior.prior, *prior.guesses)] == pytest.approx(
+        [500.0, 470.0, 530.0]
+    )
+    assert prior.source == "exif"
+    for guess in (prior.prior, *prior.guesses):
+        assert (guess.fy, guess.cx, guess.cy) == (guess.fx, 300.0, 200.0)
+        assert not any(guess.distortion)
+    assert prior.freedom.names == FREE
+    # The principal point to a hundredth of the longer side.
+    assert prior.freedom.sigmas.tolist() == OF_EXIF
+
+
+@pytest.mark.parametrize("size", [(600, 400), (400, 600)])
+def test_without_exif_lenses_from_wide_to_long_are_tried(size: tuple[int, int]) -> None:
+    prior = lenses.lens_prior(lens_photo(size=size))
+    shares = [guess.fx / 600.0 for guess in (prior.prior, *prior.guesses)]
+    assert shares == pytest.approx([0.6, 0.75, 0.95, 1.2, 1.6, 2.2])
+    assert {(guess.cx, guess.cy) for guess in (prior.prior, *prior.guesses)} == {
+        (size[0] / 2, size[1] / 2)
+    }
+    assert (prior.source, prior.freedom.names) == ("none", FREE)
+    assert prior.freedom.sigmas.tolist() == [0.35, *OF_EXIF[1:]]
+
+
+@pytest.mark.parametrize(
+    ("sharing", "lens_of"),
+    [
+        ("per-photo", (0, 1, 2, 3, 4, 5)),
+        ("shared", (0, 0, 0, 0, 0, 1)),
+        # Two of one focal length; a third of another; two of none known; another size.
+        ("focal-group", (0, 0, 1, 2, 2, 3)),
+    ],
+)
+def test_photos_share_a_lens_by_size_and_known_focal_length(
+    sharing: Sharing, lens_of: tuple[int, ...]
+) -> None:
+    photos = [
+        lens_photo("a", exif_focal_px=500.0),
+        lens_photo("b", exif_focal_px=500.0),
+        lens_photo("c", exif_focal_px=700.0),
+        lens_photo("d"),
+        lens_photo("e"),
+        lens_photo("f", exif_focal_px=500.0, size=(400, 600)),
+    ]
+    lens_of_photos, found = lenses.lens_groups(photos, oriented(*[500.0] * 6), sharing)
+    assert lens_of_photos == lens_of
+    assert len(found) == max(lens_of) + 1
+
+
+def test_photos_that_are_set_apart_share_no_lens() -> None:
+    # An index is no focal length.
+    photos = [lens_photo("a"), lens_photo("b"), lens_photo("c"), lens_photo("d", exif_focal_px=1.0)]
+    cameras = oriented(*[500.0] * 4)
+    for sharing, lens_of in (("focal-group", (0, 1, 0, 2)), ("shared", (0, 1, 0, 0))):
+        assert lenses.lens_groups(photos, cameras, sharing, {1})[0] == lens_of
+
+
+def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
+    photos = [
+        lens_photo("a"),
+        lens_photo("b", exif_focal_px=520.0),
+        lens_photo("c", intrinsics=CALIBRATED),
+    ]
+    cameras = oriented(480.0, 500.0, 510.0)
+    for n_photos, source, focal_px in ((3, "calibration", 510.0), (2, "exif", 520.0)):
+        _, found = lenses.lens_groups(photos[:n_photos], cameras[:n_photos], "shared")
+        (lens,) = found
+        assert (lens.source, lens.prior.fx) == (source, focal_px)
+
+
+def test_calibrated_lenses_are_held() -> None:
+    photos = [lens_photo("a", exif_focal_px=500.0), lens_photo("b", intrinsics=CALIBRATED)]
+    _, found = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo")
+    assert [lens.freedom.sigmas.tolist() for lens in found] == [OF_EXIF, []]
+
+
+def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:
+    camera = replace(
+        ms.camera_before(ms.photographed_scene()), distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0])
+    )
+    # With k1 = -0.5 no ray comes out farther than 0.54 focal lengths from the axis.
+    rays = lenses.camera_rays(
+        camera,
+        np.array([[camera.cx + 0.5 * camera.fx, camera.cy], [camera.cx + camera.fx, camera.cy]]),
+    )
+    assert np.isfinite(rays[0]).all()
+    assert np.isnan(rays[1]).all()
+
+
+def ties(n: int = 12) -> Ties:
+    """Ties of two photos in turn, their pixels numbered."""
+    at = np.arange(n)
+    return samples.ties(
+        np.column_stack([at, 10.0 * at]).astype(np.float64),
+        photo_names=("a", "b"),
+        photo=(at % 2).astype(np.int32),
+        points_world=np.zeros((n, 3)),
+        sigma_px=0.1 + at,
+        sigma_m=0.001 + at,
+        role=np.full(n, TieRole.CONTROL, dtype=np.uint8),
+    )
+
+
+def small_photo(name: str) -> Photo:
+    return Photo(name=name, encoded=b"", width=100, height=100)
+
+
+def test_what_no_orientation_can_start_from_is_refused() -> None:
+    both = Photos(photos=(small_photo("a"), small_photo("b")))
+    photos.require(ties(), both)
+    with pytest.raises(MethodError, match="there are no photos to orient"):
+        photos.require(ties(), Photos(photos=()))
+    with pytest.raises(MethodError, match="there are no ties between photos and walls"):
+        photos.require(ties(0), both)
+    with pytest.raises(MethodError, match="the ties refer to photo b, which is not among"):
+        photos.require(ties(), Photos(photos=(small_photo("a"),)))
+
+
+def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:
+    by_hand = np.zeros(400, dtype=np.uint8)
+    by_hand[:40] = 1
+    of = replace(ties(400), by_hand=by_hand)
+    params = OrientParams()
+    tied = photos.tied_photo(small_photo("a"), of, params, np.random.default_rng(1))
+    np.testing.assert_array_equal(tied.chosen, np.arange(0, 400, 2))
+    np.testing.assert_array_equal(tied.by_hand, by_hand[::2] > 0)
+    assert not (tied.is_check & tied.by_hand).any()
+    share = tied.is_check.sum() / (~tied.by_hand).sum()
+    assert share == pytest.approx(params.check_share, abs=0.1)
+    np.testing.assert_array_equal(tied.seen.pixels_photo, of.pixels_photo[::2])
+    np.testing.assert_array_equal(tied.seen.sigma_px, of.sigma_px[::2])
+    np.testing.assert_array_equal(tied.seen.sigma_m, of.sigma_m[::2])
+    plain = photos.tied_photo(small_photo("a"), ties(400), params, np.random.default_rng(1))
+    assert not plain.by_hand.any()
+
+
+def test_rejected_ties_are_not_used() -> None:
+    of = ties(24)
+    of.role[[0, 4]] = TieRole.REJECTED
+    of.role[2] = TieRole.CHECK
+    tied = photos.tied_photo(small_photo("a"), of, OrientParams(), np.random.default_rng(1))
+    assert tied.chosen.tolist() == [2, 6, 8, 10, 12, 14, 16, 18, 20, 22]
+
+
+@pytest.mark.parametrize(("share", "n_check"), [(0.2, 144), (0.25, 180), (0.001, 1), (0.0, 0)])
+def test_check_points_are_withheld_evenly(share: float, n_check: int) -> None:
+    rng = np.random.default_rng(0)
+    # Twenty ties in each of six by six cells.
+    corner = np.stack(np.meshgrid(np.arange(6), np.arange(6)), axis=-1).reshape(-1, 1, 2)
+    pixels = (100.0 * (corner + rng.random((36, 20, 2)))).reshape(-1, 2)
+    chosen = photos.withheld(pixels, (600, 600), share, rng)
+    assert chosen.sum() == n_check
+    counts = np.bincount(image_cells(pixels[chosen], (600, 600), 6), minlength=36)
+    assert np.abs(counts - share * 20).max() <= 1.0
+    # Which ones is left to chance.
+    other = photos.withheld(pixels, (600, 600), share, rng)
+    assert n_check == 0 or (other != chosen).any()
+    assert photos.withheld(pixels[:0], (600, 600), 0.5, rng).shape == (0,)
+
+
+CAMERA = ms.camera_before(SCENE)
+
+
+def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:
+    ahead = CAMERA.rotation[2]
+    # 2 mm and 2 m before the camera, known to 3 mm: the first may be anywhere in the image.
+    points = CAMERA.centre_world + np.array([[0.002], [2.0]]) * ahead
+    seen = SeenPoints(
+        pixels_photo=CAMERA.project(points)[:, :2] + [1.0, 0.0],
+        points_world=points,
+        sigma_px=np.full(2, 0.5),
+        sigma_m=np.full(2, 0.003),
+    )
+    near, far = misfit(seen, CAMERA).normalised
+    assert np.isinf(near)
+    assert 0.5 < far < 1.5
+
+
+def test_survey_coordinates_lose_nothing() -> None:
+    seen = seen_by(CAMERA, 120, noise_px=0.5)
+    near = adjust(seen, CAMERA)
+    shifted = replace(seen, points_world=seen.points_world + SURVEY_SHIFT_M)
+    far = adjust(shifted, CAMERA.shifted(-SURVEY_SHIFT_M))
+    np.testing.assert_allclose(
+        far.camera.centre_world - SURVEY_SHIFT_M, near.camera.centre_world, atol=2e-6
+    )
+    at = seen.points_world[:5]
+    np.testing.assert_allclose(
+        predicted_covariances(far, at + SURVEY_SHIFT_M),
+        predicted_covariances(near, at),
+        # The lever of 10^6 m costs eleven digits of sixteen; 1e-5 square pixels remain.
+        atol=1e-5,
+    )
+
+
+def test_the_stated_covariance_is_the_scatter_of_repeated_adjustments() -> None:
+    at = np.array([[0.5, 0.0, 0.4], [2.5, 0.0, 1.6], [1.5, 0.0, 1.0]])
+    exact = CAMERA.project(at)[:, :2]
+    ratios = []
+    for seed in range(60):
+        noise = {"noise_px": 0.6, "noise_m": 0.002, "sigma_px": 0.6, "sigma_m": 0.002}
+        seen = seen_by(CAMERA, 120, seed=seed, **noise)
+        result = adjust(seen, CAMERA)
+        error = result.camera.project(at)[:, :2] - exact
+        covariances = predicted_covariances(result, at)
+        ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariances), error))
+    # Chi-squared with 2 degrees of freedom has mean 2; 60 runs of correlated triples leave 15 %.
+    assert np.mean(ratios) == pytest.approx(2.0, rel=0.3)
+
+
+def test_a_soft_limit_bears_outliers() -> None:
+    seen = seen_by(CAMERA, 120, noise_px=0.3, sigma_px=0.3)
+    pixels = seen.pixels_photo.copy()
+    pixels[:12] += 40.0
+    spoilt = replace(seen, pixels_photo=pixels)
+    soft = adjust(spoilt, CAMERA, soft_limit=2.0).camera
+    hard = adjust(spoilt, CAMERA).camera
+
+    def miss(found: ViewingCamera) -> float:
+        return float(np.linalg.norm(found.centre_world - CAMERA.centre_world))
+
+    assert miss(soft) < 0.25 * miss(hard)
+
+
+def test_too_few_points_and_a_start_that_looks_away_are_refused() -> None:
+    with pytest.raises(GeometryError, match=r"6 unknowns got only 3 points"):
+        adjust(seen_by(CAMERA, 3), CAMERA)
+    adjust(seen_by(CAMERA, 4), CAMERA)
+    turned = ms.nudged(CAMERA, (0.0, np.pi, 0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(GeometryError, match=r"cannot see its points"):
+        adjust(seen_by(CAMERA, 120), turned)

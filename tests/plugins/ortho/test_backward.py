@@ -3,20 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.dsm_forward import DsmForward
+from orthoflow_plugins.ortho.layers import (
+    NO_SOURCE,
+    LayerStack,
+    count_shown,
+)
+from orthoflow_plugins.ortho.photos_on_walls import warn_of_heads
 
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.errors import MethodError
+from orthoflow.files.images import encode_png
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Camera, Cameras, LayerMask, Layers, PointCloud
+from orthoflow.geometry.frames import rotation_from_vector
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Layer,
+    LayerMask,
+    Layers,
+    Photo,
+    Photos,
+    PointCloud,
+    Walls,
+)
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes
+from tests import samples
 from tests.long_loops import seeds
 from tests.raster_scenes import context
 
@@ -313,3 +336,183 @@ def test_what_cannot_be_painted_is_refused_with_the_reason(tmp_path: Path) -> No
     assert "0.png has 1000 x 799 pixels" in refused(good, tmp_path, photos=small)
     none = dataclasses.replace(scenes.walls(where), walls=())
     assert "there are no walls" in refused(good, tmp_path, walls=none)
+
+
+MASKED = np.s_[300:420, 400:600]
+
+
+def painted_by(method: type[DsmBackward] | type[DsmForward], photos: Photos, folder: Path) -> Layer:
+    # Layers lie in files of the scratch folder.
+    folder.mkdir()
+    inputs = scenes.inputs(method.In, photos=photos)
+    (layer,) = method().run(inputs, method.Params(), context(folder)).layers.layers
+    return layer
+
+
+@pytest.mark.parametrize("method", [DsmBackward, DsmForward])
+def test_masked_pixels_paint_nothing_and_others_what_they_did(
+    tmp_path: Path, method: type[DsmBackward] | type[DsmForward]
+) -> None:
+    photos = scenes.photos(scenes.rendered())
+    used = np.full(scenes.rendered().shape[:2], 255, dtype=np.uint8)
+    used[MASKED] = 0
+    masked = dataclasses.replace(photos.photos[0], mask=encode_png(used))
+    before = painted_by(method, photos, tmp_path / "before")
+    after = painted_by(method, Photos(photos=(masked,)), tmp_path / "after")
+    # A bright picture of the mask says which cells show masked pixels.
+    picture = scenes.photos(np.dstack([255 - used] * 3))
+    seen = painted_by(method, picture, tmp_path / "seen").rgb[..., 0]
+    shows, near = (
+        cv2.morphologyEx((seen == 255).astype(np.uint8), way, np.ones((side, side))) > 0
+        for way, side in ((cv2.MORPH_ERODE, 5), (cv2.MORPH_DILATE, 9))
+    )
+    was, is_painted = (layer.mask == LayerMask.PAINTED for layer in (before, after))
+    assert (was & shows).sum() > 500
+    assert not is_painted[shows].any()
+    # Farther off than the rim of the mask nothing changes.
+    np.testing.assert_array_equal(after.mask[~near], before.mask[~near])
+    np.testing.assert_array_equal(after.rgb[~near & was], before.rgb[~near & was])
+
+
+def posed(*turns_deg: float) -> list[tuple[Photo, Camera]]:
+    """Photos of the board, turned about their axes."""
+    where = scenes.frame()
+    viewer = scenes.camera(where)
+    turned = []
+    for turn_deg in turns_deg:
+        turn = rotation_from_vector(np.array([0.0, 0.0, np.radians(turn_deg)]))
+        turned.append(
+            replace(viewer, rotation=turn @ viewer.rotation, translation=turn @ viewer.translation)
+        )
+    pictures = [np.zeros((8, 8, 3), np.uint8)] * len(turned)
+    photos, cameras = scenes.photos(*pictures).photos, scenes.cameras(*turned).cameras
+    return list(zip(photos, cameras, strict=True))
+
+
+def said(folder: Path, *turns_deg: float, sign: float = 1.0) -> list[Diagnostic]:
+    ctx: StepContext = context(folder)
+    warn_of_heads(sign * scenes.walls(scenes.frame()).up, posed(*turns_deg), ctx)
+    return ctx.diagnostics
+
+
+def test_a_scan_whose_up_is_down_is_told_by_its_photos(tmp_path: Path) -> None:
+    (told,) = said(tmp_path, 0.0, 10.0, -20.0, 180.0, sign=-1.0)
+    assert (told.values["n_down"], told.values["n_photos"], told.values["opposite"]) == (3, 4, "z")
+    (told,) = said(tmp_path, 180.0)
+    assert told.values["opposite"] == "-z"
+
+
+@pytest.mark.parametrize(
+    "turns_deg", [(0.0, 0.0), (90.0, -90.0), (180.0, 0.0), (110.0, 115.0)], ids=str
+)
+def test_upright_sideways_and_divided_photos_say_nothing(
+    tmp_path: Path, turns_deg: tuple[float, float]
+) -> None:
+    assert said(tmp_path, *turns_deg) == []
+
+
+@pytest.mark.parametrize("method", [DsmBackward, DsmForward])
+def test_methods_that_lay_photos_tell_it(
+    tmp_path: Path, method: type[DsmBackward] | type[DsmForward]
+) -> None:
+    where = scenes.frame()
+    walls = replace(scenes.walls(where), up=-scenes.walls(where).up)
+    ctx = context(tmp_path)
+    method().run(scenes.inputs(method.In, walls=walls), method.Params(), ctx)
+    assert "photos-upside-down" in [one.code for one in ctx.diagnostics]
+
+
+SHAPE = (4, 6)
+OUTSIDE, PAINTED, HIDDEN, VOID = (
+    LayerMask.OUTSIDE,
+    LayerMask.PAINTED,
+    LayerMask.OCCLUDED,
+    LayerMask.NO_SURFACE,
+)
+
+
+def walls(n: int = 3) -> Walls:
+    frame = samples.facing_south(0.01, SHAPE[1], SHAPE[0])
+    depths = np.zeros(SHAPE, dtype=np.float32)
+    depths[3] = np.nan
+    return samples.walls(
+        *(
+            samples.wall(frame, name=f"wall {k}", plane_index=k + 4, depth_m=depths)
+            for k in range(n)
+        )
+    )
+
+
+def mask_of(**rows: LayerMask) -> np.ndarray:
+    """States of the first rows; the last one is void."""
+    mask = np.full(SHAPE, VOID, dtype=np.uint8)
+    mask[:3] = [[state] for state in rows.values()]
+    return mask
+
+
+def layer(wall: int, source: str, mask: np.ndarray, *, deep: bool = False) -> Layer:
+    rgb = np.zeros((*SHAPE, 3), dtype=np.uint16 if deep else np.uint8)
+    return samples.layer(mask, wall=wall, source=source, rgb=rgb)
+
+
+def stacked(ctx: StepContext, *found: Layer) -> LayerStack:
+    stack = LayerStack(walls(), ctx)
+    for each in found:
+        stack.add(each)
+    return stack
+
+
+def test_layers_come_by_wall_and_then_by_photo(tmp_path: Path) -> None:
+    shown = mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)
+    photos = (layer(wall, name, shown) for wall, name in ((2, "a"), (0, "a"), (1, "b"), (0, "b")))
+    ctx = context(tmp_path)
+    found = stacked(ctx, *photos).joined(np.uint8)
+    assert [(each.wall, each.source) for each in found.layers] == [
+        (0, "a"), (0, "b"), (1, "b"), (2, "a"),
+    ]  # fmt: skip
+    assert found.names == ("wall 0", "wall 1", "wall 2")
+    assert found.plane_indices == (4, 5, 6)
+    assert ctx.warnings == []
+    with pytest.raises(MethodError, match="no oriented photo sees a wall"):
+        stacked(ctx).joined(np.uint8)
+
+
+def test_a_wall_that_no_photo_paints_is_bare_but_states_what_is_hidden(tmp_path: Path) -> None:
+    shown = layer(0, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE), deep=True)
+    ctx = context(tmp_path)
+    stack = stacked(ctx, shown)
+    mask = mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)
+    stack.note_reached(1, mask)
+    # The mask of the next photo lies where that of the first did.
+    mask[:3] = [[OUTSIDE], [HIDDEN], [OUTSIDE]]
+    stack.note_reached(1, mask)
+    # A photo paints this wall.
+    stack.note_reached(0, mask_of(a=HIDDEN, b=HIDDEN, c=HIDDEN))
+    found = stack.joined(np.uint16)
+    first, second, third = found.layers
+    assert first is shown
+    assert [one.values["walls"] for one in ctx.diagnostics] == ["wall 1, wall 2"]
+    assert (second.wall, second.source, third.wall, third.source) == (1, NO_SOURCE, 2, NO_SOURCE)
+    np.testing.assert_array_equal(second.mask, mask_of(a=HIDDEN, b=HIDDEN, c=OUTSIDE))
+    np.testing.assert_array_equal(third.mask, mask_of(a=OUTSIDE, b=OUTSIDE, c=OUTSIDE))
+    for bare in (second, third):
+        assert bare.rgb.dtype == shown.rgb.dtype
+        assert not bare.rgb.any()
+        assert not bare.quality.any()
+        assert bare.rgb.shape == (*SHAPE, 3)
+
+
+def test_cells_are_counted_once_however_many_photos_show_them() -> None:
+    layered = Layers(
+        layers=(
+            layer(0, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)),
+            layer(0, "b", mask_of(a=PAINTED, b=PAINTED, c=HIDDEN)),
+            layer(1, "a", mask_of(a=HIDDEN, b=HIDDEN, c=OUTSIDE)),
+            layer(2, "b", mask_of(a=OUTSIDE, b=OUTSIDE, c=OUTSIDE)),
+        ),
+        names=("wall 0", "wall 1", "wall 2"),
+        plane_indices=(4, 5, 6),
+    )
+    # Three of four rows have a depth; two are painted on the first wall, one hidden, and two on
+    # the second one.
+    assert count_shown(walls(), layered) == (3 * 18, 12, 6 + 12)

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho.filling import fillable_gaps
+from orthoflow_plugins.ortho.filling import fillable_gaps, filling_preview, void_counts
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.simulate.room import SimulateRoom
 
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.errors import MethodError, ProductError
 from orthoflow.geometry import frame_over
+from orthoflow.geometry.levels import light_of_levels, lit
 from orthoflow.products import Layer, LayerMask, PointCloud, Walls
 from tests import raster_scenes as scenes
 from tests import samples
+from tests.raster_scenes import context
 
 
 def bare_walls(known: scenes.KnownWall, *, buffer_m: float = 0.15) -> Walls:
@@ -289,3 +296,214 @@ def test_what_is_painted_from_a_cloud_is_where_it_is(
     # OpenCV's fronts begin at the top left, and shift what they paint: by 0.15 cells here.
     limit_cells = 0.02 if inpaint == "between" or cells < 1.0 else 0.2
     assert np.abs(scenes.shift_of_waves(shown)).max() < limit_cells
+
+
+N_TOP = 5
+
+
+def painted_by_rule(
+    folder: Path, colouring: str, inpaint: str = "none"
+) -> tuple[Layer, dict[int, list[int]]]:
+    """A wall with two layers of random colours, and its points by cell."""
+    known = scenes.leaning_wall(shape=(20, 30))
+    rng = np.random.default_rng(8)
+    n_points = 6000
+    places = rng.uniform([0, 0], [30, 20], (n_points, 2))
+    depths_m = rng.choice([-0.06, 0.05], n_points) + rng.uniform(0.0, 0.009, n_points)
+    rgb = rng.integers(0, 256, (n_points, 3), dtype=np.uint8)
+    cloud = scenes.cloud_of(known.world(*places.T, depths_m), rgb=rgb)
+    chosen = PointcloudDirect.Params.model_validate({"colouring": colouring, "inpaint": inpaint})
+    inputs = PointcloudDirect.In(walls=bare_walls(known), cloud=cloud)
+    ctx = scenes.context(folder)
+    layer = PointcloudDirect().run(inputs, chosen, ctx).layers.layers[0]
+    tops: dict[int, list[int]] = {}
+    cells = np.floor(places[:, 1]).astype(int) * 30 + np.floor(places[:, 0]).astype(int)
+    for cell in np.unique(cells):
+        own = np.flatnonzero(cells == cell)
+        own = own[np.argsort(-depths_m[own], kind="stable")]
+        tops[int(cell)] = [int(k) for k in own if depths_m[own[0]] - depths_m[k] <= 0.02]
+    return layer, {
+        cell: _expected(colouring, np.array(own), places, rgb) for cell, own in tops.items()
+    }
+
+
+def _expected(
+    colouring: str, own: NDArray[np.int64], places: NDArray[np.float64], rgb: NDArray[np.uint8]
+) -> list[int]:
+    squares = ((places[own] % 1.0 - 0.5) ** 2).sum(axis=1)
+    if colouring == "topmost":
+        colour = rgb[own[0]].astype(float)
+    elif colouring == "centre":
+        colour = rgb[own[np.argmin(squares)]].astype(float)
+    elif colouring == "gaussian":
+        weights = np.exp(-squares / (2 * 0.36**2))
+        colour = weights @ rgb[own] / weights.sum()
+    else:
+        colour = np.floor(np.median(rgb[own[:N_TOP]], axis=0) + 0.5)
+    return [round(float(value)) for value in colour]
+
+
+@pytest.mark.parametrize("colouring", ["topmost", "centre", "gaussian", "median"])
+def test_colours_follow_their_rule(tmp_path: Path, colouring: str) -> None:
+    layer, expected = painted_by_rule(tmp_path, colouring)
+    shown = layer.mask.ravel() == LayerMask.PAINTED
+    np.testing.assert_array_equal(np.flatnonzero(shown), sorted(expected))
+    colours = np.array([expected[cell] for cell in sorted(expected)])
+    # One grey level: positions went through float32 offsets.
+    assert np.abs(layer.rgb.reshape(-1, 3)[shown].astype(int) - colours).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("colouring", "inpaint"),
+    [("topmost", "between"), ("centre", "telea"), ("gaussian", "none"), ("median", "between")],
+)
+def test_bands_do_not_show_in_colours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, colouring: str, inpaint: str
+) -> None:
+    (tmp_path / "banded").mkdir()
+    whole, _ = painted_by_rule(tmp_path, colouring, inpaint=inpaint)
+    # Fronts of this wall are short.
+    monkeypatch.setattr("orthoflow_plugins.ortho.filling._FRONT_CELLS", 2)
+    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", 30 * 24)
+    monkeypatch.setattr("orthoflow_plugins.ortho.point_colours._POINTS_AT_ONCE", 100)
+    banded, _ = painted_by_rule(tmp_path / "banded", colouring, inpaint=inpaint)
+    for name in ("rgb", "mask", "filled"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name), err_msg=name)
+    # Places are counted from the band's own corner: the last digit of float32.
+    np.testing.assert_allclose(whole.quality, banded.quality, atol=1e-6)
+
+
+VOID = (255, 0, 255)
+
+
+@pytest.mark.parametrize("window", [3, 5, 7])
+def test_void_cells_are_counted_in_a_window_and_outside_all_are_void(window: int) -> None:
+    is_void = np.random.default_rng(1).random((9, 12)) < 0.3
+    padded = np.pad(is_void, 3, constant_values=True)
+    reach = window // 2
+    for row, column in np.ndindex(is_void.shape):
+        around = padded[row + 3 - reach : row + 4 + reach, column + 3 - reach : column + 4 + reach]
+        assert void_counts(is_void, window)[row, column] == np.count_nonzero(around)
+
+
+def test_a_gap_is_fillable_where_no_window_has_too_many_void_cells() -> None:
+    is_void = np.random.default_rng(2).random((30, 40)) < 0.35
+    limits = (4, 10, 19)
+    counts = [void_counts(is_void, window) for window in (3, 5, 7)]
+    wanted = is_void & np.logical_and.reduce(
+        [count <= limit for count, limit in zip(counts, limits, strict=True)]
+    )
+    found = fillable_gaps(is_void, limits)
+    np.testing.assert_array_equal(found, wanted)
+    assert 0 < found.sum() < is_void.sum()
+    # Each of the three limits counts.
+    for place in range(3):
+        tight = [9, 25, 49]
+        tight[place] = 1
+        assert fillable_gaps(is_void, (tight[0], tight[1], tight[2])).sum() < is_void.sum()
+    assert fillable_gaps(is_void, (9, 25, 49)).sum() == is_void.sum()
+
+
+def layer(shape: tuple[int, int], filled: NDArray[np.uint8] | None) -> Layer:
+    mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
+    mask[:, -5:] = LayerMask.OCCLUDED
+    rgb = np.where((mask == LayerMask.PAINTED)[..., None], (10, 20, 30), 0).astype(np.uint8)
+    return samples.layer(mask, rgb=rgb, filled=filled)
+
+
+def shown(of: Layer) -> NDArray[np.uint8]:
+    encoded = np.frombuffer(filling_preview(of), np.uint8)
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB))
+
+
+def test_a_small_layer_is_shown_before_and_after_it_was_filled() -> None:
+    filled = np.zeros((20, 30), dtype=np.uint8)
+    filled[4, 7] = filled[10, 11] = 1
+    picture = shown(layer((20, 30), filled))
+    zoom = picture.shape[0] // 20
+    assert zoom >= 2
+    assert picture.shape[0] == 20 * zoom
+    before, after = picture[:, : 30 * zoom], picture[:, -30 * zoom :]
+    # White between.
+    between = picture[:, 30 * zoom : -30 * zoom]
+    assert between.shape[1] > 0
+    assert (between == 255).all()
+    for part, is_before in ((before, True), (after, False)):
+        cells = part[::zoom, ::zoom]
+        np.testing.assert_array_equal(np.repeat(np.repeat(cells, zoom, 0), zoom, 1), part)
+        is_void = (cells == VOID).all(axis=2)
+        wanted = np.zeros((20, 30), dtype=bool)
+        wanted[:, -5:] = True
+        if is_before:
+            wanted |= filled > 0
+        np.testing.assert_array_equal(is_void, wanted)
+        assert (cells[~is_void] == (10, 20, 30)).all()
+    # Without anything filled both are the same.
+    plain = shown(layer((20, 30), None))
+    np.testing.assert_array_equal(plain[:, : 30 * zoom], plain[:, -30 * zoom :])
+
+
+# Factors on the light of one scan: yellowish.
+CAST = np.array([1.3, 1.0, 0.7])
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[PointCloud, Walls]:
+    """A simulated room, scanned in colour twice from two stations, and its largest wall."""
+    ctx = context(tmp_path_factory.mktemp("room"))
+    params = SimulateRoom.Params(scan_step_m=0.012, panorama_step_m=0.012)
+    simulated = SimulateRoom().run(SimulateRoom.In(), params, ctx)
+    inputs = RasterGrid.In(cloud=simulated.cloud, planes=simulated.truth.planes)
+    chosen = RasterGrid.Params(gsd_m=0.02, n_walls_max=1)
+    return simulated.cloud, RasterGrid().run(inputs, chosen, ctx).walls
+
+
+def light_painted(
+    cloud: PointCloud, walls: Walls, folder: Path, **params: object
+) -> tuple[NDArray[np.float64], list[Diagnostic]]:
+    """Logarithm of the light of each cell (rows, cols, 3), NaN without; what was reported."""
+    folder.mkdir()
+    ctx = context(folder)
+    chosen = PointcloudDirect.Params.model_validate({"inpaint": "none", **params})
+    (layer,) = (
+        PointcloudDirect()
+        .run(PointcloudDirect.In(walls=walls, cloud=cloud), chosen, ctx)
+        .layers.layers
+    )
+    light = np.log(np.maximum(light_of_levels(255)[layer.rgb], 1e-3).astype(np.float64))
+    light[(layer.mask != LayerMask.PAINTED) | (layer.rgb.min(axis=2) < 20)] = np.nan
+    return light, [one for one in ctx.diagnostics if one.code == "scans-balanced"]
+
+
+def test_scans_of_one_white_balance_are_painted_as_they_are(
+    tmp_path: Path, room: tuple[PointCloud, Walls]
+) -> None:
+    found, reported = light_painted(*room, tmp_path / "on")
+    plain, _ = light_painted(*room, tmp_path / "off", balance_scans=False)
+    np.testing.assert_array_equal(found, plain)
+    assert reported == []
+
+
+def test_a_cast_of_one_scan_is_taken_away(tmp_path: Path, room: tuple[PointCloud, Walls]) -> None:
+    cloud, walls = room
+    assert cloud.rgb is not None
+    assert cloud.scan is not None
+    rgb, is_off = np.array(cloud.rgb), cloud.scan == np.bincount(cloud.scan).argmax()
+    gains = np.broadcast_to(np.log(CAST).astype(np.float32), (int(is_off.sum()), 3))
+    rgb[is_off] = lit(rgb[is_off], gains)
+    cast = replace(cloud, rgb=rgb)
+    expected, _ = light_painted(cloud, walls, tmp_path / "expected")
+    found, reported = light_painted(cast, walls, tmp_path / "balanced")
+    left, silent = light_painted(cast, walls, tmp_path / "left", balance_scans=False)
+    (said,) = reported
+    assert silent == []
+    assert (said.values["n"], said.values["n_scans"]) == (1, int(cloud.scan.max()) + 1)
+    assert said.values["share"] == pytest.approx(1.0 / CAST.min() - 1.0, abs=0.05)
+    apart, before = found - expected, left - expected
+    known = np.isfinite(apart).all(axis=2) & np.isfinite(before).all(axis=2)
+    # Where that scan paints, its cast is visible, and afterwards no cell differs.
+    is_cast = known & (np.abs(before - np.log(CAST)).max(axis=2) < 0.1)
+    assert is_cast.mean() > 0.05
+    for cells in (is_cast, known):
+        assert np.abs(np.median(apart[cells], axis=0)).max() < 0.03
+        assert np.percentile(np.abs(apart[cells]), 95) < 0.05

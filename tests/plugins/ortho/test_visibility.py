@@ -1,17 +1,37 @@
-"""Where the backward projection finds cells in a photo, against the exact camera."""
+"""Where the projection finds cells in a photo, what hides them, how colours are sampled."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.ortho import surfaces
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.parameters import VisibilityParams
-from orthoflow_plugins.ortho.surfaces import Surface, cells_seen, relief_of, view_of
+from orthoflow_plugins.ortho.painting import (
+    CellFootprint,
+    footprint_of,
+    near_patches,
+    sample,
+    sample_bilinear,
+)
+from orthoflow_plugins.ortho.parameters import BackwardParams, VisibilityParams
+from orthoflow_plugins.ortho.surfaces import (
+    Surface,
+    cells_seen,
+    is_before,
+    relief_of,
+    surfaces_of,
+    view_of,
+)
 from orthoflow_plugins.ortho.visibility_kernels import (
+    BLOCK_CELLS,
+    FINE_CELLS,
     NO_SURFACE,
     OCCLUDED,
     PAINTED,
@@ -23,7 +43,8 @@ from orthoflow_plugins.ortho.visibility_kernels import (
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.occluders import nothing_in_the_way
-from orthoflow.products import LayerMask
+from orthoflow.geometry.robust import depth_noise_m
+from orthoflow.products import LayerMask, Wall
 from tests import ortho_scenes as scenes
 from tests import samples
 from tests.raster_scenes import context
@@ -229,3 +250,277 @@ def test_cells_at_the_border_of_a_photo_ask_the_last_pixel_of_the_buffer() -> No
     n_inside = np.count_nonzero(mask == PAINTED)
     assert 200 < n_inside < 300
     assert (mask[0, n_inside:] == LayerMask.OUTSIDE).all()
+
+
+GSD_M = 0.01
+
+
+def wall_of(depths: NDArray[np.floating]) -> Wall:
+    rows, columns = depths.shape
+    frame = samples.facing_south(GSD_M, columns, rows, (1.0, 2.0, 3.0))
+    return samples.wall(frame, depth_m=depths.astype(np.float32))
+
+
+def rough(shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Depths with a void block, void cells, and a raised part."""
+    rng = np.random.default_rng(5)
+    depths = rng.normal(0.0, 0.003, shape)
+    depths[rng.random(shape) < 0.02] = np.nan
+    depths[shape[0] // 2 :, shape[1] // 3 :] += 0.08
+    depths[:9, : BLOCK_CELLS + 3] = np.nan
+    return depths.astype(np.float32)
+
+
+def of_blocks(values: NDArray[np.floating], side: int, pick: Any) -> NDArray[np.float64]:
+    rows, columns = (-(-n // side) for n in values.shape)
+    return np.array(
+        [
+            [
+                pick(values[side * r : side * (r + 1), side * c : side * (c + 1)])
+                for c in range(columns)
+            ]
+            for r in range(rows)
+        ],
+        dtype=np.float64,
+    )
+
+
+SHAPES = [(9, 17), (70, 101), (5, 40)]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_bounds_of_blocks_are_those_of_their_cells(shape: tuple[int, int]) -> None:
+    depths = rough(shape)
+    relief, clear = relief_of(wall_of(depths)), relief_of(wall_of(depths), hides=False)
+    low = np.where(np.isnan(depths), np.inf, depths)
+    for prepared in (relief, clear):
+        np.testing.assert_array_equal(prepared.bottoms, of_blocks(low, BLOCK_CELLS, np.min))
+        np.testing.assert_array_equal(prepared.depth, depths)
+        # For others kernels would be compiled once more.
+        assert not prepared.depth.flags.writeable
+        assert not prepared.occluding.flags.writeable
+    tops = of_blocks(relief.occluding, BLOCK_CELLS, np.max)
+    np.testing.assert_array_equal(relief.tops, tops)
+    fine_tops = of_blocks(relief.occluding, FINE_CELLS, np.max)
+    np.testing.assert_array_equal(relief.fine_tops, fine_tops)
+    np.testing.assert_array_equal(relief.fine_bottoms, of_blocks(low, FINE_CELLS, np.min))
+    assert relief.highest_m == tops.max()
+    assert clear.occluding.size == 0
+    assert clear.highest_m == clear.tops.max() == -np.inf
+
+
+def test_bands_of_a_large_wall_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = wall_of(rough((100, 33)))
+    whole = relief_of(wall).occluding
+    monkeypatch.setattr(surfaces, "_BAND_CELLS", 33 * 20)
+    np.testing.assert_array_equal(relief_of(wall).occluding, whole)
+
+
+STEEP = VisibilityParams(incidence_max_deg=70.0)
+
+
+def clear_surface(depths: NDArray[np.floating]) -> Surface:
+    wall = wall_of(depths)
+    return Surface(
+        frame=wall.frame,
+        relief=relief_of(wall, hides=False),
+        front_m=0.2,
+        tolerance_m=0.007,
+    )
+
+
+def test_a_camera_is_the_same_in_the_axes_of_a_wall() -> None:
+    where = scenes.frame(at_survey=True)
+    camera = replace(scenes.camera(where, aside_m=0.4), skew=2.0)
+    surface = replace(clear_surface(np.zeros((4, 5))), frame=where)
+    view = view_of(camera, surface, STEEP)
+    (foot,) = where.wall_from_world(camera.centre_world[None])
+    # The centre of the first cell is 0.
+    assert (view.column, view.row) == pytest.approx((foot[0] - 0.5, foot[1] - 0.5), abs=1e-6)
+    assert view.height_m == pytest.approx(foot[2], abs=1e-9)
+    assert (view.gsd_m, view.front_m, view.tolerance_m) == (where.gsd_m, 0.2, 0.007)
+    assert view.cosine_least == pytest.approx(math.cos(math.radians(70.0)))
+    assert view.border_px == 0.05 * min(camera.width, camera.height)
+    # Points in metres right, down and before the wall are seen where the camera sees them.
+    at = np.random.default_rng(2).uniform([0.0, 0.0, -0.1], [1.2, 0.9, 0.1], (20, 3))
+    world = where.world_from_wall(at[:, :2] / where.gsd_m, at[:, 2])
+    flat = view.camera
+    local = flat[:9].reshape(3, 3) @ at.T + flat[9:12, None]
+    expected = camera.rotation @ world.T + camera.translation[:, None]
+    np.testing.assert_allclose(local, expected, atol=1e-6)
+    np.testing.assert_array_equal(flat[12:], camera.flat[12:])
+
+
+@pytest.mark.parametrize(("least_m", "is_seen"), [(0.1, True), (1.99, True), (2.01, False)])
+def test_a_camera_stands_before_a_wall_where_any_of_it_is_lower(
+    least_m: float, is_seen: bool
+) -> None:
+    depths = np.full((40, 40), 2.5)
+    depths[35, 36] = least_m
+    surface = clear_surface(depths)
+    frame = surface.frame
+    centre = frame.world_from_wall(np.array([[20.0, 20.0]]), 2.0)[0]
+    camera = scenes.camera(scenes.frame())
+    there = replace(camera, translation=-camera.rotation @ centre)
+    assert is_before(view_of(there, surface, STEEP), surface) == is_seen
+
+
+def test_surfaces_tolerate_their_noise_and_what_cells_cannot_hold(tmp_path: Path) -> None:
+    depths = np.random.default_rng(1).normal(0.0, 0.002, (60, 60))
+    wall = wall_of(depths)
+    walls = samples.walls(wall, replace(wall, plane_index=0), buffer_m=0.15)
+    ctx = context(tmp_path)
+    first, second = surfaces_of(walls, ctx)
+    noise_m = depth_noise_m(wall.depth_m)
+    assert noise_m == pytest.approx(0.002, rel=0.1)
+    assert first.tolerance_m == pytest.approx(3.0 * noise_m + 0.5 * GSD_M)
+    assert first.front_m == 0.15
+    assert first.frame is wall.frame
+    assert first.relief.occluding.size == second.relief.occluding.size == 3600
+    (clear, _) = surfaces_of(walls, ctx, hides=False)
+    assert clear.relief.occluding.size == 0
+    assert clear.tolerance_m == 0.5 * GSD_M  # nothing to tell from noise
+
+
+@pytest.mark.parametrize(("step_cells", "is_edge"), [(4.9, False), (5.1, True)])
+def test_a_step_of_five_cells_is_an_edge_that_hides_in_full(
+    step_cells: float, is_edge: bool
+) -> None:
+    depths = np.zeros((20, 20))
+    depths[:, 10:] = step_cells * GSD_M
+    relief = relief_of(wall_of(depths))
+    beside = relief.occluding[5, 9]
+    assert beside == pytest.approx(step_cells * GSD_M if is_edge else 0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("reach", [0, 3])
+def test_cells_near_hidden_patches_are_those_within_reach_of_two_by_two(reach: int) -> None:
+    hidden = np.random.default_rng(0).random((23, 31)) < 0.12
+    hidden[5:7, 20:22] = hidden[0:2, 0:2] = hidden[21:23, 29:31] = True
+    hidden[12, 3:12] = True  # one row is no patch
+    hidden[11, 3:12] = hidden[13, 3:12] = False
+    near = np.zeros(hidden.shape, dtype=np.bool_)
+    for row in range(22):
+        for column in range(30):
+            if hidden[row : row + 2, column : column + 2].all():
+                top, left = max(0, row - reach), max(0, column - reach)
+                near[top : row + 2 + reach, left : column + 2 + reach] = True
+    inner = (slice(reach + 1, -reach - 1),) * 2
+    np.testing.assert_array_equal(near_patches(hidden, reach)[inner], near[inner])
+
+
+@pytest.mark.parametrize("aside_m", [0.0, 0.5])
+def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) -> None:
+    where = scenes.frame()
+    camera = scenes.camera(where, aside_m=aside_m)
+    depths = np.full(scenes.SHAPE, 0.03, dtype=np.float32)
+    surface = Surface(
+        frame=where,
+        relief=relief_of(scenes.walls(where, depths).walls[0]),
+        front_m=scenes.BUFFER_M,
+        tolerance_m=0.008,
+    )
+    # Nine cells about column 31, row 14, of a tile whose margin begins two cells before it.
+    painted = np.zeros((20, 40), dtype=np.bool_)
+    painted[13 - 10 : 16 - 10, 30 - 18 : 33 - 18] = True
+    tile, inner = (slice(12, 30), slice(20, 58)), (slice(2, 20), slice(2, 40))
+    params = VisibilityParams(incidence_max_deg=80.0)
+    found = footprint_of(view_of(camera, surface, params), surface, painted, tile, inner)
+    at = np.array([[31.5, 14.5], [35.5, 14.5], [31.5, 18.5]])
+    points = where.world_from_wall(at, 0.03)
+    pixels = camera.project(points)
+    # Over four cells.
+    across, down = (
+        math.hypot(pixels[1, k] - pixels[0, k], pixels[2, k] - pixels[0, k]) / 4.0 for k in range(2)
+    )
+    assert found.pixels_across == pytest.approx(across, rel=1e-6)
+    assert found.pixels_down == pytest.approx(down, rel=1e-6)
+    assert found.photo_gsd_m == pytest.approx(pixels[0, 2] / math.sqrt(camera.fx * camera.fy))
+    ray = camera.centre_world - points[0]
+    cosine = float(ray @ where.normal_world) / np.linalg.norm(ray)
+    assert found.obliquity_deg == pytest.approx(math.degrees(math.acos(cosine)), abs=1e-6)
+    assert found.n_cells == 9
+
+
+@pytest.mark.parametrize("depth", [8, 16])
+@pytest.mark.parametrize("size", [(40, 60), (1, 7), (6, 1), (1, 1)], ids=str)
+def test_bilinear_colours_are_those_of_the_formula(depth: int, size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    photo = rng.integers(0, 2**depth, (*size, 3), dtype=np.uint8 if depth == 8 else np.uint16)
+    # From the centre of the first pixel of a part that begins at column 7 and row 3.
+    u, v = rng.uniform(-4.0, 66.0, (2, 30, 40)).astype(np.float32)
+    is_painted = rng.random(u.shape) < 0.9
+    last_u, last_v = size[1] - 1, size[0] - 1
+    across, down = np.clip(u.astype(float), 0, last_u), np.clip(v.astype(float), 0, last_v)
+    left, upper = np.floor(across).astype(int), np.floor(down).astype(int)
+    right, lower = np.minimum(left + 1, last_u), np.minimum(upper + 1, last_v)
+    a, d = (across - left)[..., None], (down - upper)[..., None]
+    above = photo[upper, left] * (1 - a) + photo[upper, right] * a
+    below = photo[lower, left] * (1 - a) + photo[lower, right] * a
+    expected = np.where(is_painted[..., None], above * (1 - d) + below * d, 0.0)
+    visible = TileVisibility(u + 7.5, v + 3.5, is_painted.astype(np.uint8), np.ones_like(u))
+    inner, colours = (slice(2, 29), slice(3, 40)), np.empty((27, 37, 3), dtype=photo.dtype)
+    sample_bilinear(photo, (7, 3), visible, inner, colours)
+    # Positions are float32: a millionth of a pixel is a sixteenth of a level of 16 bits.
+    tolerance = 0.5 + (1e-3 if depth == 8 else 0.5)
+    assert np.abs(colours - expected[inner]).max() <= tolerance
+
+
+def places_of(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Positions of cells in a photo."""
+    rows, columns = np.indices((16, 24))
+    u = 41.0 + 2.3 * columns + 0.1 * rows + rng.uniform(0, 0.2, rows.shape)
+    v = 37.0 + 1.9 * rows - 0.2 * columns + rng.uniform(0, 0.2, rows.shape)
+    return u.astype(np.float32), v.astype(np.float32)
+
+
+def sampled(photo: Any, pixels: tuple[float, float], resampling: Any, *, antialias: bool) -> Any:
+    u, v = places_of(np.random.default_rng(0))
+    across, down = pixels
+    footprint = CellFootprint(
+        pixels_across=across, pixels_down=down, photo_gsd_m=0.001, obliquity_deg=0.0, n_cells=9
+    )
+    bounds = tuple(math.floor(value) for value in (u.min(), u.max(), v.min(), v.max()))
+    visible = TileVisibility(u, v, np.ones(u.shape, dtype=np.uint8), np.ones_like(u))
+    inner, colours = (slice(0, u.shape[0]), slice(0, u.shape[1])), np.empty((*u.shape, 3), np.uint8)
+    params = BackwardParams(resampling=resampling, antialias=antialias)
+    sample(photo, visible, inner, bounds, footprint, params, into=colours)
+    return colours
+
+
+@pytest.mark.parametrize("resampling", ["nearest", "bilinear", "cubic", "lanczos"])
+@pytest.mark.parametrize("antialias", [False, True])
+def test_what_is_cut_out_of_a_photo_does_not_show(resampling: Any, antialias: bool) -> None:
+    rng = np.random.default_rng(0)
+    photo = cv2.GaussianBlur(rng.integers(0, 256, (120, 160, 3), dtype=np.uint8), (0, 0), 1.5)
+    u, v = places_of(np.random.default_rng(0))
+    found = sampled(photo, (2.3, 1.9), resampling, antialias=antialias)
+    if resampling == "nearest":
+        expected = photo[np.floor(v).astype(int), np.floor(u).astype(int)]
+        np.testing.assert_array_equal(found, expected)
+        return
+    # A cell of n pixels is their mean: a Gauss of half of sqrt(n^2 - 1) pixels.
+    whole = photo
+    if antialias:
+        sigmas = [0.5 * math.sqrt(n**2 - 1.0) for n in (2.3, 1.9)]
+        whole = cv2.GaussianBlur(
+            photo, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1], borderType=cv2.BORDER_REPLICATE
+        )
+    flag = {"bilinear": 1, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}[resampling]
+    expected = cv2.remap(whole, u - 0.5, v - 0.5, flag)
+    apart = np.abs(found.astype(int) - expected)
+    # OpenCV knows places to a 32nd of a pixel, and its own kernel is a little wider than ours.
+    assert apart.mean() < 0.6
+    assert apart.max() <= 6
+
+
+@pytest.mark.parametrize(("pixels", "is_blurred"), [(1.06, False), (1.3, True)])
+def test_cells_of_hardly_more_than_a_pixel_are_not_averaged(
+    pixels: float, is_blurred: bool
+) -> None:
+    """Eight bits do not show a Gauss of less than a fifth of a pixel."""
+    photo = np.random.default_rng(1).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    plain, filtered = (
+        sampled(photo, (1.0, pixels), "cubic", antialias=antialias) for antialias in (False, True)
+    )
+    assert (plain != filtered).any() == is_blurred
