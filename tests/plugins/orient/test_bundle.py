@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import photo_ties
-from orthoflow_plugins.orient.block import Block, Observations, Points, block_covariance, solve
 from orthoflow_plugins.orient.bundle import OrientColmapBundle, adjust_block
 from orthoflow_plugins.orient.photo_ties import (
     PhotoTies,
@@ -22,12 +21,11 @@ from orthoflow_plugins.orient.photo_ties import (
 )
 from orthoflow_plugins.orient.photos import Trusted, by_itself, tied_photo
 from orthoflow_plugins.orient.pnp import OrientPnp
-from orthoflow_plugins.orient.pose import Lens, estimate_pose, lens_groups
+from orthoflow_plugins.orient.pose import estimate_pose, lens_groups
 
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, looking_at
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.key_points import Features
-from orthoflow.geometry.resection import adjust
 from orthoflow.products import Cameras, Photo, Photos, Ties
 from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
@@ -223,44 +221,6 @@ def test_the_noise_of_ties_between_photos_is_found() -> None:
     assert found.tie_sigma_px == pytest.approx(0.8, rel=0.1)
 
 
-def test_one_photo_is_as_exact_as_its_resection_says() -> None:
-    """The covariance of a block of one photo against the adjustment of one camera."""
-    ties = bs.scan_ties(9, wrong_share=0.0)
-    seen = tp.seen_of(ties).take(ties.photo == 0)
-    middle = seen.points_world.mean(axis=0)
-    seen = replace(seen, points_world=seen.points_world - middle)
-    camera = bs.viewers()[0].shifted(middle)
-    freedom = LensFreedom(focal_sigma=0.05, k1_sigma=0.1)
-    single = adjust(seen, camera, lens=freedom, soft_limit=2.0)
-    points = Points(now=seen.points_world, known=seen.points_world, sigma_m=seen.sigma_m)
-    block = Block(
-        cameras=(camera,),
-        lens_of=(0,),
-        lenses=(Lens(prior=camera, freedom=freedom, source="calibration"),),
-        points=points,
-        seen=Observations(
-            photo=np.zeros(len(seen), np.intp),
-            point=np.arange(len(seen)),
-            pixels=seen.pixels_photo,
-            sigma_px=seen.sigma_px,
-        ),
-    )
-    solved = solve(block, soft_limit=2.0)
-    found = solved.cameras[0]
-    assert found.fx == pytest.approx(single.camera.fx, rel=1e-4)
-    # Its distance is known to 10 mm, and the solver stops at a hundredth of that.
-    np.testing.assert_allclose(found.centre_world, single.camera.centre_world, atol=3e-4)
-    exact = replace(block, cameras=(single.camera,))
-    covariance = block_covariance(exact, soft_limit=2.0)
-    assert covariance.sigma0 == pytest.approx(single.sigma0, rel=1e-6)
-    scale = np.sqrt(np.diag(single.covariance))
-    np.testing.assert_allclose(
-        covariance.sigma0**2 * covariance.cofactors / np.outer(scale, scale),
-        single.covariance / np.outer(scale, scale),
-        atol=1e-6,
-    )
-
-
 def camera(*centre: float) -> ViewingCamera:
     where = np.array(centre)
     rotation = looking_at(where, np.array([0.2, 5.0, 0.3]), samples.UP)
@@ -350,29 +310,24 @@ def across_line(point: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([-along[1], along[0]]) / np.linalg.norm(along)
 
 
-@pytest.mark.parametrize(("off_px", "is_tied"), [(5.6, True), (6.4, False)])
-def test_matches_more_than_six_pixels_off_the_line_are_none(off_px: float, is_tied: bool) -> None:
-    points = scene_points()
-    way = tuple(off_px * across_line(points[4]))
-    ties = tie_photos(CAMERAS[:2], seen_in(points, {(1, 4): way})[:2], [(0, 1)], 1000)
-    assert len(ties.points_world) == (30 if is_tied else 29)
-
-
-@pytest.mark.parametrize(("off_px", "is_tied"), [(20.0, True), (22.0, False)])
-def test_rays_that_miss_their_point_by_eight_pixels_do_not_meet(
-    off_px: float, is_tied: bool
+@pytest.mark.parametrize(
+    ("is_along", "off_px", "is_tied"),
+    [(False, 5.6, True), (False, 6.4, False), (True, 20.0, True), (True, 22.0, False)],
+)
+def test_matches_within_six_pixels_of_the_line_and_eight_of_the_point_are_tied(
+    *, is_along: bool, off_px: float, is_tied: bool
 ) -> None:
-    # Along the line of the first photo, which does not see it; the other two do.
-    points = scene_points()
+    # Along the line of the first photo, which does not see it, the third one does.
+    points, n_photos = scene_points(), 2 + is_along
     across = across_line(points[4])
-    way = (off_px * across[1], -off_px * across[0])
-    ties = tie_photos(CAMERAS[:3], seen_in(points, {(1, 4): way})[:3], [(0, 1), (0, 2)], 1000)
-    worst = [
-        np.linalg.norm(CAMERAS[photo].project(ties.points_world[point][None])[0, :2] - pixel)
-        for photo, point, pixel in zip(ties.photo, ties.point, ties.pixels, strict=True)
-    ]
-    assert max(worst) <= 8.0
-    assert (len(ties.points_world) == 30) == is_tied
+    way = (across[1], -across[0]) if is_along else tuple(across)
+    moved = {(1, 4): (off_px * way[0], off_px * way[1])}
+    pairs = [(0, 1), (0, 2)][: 1 + is_along]
+    ties = tie_photos(CAMERAS[:n_photos], seen_in(points, moved)[:n_photos], pairs, 1000)
+    for photo, point, pixel in zip(ties.photo, ties.point, ties.pixels, strict=True):
+        seen = CAMERAS[photo].project(ties.points_world[point][None])[0, :2]
+        assert np.linalg.norm(seen - pixel) <= 8.0
+    assert len(ties.points_world) == (30 if is_tied else 29)
 
 
 @pytest.mark.parametrize(("angle_deg", "is_tied"), [(1.9, False), (2.1, True)])
@@ -397,28 +352,20 @@ def test_pairs_show_enough_of_each_others_walls(share: float, is_pair: bool) -> 
     assert overlapping_pairs(views, [points[:0], points], share) == []
 
 
-def disc_photo(width: int, height: int, radius: float) -> tuple[Photo, NDArray[np.float64]]:
-    """Bright discs on grey; their centres, first pixel centre at (0.5, 0.5)."""
+def test_key_points_are_in_pixels_of_the_photo_when_it_was_reduced() -> None:
+    """Bright discs on grey, the first pixel's centre at (0.5, 0.5)."""
+    width, height = 2400, 150
     centres = np.array([[0.2, 0.5], [0.45, 0.4], [0.7, 0.6]]) * (width, height)
     rows, columns = np.mgrid[:height, :width] + 0.5
-    grey = np.full((height, width), 90.0)
-    for column, row in centres:
-        grey += 120.0 * (np.hypot(columns - column, rows - row) < radius)
+    away = [np.hypot(columns - column, rows - row) for column, row in centres]
+    grey = np.where(np.min(away, axis=0) < 18.0, 210.0, 90.0)
     soft = cv2.GaussianBlur(grey, (0, 0), 2.0).astype(np.uint8)
     photo = Photo(name="a.png", encoded=encode_png(soft), width=width, height=height)
-    return photo, centres
-
-
-def test_key_points_are_in_pixels_of_the_photo_when_it_was_reduced() -> None:
-    photo, centres = disc_photo(2400, 150, 18.0)
-    found = photo_features(photo, 100)
-    for centre in centres:
-        assert np.linalg.norm(found.pixels - centre, axis=1).min() < 0.5
-    assert found.descriptors.shape == (len(found.pixels), 128)
-    few = photo_features(photo, 3)
-    assert len(few.pixels) == 3
-    # One of each part of the photo, before a second of any.
-    assert np.linalg.norm(few.pixels[:, None] - centres[None], axis=2).min(axis=0).max() < 20.0
+    for n_most, limit_px in ((100, 0.5), (3, 20.0)):
+        found = photo_features(photo, n_most).pixels
+        # The strongest are one of each part of the photo, before a second of any.
+        assert np.linalg.norm(found[:, None] - centres, axis=2).min(axis=0).max() < limit_px
+    assert len(found) == 3
 
 
 def test_points_behind_a_camera_are_none() -> None:

@@ -17,15 +17,15 @@ from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.pose import Estimate, Start
 from orthoflow_plugins.read.cameras import ReadCameras
 
-from orthoflow.errors import InputError, MethodError
-from orthoflow.files.colmap import write_colmap_model
+from orthoflow.errors import MethodError
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photo, Photos, TieRole, Ties
+from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
 from tests import tied_photos as tp
+from tests.method_runs import run
 from tests.tied_photos import context, known_ties, photo
 
 SCENE = tp.SCENE
@@ -168,11 +168,6 @@ def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
     assert error_share(cameras.cameras[0]) < 3.0
 
 
-def test_fewer_than_six_are_ordinary_ties(orient: Orient) -> None:
-    (found,) = orient(clicked(1, n=5), CALIBRATED)[0].cameras
-    assert found.status.startswith("only 5 ties to the walls")
-
-
 # --- which of them fit together ---
 
 
@@ -230,72 +225,39 @@ PHOTO = photo()
 PHOTOS = ms.photos(PHOTO)
 
 
-def oriented(camera: ViewingCamera = CAMERA, *, name: str = "a.png") -> Cameras:
-    return ms.cameras(ms.oriented(camera, name=name))
-
-
-def read(folder: Path, photos: Photos = PHOTOS, **params: object) -> tuple[Cameras, list[str]]:
-    ctx = context(folder)
-    files = InputFiles(name="cameras", paths=tuple(sorted((folder / "given").iterdir())))
-    inputs = ReadCameras.In(files=files, photos=photos)
-    found = ReadCameras().run(inputs, ReadCameras.Params.model_validate(params), ctx).cameras
-    return found, list(ctx.warnings)
+def oriented(camera: ViewingCamera = CAMERA) -> Cameras:
+    return ms.cameras(ms.oriented(camera))
 
 
 def given(
-    folder: Path, cameras: Cameras, ties: Ties | None = None, **params: object
+    folder: Path,
+    cameras: Cameras,
+    ties: Ties | None = None,
+    photos: Photos = PHOTOS,
 ) -> tuple[Cameras, list[str]]:
     ctx = context(folder)
-    inputs = OrientGiven.In(cameras=cameras, photos=PHOTOS, walls=WALLS, ties=ties)
-    found = OrientGiven().run(inputs, OrientGiven.Params.model_validate(params), ctx).cameras
+    inputs = OrientGiven.In(cameras=cameras, photos=photos, walls=WALLS, ties=ties)
+    found = OrientGiven().run(inputs, OrientGiven.Params(), ctx).cameras
     return found, list(ctx.warnings)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "given").mkdir()
-    return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("camera", "name", "photo", "reason"),
-    [
-        (
-            replace(CAMERA, translation=np.array([0.0, 1e9, 0.0])),
-            "a.png",
-            PHOTO,
-            r"from the origin",
-        ),
-        (CAMERA, "a.png", replace(PHOTO, width=450, height=320), r"a\.png has 450 x 320 pixels"),
-        (CAMERA, "other.png", PHOTO, r"orients none of the 1 photos, such as a\.png"),
-    ],
-    ids=["nowhere on earth", "another size", "another photo"],
-)
-def test_cameras_that_cannot_be_those_of_the_photos_are_refused(
-    folder: Path, camera: ViewingCamera, name: str, photo: Photo, reason: str
-) -> None:
-    write_colmap_model(folder / "given", oriented(camera, name=name))
-    with pytest.raises(InputError, match=reason):
-        read(folder, ms.photos(photo))
 
 
 def test_given_poses_are_taken_as_they_are(tmp_path: Path) -> None:
     cameras, warnings = given(tmp_path, oriented())
     (found,) = cameras.cameras
-    assert found.status == "ok"
-    assert found.sigma_wall_m is None
+    assert (found.status, found.sigma_wall_m) == ("ok", None)
     np.testing.assert_array_equal(found.rotation_camera_from_world, CAMERA.rotation)
-    assert not warnings
-    assert cameras.ties is None
-    assert cameras.details["given"] == ["a.png"]
+    assert (warnings, cameras.ties, cameras.details["given"]) == ([], None, ["a.png"])
 
 
-@pytest.mark.parametrize("where", ["elsewhere", "behind"])
-def test_poses_that_show_no_wall_are_refused(tmp_path: Path, where: str) -> None:
-    away = {
-        "elsewhere": replace(CAMERA, translation=CAMERA.translation + np.array([500.0, 0, 0])),
-        "behind": ms.camera_before(SCENE, centre=(1.3, 2.6, 1.1)),
-    }[where]
+@pytest.mark.parametrize(
+    "away",
+    [
+        replace(CAMERA, translation=CAMERA.translation + np.array([500.0, 0, 0])),
+        ms.camera_before(SCENE, centre=(1.3, 2.6, 1.1)),
+    ],
+    ids=["elsewhere", "behind"],
+)
+def test_poses_that_show_no_wall_are_refused(tmp_path: Path, away: ViewingCamera) -> None:
     with pytest.raises(
         MethodError, match=r"none of the 1 given poses shows a wall: the cameras are"
     ):
@@ -323,37 +285,35 @@ def test_six_ties_by_hand_correct_a_given_pose_and_fewer_check_it(tmp_path: Path
 
 def test_ties_by_hand_orient_a_photo_without_a_pose(tmp_path: Path) -> None:
     lost = Cameras(cameras=(Camera(photo="a.png", status="Metashape did not align it"),))
-    (found,) = given(tmp_path, lost)[0].cameras
-    assert found.status == "Metashape did not align it"
-    photos = ms.photos(photo(CAMERA))
-    inputs = OrientGiven.In(cameras=lost, photos=photos, walls=WALLS, ties=clicked(4))
-    (found,) = OrientGiven().run(inputs, OrientGiven.Params(), context(tmp_path)).cameras.cameras
+    assert given(tmp_path, lost)[0].cameras == lost.cameras
+    (found,) = given(tmp_path, lost, clicked(4), ms.photos(photo(CAMERA)))[0].cameras
     assert found.status == "ok"
     assert error_share(found) < 3.0
+    # Fewer than six are ordinary ties, of which eight are needed.
+    few = samples.taken(clicked(4), slice(5))
+    (found,) = tp.oriented(OrientPnp, few, CALIBRATED, context(tmp_path)).cameras
+    assert found.status.startswith("only 5 ties to the walls")
 
 
 @pytest.mark.parametrize("n_by_hand", [0, 3], ids=["as they are", "checked by hand"])
-def test_the_error_that_handed_on_cameras_carry_is_reported(folder: Path, n_by_hand: int) -> None:
-    names_mm = {"a.png": 1.25, "b.png": 3.5, "c.png": None, "d.png": 1.5}
-    handed_on = Cameras(
-        cameras=tuple(
-            replace(
-                ms.oriented(CAMERA, name=name),
-                sigma_wall_m=None if sigma_mm is None else sigma_mm / 1e3,
-            )
-            for name, sigma_mm in names_mm.items()
+def test_the_error_that_handed_on_cameras_carry_is_reported(tmp_path: Path, n_by_hand: int) -> None:
+    sigmas_m = {"a.png": 1.25e-3, "b.png": 3.5e-3, "c.png": None, "d.png": 1.5e-3}
+    handed_on = ms.cameras(
+        *(
+            replace(ms.oriented(CAMERA, name=name), sigma_wall_m=sigma_m)
+            for name, sigma_m in sigmas_m.items()
         )
     )
-    publish_cameras(handed_on, folder / "given", "sha256:0")
-    photos = ms.photos(*(replace(PHOTO, name=name) for name in names_mm))
-    files = InputFiles(name="cameras", paths=tuple(sorted((folder / "given").iterdir())))
-    first, second = context(folder), context(folder)
-    cameras = ReadCameras().run(
-        ReadCameras.In(files=files, photos=photos), ReadCameras.Params(), first
-    )
+    (tmp_path / "given").mkdir()
+    publish_cameras(handed_on, tmp_path / "given", "sha256:0")
+    photos = ms.photos(*(replace(PHOTO, name=name) for name in sigmas_m))
+    files = InputFiles(name="cameras", paths=tuple(sorted((tmp_path / "given").iterdir())))
+    contexts = context(tmp_path), context(tmp_path)
+    inputs = {"files": files, "photos": photos}
+    cameras = run(ReadCameras, contexts[0], inputs).cameras
     ties = samples.taken(clicked(4), slice(n_by_hand)) if n_by_hand else None
-    inputs = OrientGiven.In(cameras=cameras.cameras, photos=photos, walls=WALLS, ties=ties)
-    OrientGiven().run(inputs, OrientGiven.Params(), second)
-    for ctx in (first, second):
+    inputs = {"cameras": cameras, "photos": photos, "walls": WALLS, "ties": ties}
+    run(OrientGiven, contexts[1], inputs)
+    for ctx in contexts:
         found = {one.name: one.value for one in ctx.metrics if one.name.startswith("sigma_wall")}
         assert found == pytest.approx({"sigma_wall_mm_median": 1.5, "sigma_wall_mm_worst": 3.5})
