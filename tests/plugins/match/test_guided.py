@@ -26,6 +26,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Camera, Cameras, Photos, Ties, Walls
 from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
+from tests import samples
 
 measure = partial(displacements.measure, radius_cells=6, min_score=0.3)
 ROUGH = (0.004, -0.005, 0.003, 0.01, -0.02, 0.01)
@@ -103,15 +104,12 @@ def test_cells_finer_than_points_lie_apart_do_as_well(tmp_path: Path) -> None:
     fine = ms.walls_of(replace(SCENE, frame=ms.textured_wall(2, gsd_m=0.003).frame)).walls[0]
     # A point in every fifth cell, and no gap is filled: 6.7 mm apart.
     is_void = np.random.default_rng(8).random(fine.frame.shape) > 0.2
-    sparse = replace(
-        fine,
+    sparse = samples.wall(
+        fine.frame,
         depth_m=np.where(is_void, np.float32(np.nan), fine.depth_m),
         sigma_m=np.full(fine.frame.shape, np.nan, dtype=np.float32),
         count=np.where(is_void, 0, fine.count // 3).astype(np.uint32),
-        mask=np.where(is_void, 0, fine.mask).astype(np.uint8),
         intensity=np.where(is_void, np.float32(np.nan), fine.intensity),
-        rgb=None,
-        rgb_mask=None,
     )
     camera = ms.camera_before(SCENE)
     walls = replace(mw.walls(2), walls=(sparse,))
@@ -146,13 +144,6 @@ def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(tmp_p
     assert np.sqrt(np.mean(error**2)) < 0.6
 
 
-def test_a_pose_far_off_gives_hardly_any_ties(tmp_path: Path) -> None:
-    camera = ms.camera_before(SCENE)
-    off = ms.nudged(camera, (0.0, 0.15, 0.0, -0.4, 0.0, 0.0))
-    photos, start = ms.photos(ms.photo_of(SCENE, camera)), ms.cameras(ms.oriented(off))
-    assert len(guided(photos, mw.walls(2), start, tmp_path).photo) < 30
-
-
 def test_ties_on_a_part_of_the_wall_that_was_moved_are_rejected(tmp_path: Path) -> None:
     # They agree with their neighbours, by four cells beside the others.
     camera = ms.camera_before(SCENE)
@@ -167,8 +158,13 @@ def test_ties_on_a_part_of_the_wall_that_was_moved_are_rejected(tmp_path: Path) 
     assert error_px.max() < 4.0
 
 
-def test_no_oriented_photo_is_refused_with_the_reasons(tmp_path: Path) -> None:
-    photos = ms.photos(ms.photo_of(SCENE, ms.camera_before(SCENE)))
+def test_no_oriented_photo_is_refused_and_a_pose_far_off_gives_hardly_any_ties(
+    tmp_path: Path,
+) -> None:
+    camera = ms.camera_before(SCENE)
+    photos = ms.photos(ms.photo_of(SCENE, camera))
+    off = ms.nudged(camera, (0.0, 0.15, 0.0, -0.4, 0.0, 0.0))
+    assert len(guided(photos, mw.walls(2), ms.cameras(ms.oriented(off)), tmp_path).photo) < 30
     refused = ms.cameras(Camera(photo="a.png", status="3 ties with the walls"))
     with pytest.raises(MethodError, match=r"no photo is oriented.*a\.png: 3 ties with the walls"):
         guided(photos, mw.walls(2), refused, tmp_path)

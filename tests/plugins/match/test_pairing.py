@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,18 +24,15 @@ LOOSE_PX = 20.0
 TILTED = np.array([[0.8, -0.3, 500.0], [0.25, 0.9, 300.0], [1e-5, -2e-5, 1.0]])
 
 
-def features(pixels: NDArray[np.float64], **more: Any) -> Features:
+# Any: fields of the key points, each of its own type.
+def features(pixels: NDArray[np.float64], **known: Any) -> Features:
     n = len(pixels)
     usual: dict[str, Any] = {
         "sizes_px": np.full(n, 4.0),
         "angles_deg": np.zeros(n),
         "descriptors": np.zeros((n, 128), dtype=np.float32),
     }
-    return Features(pixels=np.asarray(pixels, dtype=np.float64), **{**usual, **more})
-
-
-def in_order(n: int) -> Matches:
-    return Matches(first=np.arange(n), second=np.arange(n), ratio=np.linspace(0.3, 0.8, n))
+    return Features(pixels=np.asarray(pixels, dtype=np.float64), **{**usual, **known})
 
 
 def on_wall(n: int, seed: int = 1) -> NDArray[np.float64]:
@@ -44,8 +40,9 @@ def on_wall(n: int, seed: int = 1) -> NDArray[np.float64]:
 
 
 def judged(wall: NDArray[np.float64], photo: NDArray[np.float64]) -> Pair:
-    sets = (features(photo), features(wall))
-    return verified(3, in_order(len(wall)), sets, LOOSE_PX)
+    at = np.arange(len(wall))
+    matches = Matches(first=at, second=at, ratio=np.linspace(0.3, 0.8, len(at)))
+    return verified(3, matches, (features(photo), features(wall)), LOOSE_PX)
 
 
 # --- what agrees ---
@@ -54,14 +51,15 @@ def judged(wall: NDArray[np.float64], photo: NDArray[np.float64]) -> Pair:
 @pytest.mark.parametrize(("n", "is_shown"), [(3, False), (7, False), (8, True), (60, True)])
 def test_eight_places_that_agree_show_a_wall(n: int, is_shown: bool) -> None:
     wall = on_wall(n)
-    found = judged(wall, mapped(TILTED, wall))
+    front = mapped(TILTED, wall)
+    found = judged(wall, front)
     assert (found.wall, found.is_shown) == (3, is_shown)
     assert found.agreeing.all() == (n >= 4)
-    if is_shown:
-        assert found.homography is not None
-        np.testing.assert_allclose(mapped(found.homography, wall), mapped(TILTED, wall), atol=0.01)
-    else:
-        assert found.homography is None
+    assert (found.homography is not None) == is_shown
+    if found.homography is not None:
+        np.testing.assert_allclose(mapped(found.homography, wall), front, atol=0.01)
+    # Seen from behind it is not shown.
+    assert not judged(wall, front * [-1.0, 1.0] + [3000.0, 0.0]).is_shown
 
 
 def test_what_lies_loosely_where_it_should_agrees_and_nothing_farther_off() -> None:
@@ -89,15 +87,10 @@ def test_many_key_points_on_one_place_are_one(is_photo: bool) -> None:
 @pytest.mark.parametrize(
     ("size", "turn_deg", "off_px", "is_found"),
     [
-        (1.0, 0.0, 0.0, True),
-        (1.6, 0.0, 0.0, True),
-        (1.65, 0.0, 0.0, False),
-        (1.0 / 1.6, 0.0, 0.0, True),
-        (1.0 / 1.65, 0.0, 0.0, False),
-        (1.0, 29.0, 0.0, True),
-        (1.0, -31.0, 0.0, False),
-        (1.0, 0.0, 9.5, True),
-        (1.0, 0.0, 10.5, False),
+        *((1.6, 0.0, 0.0, True), (1.65, 0.0, 0.0, False)),
+        *((1.0 / 1.6, 0.0, 0.0, True), (1.0 / 1.65, 0.0, 0.0, False)),
+        *((1.0, 29.0, 0.0, True), (1.0, -31.0, 0.0, False)),
+        *((1.0, 0.0, 9.5, True), (1.0, 0.0, 10.5, False)),
     ],
 )
 def test_key_points_are_added_where_place_size_and_direction_are_as_expected(
@@ -108,11 +101,9 @@ def test_key_points_are_added_where_place_size_and_direction_are_as_expected(
     descriptors = rng.integers(0, 200, (12, 128)).astype(np.float32)
     # The photo is half as large as the wall, and turned by 170 degrees; the last is asked about.
     wall = features(pixels, sizes_px=rng.uniform(3.0, 9.0, 12), descriptors=descriptors)
-    sizes = 0.5 * wall.sizes_px
-    turns = np.full(12, 170.0)
+    sizes, turns, places = 0.5 * wall.sizes_px, np.full(12, 170.0), 0.5 * pixels
     sizes[-1] *= size
     turns[-1] += turn_deg
-    places = 0.5 * pixels
     places[-1, 1] += off_px
     photo = features(places, sizes_px=sizes, angles_deg=turns % 360.0, descriptors=descriptors)
     first = Matches(first=np.arange(10), second=np.arange(10), ratio=np.full(10, 0.5))
@@ -128,27 +119,19 @@ def test_key_points_are_added_where_place_size_and_direction_are_as_expected(
     assert len(look(0.5 * pixels + 5000.0)) == 10
 
 
-def test_a_wall_seen_from_behind_is_not_shown() -> None:
-    wall = on_wall(40)
-    front = mapped(TILTED, wall)
-    assert judged(wall, front).is_shown
-    assert not judged(wall, front * [-1.0, 1.0] + [3000.0, 0.0]).is_shown
-
-
+# Any: fields of the piece, each of its own type.
 def piece(
     pixels: list[tuple[float, float]],
     points: list[tuple[float, float, float]],
     sigma_m: list[float],
-    **given: Any,
+    **known: Any,
 ) -> TiePiece:
     return TiePiece(
-        photo=given.get("photo", 0),
-        wall=given.get("wall", 0),
+        **{"photo": 0, "wall": 0, **known},
         pixels_photo=np.array(pixels),
         points_world=np.array(points),
         sigma_px=np.ones(len(pixels)),
         sigma_m=np.array(sigma_m),
-        role=given.get("role", TieRole.CONTROL),
     )
 
 
@@ -171,19 +154,14 @@ def test_of_ties_of_one_key_point_with_one_place_the_most_exact_stays() -> None:
     # Alone, nothing is looked at.
     assert kept(first) == [[0.002, 0.004]]
     assert without_twins([]) == []
-
-
-def test_other_places_and_other_pixels_are_no_twins() -> None:
+    # Other places, beyond four times the sum of both deviations, and other pixels are no twins.
     first = piece([(5.0, 7.0)], [(0, 0, 0)], [0.002])
-
-    def beside(du_px: float, dz_m: float) -> list[list[float]]:
-        return kept(first, piece([(5.0 + du_px, 7.0)], [(0, 0, dz_m)], [0.003]))
-
-    # Four times the sum of both deviations: 20 mm.
-    assert beside(0.0, 0.0199) == [[0.002], []]
-    assert beside(0.0, 0.0201) == [[0.002], [0.003]]
-    assert beside(0.0004, 0.0) == [[0.002], []]
-    assert beside(0.002, 0.0) == [[0.002], [0.003]]
+    for du_px, dz_m, is_twin in (
+        *((0.0, 0.0199, True), (0.0, 0.0201, False)),
+        *((0.0004, 0.0, True), (0.002, 0.0, False)),
+    ):
+        second = piece([(5.0 + du_px, 7.0)], [(0, 0, dz_m)], [0.003])
+        assert kept(first, second) == [[0.002], [] if is_twin else [0.003]]
 
 
 def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
@@ -209,48 +187,31 @@ def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
 
 def test_ties_in_masked_pixels_are_left_out() -> None:
     used = np.full((8, 10), 255, dtype=np.uint8)
-    used[5:7, 3] = 0
-    # In the mask; right beside it; and on the rim of the photo, which is nowhere.
-    pixels = [(3.2, 5.9), (4.01, 5.9), (10.0, 8.0)]
-    first = piece(pixels, [(k, k, k) for k in range(3)], [0.1, 0.2, 0.3])
-    ties = ties_of([first], photos_of(encode_png(used)), inspect_scenes.walls(), {})
-    np.testing.assert_array_equal(ties.sigma_m, [0.2, 0.3])
-    np.testing.assert_array_equal(ties.pixels_photo, pixels[1:])
-    # The first column and row are those that begin at 0.
-    used[:, 0] = used[0] = 0
-    rim = replace(first, pixels_photo=np.array([(0.4, 3.3), (3.3, 0.4), (1.2, 1.2)]))
-    assert ties_of(
-        [rim], photos_of(encode_png(used)), inspect_scenes.walls(), {}
-    ).sigma_m.tolist() == [0.3]
-
-
-def sized_features(pixels: NDArray[np.float64], sizes: list[float]) -> Features:
-    return Features(
-        pixels=pixels,
-        sizes_px=np.array(sizes),
-        angles_deg=np.zeros(len(sizes)),
-        descriptors=np.zeros((len(sizes), 128), dtype=np.float32),
-    )
+    used[5:7, 3] = used[:, 0] = used[0] = 0
+    # In the mask; right beside it; on the rim of the photo, which is nowhere; and in the first
+    # column and row, which begin at 0.
+    pixels = [(3.2, 5.9), (4.01, 5.9), (10.0, 8.0), (0.4, 3.3), (3.3, 0.4), (1.2, 1.2)]
+    every = piece(pixels, [(k, k, k) for k in range(6)], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    ties = ties_of([every], photos_of(encode_png(used)), inspect_scenes.walls(), {})
+    np.testing.assert_array_equal(ties.sigma_m, [0.2, 0.3, 0.6])
+    np.testing.assert_array_equal(ties.pixels_photo, [pixels[at] for at in (1, 2, 5)])
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_large_key_points_are_less_exact_and_those_of_voids_left_out(scale: float) -> None:
     wall = inspect_scenes.walls().walls[0]
     # The second lies in a void; the last is so large that it is known to no three cells.
-    on_wall = sized_features(
-        np.array([[50.5, 40.5], [220.5, 110.5], [300.5, 200.5], [60.5, 60.5]]),
-        [2.0, 2.0, 40.0, 1e4],
-    )
-    in_photo = sized_features(np.arange(8.0).reshape(4, 2), [2.0, 4.0, 100.0, 8.0])
+    pixels = np.array([[50.5, 40.5], [220.5, 110.5], [300.5, 200.5], [60.5, 60.5]])
+    on_wall = features(pixels, sizes_px=np.array([2.0, 2.0, 40.0, 1e4]))
+    sizes_px = np.array([2.0, 4.0, 100.0, 8.0])
+    in_photo = features(np.arange(8.0).reshape(4, 2), sizes_px=sizes_px)
     found = key_point_ties((3, 0), wall, (in_photo, on_wall), scale=scale)
     assert (found.photo, found.wall, found.role) == (3, 0, TieRole.CONTROL)
     np.testing.assert_array_equal(found.pixels_photo, in_photo.pixels[[0, 2]])
     expected = wall.frame.world_from_wall(on_wall.pixels[[0, 2]], 0.0)
     np.testing.assert_allclose(found.points_world, expected, atol=1e-6)
     # Key points of a hundred pixels are known to six of them, small ones to a third of one.
-    small, large = found.sigma_px * scale
-    assert small == pytest.approx(0.35)
-    assert large == pytest.approx(6.0 * scale)
+    assert found.sigma_px * scale == pytest.approx([0.35, 6.0 * scale])
     on_raster = GSD_M * np.array([0.35, 2.4])
     # The surface's own deviation comes on top.
     assert (found.sigma_m >= on_raster).all()

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from orthoflow_plugins.match.key_points import PairingParams, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.placing import Placed, confirmed, places_of
 from orthoflow_plugins.match.structures import (
-    WallStructure,
     likely_places,
     structure_of,
     wall_structure,
@@ -69,9 +68,7 @@ def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
     assert placed(replace(PHOTO, encoded=encode_png(mirrored))) is None
     other = ms.textured_wall(2)
     assert placed(ms.photo_of(other, ms.camera_before(other), calibrated=False)) is None
-
-
-def test_a_wall_that_shows_nothing_places_no_photo() -> None:
+    # Nor is any on a wall that shows nothing.
     blind = replace(patchy_wall(), intensity=None)
     assert places_of(0, PHOTO, [wall_structure(blind)]) == []
 
@@ -134,9 +131,7 @@ def test_places_that_agree_are_taken_if_one_of_them_is_clear() -> None:
     assert chosen({0: [place(0, is_clear=True)], 1: [place(1)]}) == {0: NEAR, 1: NEAR}
     assert chosen({0: [place(0)], 1: [place(1)]}) == {}
     assert chosen({k: [place(k)] for k in range(3)}) == {0: NEAR, 1: NEAR, 2: NEAR}
-
-
-def test_a_place_that_no_photo_confirms_is_not_taken_however_clear_it_is() -> None:
+    # A place that no photo confirms is not taken however clear it is.
     assert chosen({0: [place(0, is_clear=True)]}) == {}
     wrong = place(0, aside_m=0.3, share=0.6, is_clear=True)
     assert chosen({0: [wrong], 1: [place(1, is_clear=True)]}) == {}
@@ -172,18 +167,6 @@ def picture(height: int, width: int) -> NDArray[np.float32]:
     return np.ascontiguousarray(wide, dtype=np.float32)
 
 
-@pytest.fixture(scope="module")
-def wall() -> Wall:
-    return ms.walls_of(ms.textured_wall(1)).walls[0]
-
-
-@pytest.fixture(scope="module")
-def structure(wall: Wall) -> WallStructure:
-    found = wall_structure(wall)
-    assert found is not None
-    return found
-
-
 def test_edges_are_the_same_whichever_side_is_brighter_and_turn_with_the_picture() -> None:
     grey, known = picture(120, 120), np.ones((120, 120), dtype=np.bool_)
     upright = structure_of(grey, known).values
@@ -209,31 +192,30 @@ def test_what_is_not_known_and_its_border_has_no_structure() -> None:
     assert (np.linalg.norm(found.values[~void], axis=1) > 0.0).mean() > 0.99
 
 
-def test_a_piece_of_the_wall_lies_where_it_was_taken_from(
-    wall: Wall, structure: WallStructure
-) -> None:
+def test_a_piece_of_the_wall_lies_where_it_was_taken_from() -> None:
+    (wall,) = WALLS.walls
+    structure = wall_structure(wall)
+    assert structure is not None
     assert wall.intensity is not None
-    rows, columns = wall.frame.shape
-    top, left, height, width = rows // 4, columns // 3, rows // 2, columns // 2
+    # A half of both sides of it.
+    corner = np.array([wall.frame.width // 3, wall.frame.height // 4])
+    size = np.array([wall.frame.width // 2, wall.frame.height // 2])
+    (left, top), (right, bottom) = corner, corner + size
     grey = np.rint(255 * np.clip(np.nan_to_num(wall.intensity, nan=0.5), 0.0, 1.0)).astype(np.uint8)
     # Inverted: edges stay where they are.
-    cut = 255 - grey[top : top + height, left : left + width]
+    cut = 255 - grey[top:bottom, left:right]
     places = likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=3)
     assert 1 < len(places) <= 3
     for one, other in itertools.combinations(places, 2):
+        assert one.lead >= other.lead
         apart_m = np.hypot(*(one.centre_m - other.centre_m))
         # The same place at a neighbouring scale is no other one.
         assert apart_m > 0.25 * one.width_m or abs(math.log(one.width_m / other.width_m)) > 0.25
-    best = places[0]
-    leads = [place.lead for place in places]
-    assert leads == sorted(leads, reverse=True)
-    cell_m, fine_m = structure.wall.frame.gsd_m, wall.frame.gsd_m
-    truth_m = fine_m * np.array([left + 0.5 * width, top + 0.5 * height])
+    best, fine_m = places[0], wall.frame.gsd_m
     # Sizes are tried in steps of a tenth, and parts may slip by 3 % of the width.
-    slip_m = 0.03 * best.width_m + cell_m
-    assert best.width_m == pytest.approx(fine_m * width, rel=0.06)
-    assert np.abs(best.centre_m - truth_m).max() < slip_m
+    slip_m = 0.03 * best.width_m + structure.wall.frame.gsd_m
+    assert best.width_m == pytest.approx(fine_m * size[0], rel=0.06)
+    assert np.abs(best.centre_m - fine_m * (corner + 0.5 * size)).max() < slip_m
     np.testing.assert_allclose(best.parts_photo.mean(axis=0), 0.5, atol=0.01)
     np.testing.assert_allclose(np.ptp(best.parts_photo, axis=0), 0.5, atol=0.02)
-    expected_m = fine_m * (np.array([left, top]) + best.parts_photo * [width, height])
-    assert np.abs(best.parts_m - expected_m).max() < slip_m
+    assert np.abs(best.parts_m - fine_m * (corner + best.parts_photo * size)).max() < slip_m
