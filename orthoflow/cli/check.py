@@ -48,16 +48,14 @@ def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
     resolve_input_files(loaded)
     cells = expand_cells(loaded, catalog)
     skipped = sum(bool(cell.skip_reason) for cell in cells)
-    without_data = (
-        f", {skipped} of them skipped because optional data are missing" if skipped else ""
-    )
-    n_data = len(loaded.chosen_data)
-    datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
-    n_runs = "" if is_plain(cells) else f", {datasets}{counted(len(cells), 'step run')} in total"
+    parts = [counted(len(loaded.steps), "step")]
+    if loaded.chosen_data:
+        parts.append(counted(len(loaded.chosen_data), "dataset"))
+    if not is_plain(cells):
+        parts.append(f"{counted(len(cells), 'step run')} in total")
+    if skipped:
+        parts.append(f"{skipped} skipped because optional data are missing")
     # In a sweep, the user chose no baseline, so none is shown.
-    named = variants_text(loaded.baseline)
-    summary = (
-        f"{loaded.name} is valid: {counted(len(loaded.steps), 'step')}"
-        f"{n_runs}{without_data}{f'; baseline {named}' if named else ''}"
-    )
-    return summary, lint_workflow(loaded)
+    if named := variants_text(loaded.baseline):
+        parts.append(f"baseline {named}")
+    return f"{loaded.name} is valid: {', '.join(parts)}", lint_workflow(loaded)

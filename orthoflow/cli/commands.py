@@ -82,26 +82,6 @@ class Command(click.Command):
         super().__init__(*args, **{"context_settings": HELP_OPTIONS, **kwargs})
         self.params.append(debug_parameter())
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments; report if the shell split a list into several arguments."""
-        given = list(args)
-        try:
-            return super().parse_args(ctx, args)
-        except click.UsageError as error:
-            broken = (one for one in given if one.count("[") > one.count("]"))
-            found = next(broken, "")
-            # A list that the shell split leaves a negative number that looks like an option, or
-            # another number that looks like an argument; click has no error class of its own for
-            # the latter.
-            is_number = isinstance(error, click.NoSuchOption) and error.option_name[1:2].isdigit()
-            if not found or not (is_number or type(error) is click.UsageError):
-                raise
-            sentence = (
-                f"{error.message.rstrip('.')}; {found} was split at its "
-                "spaces: quote the whole value, as in --set 'wall.near=[[1, 2, 3]]'"
-            )
-            raise click.UsageError(sentence, ctx) from error
-
 
 class RecordCommand(Command):
     """A command whose arguments are runs; errors due to a damaged record are reported as such.

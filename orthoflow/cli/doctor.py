@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shutil
@@ -10,13 +11,14 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Final, Literal
 
 import click
 
+from orthoflow.catalog.distributions import direct_requirements
 from orthoflow.cli.commands import (
     EXIT_GOOD,
     EXIT_PLUGIN_MISSING,
@@ -24,58 +26,26 @@ from orthoflow.cli.commands import (
     json_option,
     store_option,
 )
-from orthoflow.cli.tables import counted, echo, echo_json, echo_table
+from orthoflow.cli.tables import counted, echo, echo_json, echo_table, size
 from orthoflow.geometry.threads import usable_cores
-from orthoflow.version import __version__
+from orthoflow.version import DISTRIBUTION, __version__
 
 _IMPORT_TIMEOUT_S: Final = 120
-_COMFORTABLE_DISK_BYTES: Final = 5 * 1024**3
-_COMFORTABLE_MEMORY_BYTES: Final = 2 * 1024**3
+_MIN_DISK_BYTES: Final = 5 * 1024**3
+_MIN_MEMORY_BYTES: Final = 2 * 1024**3
 
-_EVERYTHING: Final = "everything"
-# Distribution on the package index -> imported module, and features that need it.
-LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
-    "click": ("click", _EVERYTHING),
-    "h5py": ("h5py", _EVERYTHING),
-    "jinja2": ("jinja2", "the report"),
-    "networkx": ("networkx", _EVERYTHING),
-    "numpy": ("numpy", _EVERYTHING),
-    "pluggy": ("pluggy", _EVERYTHING),
-    "pydantic": ("pydantic", _EVERYTHING),
-    "rich": ("rich", "live progress"),
-    "ruamel.yaml": ("ruamel.yaml", _EVERYTHING),
-    "numba": ("numba", "methods of simulate, plane, raster, ortho and inspect"),
-    "scipy": ("scipy", "methods of plane and inspect"),
-    "opencv-python-headless": ("cv2", "photos, previews: simulate.room, raster and ortho"),
-    "rasterio": ("rasterio", "GeoTIFF files: raster and mosaic"),
-    "laspy": ("laspy", "LAS and LAZ files: read.scan, --to laz"),
-    "lazrs": ("lazrs", "compressed LAZ files: read.scan, --to laz"),
-    "pye57": ("pye57", "E57 files: read.scan, --to e57"),
-    "pyproj": ("pyproj", "coordinate systems: read.scan, cameras of Metashape"),
-    "plyfile": ("plyfile", "PLY files with list properties: read.scan"),
-    "pandas": ("pandas", "point clouds as text files: read.scan"),
-    "pillow": ("PIL", "EXIF data of photos: read.photos, ortho"),
-    "simplejpeg": ("simplejpeg", "detection of damaged JPEG files: read.photos"),
-    "psutil": ("psutil", "free memory: methods of raster"),
-    "threadpoolctl": ("threadpoolctl", "number of cores per step"),
-    "matplotlib": ("matplotlib", "methods of plane, for drawing plans"),
-    "mahotas": ("mahotas", "inspection by SURF features"),
-    "pycolmap": ("pycolmap", "bundle adjustment"),
-    "pyceres": ("pyceres", "bundle adjustment"),
-    "libusb-package": ("libusb_package", "open3d on machines without libusb-1.0"),
-    "open3d-cpu": ("open3d", "comparators of open3d; the default methods work without it"),
-    "fonttools": ("fontTools", "system fonts in sheets"),
-    "ezdxf": ("ezdxf", "CAD drawings: --to dxf"),
-    "prov": ("prov", "PROV documents: --to prov"),
-    "reportlab": ("reportlab", "sheets: --to sheet"),
-    "cryptography": ("cryptography", "signatures of records: sign, verify --signer"),
-    "distributed": ("distributed", "clusters: --executor dask"),
-}
+# Distributions without which no command works.
 _CORE: Final = frozenset(
-    (*(name for name, (_, use) in LIBRARIES.items() if use == _EVERYTHING), "jinja2", "rich")
+    {"click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich", "ruamel-yaml"}
 )
-# Optional packages, with the extras that `pip install` needs.
-_EXTRAS: Final = {"cryptography": "cryptography[ssh]", "distributed": "distributed"}
+# Imported modules, where they are not named as their distribution.
+_MODULES: Final[Mapping[str, str]] = {
+    "fonttools": "fontTools",
+    "open3d-cpu": "open3d",
+    "opencv-python-headless": "cv2",
+    "pillow": "PIL",
+    "ruamel-yaml": "ruamel.yaml",
+}
 # Part of the message of a failed import -> missing system package.
 _SYSTEM_PACKAGES: Final = {
     "libGL.so": "libgl1",
@@ -94,8 +64,6 @@ except (ImportError, OSError, TypeError):
     pass
 """
 
-Verdict = Literal["ok", "limited", "missing"]
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -106,16 +74,14 @@ class Finding:
         verdict: ok, limited (works with a restriction) or missing.
         found: version, size or setting.
         cost: consequence and remedy; empty if ok.
-        use: features that need it, for libraries.
-        is_core: whether orthoflow cannot work without it.
+        core: whether orthoflow cannot work without it.
     """
 
     name: str
-    verdict: Verdict
+    verdict: Literal["ok", "limited", "missing"]
     found: str
     cost: str = ""
-    use: str = ""
-    is_core: bool = False
+    core: bool = False
 
 
 @click.command(cls=Command)
@@ -128,15 +94,11 @@ def doctor(store: Path, *, as_json: bool) -> int:
     """
     # A broken library may crash the process that imports it.
     with ThreadPoolExecutor(max_workers=max(2, os.cpu_count() or 1)) as pool:
-        libraries = list(pool.map(_library, LIBRARIES))
+        libraries = list(pool.map(_library, _libraries()))
     findings = [*_machine(), *_store(store), *libraries, *_plugins()]
-    is_broken = any(item.is_core and item.verdict == "missing" for item in findings)
+    is_broken = any(item.core and item.verdict == "missing" for item in findings)
     if as_json:
-        # Same names as the columns of the table.
-        keys = {"use": "for", "is_core": "core"}
-        listed = [
-            {keys.get(name, name): value for name, value in vars(item).items()} for item in findings
-        ]
+        listed = [asdict(item) for item in findings]
         echo_json({"version": __version__, "ok": not is_broken, "findings": listed})
     else:
         _print(findings, is_broken=is_broken)
@@ -145,59 +107,50 @@ def doctor(store: Path, *, as_json: bool) -> int:
 
 def _print(findings: list[Finding], *, is_broken: bool) -> None:
     echo(f"orthoflow {__version__}", "")
-    echo_table(
-        ("what", "verdict", "found", "for"),
-        [(item.name, item.verdict, item.found, item.use) for item in findings],
-    )
+    rows = [(item.name, item.verdict, item.found) for item in findings]
+    echo_table(("what", "verdict", "found"), rows)
     costs = [f"- {item.name}: {item.cost}" for item in findings if item.cost]
     if costs:
         echo("", "Consequences:", *costs)
-    if is_broken:
-        echo("", "a required library is missing")
-    elif costs:
-        echo("", f"orthoflow works, with {counted(len(costs), 'restriction')}")
-    else:
-        echo("", "everything works")
+    restricted = f"orthoflow works, with {counted(len(costs), 'restriction')}"
+    echo("", "a required part is missing" if is_broken else restricted)
+
+
+def _libraries() -> list[str]:
+    """Return the names of the libraries that an installation brings."""
+    # On Linux, open3d comes as open3d-cpu.
+    return sorted((direct_requirements(DISTRIBUTION) or frozenset()) - {"open3d"})
 
 
 def _library(name: str) -> Finding:
-    module, use = LIBRARIES[name]
-    is_core = name in _CORE
+    core = name in _CORE
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
-        version = ""
-    problem = _import_problem(module)
+        cost = f"methods that need it do not work (pip install {name})"
+        return Finding(name, "missing", "not installed", cost, core)
+    problem = _import_problem(_MODULES.get(name, name.replace("-", "_")))
     if not problem:
-        return Finding(name, "ok", version or "present", use=use, is_core=is_core)
-    if version:
-        lacks = (package for part, package in _SYSTEM_PACKAGES.items() if part in problem)
-        package = next(lacks, "")
-        way_out = f"apt-get install {package}" if package else "reinstall it"
-        found = f"{version}, but {problem}"
-    else:
-        wanted = _EXTRAS.get(name, name)
-        way_out = f"pip install '{wanted}'" if "[" in wanted else f"pip install {wanted}"
-        found = "not installed"
-    verdict: Verdict = "limited" if name in _EXTRAS and not version else "missing"
-    return Finding(name, verdict, found, f"not available: {use} ({way_out})", use, is_core)
+        return Finding(name, "ok", version, core=core)
+    lacking = [package for part, package in _SYSTEM_PACKAGES.items() if part in problem]
+    remedy = f"apt-get install {lacking[0]}" if lacking else "reinstall it"
+    cost = f"methods that need it do not work ({remedy})"
+    return Finding(name, "missing", f"{version}, but {problem}", cost, core)
 
 
 def _import_problem(module: str) -> str:
     prelude = _OPEN3D_PRELUDE if module == "open3d" else ""
     command = [sys.executable, "-c", f"{prelude}\nimport {module}"]
     try:
-        done = subprocess.run(command, capture_output=True, timeout=_IMPORT_TIMEOUT_S, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_IMPORT_TIMEOUT_S, check=False
+        )
     except subprocess.TimeoutExpired:
         return f"importing it takes longer than {_IMPORT_TIMEOUT_S} s"
-    if done.returncode == 0:
-        return ""
     if done.returncode < 0:
         return f"importing it crashes (signal {-done.returncode})"
-    lines = done.stderr.decode(errors="replace").split("\n")
-    return (
-        f"importing it fails: {next(filter(None, map(str.strip, reversed(lines))), 'no message')}"
-    )
+    lines = done.stderr.strip().splitlines() or ["no message"]
+    return f"importing it fails: {lines[-1]}" if done.returncode else ""
 
 
 def _machine() -> Iterator[Finding]:
@@ -207,26 +160,18 @@ def _machine() -> Iterator[Finding]:
     else:
         yield Finding("platform", "limited", found, "only Linux on x86-64 is tested")
     yield Finding("cores", "ok", str(usable_cores()))
-    try:
+    with contextlib.suppress(ImportError):  # reported with the libraries
         import psutil
 
-        n_bytes = psutil.virtual_memory().available
-    except (ImportError, OSError):
-        # A missing library is reported separately.
-        yield Finding("memory", "limited", "unknown", "cannot be measured")
-        return
-    cost = "scans with many millions of points will not fit"
-    yield _enough("memory", n_bytes, _COMFORTABLE_MEMORY_BYTES, "available", cost)
+        cost = "scans with many millions of points will not fit"
+        yield _enough("memory", psutil.virtual_memory().available, _MIN_MEMORY_BYTES, cost)
 
 
-def _enough(name: str, n_bytes: int, comfortable_bytes: int, found: str, cost: str) -> Finding:
+def _enough(name: str, n_bytes: int, min_bytes: int, cost: str) -> Finding:
     """Return the finding on whether there is enough of a resource."""
-    text = f"{n_bytes / 1024**3:.1f} GiB {found}"
-    return (
-        Finding(name, "ok", text)
-        if n_bytes >= comfortable_bytes
-        else Finding(name, "limited", text, cost)
-    )
+    is_enough = n_bytes >= min_bytes
+    verdict: Literal["ok", "limited"] = "ok" if is_enough else "limited"
+    return Finding(name, verdict, f"{size(n_bytes)} free", "" if is_enough else cost)
 
 
 def _store(store: Path) -> Iterator[Finding]:
@@ -234,16 +179,16 @@ def _store(store: Path) -> Iterator[Finding]:
     folder = next(place for place in places if place.is_dir())
     free = shutil.disk_usage(folder).free
     cost = "long runs may fill it (orthoflow cache gc, or --store DIR)"
-    yield _enough("disk of the store", free, _COMFORTABLE_DISK_BYTES, "free", cost)
+    yield _enough("disk of the store", free, _MIN_DISK_BYTES, cost)
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")
     except OSError as error:
         problem = f"{folder} cannot be written: {(error.strerror or str(error)).lower()}"
         cost = "no run can start here (choose another folder with --store DIR)"
-        yield Finding("store", "missing", problem, cost, is_core=True)
+        yield Finding("store", "missing", problem, cost, core=True)
     else:
-        yield Finding("store", "ok", f"{store} is writable", is_core=True)
+        yield Finding("store", "ok", f"{store} is writable", core=True)
 
 
 def _plugins() -> Iterator[Finding]:

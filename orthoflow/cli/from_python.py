@@ -34,8 +34,8 @@ def run(
 ) -> OpenedRun:
     """Run a workflow, as `orthoflow run` does, and open the finished run.
 
-    Progress is written to standard error; in a notebook, it is a single output. If a step fails,
-    `record.status` of the run is `failed`. Stored results are not recomputed.
+    Progress is written to standard error. If a step fails, `record.status` of the run is `failed`.
+    Stored results are not recomputed.
 
     Args:
         workflow: a file, or the name of a shipped workflow.

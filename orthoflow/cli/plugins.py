@@ -7,7 +7,6 @@ import inspect
 import json
 import os
 import re
-import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,17 +17,15 @@ import click
 
 from orthoflow.catalog.catalog import Catalog, KindEntry, MethodEntry, ProductEntry
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.cli.commands import (
     EXIT_CELL_FAILED,
     EXIT_GOOD,
-    EXIT_PLUGIN_MISSING,
     Command,
     LazyGroup,
+    current_session,
     json_option,
 )
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
-from orthoflow.errors import PluginError
 
 _SUMMARIES: Final = {
     "list": "List all methods, and problems of plugins that cannot be loaded.",
@@ -53,7 +50,7 @@ plugins: Final[click.Command] = LazyGroup(
 def plugins_list(*, as_json: bool) -> int:
     """List methods, kinds and product types, and plugins that cannot be loaded.
 
-    `orthoflow plugins show PLUGIN` prints the traceback of such a plugin.
+    With --debug, the tracebacks of such plugins are shown.
     """
     found = _listing(discover_catalog())
     if as_json:
@@ -80,8 +77,8 @@ def plugins_list(*, as_json: bool) -> int:
     problems = [one["problem"] for rows in found.values() for one in rows if one["problem"]]
     if problems:
         echo("", "problems:", *(f"- {problem}" for problem in problems))
-    for one in found["broken"]:
-        echo(f"`orthoflow plugins show {one['plugin']}` prints its traceback")
+    if current_session().debug:
+        echo(*(line for one in found["broken"] for line in ["", *one["traceback"].split("\n")]))
     return EXIT_GOOD
 
 
@@ -138,60 +135,15 @@ def _cell(entry: Mapping[str, Any], key: str) -> str:
 def plugins_show(method_id: str, *, as_json: bool) -> int:
     """Show the method ID, e.g. plane.hough2d: parameters, ports, origin and citations.
 
-    If a plugin or method cannot be loaded, its traceback is shown; ID may then be the name of the
-    plugin. The exit code is 2 if the method does not exist, and 4 if it cannot be used.
+    The exit code is 2 if the method does not exist, and 4 if it cannot be used; with --debug, the
+    traceback is shown.
     """
-    catalog = discover_catalog()
-    if failure := _failure(catalog, method_id):
-        if as_json:
-            echo_json(failure)
-        else:
-            _print_failure(failure)
-        return EXIT_PLUGIN_MISSING
-    described = _described(catalog.method(method_id))
+    described = _described(discover_catalog().method(method_id))
     if as_json:
         echo_json(described)
     else:
         _print_method(described)
     return EXIT_GOOD
-
-
-def _failure(catalog: Catalog, name: str) -> dict[str, str]:
-    """Return why a plugin or a method cannot be loaded; empty if it can."""
-    found: tuple[DistributionInfo, str, str, str] | None = None
-    if entry := catalog.methods.get(name):
-        try:
-            if entry.state == "fine":
-                entry.load()
-        except PluginError as error:
-            cause = error.__cause__
-            # A class that can be imported but violates a rule has no traceback.
-            trace = "".join(traceback.format_exception(cause)) if cause else ""
-            found = entry.distribution, str(error), entry.spec.target, trace
-    else:
-        for one in catalog.broken:
-            if name in (one.entry_point, one.distribution.name) or one.mentions(name):
-                found = one.distribution, str(one), one.module, one.traceback
-                break
-    if found is None:
-        return {}
-    distribution, problem, target, trace = found
-    return {
-        "state": "broken",
-        "problem": problem,
-        "distribution": distribution.name,
-        "version": distribution.version,
-        "target": target,
-        "traceback": trace,
-    }
-
-
-def _print_failure(failure: Mapping[str, str]) -> None:
-    echo(failure["problem"], "")
-    echo(f"distribution  {failure['distribution']} {failure['version']}")
-    echo("state         broken", f"from          {failure['target']}")
-    if failure["traceback"]:
-        echo("", *failure["traceback"].rstrip().split("\n"))
 
 
 def _described(entry: MethodEntry) -> dict[str, Any]:
@@ -311,14 +263,16 @@ def _metric_text(spec: Mapping[str, str]) -> str:
     default=Path(),
     help="Parent folder of the new folder NAME; by default the working directory.",
 )
-@click.option(
-    "--author", default="The authors", help="Name in pyproject.toml, licence and citation."
-)
-@click.option("--licence", default="MIT", show_default=True, help="SPDX licence expression.")
-@click.option("--citation", default="", help="Source of the method: DOI, title or URL.")
 @json_option
 def plugins_new(
-    name: str, *, as_json: bool, folder: Path, new_kind: str, takes: str, gives: str, **about: str
+    name: str,
+    kind: str,
+    new_kind: str,
+    takes: str,
+    gives: str,
+    folder: Path,
+    *,
+    as_json: bool,
 ) -> int:
     """Write a plugin NAME, e.g. my-detector, that can be installed and passes its tests.
 
@@ -328,14 +282,10 @@ def plugins_new(
     """
     from orthoflow.scaffold import Project, write_project
 
-    if about["kind"] and new_kind:
+    if bool(kind) == bool(new_kind):
         raise click.UsageError(
-            f"--kind {about['kind']} (an existing kind) and --new-kind {new_kind} (a kind of "
-            "its own) exclude each other: omit one of them"
-        )
-    if not (about["kind"] or new_kind):
-        raise click.UsageError(
-            "pass --kind, the kind of the method (see `orthoflow plugins list`), or --new-kind"
+            "pass either --kind, the kind of the method (see `orthoflow plugins list`), or "
+            "--new-kind"
         )
     catalog = discover_catalog()
     taken, given = (
@@ -345,15 +295,12 @@ def plugins_new(
     own = [name for name in given if name not in catalog.products]
     if len(own) > 1:
         raise click.UsageError(
-            f"--gives {gives}: of {' and '.join(own)} no plugin has a product type, and a new "
-            "plugin brings one; `orthoflow plugins list` names those that are there"
+            f"--gives {gives}: a new plugin defines one product type, not {' and '.join(own)}; "
+            "`orthoflow plugins list` names those that exist"
         )
     project = Project(
         name=name,
-        kind=new_kind or about["kind"],
-        author=about["author"],
-        licence=about["licence"],
-        citation=about["citation"],
+        kind=new_kind or kind,
         takes=tuple(taken),
         gives=tuple(name for name in given if name not in own),
         product=own[0] if own else "",
@@ -394,10 +341,8 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
     input, and known properties of the example.
 
     A problem that prevents all runs is reported once, and other rules are skipped. The exit code is
-    1 if a rule is violated, and 4 if the method cannot be loaded. Unchanged text from `plugins
-    new` causes a warning only.
+    1 if a rule is violated, and 4 if the method cannot be loaded.
     """
-    from orthoflow.scaffold import unwritten
     from orthoflow.testing import conformance_cases
 
     results: list[dict[str, str]] = []
@@ -417,9 +362,8 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
             if not as_json:
                 echo(f"{state:{8 if quick else 7}} {name}: {text or rule}")
     counts = Counter(result["state"] for result in results)
-    left = unwritten(method_id, discover_catalog())
     if as_json:
-        echo_json({"method": method_id, "checks": results, "unwritten": list(left)})
+        echo_json({"method": method_id, "checks": results})
     else:
         words = {
             "kept": f"{method_id} meets {counted(counts['kept'], 'rule')}",
@@ -429,11 +373,6 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
         }
         parts = [text for state, text in words.items() if state == "kept" or counts[state]]
         echo("", ", ".join(parts))
-        if left:
-            echo(
-                "warning: still the text from `plugins new`; replace it with your own: "
-                f"{', '.join(left)}"
-            )
     return EXIT_CELL_FAILED if counts["broken"] else EXIT_GOOD
 
 

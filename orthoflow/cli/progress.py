@@ -9,8 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from orthoflow.cli.commands import echo_error
 from orthoflow.cli.tables import counted, duration
@@ -38,9 +37,6 @@ _MIN_ELAPSED_S: Final = 2.0
 _REFRESH_PER_S: Final = 4
 # Maximum time between lines in a log file.
 _EVERY_S: Final = 10.0
-_NOTEBOOK_EVERY_S: Final = 1.0
-# While running, a notebook shows only the last lines, so that the running steps below stay visible.
-_NOTEBOOK_LINES: Final = 40
 # Shorter times of starting, loading and compiling are not reported.
 _MIN_MORE_S: Final = 2.0
 _STYLES: Final = {
@@ -125,10 +121,10 @@ def about(seconds: float) -> str:
 
 
 class Progress:
-    """Display of a run: a table on a terminal, one output in a notebook, log lines elsewhere.
+    """Display of a run: a table on a terminal, log lines elsewhere.
 
     Attributes:
-        every_s: interval of updates in a notebook, and of running steps in a log.
+        every_s: interval of lines on running steps in a log.
         console: console of the terminal; None if there is no terminal.
     """
 
@@ -139,12 +135,10 @@ class Progress:
         self._n_cells = len(cells)
         self._reported: set[tuple[str, str]] = set()
         self._n_similar: Counter[str] = Counter()
-        self._lines: list[str] = []
         self._stack = ExitStack()
-        self._notebook = _NotebookOutput() if in_notebook() else None
-        self.every_s = _NOTEBOOK_EVERY_S if self._notebook else _EVERY_S
+        self.every_s = _EVERY_S
         self.console: Console | None = None
-        if sys.stderr.isatty() and not self._notebook:
+        if sys.stderr.isatty():
             from rich.console import Console
 
             self.console = Console(stderr=True)
@@ -160,21 +154,17 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
-        if self._notebook:
-            self._notebook.show(self._lines)
 
     def take(self, event: RunEvent) -> None:
         """Update the display with an event."""
         line = self._applied(event)
         if isinstance(event, RunStarted):
             self._n_cells = event.n_cells
-            left = "" if self._notebook or self.console else self.left()
+            left = "" if self.console else self.left()
             line += f", {left}" if left else ""
         if not line:
             return
-        if self._notebook:
-            self._lines += [] if isinstance(event, CellStarted) else [line]
-        elif self.console:
+        if self.console:
             # Warnings and failures are printed above the table, so that they stay readable.
             has_failed = isinstance(event, CellFinished) and event.result.status == "failed"
             style = _STYLES["failed"] if has_failed else "yellow"
@@ -263,11 +253,7 @@ class Progress:
                     f"about {about(left_s)} left" if left_s is not None else "",
                 ]
                 running.append(f"{address}: {', '.join(part for part in parts if part)}")
-        if self._notebook:
-            left = [self.left()] if running else []
-            lines = [*self._lines[-_NOTEBOOK_LINES:], *running, *filter(None, left)]
-            self._notebook.show(lines)
-        elif running:
+        if running:
             echo_error(*running)
 
     def drawn(self) -> Group:
@@ -327,56 +313,22 @@ def _end_text(event: CellFinished, more_s: float) -> str:
     return f"{event.address}: {result.status}{took}{why}"
 
 
-class _NotebookOutput:
-    """An output of a notebook cell; each text replaces the previous one."""
-
-    # Any: IPython is optional and untyped.
-    handle: Any = None
-
-    def show(self, lines: Sequence[str]) -> None:
-        data = {"text/plain": shown("\n".join(lines), keep="\n")}
-        if self.handle is None:
-            display = import_module("IPython.display").display
-            self.handle = display(data, raw=True, display_id=True)
-        else:
-            self.handle.update(data, raw=True)
-
-
-def in_notebook() -> bool:
-    """Return whether a notebook shows the output; False for IPython in a terminal."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return hasattr(shell, "kernel")
-
-
 @contextmanager
 def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
-    """Show an activity outside of cells, with its start time, while the block runs.
-
-    If it took long, a notebook keeps the line with its duration.
-    """
+    """Show an activity outside of cells, with its duration so far, while the block runs."""
     started = time.monotonic()
 
-    def took() -> str:
-        return duration(time.monotonic() - started)
-
     def line() -> str:
-        return f"{what}, {took()} so far"
+        return f"{what}, {duration(time.monotonic() - started)} so far"
 
     if sys.stderr.isatty():
         from rich.console import Console
 
         with _live(Console(stderr=True), line):
             yield
-        return
-    output = _NotebookOutput() if in_notebook() else None
-    end = "stopped after"
-    try:
-        with _repeating(lambda: output.show([line()]) if output else echo_error(line()), every_s):
+    else:
+        with _repeating(lambda: echo_error(line()), every_s):
             yield
-        end = "done in"
-    finally:
-        if output and output.handle:
-            output.show([f"{what}: {end} {took()}"])
 
 
 def _live(console: Console, drawn: Callable[[], RenderableType]) -> Live:

@@ -24,14 +24,28 @@ from orthoflow.cli.commands import (
     output_option,
 )
 from orthoflow.cli.run import executed
-from orthoflow.cli.tables import echo, echo_distances, echo_json, number
+from orthoflow.cli.tables import (
+    ROWS_MOST,
+    counted,
+    echo,
+    echo_distances,
+    echo_json,
+    echo_table,
+)
 from orthoflow.errors import CancelledStepError, ClusterError
-from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.records.replay import ReplayedMetric
 
-_METRICS_MOST: Final = 5
+_NOTHING: Final = "-"
+# Why a metric is not the same, by verdict.
+_CAUSES: Final = {
+    "different": "unknown: the products of its step are identical",
+    "code changed": "the code of a method on which it depends has changed",
+    "products": "the products of its step differ",
+    "not in the record": "not in the record",
+    "rounding": "rounding",
+}
 
 
 @click.command(cls=RecordCommand)
@@ -135,7 +149,7 @@ def replay(
     else:
         echo()
         echo_distances(distances)
-        echo(*_metric_lines(metrics))
+        _print_metrics(metrics)
         echo(f"record of the replay: {made.path}", f"report: {folder / REPORT_FILE}")
     if differs:
         echo_error(f"error: the replay of {original.path} differs from the record (see above)")
@@ -167,30 +181,23 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
                     place.rmdir()
 
 
-def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:
-    """Count and list metrics that differ; unexpected differences first, on a line of their own."""
-    what = "metrics, without times"
-    kinds = (
-        ("different", "differ although the products of their steps are identical"),
-        ("code changed", "differ, and the code of a method on which they depend has changed"),
-        ("products", "differ, as do the products of their steps"),
-        ("not in the record", "are not in the record"),
-        ("rounding", "differ by rounding"),
+def _print_metrics(metrics: Sequence[ReplayedMetric]) -> None:
+    moved = [item for item in metrics if item.verdict != "same"]
+    echo_table(
+        ("metric", "recorded", "replayed", "cause"),
+        [
+            (
+                f"{item.cell}.{item.metric}",
+                *(
+                    _NOTHING if value is None else f"{value!r} {unit}".rstrip()
+                    for value, unit in (
+                        (item.recorded, item.recorded_unit),
+                        (item.replayed, item.replayed_unit),
+                    )
+                ),
+                _CAUSES[item.verdict],
+            )
+            for item in moved[:ROWS_MOST]
+        ],
     )
-    lines = []
-    for verdict, words in kinds:
-        if found := [_metric_text(item) for item in metrics if item.verdict == verdict]:
-            some = first_few(found, most=_METRICS_MOST)
-            lines.append(f"{what}: {len(found)} of {len(metrics)} {words}: {some}")
-    return lines or [f"{what}: {len(metrics)} same"]
-
-
-def _metric_text(item: ReplayedMetric) -> str:
-    sides = (item.recorded, item.replayed)
-    texts = ["-" if side is None else number(side) for side in sides]
-    if texts[0] == texts[1]:
-        texts = [repr(side) for side in sides]
-    if item.recorded_unit != item.replayed_unit:
-        units = (item.recorded_unit, item.replayed_unit)
-        texts = [f"{text} {unit}".rstrip() for text, unit in zip(texts, units, strict=True)]
-    return f"{item.cell}.{item.metric} {texts[0]} -> {texts[1]}"
+    echo(f"{counted(len(metrics), 'metric')}, without times: {len(moved)} differ")

@@ -8,26 +8,22 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
-from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, medians, number
+from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, number
 from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.report.browsing import RunSummary
 
-_STATES: Final = ("ok", "failed", "running", "unfinished", "damaged")
 _COLUMNS: Final = ("folder", "started", "workflow", "status")
 # Number of metrics that fit next to the other columns on a wide terminal.
 _METRICS_MOST: Final = 4
 _LONGEST_FACT: Final = 40
 _FACTS_MOST: Final = 4
-# Texts in a record may have any length.
-_LONGEST_NAME: Final = 60
-_LONGEST_REASON: Final = 1000
 _CONDITION: Final = re.compile(
     r"\s*(.+?)\s*(<=|>=|!=|=|<|>)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 )
@@ -44,16 +40,6 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
 @click.command(cls=Command)
 @click.argument("folders", metavar="[FOLDER ...]", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
-    "--workflow", "workflows", metavar="NAME", multiple=True, help="Only runs of this workflow."
-)
-@click.option(
-    "--status",
-    "states",
-    type=click.Choice(_STATES),
-    multiple=True,
-    help="Only runs with this status.",
-)
-@click.option(
     "--where",
     metavar="'METRIC > X'",
     multiple=True,
@@ -68,13 +54,6 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     help="Sort by folder, started, workflow, status, or a metric; -COLUMN for descending order.",
 )
 @click.option(
-    "--metric",
-    "metrics",
-    metavar="NAME",
-    multiple=True,
-    help="Show this metric.  [default: headline metrics]",
-)
-@click.option(
     "--table",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
@@ -84,12 +63,10 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
 def runs(
     folders: tuple[Path, ...],
     where: tuple[str, ...],
+    sort: str,
+    table: Path | None,
     *,
     as_json: bool,
-    sort: str,
-    metrics: tuple[str, ...],
-    # Any: which runs to choose, whose types click has checked.
-    **chosen: Any,
 ) -> int:
     """List the runs in and below each FOLDER, by default the working directory.
 
@@ -101,15 +78,14 @@ def runs(
     and metric; cells with the same methods, parameters, seeds and data in several runs are merged,
     and `environments` is the number of machines.
     """
-    table = chosen.pop("table")
     if table is not None:
         return _write_table(folders, table)
     found = list_runs(folders or (Path(),))
-    kept = _sorted(_filtered(found, where, **chosen), sort)
+    kept = _sorted(_filtered(found, where), sort)
     if as_json:
         echo_json(runs_json(kept, found))
     else:
-        print_runs(kept, found, metrics=metrics)
+        print_runs(kept, found)
     return EXIT_GOOD
 
 
@@ -161,14 +137,11 @@ def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[d
     return [_row_json(run, run.all_facts, differs[run.folder]) for run in kept]
 
 
-def print_runs(
-    kept: Sequence[RunSummary], found: Sequence[RunSummary], *, metrics: Sequence[str] = ()
-) -> None:
+def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
     """Print a table of some of the runs found, their problems, and their number."""
     from orthoflow.report.browsing import differing_facts, key_metrics
 
-    names = list(metrics) or key_metrics(kept, most=_METRICS_MOST)
-    _require_known(names, kept)
+    names = key_metrics(kept, most=_METRICS_MOST)
     facts = differing_facts(found)
     echo_table(
         (*_COLUMNS, *names, "differs in"),
@@ -176,8 +149,8 @@ def print_runs(
             (
                 str(run.folder),
                 run.started[:16].replace("T", " "),
-                run.workflow[:_LONGEST_NAME],
-                run.state,
+                run.workflow,
+                run.status,
                 *(number(run.metrics[name]) if name in run.metrics else "" for name in names),
                 _facts_text(facts[run.folder]),
             )
@@ -186,11 +159,7 @@ def print_runs(
     )
     for run in kept:
         if run.reason:
-            echo_folded(f"{run.folder} {run.state}: {run.reason[:_LONGEST_REASON]}")
-    for run in kept:
-        if run.n_datasets > 1:
-            counts = {name: (run.n_values[name],) for name in names if name in run.n_values}
-            echo_folded(f"{run.folder}: {medians(counts, run.n_datasets, run.flags)}")
+            echo_folded(f"{run.folder} {run.status}: {run.reason}")
     n_left_out = len(found) - len(kept)
     others = f", {counted(n_left_out, 'other')} omitted" if n_left_out else ""
     echo(f"{counted(len(kept), 'run')}{others}")
@@ -208,13 +177,7 @@ def _condition(text: str) -> tuple[str, Callable[[float], bool]]:
     return match[1], lambda value: holds(value, limit)
 
 
-def _filtered(
-    found: Sequence[RunSummary],
-    where: Sequence[str],
-    *,
-    workflows: Sequence[str],
-    states: Sequence[str],
-) -> list[RunSummary]:
+def _filtered(found: Sequence[RunSummary], where: Sequence[str]) -> list[RunSummary]:
     conditions = [_condition(text) for text in where]
     _require_known([name for name, _ in conditions], found)
 
@@ -225,21 +188,14 @@ def _filtered(
             if isinstance(value, int | float) and not isinstance(value, bool)
         )
 
-    return [
-        run
-        for run in found
-        if (not workflows or run.workflow in workflows)
-        and (not states or run.state in states)
-        and all(meets(run, *condition) for condition in conditions)
-    ]
+    return [run for run in found if all(meets(run, *condition) for condition in conditions)]
 
 
 def _sorted(kept: Sequence[RunSummary], key: str) -> list[RunSummary]:
     """Sort runs; those without the metric come last in both directions."""
     name = key.removeprefix("-")
     if name in _COLUMNS:
-        attribute = "state" if name == "status" else name
-        text = operator.attrgetter(attribute)
+        text = operator.attrgetter(name)
         return sorted(kept, key=lambda run: (str(text(run)), str(run.folder)), reverse=key != name)
     _require_known([name], kept)
     sign = -1.0 if key != name else 1.0
@@ -279,7 +235,5 @@ def _row_json(
     run: RunSummary, facts: Mapping[str, object], differs: Mapping[str, object]
 ) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
-    values["status"] = values.pop("state")
-    for name in ("n_values", "parameters"):
-        del values[name]
+    del values["parameters"]
     return values | {"facts": dict(facts), "differs": dict(differs)}

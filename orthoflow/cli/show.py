@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
 
 from orthoflow.cli.commands import EXIT_GOOD, RecordCommand, code_for, json_option
-from orthoflow.cli.doctor import LIBRARIES
 from orthoflow.cli.runs import list_runs, print_runs, runs_json
 from orthoflow.cli.tables import (
     ROWS_MOST,
@@ -23,17 +20,14 @@ from orthoflow.cli.tables import (
     echo_left_out,
     echo_table,
     first_rows,
-    medians,
     number,
     size,
-    verify_hint,
 )
 from orthoflow.workflow.model import DATA
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
-    from orthoflow.report.paired import MethodOverDatasets
 
 # Number of columns of metrics that fit in a wide window.
 _COLUMNS_MOST: Final = 5
@@ -72,12 +66,12 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     else:
         _print_head(opened)
         _print_cells(opened, is_whole=is_whole)
-        is_compared = _print_comparison(opened)
+        most = None if is_whole else ROWS_MOST
+        is_compared = _print_comparison(opened, most)
         if is_whole or not is_compared:
-            _print_metrics(opened, most=None if is_whole else ROWS_MOST)
+            _print_metrics(opened, most=most)
         _print_environments(opened)
         _print_files(opened)
-        echo("", verify_hint(run))
     return code_for([broken_seal(opened)], "do not rely on this output")
 
 
@@ -129,67 +123,41 @@ def _print_cells(run: Run, *, is_whole: bool) -> None:
     echo_diagnostics(run.record.cells, run.folder, is_whole=is_whole)
 
 
-def _print_comparison(run: Run) -> bool:
-    """Print a row per combination and the best ones; return whether there are several."""
+def _print_comparison(run: Run, most: int | None) -> bool:
+    """Print a row per combination; return whether there are several."""
     if all(set(cell.assignment) <= {DATA} for cell in run.record.cells):
         return False
     from orthoflow.records.runs import parts_of
-    from orthoflow.report.combinations import combinations_of
     from orthoflow.report.comparisons import comparison_table
     from orthoflow.report.paired import over_datasets, who_leads
-    from orthoflow.workflow.expand import variants_text
 
     parts = parts_of(run)
-    names: Sequence[str]
-    rows: list[tuple[str, ...]]
     if over := over_datasets(parts):
-        names = [f"{one.column.step}.{one.column.metric}" for one in over]
-        combinations = [
-            {step: variant for step, variant in one.assignment.items() if step != DATA}
-            for part in parts.values()
-            for one in combinations_of(part)
-        ]
-        rows = list(
-            dict.fromkeys(
-                (variants_text(one), *(_median(metric.method_of(one)) for metric in over))
-                for one in combinations
-            )
-        )
-        leaders = who_leads(over, len(parts))
-        shown = dict(zip(names[:_COLUMNS_MOST], over, strict=False))
-        counts = {name: [one.n for one in metric.methods] for name, metric in shown.items()}
-        about = (
-            "± is 1.4826 times the median absolute deviation; repeats are averaged; "
-            f"{medians(counts, len(parts))}"
-        )
-    elif table := comparison_table([run]):
-        names = [f"{one.step}.{one.metric}" for one in table.columns if one.step]
         rows = [
-            (row.name, *(value.text or _NOTHING for value in row.values[: len(names)]))
-            for row in table.rows
+            (name, one.name, number(one.median), number(one.spread), str(one.n))
+            for name, metric in ((f"{one.column.step}.{one.column.metric}", one) for one in over)
+            for one in metric.methods
         ]
-        leaders, about = "", "means over repeats ± standard deviation, where a step was repeated"
-    else:
-        return False
-    if not names:
+        echo()
+        echo_table(("metric", "combination", "median", "spread", "datasets"), rows[:most])
+        echo_left_out(len(rows), most)
+        echo(who_leads(over, len(parts)))
+        return True
+    compared = comparison_table([run])
+    names = [f"{one.step}.{one.metric}" for one in compared.columns if one.step] if compared else []
+    if compared is None or not names:
         return False
     width = 1 + _COLUMNS_MOST
     echo()
-    echo_table(("combination", *names)[:width], [row[:width] for row in rows])
-    n_more = len(names) - _COLUMNS_MOST
-    more = f"; {counted(n_more, 'more metric')} in the report" if n_more > 0 else ""
-    echo(f"{about}{more}; --all prints all metrics", *([f"{leaders}."] if leaders else []))
+    echo_table(
+        ("combination", *names)[:width],
+        [
+            (row.name, *(value.text or _NOTHING for value in row.values[: len(names)]))[:width]
+            for row in compared.rows
+        ],
+    )
+    echo("means over repeats ± standard deviation; --all prints all metrics")
     return True
-
-
-def _median(one: MethodOverDatasets | None) -> str:
-    from orthoflow.report import rankings as numbers
-
-    if one is None or math.isnan(one.median):
-        return _NOTHING
-    if math.isnan(one.spread):
-        return numbers.number(one.median)
-    return numbers.number_with_spread(one.median, one.spread)
 
 
 def _print_metrics(run: Run, *, most: int | None = None) -> None:
@@ -218,16 +186,13 @@ def _print_metrics(run: Run, *, most: int | None = None) -> None:
 def _print_environments(run: Run) -> None:
     for environment in run.record.environments:
         commit = f", commit {environment.git_commit}" if environment.git_commit else ""
-        packages = environment.packages
         echo(
             "",
             f"environment: Python {environment.python}, {environment.os}, {environment.cpu}, "
             f"{counted(environment.cores, 'core')}, {counted(environment.threads, 'thread')}"
             f"{commit}",
         )
-        used = [name for name in packages if name.lower() in LIBRARIES]
-        others = f" and {len(packages) - len(used)} others (listed by --json)"
-        echo(", ".join(f"{name} {packages[name]}" for name in used) + others)
+        echo(f"{counted(len(environment.packages), 'package')}, listed by --json")
 
 
 def _print_files(run: Run) -> None:

@@ -7,7 +7,8 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -125,7 +126,9 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
         if item.reason:
             echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
     echo_left_out(len(distances), most)
-    echo(verdict_counts(distances))
+    verdicts = Counter(item.verdict for item in distances)
+    counts = ", ".join(f"{verdicts[name]} {name}" for name in _VERDICTS if verdicts[name])
+    echo(f"{counted(len(distances), 'product')}{': ' if counts else ''}{counts}")
 
 
 def first_rows(
@@ -141,32 +144,6 @@ def echo_left_out(n_rows: int, most: int | None) -> None:
     """Print how many rows of a table were omitted, and how to see them."""
     if most is not None and n_rows > most:
         echo(f"and {n_rows - most} more, shown by --all")
-
-
-def verify_hint(*runs: Path) -> str:
-    """Return a sentence about the command that also checks large arrays.
-
-    >>> verify_hint(Path("first"))
-    '`orthoflow verify first` checks that the run has not changed since it was written'
-    """
-    commands = " and ".join(f"`orthoflow verify {shlex.quote(str(run))}`" for run in runs)
-    if len(runs) == 1:
-        return f"{commands} checks that the run has not changed since it was written"
-    return f"{commands} check that the runs have not changed since they were written"
-
-
-def verdict_counts(distances: Sequence[ProductDistance]) -> str:
-    """Return the number of products of each verdict.
-
-    >>> verdict_counts(())
-    '0 products'
-    """
-    counts = [
-        f"{count} {verdict}"
-        for verdict in _VERDICTS
-        if (count := sum(item.verdict == verdict for item in distances))
-    ]
-    return ": ".join([counted(len(distances), "product"), *([", ".join(counts)] if counts else [])])
 
 
 def duration(seconds: float) -> str:
@@ -216,35 +193,6 @@ def counted(count: int, noun: str) -> str:
     ('1 step', '3 steps')
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
-def medians(
-    counts: Mapping[str, Collection[int]], n_datasets: int, flags: Collection[str] = ()
-) -> str:
-    """Describe over how many datasets medians are taken.
-
-    Args:
-        counts: name of a metric -> number of datasets that have it, for each of its rows.
-        n_datasets: number of datasets of the run.
-        flags: names of yes/no metrics.
-
-    >>> medians({"rms_mm": [2, 2], "depth_rmse_mm": [1, 1], "n_oriented": [0, 2]}, 2)
-    'medians of 2 datasets, of fewer where some have no value: depth_rmse_mm 1, n_oriented 0 to 2'
-    >>> medians({"rms_mm": [2]}, 2)
-    'medians of 2 datasets'
-    >>> medians({"rms_mm": [2], "check.main_found": [2]}, 2, ["check.main_found"])
-    'medians (of check.main_found shares) of 2 datasets'
-    """
-    shares = ", ".join(name for name in counts if name in flags)
-    what = f"medians (of {shares} shares)" if shares else "medians"
-    ends = {name: (min(found), max(found)) for name, found in counts.items()}
-    fewer = [
-        f"{name} {least}" if least == most else f"{name} {least} to {most}"
-        for name, (least, most) in ends.items()
-        if least < n_datasets
-    ]
-    of_fewer = f", of fewer where some have no value: {', '.join(fewer)}" if fewer else ""
-    return f"{what} of {counted(n_datasets, 'dataset')}{of_fewer}"
 
 
 def _distance_text(distance: Distance) -> str:

@@ -77,16 +77,11 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
 
 
 def _summary(verification: Verification) -> str:
-    parts = [counted(verification.n_products, "product")]
-    if verification.n_named:
-        parts[0] += f" ({verification.n_named} more by digest only)"
-    if verification.n_inputs:
-        parts.append(counted(verification.n_inputs, "input file"))
-    parts.append("seal ok")
-    if verification.n_published:
-        parts.append(f"{counted(verification.n_published, 'published file')} unchanged")
-    if verification.n_pages:
-        parts.append(f"{counted(verification.n_pages, 'report page')} unchanged")
-    if verification.signed_with:
-        parts.append(f"signed with {verification.signed_with}")
-    return f"verified: {', '.join(parts)}"
+    signed = f", signed with {verification.signed_with}" if verification.signed_with else ""
+    return (
+        f"verified: seal ok, {counted(verification.n_products, 'product')} "
+        f"({verification.n_named} more by digest only), "
+        f"{counted(verification.n_inputs, 'input file')}, "
+        f"{counted(verification.n_published, 'published file')}, "
+        f"{counted(verification.n_pages, 'report page')} unchanged{signed}"
+    )

@@ -42,8 +42,8 @@ class RunSummary:
 
     Attributes:
         folder: run folder, as found.
-        state: `ok`; `failed` if a cell failed; `running`; `unfinished` if interrupted; `damaged` if
-            the record cannot be read or its seal is broken.
+        status: `ok`; `failed` if a cell failed; `running`; `unfinished` if interrupted; `damaged`
+            if the record cannot be read or its seal is broken.
         reason: first failure, or why the record cannot be read; empty if there is no problem.
         workflow: name of the workflow.
         run_id: id of the run.
@@ -52,25 +52,21 @@ class RunSummary:
             that reports it. For several datasets, the median, or the share of "yes" for yes/no
             metrics.
         n_datasets: number of datasets; 0 if the workflow lists none.
-        n_values: number of datasets that have each metric; empty if there are no datasets.
         headlines: names of the headline metrics, most important first.
-        flags: names of yes/no metrics.
         facts: properties other than parameters that may differ between runs: `seed`, `orthoflow`
             (version), methods of the baseline by `step.use`, and inputs by `input <name>`.
         parameters: `step.parameter` -> values, more than one if variants or datasets differ.
     """
 
     folder: Path
-    state: RunState
+    status: RunState
     reason: str = ""
     workflow: str = ""
     run_id: str = ""
     started: str = ""
     metrics: Mapping[str, float] = field(default_factory=dict)
     n_datasets: int = 0
-    n_values: Mapping[str, int] = field(default_factory=dict)
     headlines: tuple[str, ...] = ()
-    flags: tuple[str, ...] = ()
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
     parameters: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
 
@@ -169,12 +165,12 @@ def _summary(folder: Path) -> RunSummary:
     try:
         run = open_run(folder)
         if doubt := broken_seal(run):
-            return RunSummary(folder=folder, state="damaged", reason=doubt)
+            return RunSummary(folder=folder, status="damaged", reason=doubt)
         return _of_run(folder, run)
     except Exception as error:  # noqa: BLE001 - a record may contain anything
         unforeseen = f"the record has invalid content: {type(error).__name__}: "
         reason = f"{'' if isinstance(error, OrthoflowError) else unforeseen}{error}"
-        return RunSummary(folder=folder, state="damaged", reason=reason)
+        return RunSummary(folder=folder, status="damaged", reason=reason)
 
 
 def _of_run(folder: Path, run: Run) -> RunSummary:
@@ -187,7 +183,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
     for given in record.inputs:
         facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
     values: dict[str, list[float]] = {}
-    flags: dict[str, None] = {}
+    flags: set[str] = set()
     of_parts = [baseline_cells(part) for part in parts.values() or (run,)]
     for cells in of_parts:
         own: dict[str, float] = {}
@@ -199,12 +195,12 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
                 is_size = len(parts) > 1 and row.better == "lower"
                 for name in (f"{row.step}.{row.metric}", row.metric):
                     own[name] = abs(row.value) if is_size else row.value
-                    flags |= {name: None} if is_flag(row.unit) else {}
+                    flags |= {name} if is_flag(row.unit) else set()
         for name, value in own.items():
             values.setdefault(name, []).append(value)
     return RunSummary(
         folder=folder,
-        state=record.status,
+        status=record.status,
         reason="" if failed is None else f"{failed.address}: {failed.error_message}",
         workflow=record.name,
         run_id=record.run_id,
@@ -214,9 +210,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
             for name, found in values.items()
         },
         n_datasets=len(parts),
-        n_values={name: len(found) for name, found in values.items()} if parts else {},
         headlines=tuple(map(".".join, headline_keys(cell for cells in of_parts for cell in cells))),
-        flags=tuple(flags),
         facts=facts,
         parameters=_parameters(record.cells),
     )
@@ -240,12 +234,12 @@ def _unfinished(folder: Path) -> RunSummary:
             first = parse_json(journal.readline(_FIRST_LINE_BYTES).decode("utf-8"))
     except (OSError, ValueError) as error:
         reason = f"it has no {RECORD_FILE}, and its journal cannot be read: {error}"
-        return RunSummary(folder=folder, state="damaged", reason=reason)
+        return RunSummary(folder=folder, status="damaged", reason=reason)
     stated = first if isinstance(first, dict) else {}
     is_under_way = is_running(folder)
     return RunSummary(
         folder=folder,
-        state="running" if is_under_way else "unfinished",
+        status="running" if is_under_way else "unfinished",
         reason="" if is_under_way else f"resume with the same command and -o {folder}",
         workflow=str(stated.get("workflow", "")),
         run_id=str(stated.get("run_id", "")),

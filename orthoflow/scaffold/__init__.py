@@ -1,5 +1,5 @@
 """Creation of new plugins: a project that can be installed and passes its tests immediately."""
 
-from orthoflow.scaffold.projects import Project, unwritten, write_project
+from orthoflow.scaffold.projects import Project, write_project
 
-__all__ = ["Project", "unwritten", "write_project"]
+__all__ = ["Project", "write_project"]

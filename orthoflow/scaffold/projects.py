@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import keyword
 import re
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from typing import Final
 import jinja2
 
 from orthoflow import products, sdk
-from orthoflow.catalog.catalog import Catalog, KindEntry, MethodEntry, ProductEntry
+from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import ArgumentError, did_you_mean
 from orthoflow.scaffold.comparing import comparison_text, own_comparison_text
@@ -24,11 +23,6 @@ from orthoflow.version import __version__
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 # Names that a written module may import.
 _IMPORTED: Final = frozenset({*products.__all__, *sdk.__all__})
-# Initial texts for the author to replace; `unwritten` finds those that are left.
-_UNWRITTEN: Final = {
-    "summary": "one line for `orthoflow plugins list`",
-    "description": "State here what the method does, for `orthoflow plugins show`.",
-}
 _NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")
 
 
@@ -39,9 +33,6 @@ class Project:
     Attributes:
         name: name of the distribution and the method, e.g. `my-detector`.
         kind: kind of its method, either one of an installed plugin or a new one.
-        author: author in pyproject, licence and citation.
-        licence: SPDX expression.
-        citation: publication of the method as DOI, title or URL; may be empty.
         takes: product types of the inputs of a new kind.
         gives: existing product types of the outputs of a new kind; empty for an existing kind.
         product: name of a new product type that a new kind also outputs; empty if there is none.
@@ -49,9 +40,6 @@ class Project:
 
     name: str
     kind: str
-    author: str = "The authors"
-    licence: str = "MIT"
-    citation: str = ""
     takes: tuple[str, ...] = ()
     gives: tuple[str, ...] = ()
     product: str = ""
@@ -118,28 +106,6 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
         path.write_text(text, encoding="utf-8")
         written.append(path.relative_to(parent))
     return tuple(written)
-
-
-def unwritten(method_id: str, catalog: Catalog) -> tuple[str, ...]:
-    """List the initial texts of `write_project` that are left in the plugin of a method.
-
-    Raises:
-        PluginError: the method cannot be loaded.
-    """
-    entry = catalog.method(method_id)
-    announced: dict[str, MethodEntry | KindEntry | ProductEntry] = {
-        f"method {method_id}": entry,
-        **{f"kind {name}": kind for name, kind in catalog.kinds.items()},
-        **{f"product {name}": product for name, product in catalog.products.items()},
-    }
-    summaries = tuple(
-        f"the summary of {name}"
-        for name, one in announced.items()
-        if one.distribution == entry.distribution and one.spec.summary == _UNWRITTEN["summary"]
-    )
-    method = entry.load()
-    is_described = inspect.getdoc(method) != _UNWRITTEN["description"]
-    return summaries if is_described else (*summaries, f"the docstring of {method.__name__}")
 
 
 def _check(project: Project, folder: Path, catalog: Catalog) -> None:
@@ -218,7 +184,6 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         "ports": ports,
         "version": __version__,
         "has_comparison": bool(comparison),
-        "unwritten": _UNWRITTEN,
         "outputs": [*filter(None, [project.product]), *project.gives],
     }
     sources = {

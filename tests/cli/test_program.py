@@ -82,15 +82,6 @@ def test_the_help_of_a_command_is_what_was_reviewed(name: str, snapshot: Snapsho
     assert result.output == snapshot
 
 
-@pytest.mark.parametrize("second", ["2,", "-0.5,"])
-def test_a_value_that_the_shell_took_apart_is_told_so(second: str) -> None:
-    words = ["run", "direct.yaml", "--set", "wall.near=[[1,", second, "3]]"]
-    result = CliRunner().invoke(program, words)
-    assert result.exit_code == 2
-    assert "wall.near=[[1, was split at its spaces" in result.output
-    assert "quote the whole value" in result.output
-
-
 NO_MEMORY = "not enough memory to continue"
 
 

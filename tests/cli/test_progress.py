@@ -6,9 +6,7 @@ import dataclasses
 import io
 import itertools
 import re
-import sys
 import time
-from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -170,79 +168,16 @@ def test_rows_that_do_not_fit_are_the_least_urgent() -> None:
         assert [str(cell) for cell in progress.table().columns[0].cells] == [*addresses]
 
 
-# Notebooks ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def outputs(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """A notebook: of each output all that stood in it, the last of it what is kept."""
-    found: list[list[str]] = []
-
-    def display(data: dict[str, str], **_: object) -> SimpleNamespace:
-        found.append([data["text/plain"]])
-        return SimpleNamespace(update=lambda data, **_: found[-1].append(data["text/plain"]))
-
-    shell = SimpleNamespace(kernel=object())
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
-    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
-    return found
-
-
-def test_a_notebook_keeps_one_output_with_a_line_per_step(
-    outputs: list[list[str]],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    progress = Progress(planned("cloud", "plane", took_s=60.0))
-    progress.every_s = 0.05
-    with progress:
-        for event in EVENTS[:4]:
-            progress.take(event)
-        time.sleep(0.3)
-        for event in EVENTS[4:]:
-            progress.take(event)
-    (written,) = outputs
-    assert any("\nplane: 50 %, peeling, " in text for text in written[:-1])
-    assert written[-1].splitlines() == [
-        "run r1: 5 steps",
-        "cloud: cached",
-        "plane: warning: the side is a [guess]",
-        "plane: warning: empty-wall (wall 2)",
-        "plane: failed in 1 min 15 s: no plane, 1 warning with a code shown above",
-        "wall: skipped",
-        "other: ok in 1.2 s",
-        "last: ok in 1.2 s",
-    ]
-    assert capsys.readouterr().err == ""
-
-
 # Work outside of cells ----------------------------------------------------------------------------
 
 
-def test_long_work_outside_of_cells_is_shown(
-    capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
-) -> None:
+def test_long_work_outside_of_cells_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     with working_on("writing the record", every_s=0.2):
         time.sleep(0.3)
     with working_on("reading", every_s=5.0):
         pass
     lines = set(re.sub(r"\d\.\d+ s", "T", capsys.readouterr().err).splitlines())
     assert lines == {"writing the record, T so far"}
-    outputs = request.getfixturevalue("outputs")
-
-    @working_on("writing", every_s=0.1)
-    def work(error: Exception | None) -> None:
-        time.sleep(0.25)
-        if error:
-            raise error
-
-    work(None)
-    with pytest.raises(OSError, match="full"):
-        work(OSError("full"))
-    assert [re.sub(r"\d\.\d+ s", "T", written[-1]) for written in outputs] == [
-        "writing: done in T",
-        "writing: stopped after T",
-    ]
-    assert re.fullmatch(r"writing, \d\.\d+ s so far", outputs[0][0])
 
 
 # Forecasts ----------------------------------------------------------------------------------------

@@ -2,49 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import pytest
-from orthoflow_provenance.document import Metric
+from orthoflow_provenance.record import write_record
 
-from orthoflow.cli import show as module
-from tests.report_runs import cell, compared_run
+from tests.report_runs import cell, compared_run, metrics, record
+from tests.studios import said
 
 
-def test_of_a_comparison_a_row_per_combination_is_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert module._print_comparison(compared_run(tmp_path))
-    told = capsys.readouterr().out.splitlines()
-    assert told[1].split()[:2] == ["combination", "plane.rms_mm"]
-    rows = {line.split("  ")[0]: line for line in told[2:5]}
+def show(folder: Path, *cells: object, **more: object) -> list[str]:
+    """The lines about a run of cells without arrays."""
+    made = record(cells, **more)  # type: ignore[arg-type]
+    write_record(folder / "run.h5", made, lambda _digest: None)
+    return said("show", folder / "run.h5").splitlines()
+
+
+def test_of_a_comparison_a_row_per_combination_is_shown(tmp_path: Path) -> None:
+    compared = compared_run(tmp_path).record
+    cells = [replace(one, outputs={}) for one in compared.cells]
+    told = show(tmp_path, *cells, workflow_resolved=compared.workflow_resolved)
+    begin = next(k for k, line in enumerate(told) if line.startswith("combination"))
+    assert told[begin].split()[1] == "plane.rms_mm"
+    rows = {line.split("  ")[0]: line for line in told[begin + 1 : begin + 4]}
     assert list(rows) == ["plane=fine", "plane=coarse", "plane=broken"]
     assert "1.10 ± 0.10" in rows["plane=fine"]
-    assert rows["plane=broken"].split()[1:] == ["-"] * (len(told[1].split()) - 1)
-    assert told[5].startswith("means over repeats ± standard deviation")
-    values = [("peak_mib", "MiB"), ("n_points", "1"), ("sigma_mm", "mm"), ("rms_mm", "mm")]
-    metrics = [
-        Metric(
-            name=name,
-            value=1.0,
-            unit=unit,
-            better="" if unit == "1" else "lower",
-            headline=name == "rms_mm",
-        )
-        for name, unit in values
+    assert {*rows["plane=broken"].split()[1:]} == {"-"}
+    assert told[begin + 4].startswith("means over repeats ± standard deviation")
+
+
+def test_quality_comes_before_counts_and_costs(tmp_path: Path) -> None:
+    many = {f"rms_{k}_px": 1.0 for k in range(19)}
+    plane = cell("plane", metrics=metrics(peak_mib=7.0, n_points=5.0, **many, rms_mm=1.0))
+    told = show(tmp_path, plane, cell("a@data=b"))
+    begin = next(k for k, line in enumerate(told) if line.startswith("step   metric"))
+    assert told[begin + 1].split()[1] == "rms_mm"
+    assert not [line for line in told if "peak_mib" in line]
+    assert "and 2 more, shown by --all" in told
+
+
+def test_over_datasets_medians_are_shown(tmp_path: Path) -> None:
+    cells = [
+        cell(f"plane@data=r{k},plane={name}", metrics=metrics(rms_mm=k + better))
+        for k in range(3)
+        for name, better in (("a", 1.0), ("b", 0.5))
     ]
-    plane: Any = SimpleNamespace(
-        record=SimpleNamespace(cells=(cell("plane", metrics=tuple(metrics)),))
-    )
-    module._print_metrics(plane, most=3)
-    rows = capsys.readouterr().out.splitlines()[2:]
-    assert [row.split()[1] for row in rows] == [
-        "rms_mm",
-        "sigma_mm",
-        "n_points",
-        "1",
-    ]  # "and 1 more"
-    alone: Any = SimpleNamespace(record=SimpleNamespace(cells=(cell("plane"), cell("a@data=b"))))
-    assert not module._print_comparison(alone)
+    told = show(tmp_path, *cells, workflow_resolved='{"datasets": {"r0": {}, "r1": {}, "r2": {}}}')
+    rows = [line.split() for line in told if line.startswith("plane.rms_mm")]
+    assert [row[1:3] for row in rows] == [["plane=a", "2"], ["plane=b", "1.5"]]
+    assert [row[-1] for row in rows] == ["3", "3"]

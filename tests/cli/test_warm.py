@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from orthoflow.cli import plugins, warm
 from orthoflow.cli.program import program
 from orthoflow.engine.kernels import VARIABLE
+from orthoflow.workflow.source import shipped_workflow
 from tests.workshop_runs import WORKSHOP, orthoflow, write_studio
 
 
@@ -30,7 +31,8 @@ def test_what_was_compiled_beforehand_is_not_compiled_by_a_run(
     tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     studio = write_studio(tmp_path, "paint.kernel")
-    monkeypatch.setattr(warm, "_recipes", lambda: {studio: ("survey.offset_m=2",)})
+    assert all(shipped_workflow(name).is_file() and sets for name, sets in warm._RECIPES.items())
+    monkeypatch.setattr(warm, "_RECIPES", {str(studio): ("survey.offset_m=2",)})
     called = CliRunner().invoke(program, ["warm", "--json"])
     assert called.exit_code == 0, called.output
     warmed = json.loads(called.stdout)
@@ -45,11 +47,6 @@ def test_what_was_compiled_beforehand_is_not_compiled_by_a_run(
     assert compiled(tmp_path / ".orthoflow") == set()
 
 
-def test_shipped_workflows_are_tried_with_what_makes_them_small() -> None:
-    assert {path.stem for path in warm._recipes()} >= {"direct", "quickstart", "plane-methods"}
-    assert all(path.is_file() and sets for path, sets in warm._recipes().items())
-
-
 def test_the_conformance_suite_shares_the_kernels_of_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -60,15 +57,3 @@ def test_the_conformance_suite_shares_the_kernels_of_runs(
         folder = Path(os.environ[VARIABLE])
     assert folder.is_relative_to(tmp_path / "orthoflow" / "numba")
     assert VARIABLE not in os.environ
-
-
-def test_methods_that_no_recipe_tries_are_named(
-    tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(warm, "_recipes", dict)
-    called = CliRunner().invoke(program, ["warm", str(write_studio(tmp_path))])
-    assert called.exit_code == 0
-    assert [line.partition(":")[0] for line in called.stdout.splitlines()[:2]] == [
-        "paint.plain",
-        "survey.offset",
-    ]
