@@ -238,7 +238,8 @@ _workflow_options = _together(
         "sets",
         multiple=True,
         metavar="STEP.PARAM=VALUE",
-        help="Change a parameter, e.g. wall.gsd_m=0.002 or plane.ransac.tolerance_m=0.05.",
+        help="Change a parameter, e.g. wall.gsd_m=0.002, plane.ransac.tolerance_m=0.05 or, quoted, "
+        "'wall.near=[[1, 2, 3]]'.",
     ),
     click.option(
         "--set-file",
