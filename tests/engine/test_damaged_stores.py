@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import random
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -77,14 +77,13 @@ CLASSES = {
 }
 
 
-@pytest.fixture(scope="module")
-def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoredRuns]:
-    with stored_runs(tmp_path_factory.mktemp("damaged")) as found:
-        yield found
-
-
 @pytest.mark.longer
-def test_no_damage_of_a_store_is_sealed_as_good(laboratory: StoredRuns) -> None:
+def test_no_damage_of_a_store_is_sealed_as_good(tmp_path: Path) -> None:
+    with stored_runs(tmp_path) as laboratory:
+        check_damages(laboratory)
+
+
+def check_damages(laboratory: StoredRuns) -> None:
     rng = random.Random(20150808)
     expected = laboratory.sealed("quiet")
     quiet = laboratory.run("sound", "again")

@@ -8,13 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.kernels import (
-    VARIABLE,
-    all_kernels,
-    is_private,
-    kernel_folder,
-    private_folder,
-)
+from orthoflow.engine import kernels
+from orthoflow.engine.kernels import VARIABLE, all_kernels, is_private, kernel_folder
 from tests.workshop_runs import orthoflow, write_studio
 
 
@@ -54,14 +49,8 @@ def test_only_the_private_folder_of_the_user_is_read(
     mark = tmp_path / "executed"
     hostile = pickle.dumps(_Hostile(mark))
     world_writable = tmp_path / "shared"
-    places = [
-        tmp_path / ".orthoflow" / "numba",
-        tmp_path / "numba",
-        tmp_path / "__pycache__",
-        tmp_path,
-        world_writable,
-    ]
-    for place in places:
+    names = (".orthoflow/numba", "numba", "__pycache__", ".", "shared")
+    for place in (tmp_path / name for name in names):
         for name in compiled:
             # With the state of the code and the module in their paths, and without.
             for path in (place / name, place.joinpath(*name.parts[1:]), place / name.name):
@@ -86,13 +75,12 @@ def test_only_the_private_folder_of_the_user_is_read(
     assert mark.exists()
     # Files that were cut off are compiled again, a debugging setting does not reach steps.
     root = tmp_path / "first" / "orthoflow" / "numba"
-    for suffix in (".nbi", ".nbc"):
-        for path, content in compiled.items():
-            (root / path).write_bytes(content[:40] if path.suffix == suffix else content)
-        environment = {"XDG_CACHE_HOME": str(tmp_path / "first"), VARIABLE: ""}
-        environment["NUMBA_DISABLE_JIT"] = "1"
-        done = orthoflow(tmp_path, *arguments, f"run{suffix}", environment=environment)
-        assert done.returncode == 0, done.stderr
+    for number, (path, content) in enumerate(compiled.items()):
+        (root / path).write_bytes(content[: 40 * (number % 2)])
+    environment = {"XDG_CACHE_HOME": str(tmp_path / "first"), VARIABLE: ""}
+    environment["NUMBA_DISABLE_JIT"] = "1"
+    done = orthoflow(tmp_path, *arguments, "fourth-run", environment=environment)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o722])
@@ -108,7 +96,7 @@ def test_a_folder_that_others_may_write_to_is_not_used(
     assert all_kernels() == tmp_path / "own" / "orthoflow" / "numba"
     assert (tmp_path / "own" / "orthoflow" / "numba").stat().st_mode & 0o777 == 0o700
     (tmp_path / "own" / "orthoflow").chmod(mode)
-    for folder in (private_folder("numba"), kernel_folder("ab")):
+    for folder in (kernels.private_folder("numba"), kernel_folder("ab")):
         assert tmp_path not in folder.parents
         assert is_private(folder)
     monkeypatch.setenv(VARIABLE, "relative")

@@ -18,12 +18,11 @@ from orthoflow.engine.journal import (
 )
 from orthoflow.errors import ArgumentError, StoreError
 
-Facts = dict[str, str | bool]
+BUSY = "is in use by another run; wait until it has ended, or"
 
 
-def ended(address: str, status: str = "ok", *, error: str = "") -> Facts:
-    facts: Facts = {"address": address, "key": f"key of {address}", "status": status}
-    return {**facts, "cached": False, "error": "", "error_type": error}
+def ended(address: str) -> dict[str, str | bool]:
+    return {"address": address, "key": f"key of {address}", "status": "ok", "cached": False}
 
 
 def lines(folder: Path) -> list[dict[str, object]]:
@@ -35,15 +34,11 @@ def test_a_run_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
     with Journal(tmp_path / "run", "hall"):
         assert is_running(tmp_path / "run")
         for refused in (Journal, require_run_folder):
-            with pytest.raises(
-                ArgumentError, match="is in use by another run; wait until it has ended, "
-            ):
+            with pytest.raises(ArgumentError, match=BUSY):
                 refused(tmp_path / "run", "hall")
     assert not is_running(tmp_path / "run")
     require_run_folder(tmp_path / "run", "hall")
-    with pytest.raises(
-        ArgumentError, match="contains an unfinished run of hall, not of court; choo"
-    ):
+    with pytest.raises(ArgumentError, match="an unfinished run of hall, not of court; choose"):
         require_run_folder(tmp_path / "run", "court")
 
 
@@ -52,18 +47,11 @@ def test_nobody_goes_on_with_a_run_while_what_came_out_is_written(tmp_path: Path
         pass
     with kept_from_others(tmp_path / "run"):
         assert is_running(tmp_path / "run")
-        with pytest.raises(
-            ArgumentError, match="is in use by another run; wait until it has ended, or"
-        ):
+        with pytest.raises(ArgumentError, match=BUSY):
             Journal(tmp_path / "run", "hall")
     with Journal(tmp_path / "run", "hall") as journal:
         assert journal.is_resumed
-        with (
-            pytest.raises(
-                ArgumentError, match="is in use by another run; wait until it has ended, or"
-            ),
-            kept_from_others(tmp_path / "run"),
-        ):
+        with pytest.raises(ArgumentError, match=BUSY), kept_from_others(tmp_path / "run"):
             pass
     # Of a folder without a journal there is nobody to keep out.
     with kept_from_others(tmp_path / "new"):
@@ -93,7 +81,6 @@ def test_a_line_that_was_cut_off_is_removed_and_a_damaged_one_is_told(tmp_path: 
 
 def test_a_finished_run_is_not_continued(tmp_path: Path) -> None:
     with Journal(tmp_path, "hall", run_id="r1") as journal:
-        journal.write("finished", **ended("a", "failed", error="MethodError"))
         journal.write("ended")
     (tmp_path / RECORD_FILE).write_text("the record")
     with pytest.raises(ArgumentError, match=r"contains a finished run \(run\.h5\); choose another"):
@@ -102,25 +89,20 @@ def test_a_finished_run_is_not_continued(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_something_else_is_refused_as_it_is(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    with pytest.raises(ArgumentError, match="is not empty and contains no unfinished run; choose"):
-        Journal(tmp_path, "hall")
-    (tmp_path / "notes.txt").unlink()
-    (tmp_path / JOURNAL).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(
-        ArgumentError, match=r"contains a link, journal\.jsonl, which no run creates"
+    path = tmp_path / JOURNAL
+    for make, reason in (
+        ((tmp_path / "notes.txt").touch, "is not empty and contains no unfinished run; choose"),
+        (lambda: path.symlink_to("elsewhere"), r"contains a link, journal\.jsonl, which no run"),
+        (lambda: os.mkfifo(path), r"contains a pipe or a device, journal\.jsonl, which no run"),
     ):
-        Journal(tmp_path, "hall")
-    (tmp_path / JOURNAL).unlink()
-    os.mkfifo(tmp_path / JOURNAL)
-    with pytest.raises(
-        ArgumentError, match=r"contains a pipe or a device, journal\.jsonl, which no run"
-    ):
-        Journal(tmp_path, "hall")
-    assert [path.name for path in tmp_path.iterdir()] == [JOURNAL]
+        make()
+        (made,) = tmp_path.iterdir()
+        with pytest.raises(ArgumentError, match=reason):
+            Journal(tmp_path, "hall")
+        assert list(tmp_path.iterdir()) == [made]
+        made.unlink()
     # A record whose journal nobody can read is of a finished run.
-    (tmp_path / JOURNAL).unlink()
-    (tmp_path / JOURNAL).write_text("nothing\n")
+    path.write_text("nothing\n")
     (tmp_path / RECORD_FILE).touch()
     with pytest.raises(ArgumentError, match="contains a finished run"):
         Journal(tmp_path, "hall")
