@@ -60,7 +60,6 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
                 "recipe": draft.recipe,
                 "inputs": dict(draft.inputs),
                 "left_out": list(draft.left_out),
-                "advice": list(draft.advice),
             }
         )
     else:
@@ -83,8 +82,6 @@ def _print(draft: Draft, output: Path) -> None:
         echo(f"{name}: {text}")
     for text in draft.left_out:
         echo_folded(f"not used: {text}")
-    for text in draft.advice:
-        echo_folded(f"note: {text}")
     name = shlex.quote(str(output))
     echo(
         f"wrote {output}, based on the recipe {draft.recipe}",

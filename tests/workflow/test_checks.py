@@ -13,29 +13,16 @@ from orthoflow.workflow.document import load_workflow
 from tests.laboratories import GOOD, load
 
 
-@pytest.mark.parametrize(
-    ("gsd_m", "said"),
-    [
-        (
-            "3",
-            (
-                "wall.gsd_m is 3 m, which is implausible: cells are 0.0001 to 0.5 m wide; "
-                "for 3 mm write gsd_m: 0.003"
-            ),
-        ),
-        (
-            "5e-6",
-            "wall.gsd_m is 5e-06 m, which is implausible: cells are 0.0001 to 0.5 m wide",
-        ),
+def test_cells_that_cannot_be_meant_are_told(catalog: Catalog, tmp_path: Path) -> None:
+    limits = "which is implausible: cells are 0.0001 to 0.5 m wide"
+    for gsd_m, said in (
+        ("3", f"wall.gsd_m is 3 m, {limits}; for 3 mm write gsd_m: 0.003"),
+        ("5e-6", f"wall.gsd_m is 5e-06 m, {limits}"),
         ("0.003", ""),
         ("0.5", ""),
-    ],
-)
-def test_cells_that_cannot_be_meant_are_told(
-    gsd_m: str, said: str, catalog: Catalog, tmp_path: Path
-) -> None:
-    text = GOOD.replace("{gsd_m: 1}", f"{{gsd_m: {gsd_m}}}")
-    assert lint_workflow(load(text, tmp_path / "flow.yaml", catalog)) == ((said,) if said else ())
+    ):
+        workflow = load(GOOD.replace("{gsd_m: 1}", f"{{gsd_m: {gsd_m}}}"), tmp_path / "a", catalog)
+        assert lint_workflow(workflow) == ((said,) if said else ())
 
 
 @pytest.mark.parametrize(("recipe", "n"), [("photos-on-scan", 1), ("direct", 0)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import InputError
 from orthoflow.untrusted_text import shown
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.draft import Recognised, draft_workflow, recognised
+from orthoflow.workflow.draft import Recipe, Recognised, draft_workflow, recognised
 from orthoflow.workflow.inputs import resolve_input_files
 from tests.studios import asked, said
 
@@ -192,16 +193,6 @@ def test_a_scan_with_empty_fields_is_no_source_of_colours(data: Path) -> None:
     said("new", data / "bare.las", "--recipe", "direct", "-o", "asked.yaml")
 
 
-@pytest.mark.parametrize(("scale", "note"), [(1000, "set cloud.unit=mm"), (1, ""), (1e-4, "unit")])
-def test_a_scan_of_another_unit_is_asked_about(data: Path, scale: float, note: str) -> None:
-    points = np.random.default_rng(1).uniform(0, 8, (50, 3)) * scale
-    rows = "\n".join(f"{x:.6f} {y:.6f} {z:.6f} {k % 7}" for k, (x, y, z) in enumerate(points))
-    (data / "room.xyz").write_text(rows)
-    out = json.loads(said("new", data / "room.xyz", "--json"))
-    assert bool(out["advice"]) is bool(note)
-    assert note in "".join(out["advice"])
-
-
 def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path) -> None:
     cloud = laspy.read(data / "hall.las")
     for epsg, name in ((2260, "feet"), (4326, "degrees")):
@@ -210,68 +201,44 @@ def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path)
         cloud.write(str(data / f"{name}.las"))
     out = said("new", data / "feet.las")
     assert "unit us-ft (GeoTIFF keys + NAD83 / New York East (ftUS))" in out
-    assert "note:" not in out
     result = asked("new", data / "degrees.las", "-o", "degrees.yaml")
     assert result.exit_code == 2
     assert "degrees.las has geographic coordinates in degrees" in result.output
-
-
-@pytest.mark.parametrize("up", ["x", "z"])
-def test_the_axis_that_surfaces_show_to_be_up_is_set_and_reported(data: Path, up: str) -> None:
-    # Two slopes on one floor, as a roof: by no other axis they are level and upright.
-    rng = np.random.default_rng(2)
-    u, v = rng.uniform(0.0, 4.0, (2, 20_000))
-    walls = np.array([[np.cos(a), np.sin(a), 0.0] for a in (0.4, 1.1, 1.8, 2.5)])
-    height = np.stack([np.zeros_like(u), np.zeros_like(u), v]).T
-    parts = [np.stack([u, v, 0.0 * u], axis=1), *(u[:, None] * wall + height for wall in walls)]
-    points = np.roll(np.concatenate(parts), "xyz".index(up) - 2, axis=1)
-    np.savetxt(data / "hall.xyz", np.column_stack([points, rng.uniform(0, 9, len(points))]))
-    out = said("new", data / "hall.xyz")
-    steps = Path("workflow.yaml").read_text()
-    assert (f"cloud.up is {up} in the workflow" in " ".join(out.split())) is (up != "z")
-    assert (f"    params: {{up: {up}}}\n" in steps) is (up != "z")
-    assert said("check", "workflow.yaml").startswith("workflow is valid")
 
 
 # --- drafts by themselves ---
 
 
 def found(kind: str, name: str, summary: str = "something", n_photos: int = 0) -> Recognised:
-    posed = n_photos if kind == "scan" else 0
-    fields = frozenset(["rgb"] if kind == "scan" else [])
-    return Recognised(
-        kind=kind,  # type: ignore[arg-type]
-        path=Path(name),
-        summary=summary,
-        n_photos=n_photos,
-        n_posed=posed,
-        fields=fields,
-    )
+    posed, fields = (n_photos, frozenset(["rgb"])) if kind == "scan" else (0, frozenset())
+    counts = {"n_photos": n_photos, "n_posed": posed}
+    return Recognised(kind=kind, path=Path(name), summary=summary, **counts, fields=fields)
 
 
 def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
+    def drafted(*files: Recognised, recipe: Recipe | None = None) -> tuple[str, Mapping[str, str]]:
+        draft = draft_workflow(files, Path("flow.yaml"), recipe)
+        return draft.recipe, draft.inputs
+
     scan = found("scan", "hall.e57", "a scan", 3)
-    inside = draft_workflow([scan], Path("flow.yaml"), None)
-    assert inside.recipe == "photos-on-scan"
-    assert inside.inputs["photos"] == "hall.e57, the photos in this file"
-    assert inside.inputs["cameras"] == "hall.e57, the poses of the photos in this file"
-    beside = draft_workflow([scan, found("photos", "a.jpg", "a photo", 1)], Path("flow.yaml"), None)
-    assert beside.inputs["photos"] == "a.jpg, a photo"
-    assert "cameras" not in beside.inputs
+    recipe, inside = drafted(scan)
+    assert recipe == "photos-on-scan"
+    assert inside["photos"] == "hall.e57, the photos in this file"
+    assert inside["cameras"] == "hall.e57, the poses of the photos in this file"
+    _, beside = drafted(scan, found("photos", "a.jpg", "a photo", 1))
+    assert beside["photos"] == "a.jpg, a photo"
+    assert "cameras" not in beside
     # Of two scans nobody knows whose poses are meant.
-    two = draft_workflow([scan, found("scan", "b.e57", "a scan", 1)], Path("flow.yaml"), None)
-    assert two.inputs["photos"] == "2 files: hall.e57, b.e57"
-    assert "cameras" not in two.inputs
-    given = draft_workflow([scan, found("cameras", "poses.json", "poses")], Path("flow.yaml"), None)
-    assert given.inputs["cameras"] == "poses.json, poses"
-
-
-def test_photos_without_a_pose_in_a_scan_are_taken_when_asked_for() -> None:
-    scan = replace(found("scan", "hall.e57", "a scan", 1), n_posed=0)
-    plain = draft_workflow([scan], Path("flow.yaml"), None)
-    assert (plain.recipe, sorted(plain.inputs)) == ("direct", ["scan"])
-    asked = draft_workflow([scan], Path("flow.yaml"), "photos-on-scan")
-    assert sorted(asked.inputs) == ["photos", "scan"]
+    _, two = drafted(scan, found("scan", "b.e57", "a scan", 1))
+    assert two["photos"] == "2 files: hall.e57, b.e57"
+    assert "cameras" not in two
+    _, given = drafted(scan, found("cameras", "poses.json", "poses"))
+    assert given["cameras"] == "poses.json, poses"
+    # Those without a pose only if they are asked for.
+    bare = replace(scan, n_posed=0)
+    recipe, inputs = drafted(bare)
+    assert (recipe, sorted(inputs)) == ("direct", ["scan"])
+    assert sorted(drafted(bare, recipe="photos-on-scan")[1]) == ["photos", "scan"]
 
 
 def test_an_orthoimage_is_taken_with_the_frame_beside_it(tmp_path: Path) -> None:
@@ -310,12 +277,11 @@ def names(paths: list[Path], root: Path) -> list[str]:
 
 def test_folders_are_looked_into_three_deep_and_no_link_is_followed(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    for place in ("b.jpg", "a.jpg", "1/c.jpg", "1/2/d.jpg", "1/2/3/e.jpg", "1/2/3/4/f.jpg"):
+    hidden = (".hidden.jpg", ".git/g.jpg")
+    shown = ("b.jpg", "a.jpg", "1/c.jpg", "1/2/d.jpg", "1/2/3/e.jpg", "1/2/3/4/f.jpg")
+    for place in (*shown, *hidden):
         (data / place).parent.mkdir(parents=True, exist_ok=True)
         (data / place).touch()
-    for hidden in (".hidden.jpg", ".git/g.jpg"):
-        (data / hidden).parent.mkdir(parents=True, exist_ok=True)
-        (data / hidden).touch()
     (data / "link").symlink_to(data / "1", target_is_directory=True)
     assert names([data], data) == ["a.jpg", "b.jpg", "1/c.jpg", "1/2/d.jpg", "1/2/3/e.jpg"]
     assert names([data / "1", data / "a.jpg"], data)[-1] == "a.jpg"

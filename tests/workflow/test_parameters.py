@@ -23,30 +23,25 @@ from orthoflow.workflow.views import resolved_json
 from tests.laboratories import GOOD, SWEPT, load
 
 LIMITS = {"low_m": 0.5, "high_m": 1.0}
+# `--set` -> step, variant and value; the method names a step without variants, too.
 SETS = {
-    "plain": ("wall.gsd_m=0.002", "wall", "", "gsd_m", 0.002),
-    "method name of a step without variants": ("wall.grid.gsd_m=2", "wall", "", "gsd_m", 2.0),
-    "variant": ("plane.ransac.iterations=7", "plane", "ransac", "iterations", 7),
-    "list": ("plane.hough2d.normal=[1, 0, 0]", "plane", "hough2d", "normal", [1.0, 0.0, 0.0]),
-    "text that YAML 1.1 takes for a flag": ("cloud.up=y", "cloud", "", "up", "y"),
-    "inside a mapping": ("plane.hough2d.limits.low_m=0.5", "plane", "hough2d", "limits", LIMITS),
-    "inside a mapping of either": (
-        "plane.limits.low_m=0.5",
-        "plane",
-        "hough2d",
-        "limits",
-        LIMITS,
-    ),
+    "wall.gsd_m=0.002": ("wall", "", 0.002),
+    "wall.grid.gsd_m=2": ("wall", "", 2.0),
+    "plane.ransac.iterations=7": ("plane", "ransac", 7),
+    "plane.hough2d.normal=[1, 0, 0]": ("plane", "hough2d", [1.0, 0.0, 0.0]),
+    "cloud.up=y": ("cloud", "", "y"),
+    "plane.hough2d.limits.low_m=0.5": ("plane", "hough2d", LIMITS),
+    "plane.limits.low_m=0.5": ("plane", "hough2d", LIMITS),
 }
 
 
-@pytest.mark.parametrize("case", SETS)
-def test_set_overrides_a_parameter_and_is_kept(case: str, catalog: Catalog, write: Path) -> None:
-    text, step, variant, parameter, value = SETS[case]
-    workflow = load(GOOD, write, catalog, text)
-    assert workflow.steps[step].variant(variant).params[parameter] == value
-    assert parameter in workflow.steps[step].variant(variant).params_set
-    assert workflow.overrides == (f"--set {text}",)
+def test_set_overrides_a_parameter_and_is_kept(catalog: Catalog, write: Path) -> None:
+    for text, (step, variant, value) in SETS.items():
+        workflow = load(GOOD, write, catalog, text)
+        call = workflow.steps[step].variant(variant)
+        parameter = next(name for name in call.params_set if f".{name}" in text)
+        assert call.params[parameter] == value
+        assert workflow.overrides == (f"--set {text}",)
 
 
 def test_parameters_that_disagree_are_told_where_the_method_stands(
@@ -80,11 +75,8 @@ def values_of(workflow: Workflow, parameter: str = "tolerance_m") -> dict[str, o
 
 def test_each_value_is_a_variant_whose_name_says_it(catalog: Catalog) -> None:
     workflow = load_swept(catalog)
-    assert values_of(workflow) == {
-        "tolerance_m-0_02": 0.02,
-        "tolerance_m-0_05": 0.05,
-        "tolerance_m-0_1": 0.1,
-    }
+    names = ("tolerance_m-0_02", "tolerance_m-0_05", "tolerance_m-0_1")
+    assert values_of(workflow) == dict(zip(names, (0.02, 0.05, 0.1), strict=True))
     assert {one.params_set["cell_m"] for one in workflow.steps["plane"].variants} == {0.01}
 
 
@@ -128,9 +120,8 @@ def test_a_value_takes_the_place_of_a_sweep_and_a_sweep_that_of_a_value(catalog:
     plain = load_swept(catalog, sets=["plane.tolerance_m=0.03"])
     assert values_of(plain) == {"": 0.03}
     assert plain.compare is None
-    other = load_swept(
-        catalog, sets=["plane.tolerance_m=0.03", "plane.cell_m={sweep: [0.001, 0.002]}"]
-    )
+    sets = ["plane.tolerance_m=0.03", "plane.cell_m={sweep: [0.001, 0.002]}"]
+    other = load_swept(catalog, sets=sets)
     assert values_of(other, "cell_m") == {"cell_m-0_001": 0.001, "cell_m-0_002": 0.002}
     again = load_swept(catalog, sets=["plane.hough2d.tolerance_m.sweep=[0.5, 0.6]"])
     assert list(values_of(again).values()) == [0.5, 0.6]
@@ -184,9 +175,8 @@ def test_a_file_of_parameters_is_gone_before_by_what_is_set(
     catalog: Catalog, tmp_path: Path
 ) -> None:
     (tmp_path / "fine.yaml").write_text("plane.cell_m: 0.004\nwall.gsd_m: 0.002\n")
-    (tmp_path / "finer.yaml").write_text(
-        "plane.cell_m: 0.003\nplane.tolerance_m: {sweep: [1, 2]}\n"
-    )
+    finer = "plane.cell_m: 0.003\nplane.tolerance_m: {sweep: [1, 2]}\n"
+    (tmp_path / "finer.yaml").write_text(finer)
     workflow = load_swept(catalog, set_files=["fine.yaml", "finer.yaml"], sets=["wall.gsd_m=0.001"])
     assert set(values_of(workflow, "cell_m").values()) == {0.003}
     assert list(values_of(workflow).values()) == [1, 2]
@@ -204,9 +194,8 @@ def test_a_file_of_parameters_is_gone_before_by_what_is_set(
 # --- how values are written ---
 
 
-@pytest.mark.parametrize(
-    ("parameter", "text", "said"),
-    [
+def test_a_number_in_words_gets_its_value() -> None:
+    for parameter, text, said in (
         ("gsd_m", "0,003", "; decimals have a point: 0.003"),
         ("gsd_m", "3mm", "; it is in metres; write it without a unit: 0.003"),
         ("gsd_m", "0,5 cm", "; it is in metres; write it without a unit: 0.005"),
@@ -214,25 +203,17 @@ def test_a_file_of_parameters_is_gone_before_by_what_is_set(
         ("noise_mm", "0.002 m", "; it is in millimetres; write it without a unit: 2"),
         ("min_share", "5 m", "; write numbers without a unit"),
         ("gsd_m", "0.003", "; write it without quotes"),
-        ("gsd_m", "fine", ""),
-        ("gsd_m", "1.2.3", ""),
-        ("gsd_m", [1], ""),
-    ],
-)
-def test_a_number_in_words_gets_its_value(parameter: str, text: object, said: str) -> None:
-    assert meant_number(parameter, text) == said
+        *(("gsd_m", odd, "") for odd in ("fine", "1.2.3", [1])),
+    ):
+        assert meant_number(parameter, text) == said
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "said"),
-    [
+def test_a_name_with_another_unit_is_led_to_ours() -> None:
+    for name, value, said in (
         ("gsd_mm", 50, " (it is gsd_m, in metres: gsd_m: 0.05)"),
         ("gsd_cm", "5", " (it is gsd_m, in metres)"),
         ("tilt_rad", math.pi, " (it is tilt_deg, in degrees: tilt_deg: 180)"),
-        ("gsd_m", 1, ""),
-        ("mm", 1, ""),
         ("gsd_mm", True, " (it is gsd_m, in metres)"),
-    ],
-)
-def test_a_name_with_another_unit_is_led_to_ours(name: str, value: object, said: str) -> None:
-    assert meant_parameter(name, ["crs", "gsd_m", "tilt_deg"], value) == said  # type: ignore[arg-type]
+        *(("gsd_m", 1, ""), ("mm", 1, "")),
+    ):
+        assert meant_parameter(name, ["crs", "gsd_m", "tilt_deg"], value) == said
