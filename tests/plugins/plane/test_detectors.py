@@ -515,13 +515,3 @@ def test_the_exactness_stated_of_a_real_wall_holds_between_its_halves(
     assert abs(apart_m) < 3.0 * first.sigma_offset_m(0)
     # Panels and painted plaster, 25 x 5 m: not micrometres.
     assert 1e-4 < first.sigma_offset_m(0) < 2e-3
-
-
-def test_levels_of_a_building_with_y_up_are_found(shared_data: Path, tmp_path: Path) -> None:
-    points = points_of(shared_data / "indoor-laz" / "indoor.laz")
-    planes = plane_scenes.detect(Hough2d, cloud_of(points, up=(0.0, 1.0, 0.0)), tmp_path)[0].planes
-    rises = np.abs(planes.normal[:, 1])
-    # Two ceilings and the floor, three metres apart, in coordinates rounded to a centimetre.
-    assert np.count_nonzero(rises > 0.99) >= 3
-    assert {"floor", "ceiling"} <= {name.split()[0] for name in planes.names}
-    assert np.count_nonzero(rises < 0.1) >= 4

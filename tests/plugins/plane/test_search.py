@@ -377,14 +377,7 @@ FIT_M = 0.015
 # What stated and true errors may differ by, over many trials.
 CALIBRATED = (0.7, 1.4)
 SHAPE = (30, 45)
-TRUE = Plane(normal=np.array([0.0, -1.0, 0.0]), offset_m=-2.0)
-WALL_CELLS = SurfaceRaster(
-    plane=TRUE,
-    axes=wall_axes(TRUE.normal, UP),
-    low_m=np.array([-1.0, -1.5]),
-    cell_m=0.1,
-    shape=SHAPE,
-)
+WALL_CELLS = raster_of(WALL, (-1.0, -1.5), SHAPE)
 
 
 def wall_of_cells(
@@ -450,8 +443,8 @@ def test_stated_sigmas_of_walls_are_their_errors(
         fit = adjust_plane(WALL_CELLS, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="free")
         assert fit is not None
         u, v = WALL_CELLS.centres_m()
-        middle = np.array([u.mean(), v.mean()]) @ WALL_CELLS.axes - 2.0 * TRUE.normal
-        trials.append(ratios(fit.plane, fit.stated()[0], TRUE, middle))
+        middle = np.array([u.mean(), v.mean()]) @ WALL_CELLS.axes - 2.0 * WALL.normal
+        trials.append(ratios(fit.plane, fit.stated()[0], WALL, middle))
     assert (rms(trials) > CALIBRATED[0]).all(), rms(trials)
     assert (rms(trials) < CALIBRATED[1]).all(), rms(trials)
 

@@ -99,18 +99,6 @@ def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool
     assert shown[16, 25] == 0
 
 
-def test_the_scan_with_most_points_is_shown() -> None:
-    cloud = scanned()
-    scan = np.where(cloud.column < 10, 0, 1).astype(np.uint16)
-    both = replace(cloud, scan=scan, stations=np.zeros((2, 3)), column=cloud.column + 5)
-    both = replace(both, row=cloud.row + 7)
-    shown = pixels(polar_view_png(both))
-    assert shown.shape == (20, 20)
-    # A station that is not known tells no side.
-    one = replace(both, stations=np.zeros((1, 3)))
-    np.testing.assert_array_equal(pixels(polar_view_png(one)), shown[:, ::-1])
-
-
 # --- rows and columns in rectangular coordinates ---
 
 

@@ -201,10 +201,11 @@ def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int)
         assert scene.role[hits.rectangle[0]] != SurfaceRole.OBJECT, shot.taken.photo
 
 
-def test_survey_coordinates_and_another_up_change_no_byte_of_a_photo(
+def test_neither_world_nor_threads_nor_calibration_change_a_byte_of_a_photo(
     tmp_path: Path, small: SimulateRoom.Out
 ) -> None:
-    far = simulate(tmp_path, photo_gsd_m=0.016, shift_world_m=tuple(scenes.SURVEY_SHIFT_M), up="-y")
+    world = {"shift_world_m": tuple(scenes.SURVEY_SHIFT_M), "up": "-y"}
+    far = simulate(tmp_path, cores=1, photo_gsd_m=0.016, **world)
     assert [photo.encoded for photo in small.photos.photos] == [
         photo.encoded for photo in far.photos.photos
     ]
@@ -214,20 +215,7 @@ def test_survey_coordinates_and_another_up_change_no_byte_of_a_photo(
         # Pixels; 800 km from the origin the camera's own translation steps by 1e-10 m.
         np.testing.assert_allclose(marks_near, marks_far, atol=1e-5)
 
-
-def test_threads_change_no_byte_and_seeds_move_the_cameras(
-    tmp_path: Path, small: SimulateRoom.Out
-) -> None:
-    one = simulate(tmp_path / "one", cores=1, photo_gsd_m=0.016)
-    other = simulate(tmp_path / "other", seed=2, photo_gsd_m=0.016)
-    assert one.photos == small.photos
-    for first, second in zip(cameras_of(one.truth), cameras_of(other.truth), strict=True):
-        assert np.linalg.norm(first.centre_world - second.centre_world) > 0.01
-
-
-def test_calibration_is_told_only_when_it_is_known(tmp_path: Path, small: SimulateRoom.Out) -> None:
-    known = small
-    unknown = simulate(tmp_path, photo_gsd_m=0.016, calibrated=False)
+    known, unknown = small, simulate(tmp_path / "a", photo_gsd_m=0.016, calibrated=False)
     camera = cameras_of(known.truth)[0]
     assert known.calibration.patterns == ("*",)
     assert known.calibration.intrinsics[0].fx == camera.fx
@@ -237,6 +225,9 @@ def test_calibration_is_told_only_when_it_is_known(tmp_path: Path, small: Simula
     assert unknown.photos.photos[0].intrinsics is None
     assert unknown.photos.photos[0].exif_focal_px == pytest.approx(camera.fx, rel=0.02)
     assert [p.encoded for p in known.photos.photos] == [p.encoded for p in unknown.photos.photos]
+    other = simulate(tmp_path / "b", seed=2, photo_gsd_m=0.016)
+    for first, second in zip(cameras_of(small.truth), cameras_of(other.truth), strict=True):
+        assert np.linalg.norm(first.centre_world - second.centre_world) > 0.01
 
 
 @pytest.mark.parametrize(("gap", "least", "most"), [("none", 0.95, 1.0), ("hard", -0.5, 0.75)])
