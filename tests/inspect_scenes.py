@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import (
     CheckPoints,
+    Inspection,
     IntensitySource,
     Layer,
     LayerMask,
@@ -32,8 +34,9 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
+from orthoflow.sdk import Method, StepContext
 from tests import samples
-from tests.raster_scenes import UP
+from tests.raster_scenes import UP, numbers
 
 GSD_M = 0.004
 SHAPE = (280, 360)
@@ -113,6 +116,15 @@ def displaced(right_cells: float, down_cells: float) -> Orthoimage:
 def surf_inputs() -> Mapping[str, Orthoimages | Walls]:
     """What `inspect.surf` takes."""
     return {"orthoimages": Orthoimages(images=(displaced(1.4, -0.6),)), "walls": walls()}
+
+
+def inspected(
+    method: type[Method], folder: Path, params: Mapping[str, object] | None = None, **inputs: Any
+) -> tuple[dict[str, float], Inspection, StepContext]:
+    """The metrics of an inspection, what it found, and what it reported."""
+    ctx = StepContext(rng=np.random.default_rng(0), cores=2, scratch=folder)
+    out: Any = method().run(method.In(**inputs), method.Params.model_validate(params or {}), ctx)
+    return numbers(ctx), out.inspection, ctx
 
 
 def points_at(

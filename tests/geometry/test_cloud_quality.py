@@ -132,18 +132,14 @@ def test_another_axis_is_told_with_the_setting(tmp_path: Path) -> None:
     assert ctx.diagnostics == [said]
 
 
+def quality_of(**numbers: float) -> CloudQuality:
+    pieces = {"side_m": 0.1, "width_95_m": 0.0125, "scan_step_m": 0.002, **numbers}
+    return CloudQuality(n_pieces=40, normals=ASKEW[:1], **pieces)
+
+
 def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
     ctx = context(tmp_path)
-    quality = CloudQuality(
-        side_m=0.1,
-        n_pieces=40,
-        sigma_m=0.0031,
-        width_95_m=0.0125,
-        scan_step_m=0.002,
-        scans_apart_m=0.0094,
-        sigma_apart_m=0.0002,
-        normals=np.tile(ASKEW[0], (40, 1)),
-    )
+    quality = quality_of(sigma_m=0.0031, scans_apart_m=0.0094, sigma_apart_m=0.0002)
     report_quality(quality, ctx)
     assert {metric.name: round(metric.value, 6) for metric in ctx.metrics} == {
         "thickness_mm": 3.1,
@@ -170,17 +166,8 @@ def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
     sigma_m: float, sigma_apart_m: float, limit_m: float
 ) -> None:
     for off in (-0.0001, 0.0001):
-        quality = CloudQuality(
-            side_m=0.1,
-            n_pieces=40,
-            sigma_m=sigma_m,
-            width_95_m=0.01,
-            scan_step_m=0.002,
-            scans_apart_m=limit_m + off,
-            sigma_apart_m=sigma_apart_m,
-            normals=ASKEW[:1],
-        )
-        assert quality.disagrees is (off > 0.0)
+        apart: dict[str, float] = {"scans_apart_m": limit_m + off, "sigma_apart_m": sigma_apart_m}
+        assert quality_of(sigma_m=sigma_m, **apart).disagrees is (off > 0.0)
 
 
 def test_of_a_large_cloud_a_part_is_measured() -> None:

@@ -99,15 +99,9 @@ def _answer(folder: Path, cache: Path, kernel: str) -> tuple[float, int]:
     folder.mkdir(exist_ok=True)
     (folder / "kernel.py").write_text(f"{kernel}\n{_PRINTED}")
     (folder / "numbers_of_it.py").write_text(_NUMBERS)
-    done = subprocess.run(
-        [sys.executable, "-c", "import kernel"],
-        cwd=folder,
-        env={"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(folder)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    value, n_compiled = done.stdout.split()
+    command = [sys.executable, "-c", "import kernel"]
+    env = {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(folder)}
+    value, n_compiled = subprocess.check_output(command, cwd=folder, env=env, text=True).split()
     return float(value), int(n_compiled)
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry.slabs import BOXED_POINTS
@@ -39,35 +38,26 @@ def test_walls_share_a_reach_or_have_their_own() -> None:
     assert (own.front_m, own.behind_m) == (0.05, 0.6)
 
 
-@pytest.mark.parametrize(
-    ("point_world", "index"),
-    [
-        ([1.0, 1.0, 0.5], 0),
-        ([7.0, 1.0, 0.5], 1),
-        # The rectangle counts, not its plane: 5 m along the one, 3 m in front of the other.
-        ([0.0, 7.0, 0.5], 2),
-    ],
-    ids=["by-the-first", "by-the-second", "beside-the-first"],
-)
-def test_the_nearest_wall_is_that_of_the_nearest_rectangle(
-    point_world: list[float], index: int
-) -> None:
+def test_the_nearest_wall_is_that_of_the_nearest_rectangle() -> None:
     turned = samples.facing_south(0.5, 4, 2, (2.0, 10.0, 1.0))
     room = walls(
         wall_at(0.0, "west"), wall_at(8.0, "east"), replace(wall_at(0.0, "north"), frame=turned)
     )
-    points_world: NDArray[np.float64] = np.array([point_world])
-    assert room.nearest(points_world).tolist() == [index]
+    # The rectangle counts, not its plane: 5 m along the first, 3 m in front of the last.
+    points = np.array([[1.0, 1.0, 0.5], [7.0, 1.0, 0.5], [0.0, 7.0, 0.5]])
+    assert room.nearest(points).tolist() == [0, 1, 2]
 
 
 def test_people_know_a_wall_by_its_plane_and_else_by_its_place() -> None:
     frame = samples.facing_east(0.5, 4, 2, (0.0, 0.0, 1.0))
     rgb = np.zeros((*frame.shape, 3), dtype=np.uint8)
-    known = [
-        samples.orthoimage(frame, wall=2, rgb=rgb, plane_index=plane).number
-        for plane in (None, 0, 7)
+    images = [
+        samples.orthoimage(frame, wall=2, rgb=rgb, plane_index=plane) for plane in (None, 0, 7)
     ]
-    assert known == [2, 0, 7]
+    assert [image.number for image in images] == [2, 0, 7]
+    layers = Layers(layers=(), names=("west",), plane_indices=(4, 6))
+    assert [layers.number(wall) for wall in range(3)] == [4, 6, 2]
+    assert [layers.name(wall) for wall in range(3)] == ["west", "wall 6", "wall 2"]
 
 
 @pytest.mark.parametrize(
@@ -102,23 +92,12 @@ def test_points_of_cells_that_are_not_known_do_not_count() -> None:
     assert walls(nothing).spacing_m() == 0.5
 
 
-def test_layers_say_how_people_call_their_walls() -> None:
-    layers = Layers(layers=(), names=("west",), plane_indices=(4, 6))
-    assert [layers.number(wall) for wall in range(3)] == [4, 6, 2]
-    assert [layers.name(wall) for wall in range(3)] == ["west", "wall 6", "wall 2"]
-
-
-@pytest.mark.parametrize(("n_more", "n_boxes"), [(0, None), (1, 17)])
-def test_a_cloud_of_few_blocks_has_no_boxes(n_more: int, n_boxes: int | None) -> None:
-    places = np.arange(16 * BOXED_POINTS + n_more, dtype=np.float32)
-    cloud = PointCloud(
-        origin=np.zeros(3), x=places, y=-places, z=np.zeros_like(places), up=np.array([0, 0, 1.0])
-    )
-    if n_boxes is None:
-        assert cloud.boxes_m is None
-        return
+def test_a_cloud_of_few_blocks_has_no_boxes() -> None:
+    places = np.arange(16 * BOXED_POINTS + 1, dtype=np.float32)
+    cloud = PointCloud(origin=np.zeros(3), x=places, y=-places, z=0.0 * places, up=UP)
+    assert cloud.selected(np.arange(16 * BOXED_POINTS)).boxes_m is None
     assert cloud.boxes_m is not None
-    assert len(cloud.boxes_m) == n_boxes
+    assert len(cloud.boxes_m) == 17
     first, last = cloud.boxes_m[0], cloud.boxes_m[-1]
     np.testing.assert_array_equal(first[:, 0], [0, BOXED_POINTS - 1])
     np.testing.assert_array_equal(first[:, 1], [1 - BOXED_POINTS, 0])

@@ -1,4 +1,4 @@
-"""`inspect.checkpoints` finds points, tells how far they lie off, and sums up as the paper did."""
+"""`inspect.checkpoints` finds points, tells how far they lie off, and doubts what cannot be."""
 
 from __future__ import annotations
 
@@ -6,39 +6,39 @@ import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect import checkpoints, figures
+from numpy.typing import NDArray
+from orthoflow_plugins.inspect import checkpoints, point_doubts
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.findings import (
     check_findings,
     outliers_at_once,
     outliers_iterated,
 )
+from orthoflow_plugins.inspect.point_doubts import Missed, with_reasons
 from orthoflow_plugins.inspect.point_places import ShownPoint
 from orthoflow_plugins.plane.given import GivenPlane
-from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.read.scan import ReadScan
 
+from orthoflow.diagnostics import Diagnostic
 from orthoflow.errors import MethodError
-from orthoflow.geometry import bands
 from orthoflow.products import (
     CheckPoints,
     InputFiles,
     Inspection,
     Orthoimage,
     Orthoimages,
-    Truth,
     Walls,
 )
 from orthoflow.sdk import StepContext
 from tests import inspect_scenes, samples
 from tests.inspect_scenes import BUFFER_M, GSD_M, points_at
-
-
-def context(folder: Path) -> StepContext:
-    return StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
+from tests.long_loops import long_only
+from tests.raster_scenes import context, rastered
 
 
 def inspect(
@@ -46,18 +46,10 @@ def inspect(
     points: CheckPoints,
     walls: Walls,
     image: Orthoimage | None = None,
-    truth: Truth | None = None,
-    **params: object,
 ) -> tuple[dict[str, float], Inspection, StepContext]:
-    inputs = InspectCheckpoints.In(
-        checkpoints=points,
-        walls=walls,
-        orthoimages=None if image is None else Orthoimages(images=(image,)),
-        truth=truth,
-    )
-    ctx = context(folder)
-    out = InspectCheckpoints().run(inputs, InspectCheckpoints.Params.model_validate(params), ctx)
-    return {item.name: item.value for item in ctx.metrics}, out.inspection, ctx
+    images = None if image is None else Orthoimages(images=(image,))
+    inputs: Any = {"checkpoints": points, "walls": walls, "orthoimages": images}
+    return inspect_scenes.inspected(InspectCheckpoints, folder, **inputs)
 
 
 def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
@@ -77,58 +69,39 @@ def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
     assert metrics["flat_mean_shift_share"] == pytest.approx(1.0)
     assert metrics["n_found"] == metrics["n_points"] == 4
     assert [figure.name for figure in ctx.figures] == ["wall_0_residuals"]
-    table = found.details["points"]
-    assert isinstance(table, list)
-    assert table[2] == {
-        "name": "P2",
-        "class": "vertical edge",
-        "how": "measured",
-        "wall": 0,
-        "u_px": 300.0,
-        "v_px": 218.0,
-        "x_mm": 0.0,
-        "y_mm": -8.0,
-    }
+    table: Any = found.details["points"]
+    place = {"wall": 0, "u_px": 300.0, "v_px": 218.0, "x_mm": 0.0, "y_mm": -8.0}
+    assert table[2] == {"name": "P2", "class": "vertical edge", "how": "measured", **place}
 
 
 def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -> None:
     walls = inspect_scenes.walls()
     frame = walls.walls[0].frame
-    places = np.array([[50.0, 40.0], [60.0, frame.height + 0.5], [-300.0, 9.0], [60.0, 60.0]])
-    surveyed = frame.world_from_wall(places)
-    surveyed[3] = frame.world_from_wall(places[3:], BUFFER_M + 0.25)[0]
-    pixels = np.full((4, 2), np.nan)
+    places = np.array([[50, 40], [60, frame.height + 0.5], [-300, 9], [60, 60], [60, 60]])
+    surveyed = frame.world_from_wall(places, [0.0, 0.0, 0.0, BUFFER_M + 0.25, 0.0])
+    pixels = np.full((5, 2), np.nan)
     pixels[0] = places[0]
     points = points_at(surveyed, pixels=pixels)
-    points = replace(points, wall=np.array([0, -1, -1, -1], dtype=np.int32))
     image = inspect_scenes.displaced(0, 0)
-    elsewhere = replace(points, wall=np.array([0, 0, 7, 0], dtype=np.int32))
-    _, _, ctx = inspect(tmp_path, elsewhere, walls, image)
-    assert "P2 (there is no orthoimage of wall 7)" in ctx.warnings[0]
-    metrics, _, ctx = inspect(tmp_path, points, walls, image)
-    assert (metrics["n_points"], metrics["n_found"]) == (4, 1)
-    (said,) = ctx.warnings
-    assert said.startswith(
-        f"3 of 4 check points are not used: P1 (2 mm below {image.name}), "
-        f"P2 (1.2 m left of {image.name}), P3 (250 mm before {image.name}, beyond its buffer): "
-    )
-    assert "margin_m" in said
 
+    def missed(*wall: int) -> dict[str, Any]:
+        numbered = replace(points, wall=np.array(wall, dtype=np.int32))
+        metrics, _, ctx = inspect(tmp_path, numbered, walls, image)
+        assert (metrics["n_points"], metrics["n_found"]) == (5, 1)
+        (said,) = ctx.diagnostics
+        assert said.code == "check-points-missed"
+        return said.values
 
-def test_points_that_are_no_targets_are_not_helped_by_larger_walls(tmp_path: Path) -> None:
-    walls = inspect_scenes.walls()
-    places = np.array([[50.0, 40.0], [60.0, 60.0]])
-    pixels = np.full((2, 2), np.nan)
-    pixels[0] = places[0]
-    points = points_at(walls.walls[0].frame.world_from_wall(places), pixels=pixels)
-    points = replace(points, wall=np.array([0, -1], dtype=np.int32))
-    image = inspect_scenes.displaced(0, 0)
-    _, _, ctx = inspect(tmp_path, points, walls, image)
-    (said,) = ctx.warnings
-    assert said == (
-        "1 of 2 check points are not used: P1 (no black and white quadrant target was recognised "
-        f"on {image.name}): measure them in an orthoimage"
+    assert "P2 (there is no orthoimage of wall 7)" in missed(0, 0, 7, 0, 0)["reasons"]
+    found = missed(0, -1, -1, -1, -1)
+    assert (found["n_missed"], found["n_points"], "margin_m" in found["ways"]) == (4, 5, True)
+    assert found["reasons"] == (
+        f"P1 (2 mm below {image.name}), P2 (1.2 m left of {image.name}), P3 (250 mm before "
+        f"{image.name}, beyond its buffer), P4 (no black and white quadrant target was recognised "
+        f"on {image.name})"
     )
+    # Points that are no targets are not helped by larger walls.
+    assert "margin_m" not in missed(0, 0, 0, 0, -1)["ways"]
 
 
 def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
@@ -158,11 +131,11 @@ def test_the_papers_numbers_for_points_fit_the_iterated_rule_only() -> None:
     assert outliers_at_once(length).sum() == 0
     assert outliers_iterated(length).sum() == 2
     shift_m = length[:, None] * np.array([0.6, 0.8])
-    numbers = {finding.name: finding.value for finding in check_findings(shift_m, 0.02)}
-    assert numbers["rms_mm"] == pytest.approx(43.9, abs=0.05)
-    assert numbers["rms_after_iterated_mm"] == pytest.approx(40.0)
-    assert numbers["rms_after_once_mm"] == pytest.approx(numbers["rms_mm"])
-    assert numbers["n_outliers_iterated"] == 2
+    found = {finding.name: finding.value for finding in check_findings(shift_m, 0.02)}
+    assert found["rms_mm"] == pytest.approx(43.9, abs=0.05)
+    assert found["rms_after_iterated_mm"] == pytest.approx(40.0)
+    assert found["rms_after_once_mm"] == pytest.approx(found["rms_mm"])
+    assert found["n_outliers_iterated"] == 2
 
 
 def test_what_is_not_found_is_said(tmp_path: Path) -> None:
@@ -179,17 +152,7 @@ def test_what_is_not_found_is_said(tmp_path: Path) -> None:
 TLS_PATCHES = ("T1.1", "T1.2", "T1.3", "T2.1", "T2.2", "T2.3", "T3.1", "T3.2")
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        pytest.param(("T2.1", "T3.1"), id="two"),
-        pytest.param(
-            TLS_PATCHES,
-            id="all",
-            marks=pytest.mark.long,
-        ),
-    ],
-)
+@pytest.mark.parametrize("names", [("T2.1", "T3.1"), *long_only((TLS_PATCHES,))], ids=len)
 def test_targets_of_a_real_scan_are_found_and_carried_back_into_space(
     tmp_path: Path, shared_data: Path, names: tuple[str, ...]
 ) -> None:
@@ -210,7 +173,8 @@ def _intensity_of(path: Path, scratch: Path) -> Walls:
     """The intensity of a patch on the plane through it, scanned from the origin."""
     files = InputFiles(name="scan", paths=(path,))
     params = ReadScan.Params(view_from=(0.0, 0.0, 0.0))
-    cloud = ReadScan().run(ReadScan.In(files=files), params, context(scratch)).cloud
+    ctx = context(scratch)
+    cloud = ReadScan().run(ReadScan.In(files=files), params, ctx).cloud
     points = cloud.points_world()
     near = np.ones(len(points), dtype=np.bool_)
     for _ in range(10):
@@ -222,10 +186,9 @@ def _intensity_of(path: Path, scratch: Path) -> Walls:
     given = GivenPlane.Params(
         normal=tuple(float(value) for value in normal), offset_m=float(normal @ middle)
     )
-    planes = GivenPlane().run(GivenPlane.In(cloud=cloud), given, context(scratch)).planes
+    planes = GivenPlane().run(GivenPlane.In(cloud=cloud), given, ctx).planes
     # As fine as the points lie.
-    grid = RasterGrid.Params(gsd_m=0.0013)
-    return RasterGrid().run(RasterGrid.In(cloud=cloud, planes=planes), grid, context(scratch)).walls
+    return rastered(cloud, planes, scratch, gsd_m=0.0013)[0]
 
 
 @pytest.mark.parametrize("has_image", [False, True], ids=["intensity", "orthoimage"])
@@ -234,21 +197,16 @@ def test_points_are_measured_without_memory_per_cell(
 ) -> None:
     where = inspect_scenes.frame(shape=(1600, 2000))
     n_cells = where.width * where.height
-    for place in (bands, figures):
-        name = "_BAND_CELLS" if place is bands else "_WHOLE_CELLS"
-        monkeypatch.setattr(place, name, 1 << 17)
-    monkeypatch.setattr("orthoflow_plugins.inspect.checkpoints.IN_MEMORY_CELLS", 1 << 17)
-    monkeypatch.setattr("orthoflow_plugins.inspect.figures._LONGEST_PX", 200)
-    monkeypatch.setattr("orthoflow_plugins.inspect.image_quality._TILE_CELLS", 256)
+    for name, limit in (
+        ("orthoflow.geometry.bands._BAND_CELLS", 1 << 17),
+        ("orthoflow_plugins.inspect.figures._WHOLE_CELLS", 1 << 17),
+        ("orthoflow_plugins.inspect.checkpoints.IN_MEMORY_CELLS", 1 << 17),
+        ("orthoflow_plugins.inspect.figures._LONGEST_PX", 200),
+        ("orthoflow_plugins.inspect.image_quality._TILE_CELLS", 256),
+    ):
+        monkeypatch.setattr(name, limit)
     grey = np.random.default_rng(1).random(where.shape, dtype=np.float32)
-    wall = samples.wall(
-        where,
-        depth_m=np.zeros(where.shape, dtype=np.float32),
-        sigma_m=np.zeros(where.shape, dtype=np.float32),
-        count=np.ones(where.shape, dtype=np.uint32),
-        mask=np.ones(where.shape, dtype=np.uint8),
-        intensity=grey,
-    )
+    wall = samples.wall(where, intensity=grey)
     image = inspect_scenes.image_of(255.0 * grey) if has_image else None
     place = np.array([[1000.5, 800.5]])
     points = points_at(where.world_from_wall(place), pixels=place + 0.25)
@@ -298,3 +256,98 @@ def test_points_without_a_class_are_check_points(tmp_path: Path) -> None:
     _, found, _ = inspect(tmp_path, points, walls)
     assert found.kinds == ("check point", "flat")
     assert found.kind.tolist() == [0, 1, 0]
+
+
+PLACES = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0], [120.0, 150.0]])
+
+
+def surveyed() -> NDArray[np.float64]:
+    return inspect_scenes.frame().world_from_wall(PLACES, 0.01)
+
+
+def said(folder: Path, points: CheckPoints) -> tuple[list[Diagnostic], dict[str, float]]:
+    image = inspect_scenes.displaced(0, 0)
+    metrics, _, ctx = inspect(folder, points, inspect_scenes.walls(), image)
+    return ctx.diagnostics, metrics
+
+
+@pytest.mark.parametrize(
+    ("n_points", "share", "is_told"),
+    [(4, 0.92, True), (4, 0.88, False), (3, 1.0, True), (2, 1.0, False)],
+)
+def test_three_points_tell_another_raster_where_nine_tenths_of_what_they_are_off_is_alike(
+    tmp_path: Path, n_points: int, share: float, is_told: bool
+) -> None:
+    places = PLACES[:n_points]
+    # Turned about their centre, they are off in no direction and on cells of the same size.
+    turned = (places - places.mean(axis=0)) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    size = np.sqrt((turned**2).sum(axis=1).mean())
+    off = np.array([24.0, -32.0]) + 40.0 * np.sqrt(1.0 / share**2 - 1.0) / size * turned
+    found, metrics = said(tmp_path, points_at(surveyed()[:n_points], pixels=places + off))
+    assert metrics["rms_mm"] == pytest.approx(1e3 * GSD_M * 40.0 / share)
+    assert [one.code for one in found] == ["check-points-shifted"] * is_told
+
+
+def test_points_in_another_unit_are_told(tmp_path: Path) -> None:
+    far = inspect_scenes.frame().world_from_wall(100.0 * PLACES, 0.0)
+    ((one,), _) = said(tmp_path, points_at(far, pixels=PLACES))
+    assert (one.code, one.values["n"], one.values["n_points"]) == ("check-points-far", 4, 4)
+
+
+def test_what_was_shown_holds_for_cells_of_any_size(tmp_path: Path) -> None:
+    off = np.array([[1.5, 0.0], [1.5, 0.0], [0.0, -2.0], [0.0, -2.0]])
+    shown = inspect_scenes.frame().world_from_wall(PLACES + off, 0.02)
+    points = points_at(surveyed(), pixels=np.full((4, 2), np.nan))
+    found, metrics = said(tmp_path, replace(points, shown_world=shown))
+    assert found == []
+    assert metrics["n_found"] == 4
+    assert metrics["mean_x_mm"] == pytest.approx(0.75e3 * GSD_M)
+    assert metrics["mean_y_mm"] == pytest.approx(-1e3 * GSD_M)
+
+
+def test_clicked_points_that_nobody_surveyed_are_no_check(tmp_path: Path) -> None:
+    points = points_at(surveyed(), pixels=np.full((4, 2), np.nan))
+    own = surveyed()
+    with pytest.raises(MethodError, match="enter the surveyed coordinates"):
+        said(tmp_path, replace(points, shown_world=own))
+    own[3, 0] += 0.001
+    (one,), metrics = said(tmp_path, replace(points, shown_world=own))
+    assert (one.code, one.values["n"]) == ("check-points-of-the-image", 3)
+    assert metrics["n_found"] == 4
+
+
+@pytest.mark.parametrize(
+    ("factor", "aside", "code"),
+    [(1.03, 30.0, "of-other-cells"), (1.015, 30.0, "shifted"), (0.97, 30.0, "of-other-cells")],
+)
+def test_cells_of_another_size_are_so_by_two_hundredths(
+    tmp_path: Path, factor: float, aside: float, code: str
+) -> None:
+    middle = PLACES.mean(axis=0)
+    pixels = middle + factor * (PLACES - middle) + aside
+    ((one,), _) = said(tmp_path, points_at(surveyed(), pixels=pixels))
+    assert one.code == f"check-points-{code}"
+
+
+@pytest.mark.parametrize("side", [(-1.0, 0.3), (2.0, 0.3), (0.3, -1.0), (0.3, 2.0)])
+def test_points_are_far_beyond_the_length_of_their_wall(side: tuple[float, float]) -> None:
+    image = inspect_scenes.displaced(0, 0)
+    picture: Any = SimpleNamespace(frame=image.frame)
+    rows, columns = image.frame.shape
+    for further, is_far in ((0.95, False), (1.05, True)):
+        off = further * max(rows, columns)
+        place = [
+            -off if part < 0.0 else size + off if part > 1.0 else part * size
+            for part, size in zip(side, (columns, rows), strict=True)
+        ]
+        point: Any = SimpleNamespace(expected=np.array(place))
+        expected = GSD_M * off if is_far else 0.0
+        assert point_doubts._beyond_m(point, picture) == pytest.approx(expected)
+    assert point_doubts._beyond_m(point, None) == 0.0
+
+
+def test_four_unused_points_are_named_and_the_others_counted() -> None:
+    missed = {f"P{k}": Missed("2 mm below wall") for k in range(6)}
+    named = "P0 (2 mm below wall), P1 (2 mm below wall), P2 (2 mm below wall), P3 (2 mm below wall)"
+    assert with_reasons(missed) == f"{named} and 2 more, see the log"
+    assert with_reasons(dict([*missed.items()][:4])) == named

@@ -1,11 +1,19 @@
-"""Numbers of an inspection, each by its definition, on a handful of values."""
+"""Numbers and pictures of an inspection, each by its definition, on a handful of values."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from orthoflow_plugins.inspect.figures import (
+    colour_error_map,
+    depth_error_map,
+    enlargement,
+    vector_map,
+)
 from orthoflow_plugins.inspect.findings import (
     check_findings,
     displacement_findings,
@@ -13,8 +21,10 @@ from orthoflow_plugins.inspect.findings import (
     report,
 )
 
+from orthoflow.files.images import decode_image
 from orthoflow.products import Finding
-from orthoflow.sdk import StepContext
+from tests.inspect_scenes import image_of
+from tests.raster_scenes import context, numbers
 
 SHIFT_M = np.array([[0.001, 0.002], [-0.003, 0.0], [0.002, -0.001], [0.02, 0.004], [0.0, 0.001]])
 
@@ -92,18 +102,17 @@ def test_a_scale_shows_in_every_length_and_a_shift_in_none() -> None:
 
 
 def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: Path) -> None:
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-
-    def of(name: str, value: float, wall: int) -> Finding:
-        return Finding(name=name, value=value, unit="mm", wall=wall)
-
+    ctx = context(tmp_path)
+    values = [
+        *(("rmse_u_mm", 1.0, 1), ("rmse_u_mm", 2.0, 0), ("rmse_u_mm", 3.0, -1)),
+        *(("p99_mm", 4.0, 1), ("p99_mm", 5.0, 0)),
+        *(("n_photos", 6.0, -1), ("n_points[a]", 7.0, -1)),
+    ]
     findings = [
-        of("rmse_u_mm", 1.0, 1), of("rmse_u_mm", 2.0, 0), of("rmse_u_mm", 3.0, -1),
-        of("p99_mm", 4.0, 1), of("p99_mm", 5.0, 0),
-        of("n_photos", 6.0, -1), of("n_points[a]", 7.0, -1),
-    ]  # fmt: skip
+        Finding(name=name, value=value, unit="mm", wall=wall) for name, value, wall in values
+    ]
     report(findings, 1, {0: 3, 1: 8}, ctx)
-    assert {metric.name: metric.value for metric in ctx.metrics} == {
+    assert numbers(ctx) == {
         "rmse_u_mm": 1.0,
         "wall_3_rmse_u_mm": 2.0,
         "all_rmse_u_mm": 3.0,
@@ -111,3 +120,62 @@ def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: P
         "n_photos": 6.0,
     }
     assert {metric.unit for metric in ctx.metrics} == {"mm"}
+
+
+@pytest.fixture
+def arrows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """Tails, components and colours of the arrows that are drawn, and the one of known length."""
+    kept: list[tuple[Any, ...]] = []
+    quiver, key = Axes.quiver, Axes.quiverkey
+
+    def draw(self: Axes, *args: Any, **settings: Any) -> Any:
+        kept.append((np.array(args[:2]).T, np.array(args[2:]).T, settings["color"]))
+        return quiver(self, *args, **settings)
+
+    def draw_key(self: Axes, *args: Any, **settings: Any) -> Any:
+        kept.append(args[3:])
+        return key(self, *args, **settings)
+
+    monkeypatch.setattr(Axes, "quiver", draw)
+    monkeypatch.setattr(Axes, "quiverkey", draw_key)
+    return kept
+
+
+def test_maps_have_the_width_of_a_column_and_a_colour_bar() -> None:
+    error = np.full((1_800, 450), 30.0)
+    error[:900] = np.nan
+    frame = image_of(np.full((1_800, 450), 80.0)).frame
+    shown = decode_image(colour_error_map(error, frame), "map").astype(int)
+    assert shown.shape[1] == 1003
+    middle = shown[:, 502]
+    # Unknown cells are grey, half of the span is the middle of the colours.
+    np.testing.assert_allclose(middle[200], (138, 148, 158), atol=12)
+    np.testing.assert_allclose(middle[1200], (188, 55, 84), atol=12)
+    square = depth_error_map(np.full((300, 300), 0.01), image_of(np.full((300, 300), 80.0)).frame)
+    red, _, blue = decode_image(square, "map")[300, 502]
+    assert red > blue
+
+
+def test_arrows_run_from_where_things_should_be_to_where_they_are(
+    arrows: list[tuple[Any, ...]],
+) -> None:
+    image = image_of(np.full((250, 250), 80.0))
+    places = np.array([[50.0, 60.0], [150.0, 100.0], [100.0, 200.0]])
+    shift_cells = np.array([[2.0, 0.0], [0.0, 2.0], [-8.0, 0.0]])
+    times = enlargement(shift_cells, image)
+    # The longest usual arrow takes at most 6 % of the side: 15 cells of 7.4 give twice, not five.
+    assert times == 2.0
+    vector_map(image, places, shift_cells)
+    (tails, components, colours), (length, label) = arrows
+    np.testing.assert_allclose(components, times * shift_cells)
+    np.testing.assert_allclose(tails + components, places)
+    # Four times the median is red; the median and what equals it is green.
+    assert colours[0] == colours[1] != colours[2]
+    cell_mm = 1e3 * image.frame.gsd_m
+    assert label == f"{length / times * cell_mm:g} mm"
+    # Of many an even part is drawn; what is longer than the median is yellow.
+    many = np.tile([[1.0, 0.0], [1.0, 0.0], [1.5, 0.0]], (1_100, 1))
+    vector_map(image, np.full((3_300, 2), 100.0), many)
+    tails, components, colours = arrows[2]
+    assert len(tails) == len(components) == 1_650
+    assert len(set(colours)) == 2

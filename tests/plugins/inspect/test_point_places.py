@@ -1,4 +1,4 @@
-"""Where a check point is shown, and where it lies on the surface that a wall has."""
+"""Where a check point is shown, as a target or by the scene, and where it lies on its wall."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from orthoflow_plugins.inspect.point_places import (
     find_by_truth,
     point_on_surface,
 )
+from orthoflow_plugins.inspect.targets import find_crossing
 from orthoflow_plugins.simulate.building import Extent, Paint, SceneDraft, wall_side
 from scipy.ndimage import gaussian_filter
 
@@ -23,10 +24,10 @@ from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.scene_views import render_frame
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
-from orthoflow.products import CheckPoints, Truth, Wall
+from orthoflow.products import Truth, Wall
 from orthoflow.testing.examples import example
 from tests import samples
-from tests.inspect_scenes import SHAPE, walls
+from tests.inspect_scenes import SHAPE, points_at, walls
 
 RADIUS_M = 0.04
 
@@ -76,18 +77,10 @@ def shown_grey(right: float, down: float) -> GreyImage:
     )
 
 
-def by_truth(
-    picture: GreyImage, place: tuple[float, float] = (120.0, 100.0), *, search: int = 5
-) -> NDArray[np.float64] | None:
+def by_truth(picture: GreyImage) -> NDArray[np.float64] | None:
     truth, where = painted()
-    return find_by_truth(
-        picture,
-        where,
-        np.array(place),
-        truth,
-        buffers_m=(0.1, 0.1),
-        search_cells=search,
-    )
+    place = np.array([120.0, 100.0])
+    return find_by_truth(picture, where, place, truth, buffers_m=(0.1, 0.1), search_cells=5)
 
 
 def test_light_and_contrast_do_not_matter_and_another_picture_shows_nothing() -> None:
@@ -126,27 +119,18 @@ def finder(
     frames = [where, replace(where, origin_world=where.origin_world + 0.1 * where.normal_world)]
     rasters = [samples.wall(item, plane_index=4 + k) for k, item in enumerate(frames)]
     on_both = samples.walls(*rasters, buffer_m=0.15)
+    black = np.zeros((*where.shape, 3), dtype=np.uint8)
     pictures = [
         Picture(
             wall=k,
             frame=raster.frame,
             grey=shown_grey(1.5, 0.5),
             surface=raster,
-            image=samples.orthoimage(
-                raster.frame, rgb=np.zeros((*raster.frame.shape, 3), np.uint8), plane_index=4 + k
-            ),
+            image=samples.orthoimage(raster.frame, rgb=black, plane_index=4 + k),
         )
         for k, raster in enumerate(rasters)
     ]
-    count = len(points)
-    checks = CheckPoints(
-        names=tuple(f"P{k}" for k in range(count)),
-        points_world=points,
-        classes=("",) * count,
-        wall=np.full(count, wall, dtype=np.int32),
-        pixels_wall=known.pop("pixels_wall", np.full((count, 2), np.nan)),
-        **known,
-    )
+    checks = replace(points_at(points), wall=np.full(len(points), wall, np.int32), **known)
     return PointFinder(
         pictures=pictures,
         checkpoints=checks,
@@ -174,11 +158,8 @@ def test_a_point_is_looked_for_on_the_nearest_wall_that_holds_it(depth_m: float,
         np.testing.assert_allclose(found.expected, [120.0, 100.0], atol=1e-6)
     else:
         assert np.isnan(found.place).all()
-
-
-def test_a_point_found_by_the_scene_is_where_the_picture_shows_it() -> None:
-    found = finder(at(120.0, 100.0, 0.0), truth=True).find(0)
-    np.testing.assert_allclose(found.place - found.expected, [1.5, 0.5], atol=0.05)
+    if wall == 0:
+        np.testing.assert_allclose(found.place - found.expected, [1.5, 0.5], atol=0.05)
     assert np.isnan(found.point_world).all()
     assert found.point_world.shape == (3,)
 
@@ -216,3 +197,57 @@ def test_places_in_metres_count_before_those_in_cells() -> None:
     found = finder(both, pixels_wall=pixels, places_m=place_m, wall=4)
     np.testing.assert_allclose(found.find(0).place, where.wall_from_raster(place_m[0]))
     np.testing.assert_array_equal(found.find(1).place, [55.0, 66.0])
+
+
+SIDE = 120
+CENTRE = np.array([60.0, 60.0])
+RADIUS = 20.0
+
+
+@cache
+def quadrants(turned_deg: float = 20.0) -> NDArray[np.float64]:
+    """Four quadrants about the middle, their borders a cell wide."""
+    fine = (np.arange(4 * SIDE) + 0.5) / 4.0
+    columns, rows = np.meshgrid(fine - CENTRE[0], fine - CENTRE[1])
+    turn = np.radians(turned_deg)
+    one = columns * np.cos(turn) + rows * np.sin(turn)
+    other = rows * np.cos(turn) - columns * np.sin(turn)
+    bright = gaussian_filter(np.where(one * other > 0.0, 220.0, 40.0), 2.0)
+    return np.asarray(bright.reshape(SIDE, 4, SIDE, 4).mean(axis=(1, 3)))
+
+
+def crossing(
+    grey: NDArray[np.float64],
+    near: tuple[float, float] = (60.0, 60.0),
+    valid: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64] | None:
+    known = np.ones(grey.shape, dtype=np.bool_) if valid is None else valid
+    picture = GreyImage(grey=np.where(known, grey, 0.0), valid=known, region=known)
+    return find_crossing(picture, np.array(near), search_cells=8.0, radius_cells=RADIUS)
+
+
+def test_edges_discs_and_even_places_are_no_targets() -> None:
+    rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5
+    edge = gaussian_filter(np.where(columns < 60.0, 40.0, 220.0), 0.7)
+    disc = gaussian_filter(np.where(np.hypot(columns - 60, rows - 60) < 12.0, 40.0, 220.0), 0.7)
+    # Two quadrants of four, and a saddle that half a turn leaves alone but a quarter does not.
+    wedge = gaussian_filter(np.where((columns > 60.0) & (rows > 60.0), 220.0, 40.0), 0.7)
+    for grey in (edge, disc, wedge, np.full((SIDE, SIDE), 90.0)):
+        assert crossing(grey) is None
+
+
+@pytest.mark.parametrize(("share", "is_found"), [(0.8, True), (0.35, False)])
+def test_half_of_a_target_must_be_there_on_both_sides(share: float, is_found: bool) -> None:
+    # A strip through the middle; what lies across the middle from a void does not count either.
+    rows = np.mgrid[:SIDE, :SIDE][0] + 0.5
+    valid = np.abs(rows - 60.0) <= share * RADIUS
+    assert (crossing(quadrants(), valid=valid) is not None) == is_found
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 33.0])
+def test_the_centre_of_a_target_is_found_in_noise_and_holes(turned_deg: float) -> None:
+    rng = np.random.default_rng(3)
+    noisy = quadrants(turned_deg) + rng.normal(scale=6.0, size=(SIDE, SIDE))
+    place = crossing(noisy, (55.0, 64.0), rng.random(noisy.shape) > 0.3)
+    assert place is not None
+    np.testing.assert_allclose(place, CENTRE, atol=0.06)  # cells

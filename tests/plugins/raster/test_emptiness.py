@@ -117,6 +117,12 @@ def told(
         threads=1,
     )
     assert found.share == pytest.approx(VOID_SHARE)
+    depths_m = places_m[:, 2]
+    if found.before_share:
+        before_m = depths_m[(depths_m > 0.15) & (depths_m < free_m)]
+        assert found.before_m == pytest.approx(np.percentile(before_m, 95.0))
+    if found.behind_share:
+        assert found.behind_m == pytest.approx(-np.median(depths_m[depths_m < -0.25]))
     shares = {cause: getattr(found, f"{cause}_share") / VOID_SHARE for cause in CAUSES}
     return {cause: share for cause, share in shares.items() if share}
 
@@ -155,26 +161,10 @@ def test_two_points_behind_or_before_a_tile_tell_why_it_is_empty(
     assert told(in_each_tile(5.1), free_m=np.inf) == {"unseen": pytest.approx(1.0)}
 
 
-def test_what_stands_before_a_wall_is_named_with_the_buffer_that_takes_it_in(
-    tmp_path: Path,
-) -> None:
-    # Four columns 2.3 m before the wall, seen from far: nothing behind them was scanned.
-    columns = [(0.4 + k, 0.65 + k) for k in range(4)]
-    wall = grid((0, 4), (0, 3))
-    for x in columns:
-        wall = without(wall, x, (0.0, 3.0))
-    before = [grid(x, (0.0, 3.0), depth_m=2.3) for x in columns]
-    # They hang together with nothing, as a portico on the ground that was not scanned.
-    shares, said = causes(scenes.cloud_of(np.vstack([wall, *before])), tmp_path)
-    assert shares["before"] == pytest.approx(0.25, abs=0.05)
-    assert [(one.code, one.values["before_m"]) for one in said] == [("wall-front-left-out", 2.3)]
-    assert "buffer_front_m=2.3" in said[0].remedy
-    shares, _ = causes(scenes.cloud_of(np.vstack([wall, *before])), tmp_path, buffer_front_m=2.4)
-    assert shares["before"] < SHARE
-
-
 def test_what_stands_before_counts_before_what_lies_behind() -> None:
     both = np.vstack([in_each_tile(-1.0), in_each_tile(0.5)[:16]])
+    both[:24:2, 2] -= 0.3
+    both[-12:, 2] += 0.2
     # The first half of the tiles.
     assert told(both) == {"before": pytest.approx(0.5), "behind": pytest.approx(0.5)}
 

@@ -8,25 +8,27 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+from orthoflow_plugins.raster.walls import bytes_needed, require_memory
 
+from orthoflow.errors import MethodError
 from orthoflow.geometry import bands
-from orthoflow.geometry.bands import count_cells, count_known, holds_cells
-from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, PointCloud, Walls
-from tests import inspect_scenes, ortho_scenes, raster_scenes
-from tests.long_loops import long_only
+from orthoflow.geometry.bands import IN_MEMORY_CELLS, holds_cells
+from orthoflow.geometry.rows import raster_rows
+from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Walls
+from tests import inspect_scenes, ortho_scenes, raster_scenes, samples
 from tests.plugins.ortho.test_direct import bare_walls
 from tests.raster_scenes import context
 
 BAND_CELLS = 1 << 17
-SHAPE = (1500, 1000)
-N_CELLS = SHAPE[0] * SHAPE[1]
 
 
 @pytest.fixture
@@ -138,9 +140,9 @@ def tall_wall() -> tuple[raster_scenes.KnownWall, PointCloud]:
     return known, raster_scenes.cloud_of(points, intensity=intensity)
 
 
-def large_layers(folder: Path, shape: tuple[int, int]) -> tuple[Layer, ...]:
+def large_layers(folder: Path) -> tuple[Layer, ...]:
     """Two photos whose quality falls from left to right, and the other way, in files."""
-    rng = np.random.default_rng(2)
+    shape, rng = (1500, 1000), np.random.default_rng(2)
     ramp = np.broadcast_to(np.linspace(1.0, 2.0, shape[1], dtype=np.float32), shape)
     layers = []
     for k, quality in enumerate((ramp, ramp[:, ::-1])):
@@ -155,54 +157,19 @@ def large_layers(folder: Path, shape: tuple[int, int]) -> tuple[Layer, ...]:
     return tuple(layers)
 
 
-def mosaic(
-    layers: tuple[Layer, ...], folder: Path, **params: object
-) -> tuple[Orthoimage, dict[str, float]]:
-    inputs, ctx = MosaicSeams.In(layers=Layers(layers=layers)), context(folder)
-    chosen = MosaicSeams.Params.model_validate({"island_cells_min": 4} | params)
-    (image,) = MosaicSeams().run(inputs, chosen, ctx).orthoimages.images
-    return image, raster_scenes.numbers(ctx)
-
-
 @pytest.mark.usefixtures("small_bands")
 def test_mosaics_are_joined_and_reported_without_memory_per_cell(
     tmp_path: Path,
 ) -> None:
-    layers = large_layers(tmp_path, SHAPE)
-    params: dict[str, object] = {"seams": "graph-cut"}
-    mosaic(tuple(crop(layer, 100) for layer in layers), tmp_path, **params)  # libraries loaded
+    layers = large_layers(tmp_path)
+    params = MosaicSeams.Params(seams="graph-cut", island_cells_min=4)
+    few = Layers(layers=tuple(raster_rows(layer, slice(0, 100)) for layer in layers))
+    MosaicSeams().run(MosaicSeams.In(layers=few), params, context(tmp_path))  # libraries loaded
+    inputs = MosaicSeams.In(layers=Layers(layers=layers))
     with peak_bytes() as peak:
-        mosaic(layers, tmp_path, **params)
+        MosaicSeams().run(inputs, params, context(tmp_path))
         # The layers hold sixteen bytes per cell, the orthoimage six; a cut is that of 30 000 cells.
-        assert peak() < 4.0 * N_CELLS + 30e6, peak()
-
-
-def crop(layer: Layer, n_rows: int) -> Layer:
-    return dataclasses.replace(
-        layer,
-        frame=dataclasses.replace(layer.frame, height=n_rows),
-        rgb=layer.rgb[:n_rows],
-        mask=layer.mask[:n_rows],
-        quality=layer.quality[:n_rows],
-    )
-
-
-@pytest.mark.parametrize("seams", ["graph-cut", *long_only("best-view", "priority", "voronoi")])
-def test_bands_show_neither_in_mosaics_nor_in_their_metrics(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seams: str
-) -> None:
-    layers = large_layers(tmp_path, (333, 270))
-    params = {"seams": seams, "priority": ["photo 1"], "gains": "global"}
-    found = []
-    for band_cells in (1 << 24, 270 * 70):
-        monkeypatch.setattr(bands, "_BAND_CELLS", band_cells)
-        for name in ("_BAND_CELLS", "_BALANCED_AT_ONCE"):
-            monkeypatch.setattr(f"orthoflow_plugins.mosaic.joining.{name}", band_cells)
-        found.append(mosaic(layers, tmp_path, **params))
-    (whole, metrics), (banded, others) = found
-    assert metrics == others
-    for name in ("rgb", "mask", "source"):
-        np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))
+        assert peak() < 4.0 * layers[0].mask.size + 30e6, peak()
 
 
 @pytest.mark.usefixtures("small_bands")
@@ -215,15 +182,26 @@ def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path)
         assert peak() < 10.0 * walls.walls[0].mask.size, peak()
 
 
-def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(1)
-    mask = rng.integers(0, 4, (103, 37), dtype=np.uint8)
-    depths = np.where(mask == 2, np.nan, 1.0)
-    monkeypatch.setattr(bands, "_BAND_CELLS", 37 * 10)
-    parts = list(bands.row_bands(mask.shape, multiple=4))
-    assert [part.stop - part.start for part in parts] == [8] * 12 + [7]
-    assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
-    assert count_cells(mask, 3) == np.count_nonzero(mask == 3)
-    assert count_known(depths) == np.count_nonzero(mask != 2)
-    assert holds_cells(mask, 3)
-    assert not holds_cells(mask, 4)
+def test_walls_may_take_three_quarters_of_the_memory_and_large_ones_that_of_a_band(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def give_memory(n_bytes: float) -> None:
+        memory = SimpleNamespace(total=int(n_bytes))
+        monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+
+    one = samples.facing_south(0.01, 3000, 2000)
+    give_memory(1.01 * bytes_needed([one.shape]) / 0.75)
+    require_memory([one])
+    give_memory(0.99 * bytes_needed([one.shape]) / 0.75)
+    with pytest.raises(MethodError, match=r"gsd_m = 0.01 m make 6e\+06 cells \(3000 x 2000"):
+        require_memory([one])
+    huge, larger = (8000, 20_000), (8000, 40_000)
+    assert huge[0] * huge[1] > IN_MEMORY_CELLS
+    assert bytes_needed([huge]) == bytes_needed([larger])
+    tins = [bytes_needed([shape], is_tin=True) for shape in (huge, larger)]
+    assert tins[1] - tins[0] == 790 * 8000 * 20_000
+    # Whatever the memory, cells are numbered with 32 bits.
+    give_memory(1e15)
+    require_memory([samples.facing_south(0.01, (1 << 16) - 1, 1 << 15)])
+    with pytest.raises(MethodError, match="cells of gsd_m"):
+        require_memory([samples.facing_south(0.01, 1 << 16, 1 << 15)])

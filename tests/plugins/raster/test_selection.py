@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster import selection
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.selection import (
     chosen_planes,
@@ -195,18 +194,3 @@ def test_walls_and_floors_lean_by_ten_degrees_at_most(
     else:
         with pytest.raises(MethodError, match=f"none of the 1 planes is {constraint}"):
             chosen_planes(leaning(degrees), choice, buffer_m)
-
-
-def test_the_raster_of_a_plane_lies_over_its_rectangle_and_a_margin() -> None:
-    turned = planes((0.0, 0.0, 5.0, 20.0))
-    for margin_m in (0.0, 0.5):
-        frame = selection.frame_of(turned, 0, gsd_m=0.1, margin_m=margin_m)
-        assert frame.shape == (round((2.0 + 2.0 * margin_m) / 0.1), round((5 + 2 * margin_m) / 0.1))
-        top_left, bottom_left, _, top_right = turned.corners[0]
-        right = (top_right - top_left) / 5.0
-        down = (bottom_left - top_left) / 2.0
-        np.testing.assert_allclose(
-            frame.origin_world, top_left - margin_m * (right + down), atol=1e-9
-        )
-        np.testing.assert_allclose(frame.u_world, right, atol=1e-9)
-        np.testing.assert_allclose(frame.v_world, down, atol=1e-9)
