@@ -418,7 +418,7 @@ def e57_colour_limit_wrong(draw: Draw) -> Case:
         paths=[path],
         rgb=True,
         intensity="linear",
-        warnings=(str(limit), "colours can reach"),
+        warnings=(str(limit), "colours reach at most"),
     )
 
 

@@ -52,7 +52,7 @@ class BrokenPlugin:
     traceback: str
 
     def __str__(self) -> str:
-        return f"plugin {self.entry_point} of {self.distribution} fails to load: {self.error}"
+        return f"plugin {self.entry_point} of {self.distribution} cannot be loaded: {self.error}"
 
     def mentions(self, method_id: str) -> bool:
         """Return whether the plugin's code contains this method id, and so probably declares it."""
@@ -189,7 +189,7 @@ class Catalog:
                     raise PluginError(f"method {method_id} cannot be used: {plugin}")
             raise WorkflowError(
                 f"unknown method {method_id}{self._suggest(method_id)}{self._hint_at_broken()}; "
-                "`orthoflow plugins list` names all; one of a plugin of your own is known after "
+                "`orthoflow plugins list` shows all; to add the methods of your own plugin, run "
                 "`pip install -e .` in its folder"
             )
         if entry.state != "fine":
@@ -210,7 +210,7 @@ class Catalog:
 
         entry = self._product(type_name)
         cls = import_target(entry.spec.target, f"product type {type_name}", entry.distribution)
-        broken = f"product type {type_name} of {entry.distribution} breaks a rule: "
+        broken = f"product type {type_name} of {entry.distribution} is invalid: "
         if not (isinstance(cls, type) and issubclass(cls, Product)):
             raise PluginError(f"{broken}{entry.spec.target} must be a subclass of Product")
         own = getattr(cls, "type_name", None)
@@ -241,8 +241,8 @@ class Catalog:
         entry = self.products.get(type_name)
         if entry is None:
             raise PluginError(
-                f"no installed plugin brings product type {type_name}"
-                f"{did_you_mean(type_name, self.products)}{self._hint_at_broken()}"
+                "no installed plugin provides the product type "
+                f"{type_name}{did_you_mean(type_name, self.products)}{self._hint_at_broken()}"
             )
         if entry.state != "fine":
             raise PluginError(entry.problem)
@@ -267,5 +267,5 @@ class Catalog:
     def _hint_at_broken(self) -> str:
         hints = [f"; {plugin}" for plugin in self.broken]
         if self.disabled:
-            hints.append(f"; {DISABLED} switches off {', '.join(self.disabled)}")
+            hints.append(f"; {DISABLED} disables {', '.join(self.disabled)}")
         return "".join(hints)

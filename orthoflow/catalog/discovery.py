@@ -134,7 +134,7 @@ def _announced(entry: EntryPoint) -> list[MethodSpec | KindSpec | ProductSpec]:
                 specs.append(item)
     if not specs:
         raise PluginError(
-            f"{entry.value} announces nothing; give it a function orthoflow_methods with @hookimpl"
+            f"{entry.value} declares nothing; add a function orthoflow_methods with @hookimpl"
         )
     return specs
 
@@ -150,7 +150,7 @@ def _check(spec: MethodSpec | KindSpec | ProductSpec) -> None:
         if item.name in ("inputs", "outputs"):
             is_fine = is_fine and isinstance(value, Mapping)
         if not is_fine:
-            raise PluginError(f"{item.name} of a {type(spec).__name__} cannot be {value!r}")
+            raise PluginError(f"{item.name} of a {type(spec).__name__} must not be {value!r}")
     name = _name(spec)
     if isinstance(spec, MethodSpec) and not _METHOD_ID.fullmatch(name):
         raise PluginError(
@@ -197,7 +197,7 @@ def _name(spec: MethodSpec | KindSpec | ProductSpec) -> str:
 
 def _contested(what: str, claims: Iterable[_AnyClaim], consequence: str) -> str:
     claimants = " and ".join(str(distribution) for _, distribution in claims)
-    return f"{what} is claimed by {claimants}: {consequence}; {DISABLED}=NAME switches a plugin off"
+    return f"{what} is declared by {claimants}: {consequence}; {DISABLED}=NAME disables a plugin"
 
 
 def _collect_products(
@@ -225,7 +225,7 @@ def _collect_kinds(
         if not problem and any(_ports(other) != _ports(spec) for other, _ in claims):
             # Identical ports are harmless: two plugins may declare the same kind.
             problem = _contested(
-                f"kind {name}", claims, "methods have the ports that their own plugin gives it"
+                f"kind {name}", claims, "methods have the ports declared by their own plugin"
             )
         entries[name] = KindEntry(
             spec=spec, distribution=distribution, state=state, problem=problem
@@ -244,8 +244,8 @@ def _unknown_products(
     if not unknown:
         return ""
     return (
-        f"kind {spec.name} of {distribution} has ports of product types that no plugin "
-        f"announces: {', '.join(unknown)}"
+        f"kind {spec.name} of {distribution} has ports with product types that no plugin "
+        f"declares: {', '.join(unknown)}"
     )
 
 
@@ -269,7 +269,7 @@ def _collect_methods(
         shared = kinds.get(spec.kind)
         who, problem = f"method {spec.id} of {distribution}", ""
         if shared is None:
-            problem = f"{who} is of kind {spec.kind}, which no plugin announces"
+            problem = f"{who} has the kind {spec.kind}, which no plugin declares"
         elif unusable := (
             _unknown_products(own, product_types)
             if own

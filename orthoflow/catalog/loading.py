@@ -48,10 +48,11 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
         lacks_it = isinstance(error, AttributeError) and error.obj is module
         if lacks_it and module is not None:
             near = did_you_mean(name, vars(module))
-            problem = f"{module_name} has no {name}{near}"
+            problem = f"{module_name} does not contain {name}{near}"
         raise PluginError(
-            f"{what} of {distribution} cannot be loaded from {target}: {problem}; install what is "
-            f"missing or another version of {distribution.name}, or correct its source"
+            f"{what} of {distribution} cannot be loaded from {target}: {problem}; install "
+            f"missing packages or another version of {distribution.name}, or correct its source "
+            "code"
         ) from error
 
 
@@ -68,7 +69,7 @@ def load_method(
         PluginError: the import fails or the class violates a rule.
     """
     method = import_target(spec.target, f"method {spec.id}", distribution)
-    broken = f"method {spec.id} of {distribution} breaks a rule: "
+    broken = f"method {spec.id} of {distribution} is invalid: "
     if not (isinstance(method, type) and issubclass(method, Method)):
         raise PluginError(f"{broken}{spec.target} must be a subclass of Method, got {method!r}")
     complaint = _class_complaint(method, spec)
@@ -101,17 +102,17 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
         f"determinism must be exact, seeded or loose, got {method.determinism!r}": (
             method.determinism in typing.get_args(Determinism)
         ),
-        f"result_version must be a whole number from 1 on, got {version!r}": (
+        f"result_version must be an integer of at least 1, got {version!r}": (
             type(version) is int and version >= 1
         ),
-        f"citations must be a tuple of texts, got {citations!r}": (
+        f"citations must be a tuple of strings, got {citations!r}": (
             isinstance(citations, tuple) and all(isinstance(item, str) for item in citations)
         ),
-        f"metrics must be a tuple of MetricSpec, or of names, got {metrics!r}": (
+        f"metrics must be a tuple of MetricSpec or of names, got {metrics!r}": (
             isinstance(metrics, tuple)
             and all(isinstance(one, MetricSpec | str) and one for one in metrics)
         ),
-        "it has no run": method.run is not Method.run,
+        "it has no method run": method.run is not Method.run,
     }
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
 
@@ -123,8 +124,8 @@ def product_complaint(cls: type[Product]) -> str:
     known = dict.fromkeys(_names_within(cls, set()))
     return next(
         (
-            f"tolerances of {cls.__qualname__} names {name}, which is not a field"
-            f"{did_you_mean(name, known)}"
+            f"tolerances of {cls.__qualname__} contains {name}, which is not a "
+            f"field{did_you_mean(name, known)}"
             for name in cls.tolerances
             if name not in known
         ),
@@ -168,15 +169,15 @@ def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozens
             return f"kind {kind.name} has no input port {port.name}; it has {_join(kind.inputs)}"
         if port.type_name != kind.inputs[port.name]:
             return (
-                f"input port {port.name} carries {kind.inputs[port.name]} in kind {kind.name}, "
-                f"not {port.type_name}"
+                f"input port {port.name} has the type {kind.inputs[port.name]} in kind "
+                f"{kind.name}, not {port.type_name}"
             )
     for port in given.values():
         wanted = kind.outputs.get(port.name, port.type_name)
         if port.type_name != wanted:
             cls = next(iter(_products_of(typing.get_type_hints(method.Out)[port.name])))
             return (
-                f"its output port {port.name} is {wanted} in kind {kind.name}, but "
+                f"its output port {port.name} has the type {wanted} in kind {kind.name}, but "
                 f"{cls.__module__}:{cls.__qualname__} has type_name '{port.type_name}'"
             )
     if given.keys() != kind.outputs.keys():
@@ -193,8 +194,8 @@ def _contested_complaint(
         target = contested.get(cls.type_name, "")
         if target and cls is not import_target(target, f"product {cls.type_name}", distribution):
             return (
-                f"its {cls.type_name} is {cls.__module__}:{cls.__qualname__}, but that name is "
-                f"taken by {target} of another plugin: disable that one, or rename the product"
+                f"its {cls.type_name} is {cls.__module__}:{cls.__qualname__}, but {target} of "
+                "another plugin has the same name: disable that plugin, or rename the product"
             )
     return ""
 
@@ -203,8 +204,7 @@ def _unknown_type(ports: Mapping[str, PortSpec], known: frozenset[str]) -> str:
     for port in ports.values():
         if port.type_name not in known:
             return (
-                f"port {port.name} carries {port.type_name}, a product type that no plugin "
-                f"announces"
+                f"port {port.name} has the product type {port.type_name}, which no plugin declares"
             )
     return ""
 

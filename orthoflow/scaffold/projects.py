@@ -118,33 +118,33 @@ def _check(project: Project, folder: Path, catalog: Catalog) -> None:
         _check_new_kind(project, catalog)
     elif project.kind not in catalog.kinds:
         raise ArgumentError(
-            f"no installed plugin announces kind {project.kind}"
+            f"no installed plugin declares the kind {project.kind}"
             f"{did_you_mean(project.kind, catalog.kinds)}; there are {', '.join(catalog.kinds)}"
         )
     if taken := catalog.methods.get(project.method_id):
         raise ArgumentError(
-            f"method {project.method_id} is brought by {taken.distribution} already; take another "
+            f"{taken.distribution} already provides the method {project.method_id}; choose another "
             "name"
         )
     if find_spec(project.package) is not None:
         raise ArgumentError(
-            f"a Python package {project.package} is installed already; take another name"
+            f"a Python package {project.package} is already installed; choose another name"
         )
     if folder.exists():
-        raise ArgumentError(f"{folder} exists already; take another name, or remove it")
+        raise ArgumentError(f"{folder} already exists; choose another name, or remove it")
 
 
 def _check_new_kind(project: Project, catalog: Catalog) -> None:
     if project.kind in catalog.kinds:
         raise ArgumentError(
-            f"kind {project.kind} is announced by an installed plugin already: write a method of "
-            f"it with --kind {project.kind}, or take another name"
+            f"kind {project.kind} is already declared by an installed plugin: write a method of "
+            f"it with --kind {project.kind}, or choose another name"
         )
     for name in filter(None, (project.kind, project.product)):
         if not re.fullmatch(NAME_PATTERN, name) or keyword.iskeyword(name) or "-" in name:
             raise ArgumentError(
-                f"names of kinds and products are lower-case letters, digits and underscores, got "
-                f"{name!r}"
+                "names of kinds and products must consist of lower-case letters, digits and "
+                f"underscores, got {name!r}"
             )
     if project.product in catalog.products:
         raise ArgumentError(

@@ -129,15 +129,17 @@ class StepContext:
         self._take_name(name)
         if not is_name(unit, also_of_file=False):
             raise ProductError(
-                f"the unit of metric {name} must be a word, 1 for counts and shares, "
-                f"got {one_line(ascii(unit), 80)}"
+                f"the unit of metric {name} must be a word, or 1 for counts and shares; got "
+                f"{one_line(ascii(unit), 80)}"
             )
         try:
             number = float(value)
         except (TypeError, ValueError, OverflowError) as error:
             raise ProductError(f"metric {name} must be a number: {one_line(error)}") from error
         if not math.isfinite(number):
-            raise ProductError(f"metric {name} must be finite, got {number}: leave it out instead")
+            raise ProductError(
+                f"metric {name} must be finite, got {number}: if it is unknown, do not report it"
+            )
         self.metrics.append(Metric(name=name, value=number, unit=unit))
 
     def figure(
@@ -165,7 +167,7 @@ class StepContext:
         suffix = _suffix(content, name) if isinstance(content, bytes) else ".png"
         path = _path_below(path.parent, f"{name}{suffix}")
         if colliding([*(figure.name for figure in self.figures), name]):
-            raise ProductError(f"figure {name} was drawn twice")
+            raise ProductError(f"figure {name} was added twice")
         path.parent.mkdir(exist_ok=True)
         if isinstance(content, bytes):
             path.write_bytes(content)
@@ -268,8 +270,8 @@ class StepContext:
     def _take_name(self, name: object) -> None:
         if not is_name(name):
             raise ProductError(
-                f"a metric must have a name of one printable line, without `/` and of at most 200 "
-                f"bytes, got {one_line(ascii(name), 80)}"
+                "the name of a metric must be a printable line of at most 200 bytes without `/`, "
+                f"got {one_line(ascii(name), 80)}"
             )
         _require_letters("metric", name)
         if name in self._named:
@@ -280,20 +282,20 @@ class StepContext:
 
 def _require_room(what: str, n_before: int, most: int) -> None:
     if n_before >= most:
-        raise ProductError(f"a step may report {most} {what}s, not more")
+        raise ProductError(f"a step may report at most {most} {what}s")
 
 
 def _require_letters(what: str, name: object) -> None:
     if strange := "".join(dict.fromkeys(re.sub(r"[\w.-]", "", str(name)))):
         raise ProductError(
-            f"the name of a {what} has letters, digits, `-`, `_` and `.`, got {strange!r} in "
-            f"{one_line(ascii(name), 80)}"
+            f"the name of a {what} may contain only letters, digits, `-`, `_` and `.`, got "
+            f"{strange!r} in {one_line(ascii(name), 80)}"
         )
 
 
 def _path_below(folder: Path, name: object) -> Path:
     if not isinstance(name, str):
-        raise ProductError(f"the name of a file must be a text, got {one_line(ascii(name), 80)}")
+        raise ProductError(f"the name of a file must be a string, got {one_line(ascii(name), 80)}")
     try:
         return path_below(folder, name)
     except UnsafeFileError as error:
@@ -307,8 +309,8 @@ def _suffix(picture: bytes, name: str) -> str:
         return ".webp"
     if not is_plain_svg(picture):
         raise ProductError(
-            f"figure {name} must be a PNG, a WebP or a plain SVG (no script, no link, no file from "
-            f"elsewhere, at most {MOST_SVG_BYTES // 1_000_000} MB), got what begins with "
+            f"figure {name} must be a PNG, a WebP or a plain SVG (without scripts, links and "
+            f"external files, at most {MOST_SVG_BYTES // 1000000} MB); its content begins with "
             f"{picture[:_HEAD_BYTES]!r}"
         )
     return ".svg"

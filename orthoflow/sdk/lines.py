@@ -69,4 +69,4 @@ def _text_of(text: object) -> str:
     try:
         return str(text)
     except Exception:  # noqa: BLE001 - the text of an exception may raise an exception
-        return f"a {type(text).__name__} without words"
+        return f"a {type(text).__name__} without a message"

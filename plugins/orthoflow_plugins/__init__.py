@@ -1,1 +1,1 @@
-"""The built-in methods, one sub-package per kind; `hooks` announces them like a stranger's."""
+"""The built-in methods, one sub-package per kind; `hooks` declares them as any plugin does."""

@@ -10,48 +10,51 @@ from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec, ProductSpec, hookim
 # hyphens instead of underscores.
 _METHODS: Final = {
     "read.scan:ReadScan": "E57, LAS/LAZ, PLY, PCD, PTX and text scans -> cloud",
-    "read.photos:ReadPhotos": "JPEG, PNG and TIFF photos as they are, with EXIF and calibration",
+    "read.photos:ReadPhotos": "JPEG, PNG and TIFF photos, unchanged, with EXIF data and "
+    "calibration",
     "read.checkpoints:ReadCheckpoints": "surveyed points from CSV files",
     "read.ties:ReadTies": "points measured by hand in photos, from CSV files",
     "read.cameras:ReadCameras": "orientations from other programs, in the frame of the scan",
     "read.orthoimage:ReadOrthoimage": "GeoTIFF orthoimages from other programs, with the frame of "
     "their wall",
-    "simulate.room:SimulateRoom": "a scanned and photographed room with relief and obstacle, and "
-    "its truth",
-    "register.similarity:RegisterSimilarity": "shift, rotation and scale from pairs of points, "
-    "with sigma0 and residuals",
-    "plane.hough2d:Hough2d": "Hough transform of the plan, cells weighted by their points",
+    "simulate.room:SimulateRoom": "a simulated room, scanned and photographed, with its true "
+    "geometry",
+    "register.similarity:RegisterSimilarity": "translation, rotation and scale from pairs of "
+    "points, with sigma0 and residuals",
+    "plane.hough2d:Hough2d": "Hough transform of the plan, cells weighted by their number of "
+    "points",
     "plane.hough3d:Hough3d": "Hough transform of voxels, planes in any direction",
     "plane.ransac:Ransac": "random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or "
     "the plan",
     "plane.region:Region": (
-        "regions grown over neighbouring points with similar normals and one plane"
+        "region growing over neighbouring points with similar normals in one plane"
     ),
-    "plane.comparators:Open3dRansac": "open3d's segment_plane, plane after plane, for comparison",
+    "plane.comparators:Open3dRansac": "open3d's segment_plane, repeated for each plane, for "
+    "comparison",
     "plane.comparators:Open3dPatches": "open3d's detect_planar_patches, for comparison",
     "plane.given:GivenPlane": "a reference plane given by the user",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
-    "match.sift:MatchSift": "key points of the photos and of the walls, RootSIFT, mutual and "
-    "distinct",
-    "match.sides:FaceByPhotos": "planes whose side was guessed, turned to the side that the photos "
-    "show",
-    "match.guided:MatchGuided": "photos matched with the walls again from a first pose",
-    "orient.pnp:OrientPnp": "each photo separately from its ties, with "
-    "its accuracy or the reason why it is refused",
+    "match.sift:MatchSift": "RootSIFT key points of photos and walls, mutual best matches that "
+    "pass the ratio test",
+    "match.sides:FaceByPhotos": "fronts of planes from photos, where they were only guessed",
+    "match.guided:MatchGuided": "photos matched with the walls again, starting from a first pose",
+    "orient.pnp:OrientPnp": "each photo separately from its ties, with its accuracy or the "
+    "reason for its rejection",
     "orient.dlt:OrientDlt": "each photo by a direct linear transform, with or without distortion",
-    "orient.bundle:OrientColmapBundle": "all photos at once, tied to the walls and to each other, "
-    "lenses refined",
+    "orient.bundle:OrientColmapBundle": "bundle adjustment of all photos with ties to the walls "
+    "and to each other, lenses refined",
     "orient.given:OrientGiven": "poses from other programs, unchanged or "
     "corrected by ties measured by hand",
-    "dense.sgm:DenseSgm": "the surface that neighbouring photos show, by semi-global matching",
+    "dense.sgm:DenseSgm": "dense cloud from neighbouring photos, by semi-global matching",
     "colour.photos:ColourPhotos": "each point takes the colour of the photo that shows it best",
-    "ortho.pointcloud_direct:PointcloudDirect": "each cell takes the colour of its topmost point",
-    "ortho.dsm_backward:DsmBackward": "each cell of a wall takes its "
-    "colour from the photos that see it",
+    "ortho.pointcloud_direct:PointcloudDirect": "each cell takes the colour of its point nearest "
+    "to the viewer",
+    "ortho.dsm_backward:DsmBackward": "each cell of a wall takes its colour from the photos that "
+    "show it",
     "ortho.dsm_forward:DsmForward": "each pixel of a photo is projected onto the wall it shows",
     "mosaic.seams:MosaicSeams": "one orthoimage per wall from its layers",
-    "segment.openings:SegmentOpenings": "windows, doors and niches as outlines, by depth, lines of "
-    "sight and picture",
+    "segment.openings:SegmentOpenings": "outlines of windows, doors and niches from depths, "
+    "lines of sight and the orthoimage",
     "inspect.openings:InspectOpenings": "compare outlines of openings with a simulated scene",
     "inspect.truth:InspectTruth": "compare orthoimages, walls and planes with a simulated scene",
     "inspect.surf:InspectSurf": "compare orthoimages with the laser's intensity, by SURF key "
@@ -76,7 +79,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(name="simulate", summary="scenes with exact truth", is_source=True),
         KindSpec(
             name="register",
-            summary="bring a cloud into another coordinate system",
+            summary="transform a cloud into another coordinate system",
             inputs=_ports("cloud", points="checkpoints", control="checkpoints"),
             outputs=_ports("cloud inspection"),
         ),
@@ -88,7 +91,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="face",
-            summary="turn planes to the side from which they are seen",
+            summary="determine the fronts of planes",
             inputs=_ports("planes cloud photos"),
             outputs=_ports("planes"),
         ),
@@ -100,7 +103,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="match",
-            summary="find points of the photos on the walls",
+            summary="find points of photos on the walls",
             inputs=_ports("photos walls cameras cloud", hand="ties"),
             outputs=_ports("ties"),
         ),
@@ -112,7 +115,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="dense",
-            summary="match the surface that oriented photos show",
+            summary="compute a dense cloud from oriented photos",
             inputs=_ports("photos cameras"),
             outputs=_ports("cloud"),
         ),
@@ -185,7 +188,7 @@ def orthoflow_products() -> list[ProductSpec]:
         _product(
             "ties",
             "photographs:Ties",
-            "points of photos with known positions on walls",
+            "points in photos with known positions on walls",
             publisher="publishing",
         ),
         _product(

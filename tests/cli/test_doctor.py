@@ -132,7 +132,7 @@ def test_broken_and_disabled_plugins_cost_their_methods(monkeypatch: pytest.Monk
     assert findings()["plugin odd"]["found"] == "switched off"
     unknown = CliRunner().invoke(program, ["plugins", "show", "plane.odd"])
     assert unknown.exit_code == 2
-    assert "ORTHOFLOW_DISABLED_PLUGINS switches off odd" in unknown.output
+    assert "ORTHOFLOW_DISABLED_PLUGINS disables odd" in unknown.output
 
     def fail() -> None:
         raise ImportError("no pluggy")

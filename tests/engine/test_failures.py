@@ -62,7 +62,7 @@ RAISED = {
     "{}['missing']": f"{UNEXPECTED}: KeyError: 'missing'",
     "raise BaseException('of no kind')": f"{UNEXPECTED}: BaseException: of no kind",
     "class Mute(Exception):\n    __str__ = None\nraise Mute": (
-        f"{UNEXPECTED}: Mute: a Mute without words"
+        f"{UNEXPECTED}: Mute: a Mute without a message"
     ),
     r"raise ValueError('one\ntwo \x1b[31m \udcff \0')": (
         rf"{UNEXPECTED}: ValueError: one two \x1b[31m \udcff \x00"
@@ -87,7 +87,7 @@ RAISED = {
         f"MethodError: {TOY} must give a numbers on its port numbers, got Scan"
     ),
     "ctx.metric('nan', float('nan'), '1')": (
-        "ProductError: metric nan must be finite, got nan: leave it out instead"
+        "ProductError: metric nan must be finite, got nan: if it is unknown, do not report it"
     ),
     "values = np.array([object()])": (
         "ProductError: a numbers cannot be stored: an array of type object cannot be stored, only "

@@ -281,5 +281,5 @@ def test_more_planes_or_parts_than_a_drawing_bears_are_refused() -> None:
     )
     for planes in (many, in_parts):
         for work in (surfaces_of, outline_of):
-            with pytest.raises(InputError, match=r"planes of .* connected parts, at most"):
+            with pytest.raises(InputError, match=r"planes with .* connected parts; at most"):
                 work(planes)

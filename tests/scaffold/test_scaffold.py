@@ -154,15 +154,18 @@ PARTS = {"kind": "part", "product": "parts", "takes": ("cloud",)}
 @pytest.mark.parametrize(
     ("project", "sentence"),
     [
-        ({**PARTS, "kind": "plane"}, "kind plane is announced by an installed plugin already"),
+        ({**PARTS, "kind": "plane"}, "kind plane is already declared by an installed plugin"),
         ({**PARTS, "kind": "my-parts"}, "lower-case letters, digits and underscores, got 'my-par"),
         ({**PARTS, "product": "planes"}, "product planes is already registered"),
         ({**PARTS, "takes": ("clouds",)}, r"no product type clouds \(did you mean cloud\?\)"),
         ({"name": "My Detector"}, "a plugin's name must be 2 to 32 lower-case letters"),
         ({"name": "x"}, "a plugin's name must be 2 to 32 lower-case letters"),
-        ({"kind": "plain"}, r"no installed plugin announces kind plain \(did you mean plane\?\)"),
-        ({"name": "hough2d"}, "method plane.hough2d is brought by orthoflow-tls"),
-        ({"name": "numpy"}, "a Python package numpy is installed already"),
+        (
+            {"kind": "plain"},
+            r"no installed plugin declares the kind plain \(did you mean plane\?\)",
+        ),
+        ({"name": "hough2d"}, "already provides the method plane.hough2d; choose another"),
+        ({"name": "numpy"}, "a Python package numpy is already installed"),
         ({"name": "taken"}, "taken exists already"),
     ],
 )

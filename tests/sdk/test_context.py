@@ -28,7 +28,7 @@ def context(folder: Path, heard: list[StepEvent] | None = None) -> StepContext:
 )
 def test_what_is_no_picture_is_refused_where_it_is_drawn(tmp_path: Path, content: bytes) -> None:
     ctx = context(tmp_path)
-    told = rf"^figure plan must be .* what begins with {re.escape(repr(content[:16]))}$"
+    told = rf"^figure plan must be .* its content begins with {re.escape(repr(content[:16]))}$"
     with pytest.raises(ProductError, match=told):
         ctx.figure("plan", content)
     assert (ctx.figures, list(tmp_path.rglob("*.svg"))) == ([], [])
@@ -38,7 +38,7 @@ def test_two_pictures_have_names_that_differ_everywhere(tmp_path: Path) -> None:
     ctx = context(tmp_path)
     ctx.figure("depth", PNG)
     for name, content in (("Depth", PNG), ("depth", SVG)):
-        with pytest.raises(ProductError, match=f"figure {name} was drawn twice"):
+        with pytest.raises(ProductError, match=f"figure {name} was added twice"):
             ctx.figure(name, content)
     assert [figure.path.name for figure in ctx.figures] == ["depth.png"]
 
@@ -97,9 +97,9 @@ NOT_NAMES = ["", "..", "../up", "two\nlines", "half \udcff", "n" * 300, 5]
 @pytest.mark.parametrize("name", NOT_NAMES, ids=ascii)
 def test_what_cannot_be_a_name_names_no_metric_and_no_figure(tmp_path: Path, name: str) -> None:
     ctx = context(tmp_path)
-    with pytest.raises(ProductError, match=r"^a metric must have a name of one printable line"):
+    with pytest.raises(ProductError, match=r"^the name of a metric must be a printable line"):
         ctx.metric(name, 1.0, "mm")
-    refused = "(cannot be the name of a file here|^the name of a file must be a text, got 5)$"
+    refused = "(cannot be the name of a file here|^the name of a file must be a string, got 5)$"
     with pytest.raises(ProductError, match=refused):
         ctx.figure(name, PNG)
     with pytest.raises(ProductError, match="so it cannot be the name of a file here"):
@@ -111,7 +111,7 @@ def test_a_metric_is_a_number_and_its_unit_a_word(tmp_path: Path) -> None:
     for unit in ("", "m\nm", None, 1.0, "\x1b"):
         with pytest.raises(ProductError, match="the unit of metric length must be a word"):
             context(tmp_path).metric("length", 1.0, unit)
-    refused = r"^metric length must be (a number: |finite, got .*: leave it out)"
+    refused = r"^metric length must be (a number: |finite, got .*: if it is unknown)"
     for value in ("three", None, 10**400, np.nan, np.inf):
         with pytest.raises(ProductError, match=refused):
             context(tmp_path).metric("length", value, "m")
@@ -123,13 +123,13 @@ def test_a_step_says_far_more_than_any_has_to_say_and_not_without_end(tmp_path: 
         ctx.metric(f"m{k}", float(k), "1")
     with pytest.raises(ProductError, match="metric m1 was reported twice"):
         ctx.metric("m1", 2.0, "m")
-    with pytest.raises(ProductError, match="a step may report 20000 metrics, not more"):
+    with pytest.raises(ProductError, match="a step may report at most 20000 metrics"):
         ctx.metric("one_more", 1.0, "1")
     ctx.figure("first", PNG)
     (figure,) = ctx.figures
     ctx.figures += [replace(figure, name=f"f{k}") for k in range(1998)]
     ctx.figure("last", PNG)
-    with pytest.raises(ProductError, match="a step may report 2000 figures, not more"):
+    with pytest.raises(ProductError, match="a step may report at most 2000 figures"):
         ctx.figure("one_more", PNG)
     heard: list[StepEvent] = []
     ctx.listen = heard.append

@@ -12,7 +12,7 @@ def test_what_cannot_say_anything_is_told_by_its_kind() -> None:
         def __str__(self) -> str:
             raise RuntimeError
 
-    assert one_line(MuteError()) == "a MuteError without words"
+    assert one_line(MuteError()) == "a MuteError without a message"
 
 
 def test_a_path_is_kept_where_others_can_read_it() -> None:

@@ -90,8 +90,9 @@ def _check_counts(planes: Planes) -> None:
     n_parts = 0 if planes.part_corners is None else len(planes.part_corners)
     if len(planes) > MOST_PLANES or n_parts > MOST_PARTS:
         raise InputError(
-            f"the run has {len(planes)} planes of {n_parts} connected parts, at most {MOST_PLANES} "
-            f"of {MOST_PARTS} are drawn: run it with fewer planes, or name another step by --step"
+            f"the run has {len(planes)} planes with {n_parts} connected parts; at most "
+            f"{MOST_PLANES} planes with {MOST_PARTS} parts can be drawn: run it with fewer "
+            "planes, or choose another step with --step"
         )
 
 

@@ -279,9 +279,9 @@ def fallback_font(letter: str) -> str:
     path = next((path for path, codes in _installed_letters().items() if code in codes), None)
     if path is None:
         raise InputError(
-            f"the letter {letter} (U+{code:04X}) of a text on the sheet is in no installed font: "
-            "install one that has it (Noto Sans CJK has those of Chinese, Japanese and Korean), or "
-            "write the text in Latin, Greek or Cyrillic letters"
+            f"no installed font contains the character {letter} (U+{code:04X}), which is used on "
+            "the sheet: install one that does (Noto Sans CJK contains Chinese, Japanese and "
+            "Korean), or write the text in Latin, Greek or Cyrillic letters"
         )
     outline = TTGlyphPen(None)
     with FontFile(path, fontNumber=0) as source:

@@ -168,7 +168,7 @@ def section_cut(planes: Planes, through: Sequence[float], language: Language = "
     first, second = (x * e1 + y * e2 for x, y in np.reshape(through, (2, 2)))
     length_m = float(np.linalg.norm(second - first))
     if length_m < 1e-6:
-        raise ArgumentError("--through takes two different places, X,Y,X,Y, got one twice")
+        raise ArgumentError("--through must be two different points, X,Y,X,Y; both are the same")
     right = (second - first) / length_m
     values = dict(zip("abcd", (f"{value:.2f}" for value in through), strict=True))
     return Cut(
@@ -203,8 +203,8 @@ def section_of(
     lines, gaps = _drawn(cut, planes, places, plane, slab_m)
     if not lines and len(places) == 0:
         raise ArgumentError(
-            f"the cut ({cut.title}) meets no plane and no point of the room; "
-            f"its places are in metres, in the coordinates of the scan"
+            f"the cut ({cut.title}) meets no plane and no point of the room; its coordinates are "
+            "those of the scan, in metres"
         )
     return Section(
         cut=cut,
@@ -447,11 +447,11 @@ def _thinned(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 LAYERS: Final[Layers] = {
-    "A-SECT-MCUT": ("what is cut", 7, 50),
-    "A-SECT-MBND": ("what lies beyond", 8, 13),
-    "A-SECT-PATT": ("hatches of what is solid", 8, 13),
-    "A-SECT-HIDN": ("stretches without points", 8, 13),
-    "A-SECT-SCAN": ("points of the scan beside the lines", 9, 13),
+    "A-SECT-MCUT": ("cut lines", 7, 50),
+    "A-SECT-MBND": ("edges beyond the cut", 8, 13),
+    "A-SECT-PATT": ("hatching of solid parts", 8, 13),
+    "A-SECT-HIDN": ("cut lines without scan points", 8, 13),
+    "A-SECT-SCAN": ("scan points away from the lines", 9, 13),
     "A-ANNO-DIMS": ("dimensions", 7, 18),
 }
 # On paper, millimetres.

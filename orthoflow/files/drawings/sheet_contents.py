@@ -153,8 +153,8 @@ def paper_of(text: str) -> Paper:
     if found and all(low <= float(edge) <= high for edge in found.groups()):
         return Paper(width_mm=float(found[1]), height_mm=float(found[2]))
     raise ArgumentError(
-        f"--paper must be {', '.join(known)}, or width x height of {low:g} to {high:g} mm such "
-        f"as 700x500, got {text[:100]!r}"
+        f"--paper must be {', '.join(known)}, or a width and height of {low:g} to {high:g} mm "
+        f"each, as in 700x500; got {text[:100]!r}"
     )
 
 
@@ -215,8 +215,9 @@ def cut_up(
     ]
     if math.prod(counts) > MOST_SHEETS:
         raise ArgumentError(
-            f"a wall of {size_m[0]:.2f} x {size_m[1]:.2f} m takes {math.prod(counts):,} sheets at "
-            f"1:{scale}, at most {MOST_SHEETS} are drawn: take a larger --paper or --scale"
+            f"a wall of {size_m[0]:.2f} x {size_m[1]:.2f} m needs {math.prod(counts):,} sheets "
+            f"at 1:{scale}; the limit is {MOST_SHEETS}: choose a larger --paper or a smaller "
+            "scale (a larger --scale number)"
         )
     across, down = (
         _even_cuts(size, limit, count, grid_m)
@@ -269,7 +270,7 @@ def _checked_text(value: object) -> object:
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)
     if isinstance(value, str) and len(value) > MOST_LETTERS:
-        raise ValueError(f"has {len(value)} letters, at most {MOST_LETTERS} fit on a sheet")
+        raise ValueError(f"has {len(value)} characters; at most {MOST_LETTERS} fit on a sheet")
     return value
 
 

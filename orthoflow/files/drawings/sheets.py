@@ -260,9 +260,9 @@ def lay_out(drawing: Drawing, given: Sequence[Paper] = ()) -> tuple[LaidOut, ...
         if fitting := [sheets for sheets in divided if sheets]:
             return min(fitting, key=len)
     raise ArgumentError(
-        f"--paper {paper.name or f'{paper.width_mm:g}x{paper.height_mm:g}'} has no room for "
-        "the title block, the legend and notes beside a picture: take a larger one, or shorten "
-        "the title block"
+        f"--paper {paper.name or f'{paper.width_mm:g}x{paper.height_mm:g}'} is too small for the "
+        "title block, the legend and the notes next to a picture: choose a larger one, or "
+        "shorten the title block"
     )
 
 

@@ -71,8 +71,8 @@ CAPPED_RULE: Final = DiagnosticSpec(
     code="outlier-rule-capped",
     severity="warning",
     text="the iterated outlier rule stopped at its cap of a quarter of the points ({numbers}), "
-    "although more exceed twice the RMS of the remaining points: there seem to be two kinds of "
-    "points, which the rule cannot separate",
+    "although more exceed twice the RMS of the remaining points: the points seem to fall "
+    "into two groups, which the rule cannot separate",
     remedy="use n_outliers_once instead",
 )
 
@@ -352,7 +352,7 @@ def _draw(
             picture.image,
             places,
             shifts,
-            title="residuals of check points (shown minus surveyed position)",
+            title="residuals of check points (position in the image minus surveyed position)",
             names=[names[k] for k in own],
         )
 

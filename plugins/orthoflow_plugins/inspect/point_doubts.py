@@ -26,7 +26,7 @@ _ALIKE_LEAST: Final = 3
 _NAMED: Final = 4
 _NEAR_M: Final = 1.0
 _ANY_CELLS: Final = (
-    "measure them in this orthoimage, or enter coordinates that do not depend on the cell size: "
+    "measure them in this orthoimage, or enter coordinates that do not depend on the pixel size: "
     "shown_x, shown_y, shown_z as saved by the report, or map_x, map_y"
 )
 OWN_POINTS: Final = DiagnosticSpec(
@@ -40,23 +40,24 @@ OWN_POINTS: Final = DiagnosticSpec(
 FAR_POINTS: Final = DiagnosticSpec(
     code="check-points-far",
     severity="warning",
-    text="{n} of {n_points} check points are farther from their wall than it is long{how_far}",
+    text="{n} of {n_points} check points are farther from their wall than the wall is "
+    "long{how_far}",
     remedy="check `unit` of read.checkpoints, and the coordinate systems of points and scan",
     rank_by="n",
 )
 OTHER_CELLS: Final = DiagnosticSpec(
     code="check-points-of-other-cells",
     severity="warning",
-    text="{subject}: its {n_points} check points seem to have been measured in an image with cells "
-    "of {measured_m:.3g} m; its own cells are {gsd_m:.3g} m",
+    text="{subject}: its {n_points} check points seem to have been measured in an image with a "
+    "pixel size of {measured_m:.3g} m; this one has {gsd_m:.3g} m",
     remedy="{any_cells}",
 )
 SHIFTED_POINTS: Final = DiagnosticSpec(
     code="check-points-shifted",
     severity="warning",
-    text="{subject}: all of its {n_points} check points are shown {right_m:+.4g} m to the right of "
-    "and {down_m:+.4g} m below the survey; perhaps they were measured in a raster with another "
-    "origin",
+    text="{subject}: all of its {n_points} check points appear {right_m:+.4g} m to the right of "
+    "and {down_m:+.4g} m below their surveyed positions; perhaps they were measured in a "
+    "raster with another origin",
     remedy="{any_cells}",
 )
 

@@ -29,7 +29,7 @@ _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
     severity="warning",
-    text="photo {subject}: with its pose, no part of the walls matches it",
+    text="photo {subject}: at its given pose, it matches no part of the walls",
     remedy="check its pose, or remove the photo",
 )
 

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 BY_EDGES: Final = DiagnosticSpec(
     code="photo-placed-by-edges",
     severity="warning",
-    text="photo {subject}: its position was found only by edges, which can be wrong where patterns "
-    "repeat",
+    text="photo {subject}: its position was found from edges only, which can be wrong where "
+    "patterns repeat",
     remedy="check its overlay",
 )
 MIRRORED: Final = DiagnosticSpec(

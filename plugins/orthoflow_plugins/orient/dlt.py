@@ -74,7 +74,7 @@ DLT_MISFIT: Final = DiagnosticSpec(
     text="photo {subject}: its ties deviate {sigma0:.1f} times as much as expected, and a complete "
     "lens model moves its points by {moved_px:.1f} px: its lens has distortion that this DLT does "
     "not model, mostly at the corners; the predicted error was multiplied by {factor:.1f}",
-    remedy="{step}.distortion=k1k2, or a calibration",
+    remedy="set {step}.distortion=k1k2, or provide a calibration",
     rank_by="sigma0",
 )
 
@@ -207,7 +207,7 @@ def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
     try:
         linear, condition = direct_linear(control.pixels_photo, control.points_world, size_px)
         if condition > _MAX_CONDITION:
-            return _flat(control, f"the equations have condition {condition:.0f}")
+            return _flat(control, f"the condition number of the equations is {condition:.0f}")
         camera = linear if params.skew else replace(linear, skew=0.0)
         lens = Lens(
             prior=replace(camera, cx=0.5 * size_px[0], cy=0.5 * size_px[1], skew=0.0),
@@ -280,7 +280,7 @@ def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
     """Return why the control points do not suffice for a DLT; empty if they do."""
     if len(control) < least:
         return (
-            f"only {len(control)} control points agree with one pose; a DLT with distortion "
+            f"only {len(control)} control ties agree with one pose; a DLT with distortion "
             f'"{distortion}" requires {least}'
         )
     rms_m, extent_m = relief(control.points_world)
@@ -344,7 +344,7 @@ def _with_what_is_missing(
 def _flat(control: SeenPoints, why: str) -> str:
     rms_m, _ = relief(control.points_world)
     return (
-        f"the control points are within {1000 * rms_m:.1f} mm (RMS) of one plane; {why}: use "
+        f"the control ties are within {1000 * rms_m:.1f} mm (RMS) of one plane; {why}: use "
         "orient.pnp or orient.colmap-bundle"
     )
 

@@ -233,7 +233,7 @@ CROWDED: Final = DiagnosticSpec(
 SMALL_HULL: Final = DiagnosticSpec(
     code="control-covers-little",
     severity="warning",
-    text="photo {subject}: the control points cover only {share:.0%} of the part of the photo that "
+    text="photo {subject}: its control ties cover only {share:.0%} of the part of the photo that "
     "shows the walls",
     rank_by="-share",
 )
@@ -242,7 +242,7 @@ FOCAL_ESTIMATED: Final = DiagnosticSpec(
     severity="warning",
     text="photo {subject}: its focal length was estimated, since neither calibration nor EXIF "
     "contains it",
-    remedy="a calibration file improves the accuracy",
+    remedy="provide a calibration file for higher accuracy",
 )
 
 
@@ -445,7 +445,7 @@ class Gate:
 
 
 def _checks(c: Candidate) -> str:
-    return f"{c.withheld.sum()} of {c.is_check.sum()} check points agree with the pose"
+    return f"{c.withheld.sum()} of {c.is_check.sum()} withheld ties agree with the pose"
 
 
 CONTROL_GATES: Final = (
@@ -455,7 +455,7 @@ CONTROL_GATES: Final = (
         limit=12,
         source="twice the unknowns of a pose",
         reason=lambda c, value, limit: (
-            f"only {value} of {(~c.is_check).sum()} control points agree with one pose; at least "
+            f"only {value} of {(~c.is_check).sum()} control ties agree with one pose; at least "
             f"{limit} are required"
         ),
     ),
@@ -481,9 +481,9 @@ CONTROL_GATES: Final = (
         name="check-share",
         value=lambda c: c.check_over_control,
         limit=0.5,
-        source="with a correct pose, check points agree as often as control points",
+        source="with a correct pose, withheld ties agree as often as control ties",
         reason=lambda c, *_: (
-            f"{_checks(c)}, but {c.control_share:.0%} of the control points do: the pose was "
+            f"{_checks(c)}, but {c.control_share:.0%} of the control ties do: the pose was "
             "fitted to ties that agree by chance"
         ),
     ),
@@ -492,9 +492,9 @@ CONTROL_GATES: Final = (
         value=lambda c: c.check_rms_over_control,
         limit=2.0,
         is_upper=True,
-        source="with a correct pose, check points deviate as much as control points",
+        source="with a correct pose, withheld ties deviate as much as control ties",
         reason=lambda _, value, limit: (
-            f"the check points deviate {value:.1f} times as much as the control points; the limit "
+            f"the withheld ties deviate {value:.1f} times as much as the control ties; the limit "
             f"is {limit:g} times"
         ),
     ),
@@ -564,7 +564,7 @@ GATES: Final = (
         limit="min_hull_ratio",
         source="the job",
         reason=lambda _, value, limit: (
-            f"the control points cover {value:.1%} of the part of the photo that shows the walls; "
+            f"the control ties cover {value:.1%} of the part of the photo that shows the walls; "
             f"at least {limit:.1%} is required"
         ),
     ),

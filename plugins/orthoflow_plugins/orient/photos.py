@@ -240,14 +240,14 @@ EXIF_CONTRADICTED: Final = DiagnosticSpec(
     text="photos {subject}: the EXIF focal length is {exif_px:.0f} px, but their ties give "
     "{focal_px:.0f} px, a factor of {factor:.2f}: EXIF was not used (possible causes: digital "
     "zoom, an adapter, or cropping)",
-    remedy="a calibration file resolves this",
+    remedy="provide a calibration file",
 )
 EXIF_LEFT_OUT: Final = DiagnosticSpec(
     code="exif-focal-left-out",
     severity="warning",
     text="photo {subject}: its EXIF focal length contradicts the other photos of its camera, so it "
     "was oriented with their focal length of {focal_px:.0f} px",
-    remedy="a calibration file resolves this",
+    remedy="provide a calibration file",
 )
 
 

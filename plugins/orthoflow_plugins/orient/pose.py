@@ -137,7 +137,7 @@ class OrientParams(MethodParams):
         default=0.4,
         ge=0,
         le=1,
-        description="Minimum ratio of the area of the control points' convex hull to that of the "
+        description="Minimum ratio of the area of the control ties' convex hull to that of the "
         "walls in the photo.",
     )
     max_sigma_wall_cells: float = Field(

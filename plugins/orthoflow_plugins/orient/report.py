@@ -442,7 +442,7 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     ctx.figure(
         "positions",
         figure,
-        "Positions and viewing directions of the oriented photos, with their control points: seen "
+        "Positions and viewing directions of the oriented photos, with their control ties: seen "
         "along the first wall (top) and facing it (bottom); for a floor, the lower view is its "
         "plan. A photo behind a wall or far from the others is oriented wrongly.",
     )

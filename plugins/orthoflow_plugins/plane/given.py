@@ -98,7 +98,7 @@ class StatedPlane(MethodParams):
         if (self.normal is None) != (self.offset_m is None):
             raise ValueError("plane.given needs normal and offset_m together, got only one")
         if self.normal is not None and math.hypot(*self.normal) < 1e-9:
-            raise ValueError("normal must have a length, got (0, 0, 0)")
+            raise ValueError("normal must not be (0, 0, 0)")
         return self
 
 

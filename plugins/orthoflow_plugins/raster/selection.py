@@ -38,15 +38,15 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
         missing = sorted(rank for rank in params.ranks if rank >= len(planes))
         if missing:
             raise MethodError(
-                f"ranks names plane {missing[0]}, but {len(planes)} planes were found, 0 to "
-                f"{len(planes) - 1}: see planes.json"
+                f"ranks contains {missing[0]}, but only planes 0 to {len(planes) - 1} were "
+                "found: see planes.json"
             )
         return sorted(set(params.ranks))
     fitting = [k for k in range(len(planes)) if _fits(planes, k, params.constraint)]
     if not fitting:
         raise MethodError(
             f"none of the {len(planes)} planes is {params.constraint} within {_LEAN_DEG:g} deg: "
-            "set constraint to any, or look for other planes"
+            "set constraint to any, or detect other planes"
         )
     if params.near:
         return sorted({nearest_plane(planes, fitting, np.array(place)) for place in params.near})

@@ -53,9 +53,9 @@ def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None
     if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
         largest = frames[int(np.argmax(sizes))]
         raise MethodError(
-            f"cells of gsd_m = {largest.gsd_m:g} m make {sum(sizes):.3g} cells ({largest.width} "
-            f"x {largest.height} on the largest wall), which need {needed / 2**30:.3g} GiB where "
-            f"this machine has {memory / 2**30:.3g} GiB: raise gsd_m, or lower n_walls_max"
+            f"gsd_m = {largest.gsd_m:g} m gives {sum(sizes):.3g} cells ({largest.width} x "
+            f"{largest.height} on the largest wall), which need {needed / 2**30:.3g} GiB; this "
+            f"machine has {memory / 2**30:.3g} GiB: raise gsd_m, or lower n_walls_max"
         )
 
 

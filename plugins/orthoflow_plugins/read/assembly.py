@@ -170,8 +170,8 @@ class CloudAssembly:
         if not is_choice and not any(count.n_kept for count in counts):
             causes = ", ".join(f"{n} {c.replace('_', ' ')}" for c, n in left_out.items() if n)
             raise InputError(
-                f"{file.name} contains no usable points: of {sum(c.n_read for c in counts)}, left "
-                f"out are {causes}; export it again"
+                f"{file.name} contains no usable points: all {sum(c.n_read for c in counts)} "
+                f"were left out ({causes}); export it again"
             )
 
     def require_points(self) -> None:

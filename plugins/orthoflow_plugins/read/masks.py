@@ -20,13 +20,13 @@ _ENDING: Final = "_mask"
 _POLYGONS: Final = (".geojson", ".json")
 UNUSED: Final = DiagnosticSpec(
     code="masks-of-no-photo",
-    text="masks without a photo: {names}",
-    remedy="photos are identified by their names",
+    text="masks that match no photo: {names}",
+    remedy="a mask must have the name of its photo",
     rank_by="n",
 )
 NO_MASKS: Final = DiagnosticSpec(
     code="files-are-no-masks",
-    text="ignored masks, neither pictures (PNG, JPEG, TIFF) nor polygons (GeoJSON): {names}",
+    text="files ignored as masks, neither images (PNG, JPEG, TIFF) nor polygons (GeoJSON): {names}",
     rank_by="n",
 )
 

@@ -87,19 +87,19 @@ FOCAL_UNKNOWN: Final = DiagnosticSpec(
     code="focal-length-unknown",
     text="the focal length of {photos} is unknown ({reason}, and no calibration): the orientation "
     "must estimate it, needs more ties for this and may fail",
-    remedy="a calibration file helps",
+    remedy="provide a calibration file",
     rank_by="n",
 )
 NOT_CALIBRATED: Final = DiagnosticSpec(
     code="calibration-without-photo",
     text="the calibration has no entry for {photos}; the others are calibrated",
-    remedy="add an entry",
+    remedy="add an entry for each",
     rank_by="n",
 )
 UNUSED_ENTRIES: Final = DiagnosticSpec(
     code="calibration-entries-unused",
     text="calibration entries that match no photo: {names}",
-    remedy="upper and lower case differ, and the first matching entry applies",
+    remedy="names are case-sensitive, and the first matching entry applies",
     rank_by="n",
 )
 
@@ -494,9 +494,9 @@ def _read_photo(
     remarks = (
         ""
         if row is None
-        else f"seems damaged from row {row} on, where colours change abruptly at the "
-        "blocks of the JPEG: check it, copy it again from the camera, or remove it",
-        f"holds bytes that its decoder skips ({odd}), so it may be damaged" if odd else "",
+        else f"seems damaged from row {row} on, where colours change abruptly at JPEG block "
+        "boundaries: check it, copy it again from the camera, or remove it",
+        f"contains bytes that the decoder skips ({odd}), so it may be damaged" if odd else "",
         f"has {n_pages} pages, of which the largest is read" if n_pages > 1 else "",
     )
     return _ReadPhoto(

@@ -44,13 +44,13 @@ COLOURS_ZERO: Final = DiagnosticSpec(
 )
 COLOUR_LIMIT: Final = DiagnosticSpec(
     code="scan-colour-limit-misfit",
-    text="{subject}: colours can reach {limit:g} according to the file, but reach {largest:g}: "
-    "they are read as {scale}",
+    text="{subject}: according to the file, colours reach at most {limit:g}, but they reach "
+    "{largest:g}: they are read as {scale}",
 )
 COLOUR_DEPTH: Final = DiagnosticSpec(
     code="scan-colour-depth-small",
-    text="{subject}: the file contains no limit of colours, which reach {largest:g}: they are read "
-    "as {scale}",
+    text="{subject}: the file gives no colour range; colours reach {largest:g} and are read as "
+    "{scale}",
     rank_by="largest",
 )
 COLOURS_GREY: Final = DiagnosticSpec(
@@ -108,18 +108,18 @@ COARSE_OFFSETS: Final = DiagnosticSpec(
     code="scan-offsets-coarse",
     text="the points reach {farthest_m:.0f} m from the origin of the cloud, where coordinates are "
     "rounded to {resolution_mm:.2f} mm",
-    remedy="check {step}.unit, or cut stray points off with {step}.box",
+    remedy="check {step}.unit, or remove stray points with {step}.box",
 )
 ROUNDED: Final = DiagnosticSpec(
     code="scan-coordinates-rounded",
-    text="the coordinates of {subject} are rounded to {rounding_mm:g} mm: planes and depths cannot "
-    "be finer, and a grid may show",
+    text="the coordinates of {subject} are rounded to {rounding_mm:g} mm, which limits the "
+    "resolution of planes and depths; a grid may be visible",
     rank_by="rounding_mm",
 )
 SIZE: Final = DiagnosticSpec(
     code="scan-size-implausible",
-    text="the scan is {size} m ({unit}): is that right?",
-    remedy="set {step}.unit={other} if it is in {other}, or to cm, ft, us-ft, in",
+    text="the extent of the scan is {size} m ({unit}), which is unusual",
+    remedy="set {step}.unit={other} if the file is in {other}, or to cm, ft, us-ft or in",
 )
 TOO_FAR: Final = DiagnosticSpec(
     code="points-too-far",
@@ -152,10 +152,10 @@ OTHER_UP: Final = DiagnosticSpec(
 )
 THICK: Final = DiagnosticSpec(
     code="scan-thick",
-    text="the cloud is thicker than its point spacing: across surfaces, in pieces of about "
-    "{side_cm:.0f} cm, its points scatter by {sigma_mm:.1f} mm (95 % within {width_mm:.1f} mm), "
-    "and along them the nearest other point is {step_mm:.1f} mm away: planes and depths "
-    "cannot be more accurate",
+    text="the cloud is thicker than its point spacing: in patches of about {side_cm:.0f} cm, the "
+    "points scatter by {sigma_mm:.1f} mm normal to the surface (95 % within {width_mm:.1f} "
+    "mm), and the nearest other point is {step_mm:.1f} mm away, which limits the accuracy of "
+    "planes and depths",
     remedy="check for noise, rough surfaces and misaligned scans",
     rank_by="sigma_mm",
 )
@@ -163,7 +163,7 @@ DISAGREE: Final = DiagnosticSpec(
     code="scans-disagree",
     text="the scans disagree: where two show the same surface, they are {apart_mm:.1f} "
     "mm apart (median), while the scatter of each is {sigma_mm:.1f} mm",
-    remedy="register them again, or use one at a time",
+    remedy="register them again, or use only one of them",
     rank_by="apart_mm",
 )
 RULES: Final = {

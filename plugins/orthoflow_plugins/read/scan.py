@@ -176,22 +176,23 @@ class ReadScan(Method):
         ctx.figure(
             "plan",
             partial(plan_chart, cloud),
-            "The cloud from above, brighter where denser: walls are thin bright lines; "
-            "double lines are misaligned scans.",
+            "The cloud from above, brighter where it is denser. Walls are thin bright lines; "
+            "double lines indicate misaligned scans.",
         )
         polar = polar_view_png(cloud)
         if polar is not None:
             ctx.figure(
                 "polar",
                 polar,
-                "Intensity over the scanner's own rows and columns: what the scanner saw; black is "
-                "no return, and where a wall is black nothing can be measured on it.",
+                "Intensity in the rows and columns of the scanner. Black pixels have no return; "
+                "where a wall is black, nothing can be measured.",
             )
         lines = scan_lines_png(cloud)
         if lines is not None:
             caption = (
-                "A wall seen squarely: rows of the scan yellow, columns blue. Meshes are even "
-                "where the scan is good; lines that break off or cross are gaps and mixed points."
+                "Rows (yellow) and columns (blue) of the scan on a wall, seen frontally. The "
+                "mesh is regular where the scan is good; interrupted or crossing lines are "
+                "gaps and mixed points."
             )
             ctx.figure("scan-lines", lines, caption)
         return self.Out(cloud=cloud)
@@ -243,7 +244,7 @@ def _check_settings(ctx: StepContext, files: list[ScanFile], params: ReadScan.Pa
     }
     for (setting, kind), is_so in is_idle.items():
         if is_so:
-            why = f"it only concerns {kind} files, and none was read"
+            why = f"it applies only to {kind} files, and none was read"
             ctx.report(NO_EFFECT, setting=setting, why=why)
     wanted = params.intensity_field
     if wanted is not None:

@@ -55,10 +55,9 @@ _KIND_RGB: Final[Mapping[OpeningKind, tuple[int, int, int]]] = {
     "no data": (200, 30, 160),
 }
 _CAPTION: Final = (
-    "blue: rays passed through, orange: a back was measured, purple: no returns. Sides "
-    "should lie on "
-    "the edges of what is seen; a side that cuts across something, or an outline round nothing, "
-    "is wrong."
+    "blue: rays passed through; orange: the back was measured; purple: no returns. Sides should "
+    "follow visible edges; a side that crosses a surface, or an outline around nothing, is "
+    "wrong."
 )
 _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_data"}
 NO_CLOUD: Final = DiagnosticSpec(
@@ -161,8 +160,8 @@ class SegmentOpenings(Method):
         ]
         if not chosen:
             raise MethodError(
-                f"none of the {len(walls.walls)} walls is upright: level: true looks at floors and "
-                "ceilings, too (segment.openings)"
+                f"none of the {len(walls.walls)} walls is vertical; set level: true to search "
+                "floors and ceilings, too (segment.openings)"
             )
         if inputs.cloud is not None:
             inputs.cloud.require_points(2)

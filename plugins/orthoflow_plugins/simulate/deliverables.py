@@ -161,8 +161,8 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
     ctx.figure(
         "main_wall",
         partial(_picture, truth, main, ctx.cores),
-        f"True orthoimage of the main wall at {_PICTURE_GSD_M * 1000:.0f} mm: what the run should "
-        "come to; blurred or doubled edges in its orthoimage are errors.",
+        f"True orthoimage of the main wall with {_PICTURE_GSD_M * 1000:.0f} mm pixels, for "
+        "comparison with the result, in which blurred or doubled edges are errors.",
     )
 
 
@@ -177,8 +177,8 @@ def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> 
     ctx.figure(
         "photos",
         partial(_contact_sheet, photos),
-        "The photos, in the order of their names: a wall is painted well where several show it "
-        "squarely; blur, or a part of it that none shows, cannot be made good later.",
+        "The photos, in the order of their names. Orthoimages are good where several photos show "
+        "a wall frontally; blur, and parts that no photo shows, cannot be corrected later.",
     )
 
 

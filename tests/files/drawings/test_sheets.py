@@ -213,7 +213,7 @@ def test_what_a_title_block_has_too_much_of_is_refused(run: Path, tmp_path: Path
     more = ("--scale", 50, "--paper", "160x160", "--title-block", office(tmp_path))
     done = export(run, tmp_path / "out", *more)
     assert done.exit_code == 2
-    assert "--paper 160x160 has no room for the title block" in done.output
+    assert "--paper 160x160 is too small for the title block" in done.output
     assert not (tmp_path / "out").exists()
 
 
@@ -294,7 +294,7 @@ def test_letters_of_no_font_are_refused_and_nothing_is_written(
     done = export(run, tmp_path / "out", "--title-block", block)
     pens._installed_letters.cache_clear()
     assert done.exit_code == 2
-    assert "the letter 松 (U+677E) of a text on the sheet is in no installed font" in done.output
+    assert "no installed font contains the character 松 (U+677E), which is used" in done.output
     assert "Noto Sans CJK" in done.output
     assert not (tmp_path / "out").exists()
 
@@ -420,7 +420,7 @@ def test_sheets_cover_a_wall_once_and_evenly(
 
 
 def test_too_many_sheets_are_refused() -> None:
-    with pytest.raises(ArgumentError, match="at most 200 are drawn: take a larger --paper"):
+    with pytest.raises(ArgumentError, match="the limit is 200: choose a larger --paper"):
         lay_out(drawing(1, (30.0, 4.0)), [paper_of("A4")])
 
 

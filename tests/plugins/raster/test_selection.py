@@ -162,7 +162,7 @@ def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
 def test_a_rank_that_no_plane_has_is_refused() -> None:
     two = planes(MAIN, (0.5, 0.0, 5.0, 0.0))
     assert chosen_planes(two, but(CHOICE, ranks=(1,)), buffer_m) == [1]
-    with pytest.raises(MethodError, match=r"ranks names plane 2, but 2 planes were found, 0 to 1"):
+    with pytest.raises(MethodError, match=r"ranks contains 2, but only planes 0 to 1 were found"):
         chosen_planes(two, but(CHOICE, ranks=(1, 2)), buffer_m)
 
 

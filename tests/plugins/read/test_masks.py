@@ -75,7 +75,7 @@ def test_a_mask_beside_its_photo_is_no_photo(tmp_path: Path) -> None:
     (photo,), said = read(tmp_path, files)
     assert photo.name == "a.jpg"
     np.testing.assert_array_equal(masked(photo), expected())
-    assert "masks without a photo" not in said
+    assert "masks that match no photo" not in said
     # What ends like a mask, but of no photo, is a photo.
     alone, _ = read(tmp_path, [file_in(tmp_path, "white_mask.png", picture())])
     assert [item.name for item in alone] == ["white_mask.png"]
@@ -90,8 +90,10 @@ def test_masks_of_no_photo_and_files_that_are_none_are_named(tmp_path: Path) -> 
     ]
     (photo,), said = read(tmp_path, [photo_in(tmp_path)], masks)
     np.testing.assert_array_equal(masked(photo), expected())
-    assert "masks without a photo: c.png, x*.jpg: photos are identified by their names" in said
-    assert "neither pictures (PNG, JPEG, TIFF) nor polygons (GeoJSON): notes.txt" in said
+    assert (
+        "masks that match no photo: c.png, x*.jpg: a mask must have the name of its photo" in said
+    )
+    assert "neither images (PNG, JPEG, TIFF) nor polygons (GeoJSON): notes.txt" in said
 
 
 def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:

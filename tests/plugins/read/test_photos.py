@@ -253,7 +253,7 @@ def test_bytes_that_a_decoder_passes_over_are_reported(read: PhotoReader) -> Non
     whole = encode_jpeg(made.picture(256, 192))
     padded = whole[:-2] + b"\0" * 40 + whole[-2:]
     assert len(read.files({"a.jpg": padded, "b.jpg": whole})) == 2
-    assert "photo a.jpg: holds bytes that its decoder skips" in read.warnings
+    assert "photo a.jpg: contains bytes that the decoder skips" in read.warnings
 
 
 def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(read: PhotoReader) -> None:
@@ -307,7 +307,9 @@ def test_the_calibration_reaches_the_photos_it_names(read: PhotoReader) -> None:
     assert (
         "the calibration has no entry for photo c.jpg; the others are calibrated" in read.warnings
     )
-    assert "calibration entries that match no photo: B.jpg: upper and lower" in read.warnings
+    assert (
+        "calibration entries that match no photo: B.jpg: names are case-sensitive" in read.warnings
+    )
     assert "the focal length of photo c.jpg is unknown" in read.warnings
 
 

@@ -118,9 +118,9 @@ def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
     cloud = read(path, unit="ft", box=box)
     assert len(cloud) == 400 + np.count_nonzero((coarse <= 3.9).all(axis=1))
     assert scan_of(cloud)["n_read"] == 800
-    assert "gsd_m only concerns" not in read.warnings
+    assert "gsd_m applies only" not in read.warnings
     read(scan_files.write_las(tmp_path / "b.laz", POINTS), gsd_m=0.1)
-    assert "gsd_m has no effect: it only concerns COPC files" in read.warnings
+    assert "gsd_m has no effect: it applies only to COPC files" in read.warnings
 
 
 def test_a_box_without_an_inside_is_refused() -> None:
@@ -137,7 +137,7 @@ def test_classes_choose_points_of_las_files(tmp_path: Path, read: ScanReader) ->
     with pytest.raises(InputError, match="400 are of other classes than requested; change"):
         read(path, classes=[9])
     read(write_text(tmp_path / "a.xyz", POINTS), classes=[2])
-    assert "classes has no effect: it only concerns LAS and LAZ files" in read.warnings
+    assert "classes has no effect: it applies only to LAS and LAZ files" in read.warnings
 
 
 def test_stray_points_do_not_cost_the_scan_its_precision(tmp_path: Path, read: ScanReader) -> None:
@@ -163,9 +163,9 @@ def test_rounded_coordinates_and_a_scan_of_less_than_a_metre_are_warned_of(
     path = write_text(tmp_path / "a.xyz", POINTS)
     read(path)
     assert "rounded" not in read.warnings
-    assert "is that right?" not in read.warnings
+    assert "which is unusual" not in read.warnings
     read(path, unit="mm")
-    assert "m (unit mm): is that right?: set {step}.unit=m if" in read.warnings
+    assert "m (unit mm), which is unusual: set {step}.unit=m if" in read.warnings
     read(write_text(tmp_path / "b.xyz", np.round(POINTS, 2)))
     assert "the coordinates of b.xyz are rounded to 10 mm" in read.warnings
 
@@ -476,7 +476,7 @@ def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_
     with pytest.raises(InputError) as caught:
         assembled(tmp_path, file("a", lost))
     assert str(caught.value) == (
-        "a contains no usable points: of 9, left out are 3 invalid, 2 withheld, 4 not finite; "
+        "a contains no usable points: all 9 were left out (3 invalid, 2 withheld, 4 not finite); "
         "export it again"
     )
 
