@@ -166,7 +166,7 @@ PARTS = {"kind": "part", "product": "parts", "takes": ("cloud",)}
         ),
         ({"name": "hough2d"}, "already provides the method plane.hough2d; choose another"),
         ({"name": "numpy"}, "a Python package numpy is already installed"),
-        ({"name": "taken"}, "taken exists already"),
+        ({"name": "taken"}, "taken already exists"),
     ],
 )
 def test_a_project_that_cannot_be_is_refused(
