@@ -72,8 +72,8 @@ def write_room(
         "children": [*children],
         "extras": {
             "offset_world": numbers(offset),
-            "meaning": "world = offset_world + what the matrices of walls give; the matrix of "
-            "this node turns the world's up to y",
+            "meaning": "world = offset_world + position after the matrix of its wall; the matrix "
+            "of this node rotates the world's up direction to y",
             "unit": "m",
         },
     }

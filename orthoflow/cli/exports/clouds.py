@@ -183,7 +183,7 @@ def _wall(walls: Walls | None, number: int | None) -> tuple[Slab | None, int]:
 def _box(text: str | None) -> NDArray[np.float64] | None:
     if text is None:
         return None
-    values = numbers_of(text, 6, "--box takes six numbers in metres, X,Y,Z of two corners,")
+    values = numbers_of(text, 6, "--box must be six numbers in metres, X,Y,Z of two corners,")
     return np.sort(np.array(values).reshape(2, 3), axis=0)
 
 

@@ -99,8 +99,8 @@ def _light(text: str | None) -> Light:
     if text is None:
         return Light()
     expected = (
-        "--light takes two numbers in degrees, the azimuth on the wall clockwise from the top and "
-        "the altitude above its plane (0 to 90),"
+        "--light must be two numbers in degrees, the azimuth on the wall clockwise from the top "
+        "and the altitude above its plane (0 to 90),"
     )
     azimuth, altitude = numbers_of(text, 2, expected)
     if not (-360.0 <= azimuth <= 360.0 and 0.0 < altitude <= 90.0):
@@ -113,7 +113,7 @@ def export_qgis(run: Run, folder: Path, chosen: Choices) -> str:
     results = room_results(run, chosen.cell)
     walls = [wall for wall in results.walls if wall.frame.raster_axes == "wall"]
     if not walls:
-        raise ArgumentError(f"the run {run.record.run_id} has no upright wall")
+        raise ArgumentError(f"the run {run.record.run_id} has no vertical wall")
     layers = []
     for wall in walls:
         kinds = [kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters]

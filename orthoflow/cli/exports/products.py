@@ -24,11 +24,11 @@ _MOST_NAMED: Final = 5
 
 # Names of product types in errors about cells, and in errors about runs.
 _SAID: Final = {
-    "cameras": ("orientations", "has oriented no photos"),
-    "layers": ("layers", "has projected nothing onto walls"),
-    "cloud": ("clouds", "has read no cloud"),
-    "orthoimages": ("orthoimages", "has made no orthoimages"),
-    "labels": ("labels of points", "has found no planes"),
+    "cameras": ("orientations", "contains no oriented photos"),
+    "layers": ("layers", "contains no layers (photos projected onto walls)"),
+    "cloud": ("clouds", "contains no cloud"),
+    "orthoimages": ("orthoimages", "contains no orthoimages"),
+    "labels": ("labels of points", "contains no planes"),
 }
 
 

@@ -26,7 +26,7 @@ from orthoflow.records.runs import Run
 from orthoflow.records.walls import RoomResults, room_results
 
 _USUAL_HEIGHT_M = 1.2
-_THROUGH = "--through takes four numbers in metres, X,Y,X,Y of two points,"
+_THROUGH = "--through must be four numbers in metres, X,Y,X,Y of two points,"
 
 
 def export_plans(run: Run, folder: Path, chosen: Choices) -> str:

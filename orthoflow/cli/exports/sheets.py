@@ -151,7 +151,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         if wall.frame.raster_axes == "wall"
     ]
     if results.planes is None or not walls:
-        raise ArgumentError(f"the run {run.record.run_id} has no upright walls for an elevation")
+        raise ArgumentError(f"the run {run.record.run_id} has no vertical walls for an elevation")
     up = results.planes.up
     order, is_inside = unfolded(walls, up)
     # Accuracy is known per wall; walls with the same notes are listed together.
@@ -202,8 +202,8 @@ def _coarse(walls: Sequence[WallResult], scale: int) -> str:
     enough = usual_scale(scale * _LEAST_PPI / _ppi(worst, scale))
     names = ", ".join(wall.name for wall in coarse)
     return (
-        f"; coarser than print, {_ppi(worst, scale):.0f} pixels per inch instead of "
-        f"{_LEAST_PPI:.0f}: {names}; 1:{enough} is fine enough"
+        f"; resolution too low for print, {_ppi(worst, scale):.0f} pixels per inch instead of "
+        f"{_LEAST_PPI:.0f}: {names}; 1:{enough} is sufficient"
     )
 
 

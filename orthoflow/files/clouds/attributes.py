@@ -374,12 +374,12 @@ def sampled_pieces(n_points: int) -> list[slice]:
 
 
 _MEANINGS: Final = {
-    "photos": "colour of the oriented photo that shows the point best; 128 128 128 and photo -1 "
-    "where no photo sees it",
+    "photos": "colour from the oriented photo that shows the point best; 128 128 128 and photo "
+    "-1 if no photo shows it",
     "rgb": "colours of the scan",
-    "intensity": "root of the scan's intensity, from its first to its 99th percentile",
-    "plane": "a hue per plane, darker where the intensity is, or without one the colour; grey: on "
-    "no plane",
+    "intensity": "square root of the scan's intensity, scaled from its 1st to its 99th percentile",
+    "plane": "a hue per plane, shaded by the intensity or, if there is none, by the brightness "
+    "of the colour; grey: on no plane",
     "deviation": "distance from the plane, positive towards the viewer; grey: on no plane",
 }
 
@@ -396,15 +396,19 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
         "points": n_points,
         "points_of_the_cloud": len(cloud),
         "product_digest": attributed.name,
-        "coordinates": "metres, as the scan has them; z or another axis is up as `up` states",
+        "coordinates": "metres, in the coordinates of the scan; `up` is the direction that "
+        "points up",
         "up": numbers(cloud.up),
         "origin_world": numbers(cloud.origin),
         "coordinate_system_wkt": attributed.crs_wkt or None,
         "colour": attributed.colouring,
         "colour_meaning": _MEANINGS[attributed.colouring],
-        "normals": "least-squares planes of voxels with their neighbours, sides of "
-        f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, towards the viewer; 0 0 0: no surface",
-        "cleaned": "points with fewer than 10 about them, in 3 x 3 x 3 cubes of "
+        "normals": (
+            "normals of least-squares planes through the points of a voxel and its neighbours, "
+            f"cubes of {3.0 * attributed.neighbourhoods.side_m:.4g} m, towards the viewer; 0 0 "
+            "0: no surface"
+        ),
+        "cleaned": "points with fewer than 10 neighbours, in 3 x 3 x 3 cubes of "
         f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, are left out"
         if attributed.is_cleaned
         else None,

@@ -34,10 +34,10 @@ _LAS_NAMES: Final = {
     "scan": "point_source_id",
 }
 _EXTRA_BYTES: Final = {
-    **dict.fromkeys(("nx", "ny", "nz"), "of the surface, 0 0 0 unknown"),
-    "plane": "plane, -1 for none",
-    "deviation": "m from the plane, to viewer",
-    "photo": "photo of the colour, -1 none",
+    **dict.fromkeys(("nx", "ny", "nz"), "surface normal, 0 0 0 unknown"),
+    "plane": "index of the plane, -1 none",
+    "deviation": "m from plane, + towards viewer",
+    "photo": "source photo of colour, -1 none",
 }
 
 
@@ -122,7 +122,7 @@ def write_ply(path: Path, attributed: AttributedCloud) -> int:
     """
     head = [
         *("ply", "format binary_little_endian 1.0", "comment orthoflow, metres"),
-        f"comment coordinate system {' '.join(attributed.crs_wkt.split()) or 'not known'}",
+        f"comment coordinate system {' '.join(attributed.crs_wkt.split()) or 'unknown'}",
         f"element vertex {0:0{_DIGITS}d}",
     ]
     columns = attributed.columns
@@ -225,7 +225,7 @@ def _write_scan(writer: _Writer, scans: Any, attributed: AttributedCloud, scan: 
         return 0
     low, high = limits - centre
     node = writer.libe57.StructureNode(writer.image)
-    name = f"scan {scan}" if station is not None else f"scan {scan}, station not known"
+    name = f"scan {scan}" if station is not None else f"scan {scan}, station unknown"
     # The same cloud always gets the same id.
     unique = uuid.uuid5(uuid.NAMESPACE_URL, f"urn:orthoflow:{attributed.name}:{scan}")
     node.set("guid", writer.text(f"{{{unique}}}"))

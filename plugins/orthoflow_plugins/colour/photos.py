@@ -46,7 +46,9 @@ class ColourPhotos(Method):
         """The colour of points that no photo sees."""
 
         unseen: Literal["drop", "grey"] = Field(
-            "drop", description="Remove points that no photo shows, or colour them medium grey."
+            "drop",
+            description="Points that no photo shows. drop: remove them; grey: colour "
+            "them medium grey.",
         )
 
     class In(Ports):

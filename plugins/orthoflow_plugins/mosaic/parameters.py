@@ -13,7 +13,11 @@ class SeamsParams(MethodParams):
     """How the layer of a cell is chosen, and how colours are balanced."""
 
     seams: Literal["best-view", "voronoi", "graph-cut", "priority"] = Field(
-        "best-view", description="Rule that selects among several layers of a cell."
+        "best-view",
+        description="Rule that selects the layer of a cell if there are several. best-view: by "
+        "angle of incidence, resolution and distance from the border of the photo; voronoi: "
+        "with seams in the middle of overlaps; graph-cut: with seams where photos look "
+        "similar, away from depth edges; priority: in the order given.",
     )
     priority: tuple[str, ...] = Field(
         (), description="Names of photos, highest priority first, for `seams: priority`."

@@ -40,8 +40,8 @@ class BackwardParams(VisibilityParams):
     )
     visibility: Literal["full", "none"] = Field(
         default="full",
-        description="What can hide cells: relief and cloud (full), or nothing (none), "
-        "for comparisons and for flat walls without objects in front of them.",
+        description="Objects that can hide cells. full: relief and cloud; none: nothing, for "
+        "comparisons and for flat walls without objects in front of them.",
     )
     erosion_cells: int = Field(
         default=1,

@@ -124,7 +124,7 @@ class DetectorParams(MethodParams):
         "more.",
     )
     constraint: Constraint = Field(
-        "any", description="Orientation of the planes to search for, within `max_tilt_deg`."
+        "any", description="Orientation of the planes to detect, within `max_tilt_deg`."
     )
     max_tilt_deg: float = Field(
         10.0,
@@ -170,7 +170,7 @@ class DetectorParams(MethodParams):
     )
     join_parts: bool = Field(
         default=True,
-        description="Treat disconnected parts of a plane as one plane instead of several.",
+        description="Treat disconnected coplanar parts as one plane instead of several.",
     )
     materials: dict[str, tuple[float, float]] = Field(
         default_factory=dict,

@@ -78,23 +78,25 @@ class Hough3d(Method):
         """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         cell_m: float = Field(
-            0.02, gt=0.0, le=1.0, description="Side of a voxel and of a distance bin."
+            0.02, gt=0.0, le=1.0, description="Size of the voxels and of the distance bins."
         )
         angle_step_deg: float = Field(
-            1.0, ge=0.25, le=15.0, description="Step between the directions of normals."
+            1.0, ge=0.25, le=15.0, description="Angle between successive normal directions."
         )
         search: Literal["coarse-to-fine", "full"] = Field(
             "coarse-to-fine",
-            description="Vote with doubled cell size and angle step and refine the maxima, or "
-            "vote with the given values.",
+            description="coarse-to-fine: vote with twice the cell size and angle step, then "
+            "refine the maxima; full: vote with the given values.",
         )
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
-            description="Score of a plane: its votes minus those of the emptier side, refined "
-            "with finer angles and bins, or only the votes of its bin, as in markiewicz2015.",
+            description="Score of a plane. contrast: its votes minus those on its emptier side, "
+            "refined with finer angles and bins; votes: only the votes of its bin, as in "
+            "markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
-            "cells", description="Positions that vote: voxels, or single points of the sample."
+            "cells",
+            description="Positions that vote. cells: voxels; raw: single points of the sample.",
         )
 
     In = DetectorIn

@@ -115,12 +115,13 @@ class Ransac(Method):
         """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         model: Model = Field(
-            "3d", description="Planes through three points, or vertical planes through two."
+            "3d", description="3d: planes through three points; 2d: vertical planes through two."
         )
         scoring: Scoring = Field(
             "msac",
-            description="Score of a hypothesis: its number of points, the number weighted by "
-            "distance, or how unlikely its points are by chance at an estimated tolerance.",
+            description="Score of a hypothesis. count: its number of points; msac: this number "
+            "weighted by distance; a-contrario: how unlikely so many points are by chance, "
+            "at an estimated tolerance.",
         )
         n_hypotheses: int = Field(
             1000,

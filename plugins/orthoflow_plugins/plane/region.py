@@ -111,34 +111,35 @@ class Region(Method):
         )
         neighbourhood: Literal["cube", "radius", "knn"] = Field(
             "cube",
-            description="Points from which a normal is computed: those in a cube, in a sphere, or "
-            "in the nearest cells with `n_neighbours` points.",
+            description="Points from which a normal is computed. cube: those in a cube; radius: "
+            "in a sphere; knn: in the nearest cells that contain `n_neighbours` points.",
         )
         neighbourhood_m: Annotated[float, Field(gt=0.0, le=2.0)] | Literal["auto"] = Field(
             "auto",
-            description="Side of the cube, radius of the sphere, metres. auto: 0.1, or three times "
-            "the tolerance of the fit if that is more, because noise must not dominate normals.",
+            description="Side of the cube or radius of the sphere, metres. auto: 0.1, or three "
+            "times the tolerance of the fit if that is more, because noise must not dominate "
+            "the normals.",
         )
         n_neighbours: int = Field(
-            30, ge=3, le=100_000, description="Number of points of a neighbourhood for knn."
+            30, ge=3, le=100_000, description="Number of points in a neighbourhood, for knn."
         )
         cell_m: float | None = Field(
             None,
             gt=0.0,
             le=1.0,
-            description="Side of the cells; by default a third of the cube's side, half of the "
-            "sphere's radius, a third of `neighbourhood_m` for knn.",
+            description="Cell size; by default a third of the side of the cube, half the radius "
+            "of the sphere, or, for knn, a third of `neighbourhood_m`.",
         )
         criterion: Literal["normal-and-distance", "normal"] = Field(
             "normal-and-distance",
-            description="Criterion for adding cells to a region: the normal and the distance from "
-            "its plane, or only the normal.",
+            description="Criterion for adding cells to a region. normal-and-distance: normal and "
+            "distance from its plane; normal: only the normal.",
         )
         angle_deg: float = Field(
             10.0,
             gt=0.0,
             le=45.0,
-            description="Maximum angle between a normal and that of the region.",
+            description="Maximum angle between the normal of a cell and that of the region.",
         )
         distance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
             "auto",
@@ -147,7 +148,8 @@ class Region(Method):
         )
         labels: Literal["plane", "region"] = Field(
             "plane",
-            description="Label points by the nearest plane, or by the region that contains them.",
+            description="Labels of points. plane: the nearest plane; region: the region that "
+            "contains the point.",
         )
 
         @model_validator(mode="before")

@@ -118,7 +118,7 @@ def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("box", ["1,2,3,4,5", "1,2,3,4,5,6,7", "a,2,3,4,5,6", "1,2,nan,4,5,6"])
 def test_a_box_is_six_numbers(box: str) -> None:
-    with pytest.raises(ArgumentError, match="--box takes six numbers in metres"):
+    with pytest.raises(ArgumentError, match="--box must be six numbers in metres"):
         module._box(box)
 
 

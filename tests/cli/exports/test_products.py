@@ -53,7 +53,7 @@ def test_a_cell_that_gives_nothing_of_the_kind_is_refused() -> None:
     assert str(caught.value) == (
         "the step scan has no labels of points; steps with labels of points: a, b"
     )
-    with pytest.raises(ArgumentError, match=r"^the run r1 has read no cloud$"):
+    with pytest.raises(ArgumentError, match=r"^the run r1 contains no cloud$"):
         output_of(run, "cloud", None)
     with pytest.raises(ArgumentError, match="steps with clouds: none"):
         output_of(run, "cloud", "a")
