@@ -202,10 +202,7 @@ class Catalog:
         Raises:
             PluginError: no plugin or several declare the type, or its class cannot be imported.
         """
-        from orthoflow.catalog.loading import (  # noqa: PLC0415 - loads pydantic
-            import_target,
-            product_complaint,
-        )
+        from orthoflow.catalog.loading import import_target  # noqa: PLC0415 - loads pydantic
         from orthoflow.products.product import Product  # noqa: PLC0415 - loads numpy
 
         entry = self._product(type_name)
@@ -216,8 +213,6 @@ class Catalog:
         own = getattr(cls, "type_name", None)
         if own != type_name:
             raise PluginError(f"{broken}the type_name of {entry.spec.target} is {own!r}")
-        if complaint := product_complaint(cls):
-            raise PluginError(broken + complaint)
         return cls
 
     def publisher(self, type_name: str) -> Publisher | None:

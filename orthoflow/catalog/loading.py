@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import typing
 from collections.abc import Iterator, Mapping
 from importlib import import_module
@@ -75,10 +74,8 @@ def load_method(
     complaint = _class_complaint(method, spec)
     if not complaint:
         try:
-            complaint = (
-                _port_complaint(method, kind, product_types)
-                or _contested_complaint(method, contested, distribution)
-                or next(filter(None, map(product_complaint, _products_of(*_hints(method.Out)))), "")
+            complaint = _port_complaint(method, kind, product_types) or _contested_complaint(
+                method, contested, distribution
             )
         except (PluginError, NameError, TypeError) as error:
             complaint = f"its ports cannot be read: {describe_error(error)}"
@@ -115,34 +112,6 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
         "it has no method run": method.run is not Method.run,
     }
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
-
-
-def product_complaint(cls: type[Product]) -> str:
-    """Return an error if a name in `tolerances` of a product class is not a field, or ''."""
-    if not hasattr(cls, "__dataclass_fields__"):
-        return f"{cls.__qualname__} must be a frozen dataclass"
-    known = dict.fromkeys(_names_within(cls, set()))
-    return next(
-        (
-            f"tolerances of {cls.__qualname__} contains {name}, which is not a "
-            f"field{did_you_mean(name, known)}"
-            for name in cls.tolerances
-            if name not in known
-        ),
-        "",
-    )
-
-
-def _names_within(hint: object, seen: set[object]) -> Iterator[str]:
-    """Yield the names of the fields of a dataclass, including nested ones."""
-    for part in typing.get_args(hint):
-        yield from _names_within(part, seen)
-    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and hint not in seen:
-        seen.add(hint)
-        hints = typing.get_type_hints(hint)
-        for field in dataclasses.fields(hint):
-            yield field.name
-            yield from _names_within(hints[field.name], seen)
 
 
 def _hints(ports: type[Ports]) -> tuple[object, ...]:

@@ -6,6 +6,7 @@ import hashlib
 import os
 import platform
 import subprocess
+from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -44,28 +45,12 @@ def packages() -> dict[str, str]:
     """Return name -> version of installed distributions; the first of a name is used."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions():
-        try:
-            name, version = _stated(distribution)
-        except ValueError:
-            # Skip metadata that is not text.
-            continue
-        if name and version and name not in found:
-            found[name] = version
+        # Skip metadata that is not text, or lacks name or version.
+        with suppress(ValueError, KeyError):
+            stated = distribution.metadata
+            if stated["Name"] and stated["Version"]:
+                found.setdefault(stated["Name"], stated["Version"])
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
-
-
-def _stated(distribution: metadata.Distribution) -> tuple[str, str]:
-    """Read name and version of a distribution without loading its long description."""
-    files = ("METADATA", "PKG-INFO", "")  # the empty name is for metadata that is a single file
-    text = next(filter(None, map(distribution.read_text, files)), "")
-    stated = {"name": "", "version": ""}
-    for line in text.splitlines():
-        key, _, value = line.partition(":")
-        if not line or all(stated.values()):
-            break
-        if not stated.get(key.lower(), "-"):
-            stated[key.lower()] = value.strip()
-    return stated["name"], stated["version"]
 
 
 @cache

@@ -64,7 +64,7 @@ from orthoflow.geometry.compile_events import on_compiling
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
-from orthoflow.sdk.lines import one_line
+from orthoflow.sdk.lines import describe_error, one_line
 from orthoflow.sdk.methods import Method, labelled
 from orthoflow.untrusted_text import shown
 
@@ -342,15 +342,7 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
         )
     if isinstance(error, OSError) and (refused := _disk_failure(error, Path(task.store))):
         return refused
-    if isinstance(error, ValueError) and "read-only" in one_line(error):
-        return MethodError(
-            f"{task.who} writes to a read-only array, probably one of its inputs ({error}); it "
-            f"must work on a copy"
-        )
-    reason = f"failed unexpectedly: {type(error).__name__}: {one_line(error)}".removesuffix(": ")
-    if isinstance(error, SystemExit):
-        reason = f"tried to end the program ({one_line(error.code)})"
-    return MethodError(f"{task.who} {reason}")
+    return MethodError(f"{task.who} failed unexpectedly: {describe_error(error)}")
 
 
 def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:

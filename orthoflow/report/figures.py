@@ -19,7 +19,7 @@ from orthoflow.report.charts import as_image, saved
 from orthoflow.report.combinations import baseline_addresses
 from orthoflow.report.pictures import LONGEST_SIDE_PX, Picture, data_uri
 from orthoflow.report.rankings import seconds_in_words
-from orthoflow.untrusted_text import is_plain_svg, shown
+from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -239,9 +239,9 @@ def write_figures(
 
 
 def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
-    """Return the content of a figure's file; None if it is damaged or an unsafe drawing."""
+    """Return the content of a figure's file; None if it is damaged, or an SVG with its scripts."""
     if figure.media_type == "image/svg+xml":
-        return figure.data if is_plain_svg(figure.data) else None
+        return None
     try:
         if as_pdf:
             return encode_pdf(decode_image(figure.data, figure.name), dpi=_DPI)

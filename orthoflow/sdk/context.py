@@ -25,19 +25,17 @@ from orthoflow.diagnostics import (
 )
 from orthoflow.errors import CancelledStepError, ProductError
 from orthoflow.sdk.lines import is_name, one_line
-from orthoflow.untrusted_text import MOST_SVG_BYTES, is_plain_svg
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 
 # Measured for every step.
 MEASURED_BY_THE_ENGINE: Final = tuple(COSTS)
-_MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "image/svg+xml"}
-# More than any step needs, but few enough for records and terminals.
-_MOST_METRICS: Final = 20_000
-_MOST_FIGURES: Final = 2_000
+_MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp"}
+# More than any step needs, but few enough for terminals.
 _MOST_DIAGNOSTICS: Final = 1_000
 _LARGEST_FIGURE: Final = 64 << 20
 _HEAD_BYTES: Final = 16  # signature of an image file
+_NAME: Final = re.compile(r"\w[\w.-]{0,199}")
 
 
 class Drawing(Protocol):
@@ -49,7 +47,7 @@ class Drawing(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnFigure(Figure):
-    """A figure of a method: a PNG, WebP or SVG file in the scratch folder."""
+    """A figure of a method: a PNG or WebP file in the scratch folder."""
 
     path: Path
 
@@ -123,10 +121,11 @@ class StepContext:
             unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
 
         Raises:
-            ProductError: the value is not finite, the name is invalid or was reported before, or
-                there are too many metrics.
+            ProductError: the value is not finite, or the name is invalid or was reported before.
         """
-        self._take_name(name)
+        _require_name("metric", name)
+        if name in self._named:
+            raise ProductError(f"metric {name} was reported twice")
         if not is_name(unit, also_of_file=False):
             raise ProductError(
                 f"the unit of metric {name} must be a word, or 1 for counts and shares; got "
@@ -140,6 +139,7 @@ class StepContext:
             raise ProductError(
                 f"metric {name} must be finite, got {number}: if it is unknown, do not report it"
             )
+        self._named.add(name)
         self.metrics.append(Metric(name=name, value=number, unit=unit))
 
     def figure(
@@ -149,23 +149,23 @@ class StepContext:
 
         Args:
             name: short name, unique in the step; letters, digits, `-`, `_`.
-            content: content of a PNG, WebP or SVG file, a function that returns it and is called
-                only if figures are needed, or a matplotlib figure. Charts are PNG or SVG; images
-                that look like photos are WebP, a tenth of the size.
+            content: content of a PNG or WebP file, a function that returns it and is called only if
+                figures are needed, or a matplotlib figure. Charts are PNG; images that look like
+                photos are WebP, a tenth of the size.
             caption: one sentence on what the figure shows.
 
         Raises:
-            ProductError: the name is invalid or was used before, there are too many figures, or the
-                content is not an image (SVG files with scripts or links are not accepted) or is
-                larger than 64 MiB.
+            ProductError: the name is invalid or was used before, or the content is not such an
+                image or is larger than 64 MiB.
         """
-        _require_room("figure", len(self.figures), _MOST_FIGURES)
-        path = _path_below(self.scratch / "figures", name)
-        _require_letters("figure", name)
+        _require_name("figure", name)
         if callable(content):
             content = content()
         suffix = _suffix(content, name) if isinstance(content, bytes) else ".png"
-        path = _path_below(path.parent, f"{name}{suffix}")
+        try:
+            path = path_below(self.scratch / "figures", f"{name}{suffix}")
+        except UnsafeFileError as error:
+            raise ProductError(f"figure {name}: {error}") from error
         if colliding([*(figure.name for figure in self.figures), name]):
             raise ProductError(f"figure {name} was added twice")
         path.parent.mkdir(exist_ok=True)
@@ -252,54 +252,28 @@ class StepContext:
 
         Raises:
             OSError: the disk is full.
-            ProductError: the name is not valid for a file.
+            ProductError: no array has such a type and shape.
         """
-        file_name = f"{port}.{name.replace('/', '.')}"
         size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
         if np.dtype(dtype).hasobject or min(shape, default=0) < 0:
             raise ProductError(f"an array cannot be of type {np.dtype(dtype)} and shape {shape}")
         if size_bytes == 0:
             return np.zeros(shape, dtype=dtype)
-        path = _path_below(self.scratch / "allocated", file_name)
-        path.parent.mkdir(exist_ok=True)
+        folder = self.scratch / "allocated"
+        folder.mkdir(exist_ok=True)
+        path = folder / f"{len(list(folder.iterdir()))}"
         with path.open("wb") as file:
             # Writing to a sparse file on a full disk would kill the process.
             os.posix_fallocate(file.fileno(), 0, size_bytes)
         return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
 
-    def _take_name(self, name: object) -> None:
-        if not is_name(name):
-            raise ProductError(
-                "the name of a metric must be a printable line of at most 200 bytes without `/`, "
-                f"got {one_line(ascii(name), 80)}"
-            )
-        _require_letters("metric", name)
-        if name in self._named:
-            raise ProductError(f"metric {name} was reported twice")
-        _require_room("metric", len(self.metrics), _MOST_METRICS)
-        self._named.add(str(name))
 
-
-def _require_room(what: str, n_before: int, most: int) -> None:
-    if n_before >= most:
-        raise ProductError(f"a step may report at most {most} {what}s")
-
-
-def _require_letters(what: str, name: object) -> None:
-    if strange := "".join(dict.fromkeys(re.sub(r"[\w.-]", "", str(name)))):
+def _require_name(what: str, name: object) -> None:
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ProductError(
-            f"the name of a {what} may contain only letters, digits, `-`, `_` and `.`, got "
-            f"{strange!r} in {one_line(ascii(name), 80)}"
+            f"the name of a {what} may contain at most 200 letters, digits, `-`, `_` and `.`, got "
+            f"{one_line(ascii(name), 80)}"
         )
-
-
-def _path_below(folder: Path, name: object) -> Path:
-    if not isinstance(name, str):
-        raise ProductError(f"the name of a file must be a string, got {one_line(ascii(name), 80)}")
-    try:
-        return path_below(folder, name)
-    except UnsafeFileError as error:
-        raise ProductError(str(error)) from error
 
 
 def _suffix(picture: bytes, name: str) -> str:
@@ -307,10 +281,6 @@ def _suffix(picture: bytes, name: str) -> str:
         return ".png"
     if picture[:4] == b"RIFF" and picture[8:12] == b"WEBP":
         return ".webp"
-    if not is_plain_svg(picture):
-        raise ProductError(
-            f"figure {name} must be a PNG, a WebP or a plain SVG (without scripts, links and "
-            f"external files, at most {MOST_SVG_BYTES // 1000000} MB); its content begins with "
-            f"{picture[:_HEAD_BYTES]!r}"
-        )
-    return ".svg"
+    raise ProductError(
+        f"figure {name} must be a PNG or a WebP; its content begins with {picture[:_HEAD_BYTES]!r}"
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
+from graphlib import CycleError, TopologicalSorter
 from typing import Final
 
 from orthoflow.errors import did_you_mean
@@ -21,7 +22,6 @@ from orthoflow.workflow.model import (
     Reference,
     StepVariant,
     Workflow,
-    is_acyclic,
 )
 from orthoflow.workflow.parameters import DraftStep
 from orthoflow.workflow.source import ProblemLog
@@ -158,16 +158,12 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
     sources: dict[str, list[str]] = {}
     for source, user in wires:
         sources.setdefault(user, []).append(source)
-    if is_acyclic(sources):
-        return
-    import networkx as nx  # noqa: PLC0415 - takes a quarter of a command's start, for a mistake only
-
-    graph: nx.DiGraph[str] = nx.DiGraph(list(wires))
-    for members in nx.strongly_connected_components(graph):
-        inside = graph.subgraph(members)
-        if inside.number_of_edges() == 0:
-            continue
-        edges = [(str(edge[0]), str(edge[1])) for edge in nx.find_cycle(inside)]
+    try:
+        TopologicalSorter(sources).prepare()
+    except CycleError as error:
+        # Each step of this list is the source of the next; the last one is the first again.
+        names_in_cycle: list[str] = error.args[1]
+        edges = list(itertools.pairwise(names_in_cycle))
         places = {edge: log.position(wires[edge][0]) for edge in edges}
         first = min(range(len(edges)), key=lambda index: places[edges[index]])
         edges = edges[first:] + edges[:first]
@@ -359,9 +355,6 @@ def _has_wildcard(text: str) -> bool:
 # Valid but implausible settings -------------------------------------------------------------------
 
 _GSD: Final = "gsd_m"
-_CROP: Final = "crop"
-# Prefix of the methods that find photos on walls.
-_MATCHING: Final = "match."
 # Limits for pixel sizes of walls and plans: finer than any scan, coarser than any building drawing.
 _MIN_GSD_M: Final = 0.0001
 _MAX_GSD_M: Final = 0.5
@@ -370,7 +363,7 @@ _MILLIMETRES: Final = 1000.0
 
 def lint_workflow(workflow: Workflow) -> tuple[str, ...]:
     """Yield a sentence for each implausible setting."""
-    return (*_idle_inputs(workflow), *_cell_sizes(workflow), *_cropped_matching(workflow))
+    return (*_idle_inputs(workflow), *_cell_sizes(workflow))
 
 
 def _idle_inputs(workflow: Workflow) -> Iterator[str]:
@@ -399,29 +392,6 @@ def _cell_sizes(workflow: Workflow) -> Iterator[str]:
             yield (
                 f"{place}{whose} is {gsd_m:g} m, which is implausible: cells are "
                 f"{_MIN_GSD_M:g} to {_MAX_GSD_M:g} m wide{hint}"
-            )
-
-
-def _cropped_matching(workflow: Workflow) -> Iterator[str]:
-    cropped = {
-        step
-        for _, step, variant in _calls(workflow, _CROP)
-        if variant.params.get(_CROP) is not None
-    }
-    matching = [
-        step
-        for step in workflow.steps.values()
-        if any(variant.method.startswith(_MATCHING) for variant in step.variants)
-    ]
-    # If cameras are given, no matching is needed.
-    if any(step.unless and workflow.inputs[step.unless].files for step in matching):
-        return
-    for first in matching[:1]:
-        for wall in cropped.intersection(first.upstream()):
-            yield (
-                f"{wall}.{_CROP} leaves a smaller area for {first.name}, so fewer photos are "
-                "oriented, and less accurately; run without it first, and use the cameras of that "
-                "run: --input cameras=RUN/products/orient/cameras.json"
             )
 
 

@@ -12,14 +12,12 @@ from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationEr
 from pydantic.json_schema import GenerateJsonSchema
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import Method, port_specs
 from orthoflow.workflow.model import (
     FORMAT,
     INPUTS,
-    CallSection,
     Comparison,
     Dataset,
     StepVariant,
@@ -50,8 +48,8 @@ class _Untitled(GenerateJsonSchema):
 def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     """Return the JSON Schema (2020-12) of workflows, for editors and other programs.
 
-    Methods that cannot be loaded are omitted. The schema checks less than `load_workflow`: it does
-    not check whether references and ports match.
+    Methods that cannot be loaded are omitted. The schema is for completion, and checks less than
+    `load_workflow`: not how keys depend on each other, nor whether references and ports match.
     """
     methods = list(_loadable(catalog))
     schema = WorkflowFile.model_json_schema(by_alias=True, schema_generator=_Untitled)
@@ -87,24 +85,6 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
             "description": use["description"],
         }
         section["allOf"] = [{"$ref": "#/$defs/parameters"}]
-    call["required"] = ["use"]
-    # If there are variants, the keys of a call belong to each of them.
-    step["oneOf"] = [
-        {"required": ["use"], "properties": {"variants": False}},
-        {
-            "required": ["variants"],
-            "properties": dict.fromkeys(CallSection.model_fields, False),
-        },
-    ]
-    properties = schema["properties"]
-    _name_keys(properties["inputs"])
-    _name_keys(properties["steps"], taken=INPUTS)
-    step["properties"]["variants"] = _first_of(step["properties"]["variants"])
-    _name_keys(step["properties"]["variants"], is_needed=True)
-    _name_keys(properties["steps"], is_needed=True, taken=INPUTS)
-    for choice in properties["datasets"]["anyOf"]:
-        if choice.get("type") == "object":
-            _name_keys(choice, is_needed=True)
     schema["required"] = ["orthoflow", "steps"]
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -144,26 +124,6 @@ def _or_sweep(schema: Schema) -> Schema:
     own = {key: value for key, value in schema.items() if key not in (*_SHOWN, "title")}
     choices = own.pop("anyOf") if set(own) == {"anyOf"} else [own]
     return {**shown, "anyOf": [*choices, _SWEEP]}
-
-
-def _first_of(schema: Schema) -> Schema:
-    """Return the schema without `null`, because a key that is present must have a value."""
-    choices = schema.pop("anyOf", [])
-    chosen = [choice for choice in choices if choice.get("type") != "null"]
-    return {**schema, **(chosen[0] if len(chosen) == 1 else {"anyOf": chosen})}
-
-
-def _name_keys(schema: Schema, *, is_needed: bool = False, taken: str = "") -> None:
-    """Restrict the keys of a mapping; in pydantic's schemas, `patternProperties` does not."""
-    for patterns in (schema.pop("patternProperties", None),):
-        if patterns:
-            schema["additionalProperties"] = next(iter(patterns.values()))
-    names: Schema = {"pattern": f"^{NAME_PATTERN}$"}
-    if taken:
-        names["not"] = {"enum": [taken]}
-    schema["propertyNames"] = names
-    if is_needed:
-        schema["minProperties"] = 1
 
 
 # Flowchart ----------------------------------------------------------------------------------------

@@ -71,11 +71,8 @@ RAISED = {
         f"PluginError: {TOY} needs no_such_library, which is missing or fails to import: "
         "No module named 'no_such_library'"
     ),
-    "values += 1.0": (
-        f"MethodError: {TOY} writes to a read-only array, probably one of its inputs (output array "
-        "is read-only); it must work on a copy"
-    ),
-    "sys.exit('bye')": f"MethodError: {TOY} tried to end the program (bye)",
+    "values += 1.0": f"{UNEXPECTED}: ValueError: output array is read-only",
+    "sys.exit('bye')": f"{UNEXPECTED}: SystemExit: bye",
     "from orthoflow.errors import MethodError\nraise MethodError('no number is large enough')": (
         "MethodError: no number is large enough"
     ),
@@ -108,7 +105,7 @@ def test_what_a_method_raises_becomes_one_sentence(world: World) -> None:
         # What is none of our errors is for the method's author, who finds it in log and record.
         is_bug = number < N_BUGS
         assert ("Traceback" in result.log, result.is_bug) == (is_bug, is_bug)
-    assert len(last.error_message) < 2200
+    assert len(last.error_message) < 700
     assert last.error_message.endswith("... (10485760 characters)")
     assert len(last.log) < 1 << 17
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,8 @@ import pytest
 from orthoflow.errors import CancelledStepError, ProductError
 from orthoflow.sdk import StepContext, StepEvent
 
-SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(20)
+WEBP = b"RIFF....WEBP"
 
 
 def context(folder: Path, heard: list[StepEvent] | None = None) -> StepContext:
@@ -23,21 +22,21 @@ def context(folder: Path, heard: list[StepEvent] | None = None) -> StepContext:
 
 @pytest.mark.parametrize(
     "content",
-    [b"no picture at all", b"\x89PNG", SVG.replace(b"/>", b"><script/></svg>"), b"<svg"],
-    ids=["text", "cut off", "script", "no XML"],
+    [b"no picture at all", b"\x89PNG", b'<svg xmlns="http://www.w3.org/2000/svg"/>'],
+    ids=["text", "cut off", "SVG"],
 )
 def test_what_is_no_picture_is_refused_where_it_is_drawn(tmp_path: Path, content: bytes) -> None:
     ctx = context(tmp_path)
     told = rf"^figure plan must be .* its content begins with {re.escape(repr(content[:16]))}$"
     with pytest.raises(ProductError, match=told):
         ctx.figure("plan", content)
-    assert (ctx.figures, list(tmp_path.rglob("*.svg"))) == ([], [])
+    assert (ctx.figures, list(tmp_path.iterdir())) == ([], [])
 
 
 def test_two_pictures_have_names_that_differ_everywhere(tmp_path: Path) -> None:
     ctx = context(tmp_path)
     ctx.figure("depth", PNG)
-    for name, content in (("Depth", PNG), ("depth", SVG)):
+    for name, content in (("Depth", PNG), ("depth", WEBP)):
         with pytest.raises(ProductError, match=f"figure {name} was added twice"):
             ctx.figure(name, content)
     assert [figure.path.name for figure in ctx.figures] == ["depth.png"]
@@ -80,7 +79,6 @@ def test_an_allocated_array_is_zero_and_a_file_of_its_size(tmp_path: Path) -> No
     (path,) = (tmp_path / "allocated").iterdir()
     # In blocks of 512 bytes: nothing of it is a hole.
     assert 512 * path.stat().st_blocks >= path.stat().st_size
-    assert path.name == "walls.walls.0.rgb"
     assert path.stat().st_size == 60 * 8
     array[1, 2, 2] = 7
     other = ctx.allocate("walls", "walls/1/rgb", (4, 5, 3), np.float64)
@@ -91,19 +89,20 @@ def test_an_allocated_array_is_zero_and_a_file_of_its_size(tmp_path: Path) -> No
             ctx.allocate("numbers", "values", shape, odd)
 
 
-NOT_NAMES = ["", "..", "../up", "two\nlines", "half \udcff", "n" * 300, 5]
+NOT_NAMES = ["", "..", "../up", "a b", "two\nlines", "half \udcff", "n" * 300, 5]
 
 
 @pytest.mark.parametrize("name", NOT_NAMES, ids=ascii)
 def test_what_cannot_be_a_name_names_no_metric_and_no_figure(tmp_path: Path, name: str) -> None:
     ctx = context(tmp_path)
-    with pytest.raises(ProductError, match=r"^the name of a metric must be a printable line"):
+    with pytest.raises(
+        ProductError, match=r"^the name of a metric may contain at most 200 letters, "
+    ):
         ctx.metric(name, 1.0, "mm")
-    refused = "(cannot be the name of a file here|^the name of a file must be a string, got 5)$"
-    with pytest.raises(ProductError, match=refused):
+    with pytest.raises(
+        ProductError, match=r"^the name of a figure may contain at most 200 letters, "
+    ):
         ctx.figure(name, PNG)
-    with pytest.raises(ProductError, match="so it cannot be the name of a file here"):
-        ctx.allocate("walls", f"{name}/\0", (3,), np.uint8)
     assert (ctx.metrics, ctx.figures, list(tmp_path.iterdir())) == ([], [], [])
 
 
@@ -117,22 +116,12 @@ def test_a_metric_is_a_number_and_its_unit_a_word(tmp_path: Path) -> None:
             context(tmp_path).metric("length", value, "m")
 
 
-def test_a_step_says_far_more_than_any_has_to_say_and_not_without_end(tmp_path: Path) -> None:
-    ctx = context(tmp_path)
-    for k in range(20_000):
-        ctx.metric(f"m{k}", float(k), "1")
+def test_a_step_names_each_metric_once_and_warns_a_thousand_times(tmp_path: Path) -> None:
+    heard: list[StepEvent] = []
+    ctx = context(tmp_path, heard)
+    ctx.metric("m1", 1.0, "1")
     with pytest.raises(ProductError, match="metric m1 was reported twice"):
         ctx.metric("m1", 2.0, "m")
-    with pytest.raises(ProductError, match="a step may report at most 20000 metrics"):
-        ctx.metric("one_more", 1.0, "1")
-    ctx.figure("first", PNG)
-    (figure,) = ctx.figures
-    ctx.figures += [replace(figure, name=f"f{k}") for k in range(1998)]
-    ctx.figure("last", PNG)
-    with pytest.raises(ProductError, match="a step may report at most 2000 figures"):
-        ctx.figure("one_more", PNG)
-    heard: list[StepEvent] = []
-    ctx.listen = heard.append
     for k in range(1003):
         ctx.warn(f"warning {k}")
     assert len(heard) == 1000

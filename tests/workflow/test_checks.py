@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.checks import lint_workflow
-from orthoflow.workflow.document import load_workflow
 from tests.laboratories import GOOD, load
 
 
@@ -23,18 +19,6 @@ def test_cells_that_cannot_be_meant_are_told(catalog: Catalog, tmp_path: Path) -
     ):
         workflow = load(GOOD.replace("{gsd_m: 1}", f"{{gsd_m: {gsd_m}}}"), tmp_path / "a", catalog)
         assert lint_workflow(workflow) == ((said,) if said else ())
-
-
-@pytest.mark.parametrize(("recipe", "n"), [("photos-on-scan", 1), ("direct", 0)])
-def test_a_crop_is_reported_where_photos_are_matched_to_it(recipe: str, n: int) -> None:
-    """A scan's own colours lose nothing by a crop."""
-    workflow = load_workflow(recipe, discover_catalog(), sets=["wall.crop=[0, 0, 1, 1]"])
-    reported = [text for text in lint_workflow(workflow) if text.startswith("wall.crop leaves ")]
-    assert len(reported) == n
-    # Cameras from elsewhere need no matches.
-    given = ["cameras=cameras.json"] if n else []
-    workflow = load_workflow(recipe, discover_catalog(), inputs=given, sets=["wall.crop=[0,0,1,1]"])
-    assert not [text for text in lint_workflow(workflow) if "crop" in text]
 
 
 def test_inputs_that_nothing_takes_are_told(catalog: Catalog, tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from syrupy.assertion import SnapshotAssertion
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.source import InvalidWorkflowError, shipped_workflow, shipped_workflows
+from orthoflow.workflow.source import shipped_workflow, shipped_workflows
 from orthoflow.workflow.views import mermaid, resolved_json, workflow_schema
 from tests import workflow_format
-from tests.laboratories import GOOD, load, with_steps
+from tests.laboratories import GOOD, load
 
 
 def test_the_resolved_workflow_is_canonical_json_without_paths_of_this_machine(
@@ -92,17 +92,3 @@ def test_the_example_of_the_reference_is_a_workflow(tmp_path: Path) -> None:
     assert load_workflow(path, catalog).name == "palace-room"
     document = YAML(typ="safe", pure=True).load(workflow_format.EXAMPLE)
     jsonschema.Draft202012Validator(workflow_schema(catalog)).validate(document)
-
-
-def test_reader_and_schema_refuse_the_same_steps(catalog: Catalog, tmp_path: Path) -> None:
-    validator = jsonschema.Draft202012Validator(workflow_schema(catalog))
-    for step in (
-        "{use: plane.hough2d, in: {cloud: cloud.cloud}, variants: {a: {use: plane.ransac}}}",
-        "{params: {cell_m: 1}, in: {cloud: cloud.cloud}, variants: {a: {use: plane.hough2d}}}",
-        "{use: plane.hough2d, in: {cloud: []}}",
-        "{in: {cloud: cloud.cloud}}",
-    ):
-        text = with_steps(f"x: {step}")
-        with pytest.raises(InvalidWorkflowError):
-            load(text, tmp_path / "flow.yaml", catalog)
-        assert list(validator.iter_errors(YAML(typ="safe", pure=True).load(text)))
