@@ -175,11 +175,6 @@ def test_voxels_grow_where_a_scene_would_have_too_many() -> None:
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def histogram_of(distances_m: NDArray[np.float64], reach_m: float) -> NDArray[np.int64]:
-    counts = np.histogram(np.abs(distances_m), bins=100, range=(0.0, reach_m))[0]
-    return counts[None].astype(np.int64)
-
-
 @pytest.mark.parametrize("seed", long_only(*range(50)))
 def test_no_seed_misses_a_wall(seed: int, tmp_path: Path) -> None:
     cloud = cloud_of(sampled(seed=seed), stations=STATION)
@@ -219,8 +214,9 @@ def test_chance_alone_is_not_meaningful_a_contrario_and_a_wall_is() -> None:
     background_m = rng.uniform(-2.0, 2.0, 5_000)
     both = np.concatenate([background_m, rng.normal(0.0, 0.002, 500)])
     alone, found = (
-        fewest_false_alarms(histogram_of(values, 0.05), 0.05, len(values), np.array([4.0]), 3)
-        for values in (background_m, both)
+        fewest_false_alarms(counts[None], 0.05, int(n_points), np.array([4.0]), 3)
+        for values, n_points in ((background_m, 5_000), (both, 5_500))
+        for counts in (np.histogram(np.abs(values), 100, (0.0, 0.05))[0],)
     )
     assert alone.value[0] < 0.0
     assert found.value[0] > 100.0

@@ -264,18 +264,6 @@ def test_cells_on_a_plane_give_that_plane_whatever_some_stand_out(outliers: int)
     assert outliers or fitted.bend_per_m == pytest.approx(0.0, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("freedom", "n_unknowns"), [("free", 3), ("vertical", 2), ("horizontal", 1)]
-)
-def test_a_fit_changes_only_what_is_free(freedom: fit.Freedom, n_unknowns: int) -> None:
-    fitted = adjusted(tilted_heights(), freedom)
-    assert fitted is not None
-    assert fitted.jacobian.shape == (4, n_unknowns)
-    normal = fitted.plane.normal
-    assert (abs(normal[0]) > 1e-4) == (n_unknowns > 1)
-    assert (abs(normal[1]) > 1e-4) == (n_unknowns > 2)
-
-
 def test_three_cells_or_a_row_of_them_fix_no_plane() -> None:
     for chosen, is_fixed in ((np.s_[0, :3], False), (np.s_[0, :], False), (np.s_[:2, :2], True)):
         cells = np.zeros((20, 30), dtype=np.bool_)

@@ -135,26 +135,17 @@ def test_what_cannot_be_is_said_with_its_line(tmp_path: Path, text: str, message
         read_ties(tmp_path, text)
 
 
-class PointReader(Reader):
-    """Returns the check points of texts."""
-
-    def __call__(self, *texts: str) -> CheckPoints:
-        paths = tuple(self.folder / f"points{index}.csv" for index in range(len(texts)))
-        for path, text in zip(paths, texts, strict=True):
-            path.write_text(text)
-        points: CheckPoints = self.run(paths, {}).checkpoints
-        return points
+def read_points(folder: Path, *texts: str) -> tuple[CheckPoints, dict[str, float]]:
+    paths = tuple(folder / f"points{index}.csv" for index in range(len(texts)))
+    for path, text in zip(paths, texts, strict=True):
+        path.write_text(text)
+    reader = Reader(ReadCheckpoints, folder)
+    return reader.run(paths, {}).checkpoints, reader.metrics
 
 
-@pytest.fixture
-def read_points(tmp_path: Path) -> PointReader:
-    return PointReader(ReadCheckpoints, tmp_path)
-
-
-def test_all_columns_come_out(read_points: PointReader) -> None:
-    points = read_points(
-        "name,class,x,y,z,wall,v_px,u_px\nP1,flat,1,2,3,1,20.25,10.5\nP 2,,4,5,6,,,\n"
-    )
+def test_all_columns_come_out(tmp_path: Path) -> None:
+    text = "name,class,x,y,z,wall,v_px,u_px\nP1,flat,1,2,3,1,20.25,10.5\nP 2,,4,5,6,,,\n"
+    points, _ = read_points(tmp_path, text)
     assert points.names == ("P1", "P 2")
     assert points.classes == ("flat", "")
     np.testing.assert_array_equal(points.points_world, [[1, 2, 3], [4, 5, 6]])
@@ -162,18 +153,13 @@ def test_all_columns_come_out(read_points: PointReader) -> None:
     np.testing.assert_array_equal(points.pixels_wall, [[10.5, 20.25], [np.nan, np.nan]])
 
 
-def test_files_are_joined_in_order(read_points: PointReader) -> None:
-    points = read_points("P1,1,2,3\n", "name,x,y,z,class\nP2,4,5,7,edge\n")
+def test_files_are_joined_in_order(tmp_path: Path) -> None:
+    points, metrics = read_points(tmp_path, "P1,1,2,3\n", "name,x,y,z,class\nP2,4,5,7,edge\n")
     assert points.names == ("P1", "P2")
     assert points.classes == ("", "edge")
-    assert read_points.metrics == {
-        "n_points": 2,
-        "n_measured": 0,
-        "extent_x_m": 3,
-        "extent_y_m": 3,
-        "extent_z_m": 4,
-    }
+    extents = {"extent_x_m": 3, "extent_y_m": 3, "extent_z_m": 4}
+    assert metrics == {"n_points": 2, "n_measured": 0, **extents}
     with pytest.raises(InputError, match=r"P1 is in points0\.csv and again in points1\.csv"):
-        read_points("P1,1,2,3\n", "P1,1,2,4\n")
+        read_points(tmp_path, "P1,1,2,3\n", "P1,1,2,4\n")
     with pytest.raises(InputError, match="the input checkpoints has no files"):
-        read_points()
+        read_points(tmp_path)

@@ -298,12 +298,8 @@ def test_lenses_of_a_layout_hold_its_footprint_and_differ_a_little(
     assert {(lens.fx, lens.fy) for lens in lenses} == {(distance_m / 0.01, distance_m / 0.01)}
     off = np.array([[lens.cx - width / 2, lens.cy - height / 2] for lens in lenses]) / width
     assert 0.0055 < np.abs(off).max() <= 0.006
-    distortion = np.array([lens.distortion for lens in lenses])
-    np.testing.assert_array_equal(distortion[:, 4], 0.0)
-    for values, middle, scatter in zip(
-        distortion.T, (-0.08, 0.02, 0.0, 0.0), (0.01, 0.005, 5e-4, 5e-4), strict=False
-    ):
-        assert 0.93 * scatter < np.abs(values - middle).max() <= scatter
+    off = np.array([lens.distortion for lens in lenses]) - [-0.08, 0.02, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(np.abs(off).max(axis=0), [0.01, 0.005, 5e-4, 5e-4, 0.0], rtol=0.07)
 
 
 @pytest.mark.parametrize("layout", ["quick", "variant2"])

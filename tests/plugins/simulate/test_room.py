@@ -39,27 +39,16 @@ def simulate(folder: Path, *, seed: int = 1, cores: int = 2, **params: object) -
     return made[numbers]
 
 
-def assert_same_points(one: PointCloud, other: PointCloud) -> None:
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-
-
 def distances_m(cloud: PointCloud, truth: Truth, plane: int) -> np.ndarray:
     chosen = np.flatnonzero(truth.labels == plane)
     return truth.planes.plane(plane).distances_m(cloud.points_world(chosen))
 
 
-def test_the_number_of_threads_changes_no_bit(tmp_path: Path) -> None:
-    one = simulate(tmp_path / "one", cores=1, **COARSE)
-    two = simulate(tmp_path / "two", cores=2, **COARSE)
-    assert_same_points(one.cloud, two.cloud)
-    np.testing.assert_array_equal(one.truth.labels, two.truth.labels)
-
-
 def test_survey_coordinates_change_nothing_but_the_origin(tmp_path: Path) -> None:
     near = simulate(tmp_path / "near", **COARSE)
     far = simulate(tmp_path / "far", **COARSE, shift_world_m=tuple(scenes.SURVEY_SHIFT_M))
-    assert_same_points(near.cloud, far.cloud)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(near.cloud, name), getattr(far.cloud, name))
     np.testing.assert_array_equal(near.truth.labels, far.truth.labels)
     np.testing.assert_array_equal(far.cloud.origin, scenes.SURVEY_SHIFT_M)
     np.testing.assert_array_equal(near.truth.planes.normal, far.truth.planes.normal)
@@ -174,18 +163,6 @@ def test_plaques_give_drawn_walls_check_points_at_edges(tmp_path: Path) -> None:
         SimulateRoom.Params(n_plaques=3)
 
 
-def test_outliers_are_as_many_as_asked_and_belong_to_no_plane(tmp_path: Path) -> None:
-    clean = simulate(tmp_path / "clean", **{**COARSE, "outlier_share": 0.0, "beam_m": 0.0})
-    dirty = simulate(tmp_path / "dirty", **{**COARSE, "outlier_share": 0.1, "beam_m": 0.0})
-    spoilt = dirty.truth.n_spoilt
-    assert isinstance(spoilt, int)
-    # 4 standard deviations of a binomial share.
-    limit = 4.0 * np.sqrt(0.1 * 0.9 / len(dirty.cloud))
-    assert spoilt / len(dirty.cloud) == pytest.approx(0.1, abs=limit)
-    moved = np.hypot(clean.cloud.x - dirty.cloud.x, clean.cloud.y - dirty.cloud.y) > 0.05
-    assert np.all(dirty.truth.labels[moved] == -1)
-
-
 @pytest.mark.usefixtures("charts")
 def test_the_main_wall_is_reported_where_the_floor_has_more_points(tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
@@ -195,6 +172,8 @@ def test_the_main_wall_is_reported_where_the_floor_has_more_points(tmp_path: Pat
     assert main > 0
     metrics = {metric.name: metric.value for metric in context.metrics}
     assert metrics["main_wall_points"] == truth.planes.n_points[main]
+    # Four in a thousand are drawn, and distances mix at edges.
+    assert 0.0035 < metrics["outlier_share"] < 0.03
     # Panoramas and details of two stations look at most of the wall.
     assert 12.0 < metrics["scan_step_median_mm"] < 16.0
     assert metrics["scan_step_p90_mm"] < 20.0

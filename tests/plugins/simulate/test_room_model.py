@@ -217,24 +217,6 @@ def test_a_box_is_closed_but_for_its_back() -> None:
     assert {surface.plane for surface in side.draft.surfaces} == {-1}
 
 
-def test_bars_are_a_frame_without_gap_or_overlap() -> None:
-    side = a_wall()
-    side.bars(EXTENT, 0.1, 0.02, PAINT, base_m=0.01)
-    fronts = side.draft.surfaces[::5]
-    assert len(side.draft.surfaces) == 20
-    inner = (-0.4, 0.9, 0.35, 0.65)
-    area = sum((e[1] - e[0]) * (e[3] - e[2]) for e in (front.extent for front in fronts))
-    assert area == pytest.approx(1.5 * 0.5 - 1.3 * 0.3)
-    rng = np.random.default_rng(1)
-    for a, b in rng.uniform([-0.6, 0.15], [1.1, 0.85], (200, 2)):
-        covered = sum(e[0] < a < e[1] and e[2] < b < e[3] for e in (f.extent for f in fronts))
-        is_out = EXTENT[0] < a < EXTENT[1] and EXTENT[2] < b < EXTENT[3]
-        is_in = inner[0] < a < inner[1] and inner[2] < b < inner[3]
-        assert covered == (is_out and not is_in)
-    for front in fronts:
-        assert all(corner[2] == pytest.approx(0.03) for corner in on_wall(side, front))
-
-
 def test_a_recess_leads_from_the_wall_to_its_back_and_needs_a_hole_of_its_size() -> None:
     side = a_wall()
     plane = side.true_plane("niche", EXTENT, -0.25)
@@ -263,9 +245,7 @@ def test_a_recess_leads_from_the_wall_to_its_back_and_needs_a_hole_of_its_size()
     )
 
 
-FULL: Extent = (-2.9, 2.9, -1.6, 1.7)
 SHOWN: Extent = (-2.7, 2.7, -1.5, 1.6)
-N_WALLS = 300
 GROUND = Paint(TextureKind.PLAIN, (1.0, 0.0, 0.0), 0.5)
 
 
@@ -304,27 +284,9 @@ def drawn(seed: int) -> Drawn:
     )
 
 
-@cache
-def all_drawn() -> tuple[Drawn, ...]:
-    return tuple(drawn(seed) for seed in range(N_WALLS))
-
-
-def is_cornice(extent: Extent) -> bool:
-    return extent[:2] == FULL[:2]
-
-
-def overlap(one: Extent, other: Extent) -> bool:
-    return (
-        one[0] < other[1] - 1e-9
-        and other[0] < one[1] - 1e-9
-        and one[2] < other[3] - 1e-9
-        and other[2] < one[3] - 1e-9
-    )
-
-
 def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:
     kinds: Counter[str] = Counter()
-    for found in all_drawn():
+    for found in map(drawn, range(300)):
         holes = list(found.wall.holes)
         assert holes == [extent for _, extent, _ in found.recesses]
         whole, *planes = found.planes
@@ -349,6 +311,6 @@ def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:
         assert all(0.0 < depth_m <= 0.3 for depth_m, _ in found.stone)
         assert all(depth_m == pytest.approx(0.03) for depth_m, _ in found.panels)
         for one, other in pairwise(holes):
-            assert not overlap(one, other)
+            assert not overlaps(one, other)
     # Each kind as likely; the fourth is bare.
     assert max(kinds.values()) < 1.6 * min(kinds.values())
