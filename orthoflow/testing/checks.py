@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import re
-import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from orthoflow import products
-from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine.store import digest_of, publish_into
-from orthoflow.errors import CancelledStepError, OrthoflowError, ProductError
-from orthoflow.products import Cameras, Planes, PointCloud, Product
+from orthoflow.engine.store import digest_of
+from orthoflow.errors import CancelledStepError, OrthoflowError
+from orthoflow.products import Cameras, PointCloud
 from orthoflow.sdk import Method, port_specs
-from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.units import UNITS
 from orthoflow.testing.examples import example_room, few_points
 from orthoflow.testing.golden import golden_problem
@@ -41,12 +34,6 @@ from orthoflow.testing.witnesses import Subject, output_of, require
 
 # The name of a float parameter must contain one of these: a unit, or a word for a unitless value.
 UNIT_SUFFIXES: Final = (*UNITS, "world", "intensity")
-# Product types whose publishers have their own tests.
-_OURS: Final = frozenset(
-    cls.type_name
-    for cls in vars(products).values()
-    if isinstance(cls, type) and issubclass(cls, Product) and cls is not Product
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,50 +112,6 @@ def outputs_are_valid(subject: Subject) -> None:
         )
 
 
-def no_covariance_is_zero(subject: Subject) -> None:
-    """No plane or pose has a covariance of zero, which would mean that it has no error."""
-    for product in subject.witness.first.run.outputs.values():
-        stated: list[tuple[str, NDArray[np.float64] | None]] = []
-        if isinstance(product, Planes):
-            stated += zip(product.names, product.covariance, strict=True)
-        if isinstance(product, Cameras):
-            stated += [(camera.photo, camera.covariance) for camera in product.cameras]
-        for name, covariance in stated:
-            require(
-                covariance is None or bool(np.any(covariance)),
-                f"the covariance of {name} is zero, which means that it is without error: put "
-                "in what your fit states; `orthoflow plugins new` writes that of least squares for "
-                "a plane, and of a camera it may be left out",
-            )
-
-
-def publishers_write_into_their_folder(subject: Subject) -> None:
-    """Publishers of the plugin's own products write only regular files, into the given folder."""
-    catalog = discover_catalog()
-    for name, product in subject.witness.first.run.outputs.items():
-        is_ours = product.type_name in _OURS
-        publisher = None if is_ours else catalog.publisher(product.type_name)
-        if publisher is None:
-            continue
-        around, here = subject.folder / f"published-{name}", subject.folder / f"beside-{name}"
-        here.mkdir(parents=True)
-        who = f"the publisher of {product.type_name}"
-        try:
-            with contextlib.chdir(here):
-                publish_into(around / "files", product, publisher, digest_of(product))
-        except ProductError as error:
-            raise AssertionError(str(error)) from error
-        except Exception as error:
-            raised = traceback.extract_tb(error.__traceback__)[-1]
-            raise AssertionError(
-                f"{who} raised {describe_error(error)} ({Path(raised.filename).name}:"
-                f"{raised.lineno})"
-            ) from error
-        beside = (path.name for folder in (around, here) for path in sorted(folder.iterdir()))
-        strays = [name for name in beside if name != "files"]
-        require(not strays, f"{who} wrote beside its folder: {', '.join(strays)}")
-
-
 def inputs_stay_untouched(subject: Subject) -> None:
     """Input arrays are not changed."""
     for name in subject.witness.first.changed_inputs:
@@ -240,11 +183,6 @@ def _refuses(subject: Subject, cloud: PointCloud, what: str) -> None:
 def empty_cloud_is_refused(subject: Subject) -> None:
     """A cloud without points causes an OrthoflowError."""
     _refuses(subject, few_points(np.zeros((0, 3))), "no points")
-
-
-def single_point_is_refused(subject: Subject) -> None:
-    """A cloud of one point causes an OrthoflowError."""
-    _refuses(subject, few_points(np.ones((1, 3))), "one point")
 
 
 def nan_is_refused(subject: Subject) -> None:
@@ -328,10 +266,6 @@ def _is_reproducible(method: type[Method]) -> bool:
     return method.determinism != "loose"
 
 
-def _makes_its_own(method: type[Method]) -> bool:
-    return any(port.type_name not in _OURS for port in port_specs(method.Out).values())
-
-
 def _of(*kinds: str) -> Callable[[type[Method]], bool]:
     return lambda method: method.id.partition(".")[0] in kinds
 
@@ -360,8 +294,6 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(parameters_are_documented, _always),
     _check(parameters_round_trip, _always),
     _check(outputs_are_valid, _always),
-    _check(no_covariance_is_zero, _of("plane", "orient")),
-    _check(publishers_write_into_their_folder, _makes_its_own),
     _check(inputs_stay_untouched, _always),
     _check(global_state_stays_untouched, _always),
     _check(nothing_is_written_outside_scratch, _always, is_quick=False),
@@ -370,7 +302,6 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(progress_never_goes_back, _always),
     _check(cancel_is_honoured, _always),
     _check(empty_cloud_is_refused, _takes_a_cloud),
-    _check(single_point_is_refused, _takes_a_cloud),
     _check(nan_is_refused, _takes_a_cloud),
     _check(a_huge_coordinate_does_no_harm, _takes_a_cloud, is_quick=False),
     _check(missing_ties_are_reported, _takes_ties, is_quick=False),

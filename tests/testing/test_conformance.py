@@ -34,8 +34,7 @@ EXPECTED_FAILURES: dict[str, dict[str, str]] = {
     "plane.given": {
         "planes-follow-a-rigid-motion": "it looks for none: its parameters say where the plane is, "
         "else it is the lowest level",
-        "no-covariance-is-zero": "what is given has no error of its own",
-        "stated-errors-of-planes-hold": "the same",
+        "stated-errors-of-planes-hold": "what is given has no error of its own",
     },
     "orient.dlt": {
         "poses-are-recovered": "eleven parameters hold no distortion unless `distortion` is set, "
