@@ -191,7 +191,6 @@ def test_long_work_outside_of_cells_is_shown(capsys: pytest.CaptureFixture[str])
         (CellState(state="ok", took_s=30.0), 0.0, 0.0),
         # Its earlier duration counts until that is over, then its progress.
         (running(took_s=30.0, fraction=0.9), 110.0, 20.0),
-        (running(took_s=30.0, fraction=0.5), 130.0, 30.0),
         (running(took_s=30.0), 150.0, None),
         # Where it never ran before, a quarter in ten seconds leaves thirty.
         (running(fraction=0.25), 110.0, 30.0),

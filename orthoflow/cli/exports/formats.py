@@ -174,36 +174,33 @@ class FormatOption(click.Option):
         self.formats = formats
 
 
+def _is_given(value: object) -> bool:
+    # Wall 0 and a grid of 0 are given; a flag that nobody set is False.
+    return value is not None and value is not False and value != ()
+
+
 def check_choices(chosen: Choices, target: str | None, options: Sequence[FormatOption]) -> None:
     """Refuse options that do not belong to the format.
 
     Raises:
         ArgumentError: one does not, or no format is named.
     """
-    if target is None and not chosen.embed and not chosen.split:
-        raise ArgumentError(
-            f"choose a format: --to {listed(tuple(FORMATS))}, or --embed or --split"
-        )
-    beside = f"--to {target}" if target else "--embed"
-    if chosen.split and (target or chosen.embed):
-        raise ArgumentError(
-            f"--split cannot be combined with {beside}: split "
-            f"first, then export each, as orthoflow export RUN/datasets/NAME {beside}"
-        )
-    said = "--split" if chosen.split else beside
-    for option in options:
-        value = getattr(chosen, str(option.name))
-        # A grid of 0 and wall 0 are given; a flag that nobody set is False.
-        is_given = value is not None and value is not False and value != ()
-        if is_given and target not in option.formats:
-            owners = [name for name in FORMATS if name in option.formats]
-            raise ArgumentError(f"{option.opts[0]} applies to --to {listed(owners)}, not to {said}")
-    if chosen.embed and target not in {None, "ro-crate"}:
-        raise ArgumentError(f"{said} writes no record, so nothing can be embedded with --embed")
+    mode = f"--to {target}" if target else "--split" if chosen.split else "--embed"
+    if not (target or chosen.embed or chosen.split):
+        raise ArgumentError(f"choose a format: --to {', '.join(FORMATS)}, or --embed or --split")
+    refused = [
+        option.opts[0]
+        for option in options
+        if target not in option.formats and _is_given(getattr(chosen, str(option.name)))
+    ]
+    if chosen.split and target:
+        refused.append("--split")
+    if chosen.embed and (chosen.split or target not in {None, "ro-crate"}):
+        refused.append("--embed")
     if chosen.inputs and not chosen.embed:
-        raise ArgumentError(f"--input applies to --embed, not to {said}")
-
-
-def listed(names: Sequence[str]) -> str:
-    """Give names as a sentence has them: `a, b or c`."""
-    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+        refused.append("--input")
+    if refused:
+        raise ArgumentError(
+            f"{' and '.join(refused)} cannot be combined with {mode}; `orthoflow export --help` "
+            "lists the options of each format"
+        )

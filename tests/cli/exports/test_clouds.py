@@ -114,12 +114,9 @@ def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
         ArgumentError, match=r"^no points of the cloud of plane are selected: choose"
     ):
         exported(tmp_path, labelled(), box="5,5,5,6,6,6")
-
-
-@pytest.mark.parametrize("box", ["1,2,3,4,5", "1,2,3,4,5,6,7", "a,2,3,4,5,6", "1,2,nan,4,5,6"])
-def test_a_box_is_six_numbers(box: str) -> None:
-    with pytest.raises(ArgumentError, match="--box must be six numbers in metres"):
-        module._box(box)
+    for box in ("1,2,3,4,5", "a,2,3,4,5,6", "1,2,nan,4,5,6"):
+        with pytest.raises(ArgumentError, match="--box must be six numbers in metres"):
+            exported(tmp_path, labelled(), box=box)
 
 
 @pytest.mark.parametrize(
@@ -181,17 +178,6 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     assert not folder.exists()
 
 
-def test_one_wall_is_meant_by_the_number_of_its_plane() -> None:
-    assert module._wall(None, None) == (None, -1)
-    walls: Any = SimpleNamespace(
-        walls=[SimpleNamespace(plane_index=4), SimpleNamespace(plane_index=8)],
-        slab=lambda place: f"slab {place}",
-    )
-    assert module._wall(walls, 8) == ("slab 1", 8)
-    with pytest.raises(ArgumentError, match="--wall 1: the run has no wall 1; it has 4, 8"):
-        module._wall(walls, 1)
-
-
 def test_the_coordinate_system_is_written_where_all_walls_agree() -> None:
     def walls(*names: str | None) -> Any:
         return SimpleNamespace(
@@ -238,18 +224,15 @@ def photographed(*names: str, takes: bool = True) -> Any:
     refused = Camera(photo="c.jpg", status="too few ties")
     first = Cameras(cameras=(replace(one, photo="a.jpg"), refused))
     last = Cameras(cameras=(replace(one, photo="b.jpg"), replace(one, photo="a.jpg"), refused))
+    photos = [Photo(name=name, encoded=b"", width=4, height=3) for name in names]
     taken = {"photos": "shots"} if takes else {}
     return ToyRun(
         {
-            "shots": ({}, {"photos": photos(*names)}),
+            "shots": ({}, {"photos": Photos(photos=tuple(photos))}),
             "orient": (taken, {"cameras": first}),
             "bundle": (taken, {"cameras": last}),
         }
     )
-
-
-def photos(*names: str) -> Photos:
-    return Photos(photos=tuple(Photo(name=name, encoded=b"", width=4, height=3) for name in names))
 
 
 def test_photos_are_those_that_the_last_cell_oriented(tmp_path: Path) -> None:

@@ -33,17 +33,13 @@ def test_the_last_cell_is_taken_and_the_first_five_others_are_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert output_of(run_of("plane"), "labels", None) == ("plane", "out")
-    assert capsys.readouterr().err == ""
     seven = [f"plane@plane=v{k}" for k in range(7)]
+    assert output_of(run_of(*seven), "labels", seven[2]) == (seven[2], "out")
+    assert capsys.readouterr().err == ""
     assert output_of(run_of(*seven), "labels", None) == (seven[-1], "out")
     said = capsys.readouterr().err
     assert f"note: using the labels of points of {seven[-1]}; --step selects others: " in said
-    assert ", ".join(seven[:5]) in said
-    assert "and 1 more" in said
-    assert output_of(run_of(*seven[:6]), "labels", None)[0] == seven[5]
-    assert "more" not in capsys.readouterr().err
-    assert output_of(run_of(*seven), "labels", seven[2]) == (seven[2], "out")
-    assert capsys.readouterr().err == ""
+    assert f"{', '.join(seven[:5])} and 1 more" in said
 
 
 def test_a_cell_that_gives_nothing_of_the_kind_is_refused() -> None:

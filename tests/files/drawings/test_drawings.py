@@ -270,7 +270,7 @@ def test_what_cannot_be_drawn_is_refused_and_nothing_is_written(
 
 def test_options_of_sheets_belong_to_sheets(run: Path, tmp_path: Path) -> None:
     done = export(run, "dxf", tmp_path / "out", "--scale", 50)
-    assert (done.exit_code, "--scale applies to --to" in done.output) == (2, True)
+    assert (done.exit_code, "--scale cannot be combined with --to dxf" in done.output) == (2, True)
 
 
 def test_a_changed_picture_is_not_drawn(tmp_path: Path) -> None:
