@@ -10,7 +10,9 @@ import pytest
 from ruamel.yaml import YAML
 
 from benchmarks.drawn_rooms import filled_in, ranking_holds
+from orthoflow.catalog.catalog import MethodEntry
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.source import shipped_workflows
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,13 +59,16 @@ PART = re.compile(r"\((planes|orient|ortho|surfaces)\)$")
 SOURCE = re.compile(r"`(tests|benchmarks)/")
 
 
-def test_the_page_names_most_built_in_methods() -> None:
+def ours() -> dict[str, MethodEntry]:
     methods = discover_catalog().methods
-    ours = {name for name in methods if methods[name].distribution.name == "orthoflow-tls"}
+    return {name: one for name, one in methods.items() if one.distribution.name == DISTRIBUTION}
+
+
+def test_the_page_names_most_built_in_methods() -> None:
     named = {METHOD.match(code).group() for code in NAMED}  # type: ignore[union-attr]
-    assert named <= ours, "a method was renamed"
+    assert named <= ours().keys(), "a method was renamed"
     for kind in ("plane", "ortho", "mosaic", "register", "inspect"):
-        missing = {name for name in ours if name.startswith(f"{kind}.")} - named
+        missing = {name for name in ours() if name.startswith(f"{kind}.")} - named
         # Neither paper asks for openings.
         assert missing <= {"inspect.truth", "inspect.openings", "plane.open3d-patches"}
 
@@ -79,28 +84,20 @@ def test_every_parameter_named_exists_and_takes_the_value() -> None:
             params.model_validate({name: YAML(typ="safe").load(value)})
 
 
-def test_every_figure_named_is_drawn_by_a_method() -> None:
+def test_every_figure_metric_workflow_and_file_named_is_there() -> None:
     sources = (ROOT / "plugins" / "orthoflow_plugins").rglob("*.py")
     whole = "\n".join(source.read_text() for source in sources)
     for figure in FIGURES:
         name = re.escape(figure.removesuffix("_...")).replace("_0_", r"_\{[^}]+\}_")
         assert re.search(rf'"{name}"', whole), figure
-
-
-def test_every_metric_named_is_declared_by_a_method() -> None:
-    methods = discover_catalog().methods
-    ours = [name for name in methods if methods[name].distribution.name == "orthoflow-tls"]
-    loaded = [methods[name].load() for name in ours]
+    loaded = [entry.load() for entry in ours().values()]
     known = {metric.name for method in loaded for metric in method.metric_specs()}
     assert len(METRICS) > 15
-    unknown = {name for name in METRICS if not any(fnmatchcase(name, one) for one in known)}
-    assert unknown == set()
-
-
-def test_every_workflow_named_is_shipped() -> None:
+    assert {name for name in METRICS if not any(fnmatchcase(name, one) for one in known)} == set()
     named = {code.removesuffix(".yaml") for code in CODE if re.fullmatch(r"[a-z-]+\.yaml", code)}
-    assert named
-    assert named <= {*shipped_workflows()}
+    assert set() < named <= {*shipped_workflows()}
+    paths = [code for code in CODE if re.match(r"(tests|benchmarks)/", code)]
+    assert [path for path in paths if not (ROOT / path).is_file()] == []
 
 
 def test_every_row_has_a_source_or_the_reason_why_it_has_none() -> None:
@@ -171,8 +168,3 @@ def test_places_become_the_mean_and_scatter_of_the_first_set() -> None:
     rooms = [[{"a s": value} for value in (0.01, 0.02, 0.03)], [{"a s": 9.0}]]
     text = "{{x: a s}}, {{x: a s : share}} %, {{x: a s : median}}, {{x: b s}}"
     assert filled_in(text, {"x": rooms}) == "0.02±0.01, 2±1 %, 0.02, no value"
-
-
-@pytest.mark.parametrize("path", [code for code in CODE if re.match(r"(tests|benchmarks)/", code)])
-def test_every_file_named_is_there(path: str) -> None:
-    assert (ROOT / path).is_file()

@@ -168,35 +168,6 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
     assert page.complaints == []
 
 
-def test_a_click_is_where_the_pointer_was_told_to_be(page: Page) -> None:
-    # Pointers know fractions of the screen's pixels, clicks do not.
-    # At once: the page may still be moving from what was done before.
-    page.evaluate(
-        f"(() => {{ const image = {FIGURE}.querySelector('img');"
-        " const box = image.getBoundingClientRect();"
-        " const x = box.left + image.clientLeft + 0.4567 * image.clientWidth;"
-        " const y = box.top + image.clientTop + 0.5678 * image.clientHeight;"
-        " image.dispatchEvent(new PointerEvent('pointermove', { bubbles: true,"
-        " clientX: x, clientY: y }));"
-        " image.dispatchEvent(new MouseEvent('click', { bubbles: true,"
-        " clientX: Math.floor(x), clientY: Math.floor(y) })); })()"
-    )
-    told = page.evaluate(f"{FIGURE}.querySelector('.readout').innerText")
-    collected = "[...document.querySelectorAll('.points [data-part=list] > div')].pop()"
-    name, told = told.split(" collected: ")
-    assert name == page.evaluate(f"{collected}.querySelector('input').value")
-    assert f"wall 0, {told}" in page.evaluate(f"{collected}.innerText")
-    # The cross with its number stands where the click was, and nowhere else.
-    mark = f"[...{FIGURE}.querySelectorAll('.marks > span')].pop()"
-    left, top = page.evaluate(f"[{mark}.style.left, {mark}.style.top].map(parseFloat)")
-    assert (left, top) == (pytest.approx(45.67, abs=0.2), pytest.approx(56.78, abs=0.2))
-    assert f"P{page.evaluate(f'{mark}.innerText')}" == name
-    # One that no pointer made, by a script or a keyboard, stays where it is itself.
-    page.evaluate(f"({POINTER})('click', 0.25, 0.5)")
-    u = re.findall(r"u ([0-9.]+) px", page.evaluate(f"{collected}.innerText"))
-    assert float(u[0]) == pytest.approx(30.0, abs=0.6)
-
-
 def test_the_theme_follows_the_system_until_it_is_chosen(page: Page) -> None:
     seen = []
     for theme, is_pressed in (("light", 0), ("dark", 0), ("dark", 1), ("dark", 1), ("light", 0)):
@@ -220,19 +191,6 @@ def test_nothing_sticks_out_of_a_phone(page: Page) -> None:
     )
     # Tables and the graph scroll inside their own boxes.
     assert page.evaluate(whole) <= width
-
-
-def test_the_first_screen_of_a_phone_shows_picture_and_accuracy(page: Page) -> None:
-    page.show_as(390, 844)
-    # The contents are folded when the browser has told of the new width.
-    page.evaluate(
-        "new Promise(done => { const look = () => document.querySelector('.contents details').open"
-        " ? setTimeout(look, 20) : done(); look(); })"
-    )
-    page.evaluate("scrollTo({top: 0, behavior: 'instant'})")
-    picture = page.evaluate("document.querySelector('.first img').getBoundingClientRect().bottom")
-    message = page.evaluate("document.querySelector('.warnings').getBoundingClientRect().top")
-    assert max(picture, message) <= 844
 
 
 def test_pictures_open_large_and_the_arrow_keys_lead_on(page: Page) -> None:
@@ -327,16 +285,6 @@ def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> No
     assert not any("points to the first plane" in name for name in names)
 
 
-def test_few_combinations_stand_beside_each_other_where_their_row_would_be_cut(page: Page) -> None:
-    region = "document.querySelector('[data-chooser]')"
-    is_cut = f"{region}.scrollWidth > {region}.clientWidth"
-    for width in (700, 1440):
-        page.show_as(width)
-        page.open(Path(page.evaluate("location.pathname")))
-        assert not page.evaluate(is_cut)
-        assert width > 700 or page.evaluate(f"!!{region}.querySelector('.turned')")
-
-
 def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:
     page.open(Path(page.evaluate("location.pathname")))
     way = "document.querySelector('.way')"
@@ -348,10 +296,9 @@ def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:
     assert "plane=coarse" in page.evaluate(f"{way}.querySelector('summary').innerText")
 
 
-@pytest.mark.parametrize(("width", "theme"), [(1440, "light"), (390, "dark")])
-def test_axe_finds_nothing_that_keeps_people_out(page: Page, width: int, theme: str) -> None:
+def test_axe_finds_nothing_that_keeps_people_out(page: Page) -> None:
     axe = Path(axe_core_python.__file__).with_name("axe.min.js").read_text(encoding="utf-8")
-    page.show_as(width, theme=theme)
+    page.show_as(390, theme="dark")
     page.open(Path(page.evaluate("location.pathname")))
     page.evaluate(f"{axe}; document.querySelectorAll('details').forEach(one => one.open = true)")
     # What lies behind the figure that is opened then is as it was.
@@ -370,40 +317,15 @@ def test_axe_finds_nothing_that_keeps_people_out(page: Page, width: int, theme: 
 def test_on_paper_results_are_unfolded(page: Page) -> None:
     page.show_as(1440)
     page.open(Path(page.evaluate("location.pathname")))
-    # As it stands where more than four things limit the result.
-    page.evaluate(
-        "document.querySelector('.warnings').insertAdjacentHTML('beforeend',"
-        " '<details><summary>1 more</summary>a fifth</details>')"
-    )
     page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
-    assert page.evaluate("document.querySelectorAll('.warnings details:not([open])').length") == 0
     assert page.evaluate("document.querySelectorAll('details.paper:not([open])').length") == 0
     wide = page.evaluate(
         "[...document.querySelectorAll('.on-paper table')].map(t => t.rows[0].cells.length)"
     )
-    assert wide
-    assert max(wide) <= 6
-    least = "getComputedStyle(document.querySelector('.on-paper .remark')).minWidth"
-    assert float(page.evaluate(least).removesuffix("px")) <= 100  # five of them fit a sheet
+    assert 0 < max(wide) <= 6
     page.evaluate("window.dispatchEvent(new Event('afterprint'))")
-    assert page.evaluate("document.querySelectorAll('.warnings details[open]').length") == 0
-    assert page.evaluate("document.querySelectorAll('.on-paper').length") == 0
-    assert page.evaluate("document.querySelectorAll('details.paper[open]').length") == 0
+    assert page.evaluate("document.querySelectorAll('.on-paper, details.paper[open]').length") == 0
     page.evaluate(UNFOLD)
-
-
-def test_two_environments_on_a_page_fit_a_phone(page: Page, tmp_path: Path) -> None:
-    run = compared_run(tmp_path)
-    [here] = run.record.environments
-    there = replace(here, id="there", cpu="another processor", git_commit="5895f5a" * 6)
-    cells = tuple(replace(cell, environment="there") for cell in run.record.cells)
-    other = replace(run, record=replace(run.record, environments=(there,), cells=cells))
-    write_report([run, other], tmp_path / "both.html")
-    page.show_as(390)
-    page.open(tmp_path / "both.html")
-    assert len(page.evaluate("document.querySelector('.legend').innerText").splitlines()) == 2
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    assert page.complaints == []
 
 
 SCRIPT = "document.title = 'injected'; console.error('injected')"
