@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from orthoflow_provenance.document import PublishedFile, RecordedProduct
 from orthoflow_provenance.record import write_record
+from scipy.spatial.transform import Rotation
 
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of
@@ -30,7 +31,6 @@ from orthoflow.products import (
     OrthoMask,
     Planes,
     Wall,
-    Walls,
 )
 from orthoflow.products.inspections import Finding
 from orthoflow.products.product import Product
@@ -41,14 +41,7 @@ from tests.report_runs import cell, metrics, record
 # As far from the origin as survey coordinates are, and turned.
 CORNER = np.array([4.0e5, 5.0e6, 100.0])
 SIZE_M = (4.0, 3.0, 2.5)
-_ANGLE = np.radians(20.0)
-AXES = np.array(
-    [
-        [np.cos(_ANGLE), np.sin(_ANGLE), 0.0],
-        [-np.sin(_ANGLE), np.cos(_ANGLE), 0.0],
-        [0.0, 0.0, 1.0],
-    ]
-)
+AXES = Rotation.from_euler("z", -20.0, degrees=True).as_matrix()
 # How far the points of a plane stay from the edges of the room.
 GAP_M = 0.1
 # The photographed wall is the third of the planes: numbers are not places among walls.
@@ -101,13 +94,7 @@ def box_products(image: Orthoimage | None = None) -> dict[str, Product]:
     frame = wall_frame(planes)
     return {
         "plane": planes,
-        "wall": Walls(
-            walls=(_wall(frame),),
-            up=planes.up.copy(),
-            intensity_source="laser",
-            buffer_front_m=0.3,
-            buffer_behind_m=0.3,
-        ),
+        "wall": samples.walls(_wall(frame), buffer_m=0.3, intensity_source="laser"),
         "mosaic": Orthoimages(images=(image or box_image(),)),
         "openings": box_openings(),
         "check": _inspection(frame),
@@ -173,7 +160,15 @@ def write_drawing_run(
     """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection."""
     folder.mkdir(parents=True)
     shelf = ProductShelf(folder)
-    given = {step: _recorded(shelf, product) for step, product in box_products(image).items()}
+    given = {}
+    for step, product in box_products(image).items():
+        payload = product.to_payload()
+        given[step] = RecordedProduct(
+            type_name=payload.type_name,
+            encoding_version=payload.encoding_version,
+            digest=shelf.put(payload),  # type: ignore[arg-type] # a payload like any
+            embedded=True,
+        )
     taken = {
         "wall": {"planes": "plane"},
         "mosaic": {"walls": "wall"},
@@ -199,29 +194,17 @@ def write_drawing_run(
     return folder
 
 
-def _recorded(shelf: ProductShelf, product: Product) -> RecordedProduct:
-    payload = product.to_payload()
-    return RecordedProduct(
-        type_name=payload.type_name,
-        encoding_version=payload.encoding_version,
-        digest=shelf.put(payload),  # type: ignore[arg-type] # a payload like any
-        embedded=True,
-    )
-
-
 def _wall(frame: WallFrame) -> Wall:
     """A wall with a step: 40 mm before the plane on the right half."""
     depth = np.zeros(frame.shape, dtype=np.float32)
     depth[:, frame.width // 2 :] = 0.04
-    return Wall(
-        frame=frame,
+    return samples.wall(
+        frame,
         name=f"wall {WALL}",
         plane_index=WALL,
         depth_m=depth,
         intensity=np.full(frame.shape, 0.5, dtype=np.float32),
         sigma_m=np.full(frame.shape, 0.001, dtype=np.float32),
-        count=np.ones(frame.shape, dtype=np.uint32),
-        mask=np.ones(frame.shape, dtype=np.uint8),
     )
 
 

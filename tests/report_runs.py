@@ -35,7 +35,7 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.products.product import Payload, Product
-from orthoflow.records.compare import ComparedMetric, Distance, ProductDistance
+from orthoflow.records.compare import Distance, ProductDistance
 from orthoflow.records.runs import Run
 from orthoflow.sdk import Method, MetricSpec
 from orthoflow.sdk.methods import labelled
@@ -200,47 +200,41 @@ def compared_run(folder: Path) -> HeldRun:
         cell("plane@plane=broken", status="failed", error_message="no plane & no <wall>"),
     ]
     products: dict[tuple[str, str], Product] = {}
-    for mark, shift in (("fine", 0), ("coarse", 60)):
-        walls = f"wall@plane={mark}"
-        digest = "ab"[mark == "coarse"]
-        cells += [
-            cell(walls, outputs={"walls": given("", digest, "walls")}),
-            cell(
-                f"orient@plane={mark}",
-                inputs={"walls": given(f"{walls}.walls", digest, "walls")},
-                outputs={"cameras": given("", "cd"[mark == "coarse"], "cameras")},
-                cached_from="r0",
-            ),
-            cell(
-                f"check@plane={mark}",
-                inputs={"walls": given(f"{walls}.walls", digest, "walls")},
-                outputs={"inspection": given("", "ef"[mark == "coarse"], "inspection")},
-                figures=(
-                    RecordedFigure(
-                        name="error_map",
-                        caption="how far",
-                        media_type="image/webp",
-                        data=encode_webp(picture(shift)),
-                    ),
-                    RecordedFigure(
-                        name="chart",
-                        caption="a chart",
-                        media_type="image/png",
-                        data=encode_png(picture(shift + 1)),
-                    ),
+    for mark, shift, digests in (("fine", 0, "ace1"), ("coarse", 60, "bdf2")):
+        made = {
+            "wall": walls_product(),
+            "orient": cameras_product(),
+            "check": inspection_product(),
+            "mosaic": orthoimages_product(shift),
+        }
+        outputs = {
+            step: {one.type_name: given("", digest, one.type_name)}
+            for digest, (step, one) in zip(digests, made.items(), strict=True)
+        }
+        walls = {"walls": replace(outputs["wall"]["walls"], source=f"wall@plane={mark}.walls")}
+        pictures = (
+            ("error_map", "how far", "image/webp", encode_webp(picture(shift))),
+            ("chart", "a chart", "image/png", encode_png(picture(shift + 1))),
+        )
+        more: dict[str, dict[str, Any]] = {
+            "wall": {},
+            "orient": {"inputs": walls, "cached_from": "r0"},
+            "check": {
+                "inputs": walls,
+                "figures": tuple(
+                    RecordedFigure(name=name, caption=caption, media_type=kind, data=data)
+                    for name, caption, kind, data in pictures
                 ),
-                metrics=metrics(rmse_u_mm=0.4 + shift, completeness=0.9931),
+                "metrics": metrics(rmse_u_mm=0.4 + shift, completeness=0.9931),
                 **warned(f"the grid is <{mark}>"),
-            ),
-            cell(
-                f"mosaic@plane={mark}",
-                outputs={"orthoimages": given("", "12"[mark == "coarse"], "orthoimages")},
-            ),
+            },
+            "mosaic": {},
+        }
+        cells += [
+            cell(f"{step}@plane={mark}", outputs=outputs[step], **about)
+            for step, about in more.items()
         ]
-        products[walls, "walls"] = walls_product()
-        products[f"orient@plane={mark}", "cameras"] = cameras_product()
-        products[f"check@plane={mark}", "inspection"] = inspection_product()
-        products[f"mosaic@plane={mark}", "orthoimages"] = orthoimages_product(shift)
+        products |= {(f"{step}@plane={mark}", one.type_name): one for step, one in made.items()}
     recorded = record(
         cells,
         status="failed",
@@ -259,21 +253,11 @@ def picture(shift: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 def walls_product() -> Walls:
     depth_m = np.full(FRAME.shape, 0.002, dtype=np.float32)
-    wall = samples.wall(
-        FRAME,
-        depth_m=depth_m,
-        sigma_m=depth_m,
-        mask=np.ones(FRAME.shape, dtype=np.uint8),
-        intensity=np.linspace(0, 1, FRAME.width * FRAME.height, dtype=np.float32).reshape(
-            FRAME.shape
-        ),
-    )
-    return Walls(
-        walls=(wall,),
-        up=np.array([0.0, 0.0, 1.0]),
+    shades = np.linspace(0, 1, depth_m.size, dtype=np.float32).reshape(FRAME.shape)
+    mask = np.ones(FRAME.shape, dtype=np.uint8)
+    return samples.walls(
+        samples.wall(FRAME, depth_m=depth_m, sigma_m=depth_m, mask=mask, intensity=shades),
         intensity_source="laser",
-        buffer_front_m=0.1,
-        buffer_behind_m=0.1,
     )
 
 
@@ -327,13 +311,6 @@ def inspection_product() -> Inspection:
         kind=np.zeros(2, dtype=np.uint8),
         kinds=("patch",),
         findings=(),
-    )
-
-
-def metric(value: float, *, is_cost: bool = False) -> ComparedMetric:
-    """A metric of one of two runs that are compared."""
-    return ComparedMetric(
-        value=value, unit="mm", is_cost=is_cost, is_cached=False, environment="e1"
     )
 
 

@@ -19,12 +19,12 @@ from orthoflow.report.differences import differences
 from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers
 from tests.compared_runs import compared
+from tests.compared_runs import number as metric
 from tests.report_runs import (
     HeldRun,
     cell,
     compared_resolved,
     distance,
-    metric,
     metrics,
     record,
 )
