@@ -42,22 +42,6 @@ class Record:
         figure = {"name": name, "caption": "a caption", "media_type": media_type, "data": sha256}
         self.cell(address)["figures"].append(figure)
 
-    def rename_files(self, entry: str, name: str) -> None:
-        """Give the files of an input another name, everywhere a digest hangs on it."""
-        (given,) = (one for one in self.document["inputs"] if one["name"] == entry)
-        for file in given["files"]:
-            file["name"] = name
-        digest = sha256_text(
-            canonical_json({"files": given["files"], "v": 1, "what": "orthoflow/files"})
-        )
-        for cell in self.document["cells"]:
-            for port, taken in cell["inputs"].items():
-                if taken["source"] == f"inputs.{entry}":
-                    taken["digest"] = f"sha256:{digest}"
-                    inputs = json.loads(cell["key_preimage"])["inputs"]
-                    inputs[port] = f"files@0:sha256:{digest}"
-                    self.rewrite_preimage(cell["address"], inputs=inputs)
-
     def rewrite_preimage(self, address: str, **facts: object) -> None:
         """Let the preimage of a cell's key state other facts, and make the key anew."""
         preimage = {**json.loads(self.cell(address)["key_preimage"]), **facts}

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from orthoflow_provenance.arrays import BLOCK_BYTES, block_indices, payload_digest
+from orthoflow_provenance.arrays import payload_digest
 from orthoflow_provenance.document import RecordFormatError, canonical_json
 
 from tests.provenance_records import Given
@@ -101,19 +101,3 @@ def test_everything_logical_shows_in_the_digest() -> None:
         Given(),
     ]
     assert len({payload_digest(payload) for payload in different}) == len(different)
-
-
-@given(st.lists(st.integers(0, 60), max_size=3).map(tuple), st.sampled_from([1, 8, 4096, 1 << 20]))
-def test_blocks_cover_an_array_once_in_c_order(shape: tuple[int, ...], itemsize: int) -> None:
-    # Elements are counted instead of made: an index block is a run of a known length.
-    n_covered = 0
-    strides = [int(np.prod(shape[axis + 1 :])) for axis in range(len(shape))]
-    for index in block_indices(shape, itemsize):
-        starts = [part.start if isinstance(part, slice) else part for part in index]
-        first = sum(start * stride for start, stride in zip(starts, strides, strict=False))
-        assert first == n_covered
-        n_rows = [part.stop - part.start for part in index if isinstance(part, slice)]
-        n_elements = int(np.prod(n_rows)) * (strides[len(index) - 1] if index else 1)
-        assert n_elements * itemsize <= BLOCK_BYTES
-        n_covered += n_elements
-    assert n_covered == int(np.prod(shape))
