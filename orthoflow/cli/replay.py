@@ -73,9 +73,10 @@ def replay(
     """Repeat RUN, a run folder or its run.h5, from its record and its input files.
 
     Workflow, parameters and seeds are taken from the record. Inputs that are not in the record are
-    located by their content, under any name: at the paths given with --input, or else at the paths
-    in the workflow, next to the run, in the working directory, and where the store in .orthoflow
-    last found them. Missing and changed files are reported before anything runs.
+    located by their content: under any name at the paths given with --input, or else where the
+    store in .orthoflow last found them, and under their own name at the paths in the workflow, in
+    the working directory and next to the run. Missing and changed files are reported before
+    anything runs.
 
     The result lists for every product whether it is identical, equal within the tolerance of its
     type, or different, and which metrics differ, apart from times and memory. The exit code is 3 if

@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import stat
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
-from itertools import islice
+from functools import cached_property
 from pathlib import Path
-from typing import Final
 
-from orthoflow_provenance.document import (
-    RecordedFile,
-    RecordedInput,
-)
-from orthoflow_provenance.paths import (
-    name_problem,
-)
+from orthoflow_provenance.document import RecordedFile, RecordedInput
+from orthoflow_provenance.paths import name_problem
 from orthoflow_provenance.record import extract_files
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.errors import InputError, OrthoflowError, PluginError, RecordError
+from orthoflow.errors import OrthoflowError, PluginError, RecordError
 from orthoflow.records.runs import Run, record_errors
-from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.inputs import (
-    InputOption,
     override_inputs,
     read_input_options,
     resolve_input_files,
     written_files,
 )
-from orthoflow.workflow.model import Workflow, WorkflowInputSpec
+from orthoflow.workflow.model import Workflow
 from orthoflow.workflow.source import ProblemLog
-
-# Maximum number of files in a folder that is searched by content; larger ones only by name.
-_MOST_LISTED: Final = 10_000
-# By default, a run is in runs/<name>/ in the folder of its workflow.
-_FOLDERS_ABOVE: Final = 3
 
 
 class ProblemsError(OrthoflowError):
@@ -86,11 +70,11 @@ def find_inputs(
     extracted: Mapping[str, tuple[Path, ...]] | None = None,
     noted: Sequence[FileDigests] = (),
 ) -> InputSearch:
-    """Search for files with the content given in a record, under any name.
+    """Search for files with the content given in a record.
 
-    If paths are given for an input, only these are searched; otherwise the extracted files;
-    otherwise the paths in the workflow, relative to the working directory, the run folder and its
-    parents, then these folders themselves, and the paths recorded in stores.
+    If paths are given for an input, only these are searched, under any name; otherwise the
+    extracted files; otherwise the paths where stores last saw the content, and the paths in the
+    workflow, relative to the working directory and the run folder.
 
     Args:
         workflow: workflow of the record.
@@ -103,23 +87,74 @@ def find_inputs(
 
     Raises:
         InvalidArgumentsError: `given` contains a name that is not an input of the workflow.
-        InputError: a given path does not exist.
+        InputError: a given path does not exist, or a file cannot be read.
     """
-    places = _places(workflow, run_folder, given, extracted or {})
+    known = {**(extracted or {}), **_given_files(workflow, given)}
+    written = written_files(workflow.source)
     paths: dict[str, tuple[Path, ...]] = {}
     problems: list[str] = []
     is_changed = False
     for entry in recorded:
+        named = [Path(), *map(Path, written.get(entry.name.partition("@")[0], ()))]
+        named += map(Path, workflow.input_specs[entry.name].files)
+        inside = [part for path in named for part in (path, path.parent)]
+        folders = [root / part for root in (Path(), run_folder) for part in inside]
         found = []
         for file in entry.files:
-            path, rival = _find(file, places[entry.name], (digests, *noted))
+            if entry.name in known:
+                candidates = list(known[entry.name])
+            else:
+                candidates = _candidates(file, folders, (digests, *noted))
+            path = next((one for one in candidates if _is_same(one, file, digests)), None)
             if path is not None:
-                found.append(path)
+                found.append(path.absolute())
                 continue
-            problems.append(_problem(entry.name, file, rival, places[entry.name].files))
+            rival = next((path for path in candidates if path.name == file.name), None)
             is_changed |= rival is not None
+            problems.append(
+                f"input {entry.name}: no file with the content of the recorded {file.name} "
+                f"({file.size_bytes} bytes, SHA-256 {file.sha256[:12]}...) was found; "
+                + (f"{rival} was changed" if rival else f"give it with --input {entry.name}=PATH")
+            )
         paths[entry.name] = tuple(found)
     return InputSearch(paths=paths, problems=tuple(problems), is_changed=is_changed)
+
+
+def _given_files(workflow: Workflow, given: Sequence[str]) -> dict[str, tuple[Path, ...]]:
+    """Return the files given with `--input`; `scan=FOLDER` applies to `scan` of all datasets."""
+    log = ProblemLog(file="")
+    specs = workflow.input_specs
+    options = [
+        dataclasses.replace(option, name=name)
+        for option in read_input_options(given, log)
+        for name in [name for name in specs if name.partition("@")[0] == option.name]
+        or [option.name]
+    ]
+    overridden = override_inputs(specs, options, log)
+    log.raise_any()
+    found = {name: spec for name, spec in overridden.items() if spec.is_given}
+    resolved = resolve_input_files(dataclasses.replace(workflow, inputs=found, datasets={}))
+    return {name: entry.paths for name, entry in resolved.items() if entry is not None}
+
+
+def _candidates(
+    file: RecordedFile, folders: Sequence[Path], memories: Sequence[FileDigests]
+) -> list[Path]:
+    seen = [path for memory in memories if (path := memory.place(file.sha256)) is not None]
+    if not name_problem(file.name):
+        seen += [folder / file.name for folder in folders]
+    return [path for path in dict.fromkeys(seen) if _is_file(path)]
+
+
+def _is_file(path: Path) -> bool:
+    with suppress(OSError):
+        return path.is_file()
+    return False
+
+
+def _is_same(path: Path, file: RecordedFile, digests: FileDigests) -> bool:
+    is_as_large = path.stat().st_size == file.size_bytes
+    return is_as_large and digests.digest(path).sha256 == file.sha256
 
 
 class PlacedInputs:
@@ -133,22 +168,18 @@ class PlacedInputs:
         self.extracted: Mapping[str, tuple[Path, ...]] = {}
         self._beside = beside
         self._stack = stack
-        self._folders: list[Path] = []
 
+    @cached_property
     def folder(self) -> Path:
-        """Create a new folder.
+        """The folder, created on first use.
 
         Raises:
             StoreError: the disk cannot be written.
         """
         with writing_to(self._beside):
-            if not self._folders:
-                self._beside.mkdir(parents=True, exist_ok=True)
-                made = tempfile.TemporaryDirectory(prefix=".inputs-", dir=self._beside)
-                self._folders.append(Path(self._stack.enter_context(made)))
-            self._folders.append(self._folders[0] / f"{len(self._folders):06}")
-            self._folders[-1].mkdir()
-        return self._folders[-1]
+            self._beside.mkdir(parents=True, exist_ok=True)
+            made = tempfile.TemporaryDirectory(prefix=".inputs-", dir=self._beside)
+            return Path(self._stack.enter_context(made))
 
     def named(self, entry: RecordedInput, paths: tuple[Path, ...]) -> tuple[Path, ...]:
         """Return the files found for an input, under their recorded names and in recorded order.
@@ -161,11 +192,13 @@ class PlacedInputs:
         # order.
         if [path.name for path in paths] == names and len(set(names)) == len(names):
             return paths
-        links = tuple(self.folder() / name for name in names)
-        for link, path in zip(links, paths, strict=True):
-            with writing_to(link.parent):
-                link.symlink_to(path)
-        return links
+        links = []
+        with writing_to(self.folder):
+            for index, (name, path) in enumerate(zip(names, paths, strict=True)):
+                links.append(self.folder / "links" / entry.name / f"{index:06}" / name)
+                links[-1].parent.mkdir(parents=True)
+                links[-1].symlink_to(path)
+        return tuple(links)
 
 
 @contextmanager
@@ -183,155 +216,7 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[PlacedInputs]:
     with ExitStack() as stack:
         placed = PlacedInputs(beside, stack)
         if any(entry.embedded for entry in run.record.inputs):
-            folder = placed.folder()
+            folder = placed.folder / "embedded"
             with record_errors(run.path), writing_to(folder):
                 placed.extracted = extract_files(run.path, run.record.inputs, folder)
         yield placed
-
-
-def _find(
-    file: RecordedFile, places: _Places, memories: Sequence[FileDigests]
-) -> tuple[Path | None, Path | None]:
-    """Return the file, and a file with its name but different content; None if not found."""
-    rival = None
-    seen: set[Path] = set()
-    for path in places.candidates(file, memories):
-        size_bytes = _size_of_file(path)
-        if path in seen or size_bytes is None:
-            continue
-        seen.add(path)
-        try:
-            if size_bytes == file.size_bytes and memories[0].digest(path).sha256 == file.sha256:
-                return path.absolute(), None
-        except InputError:
-            # Ignore unreadable files that were not given explicitly and have another name.
-            if path.name == file.name or places.files:
-                raise
-            continue
-        if path.name == file.name:
-            rival = rival or path
-    return None, rival
-
-
-def _problem(name: str, file: RecordedFile, rival: Path | None, given: tuple[Path, ...]) -> str:
-    digest = f"SHA-256 {file.sha256[:12]}..."
-    expected = f"{file.size_bytes} bytes with the {digest}"
-    if rival is not None:
-        return (
-            f"input {name}: {rival} differs from the recorded {file.name}: it was changed "
-            f"(expected {expected})"
-        )
-    if given:
-        return (
-            f"input {name}: the recorded {file.name} is not among the given files, "
-            f"{first_few([str(path) for path in given])} (expected {expected}, under any name)"
-        )
-    return (
-        f"input {name}: {file.name} ({file.size_bytes} bytes, {digest}) was not found; give it"
-        f" with --input {name}=PATH"
-    )
-
-
-def _size_of_file(path: Path) -> int | None:
-    """Return the size of a regular, accessible file; otherwise None."""
-    try:
-        state = path.stat()
-    except (OSError, ValueError):
-        return None
-    return state.st_size if stat.S_ISREG(state.st_mode) else None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Places:
-    """Candidate paths for the files of one input: folders to search, or given files.
-
-    Attributes:
-        folders: folders to search.
-        files: files given by the user or extracted from the record; `folders` is then empty.
-        listed: function that returns the files directly in a folder, by size.
-    """
-
-    folders: tuple[Path, ...] = ()
-    files: tuple[Path, ...] = ()
-    listed: Callable[[Path], Mapping[int, list[Path]]]
-
-    def candidates(self, file: RecordedFile, memories: Sequence[FileDigests]) -> Iterator[Path]:
-        """Yield candidate paths of a file, most likely first: with its name, then others."""
-        if name_problem(file.name):
-            return
-        yield from (path for path in self.files if path.name == file.name)
-        yield from (folder / file.name for folder in self.folders)
-        yield from self.files
-        if self.files:
-            return
-        noted = [memory.place(file.sha256) for memory in memories]
-        seen_last = [path for path in noted if path is not None]
-        yield from seen_last
-        for folder in dict.fromkeys((*self.folders, *(path.parent for path in seen_last))):
-            yield from self.listed(folder.absolute()).get(file.size_bytes, ())
-
-
-def _listed(folder: Path) -> Mapping[int, list[Path]]:
-    """Return the files directly in a folder by size; empty if it cannot be read."""
-    found: dict[int, list[Path]] = {}
-    try:
-        with os.scandir(folder) as entries:
-            for entry in islice(entries, _MOST_LISTED):
-                if entry.is_file() and not name_problem(entry.name):
-                    found.setdefault(entry.stat().st_size, []).append(folder / entry.name)
-    except OSError:
-        return {}
-    return {size: sorted(paths) for size, paths in found.items()}
-
-
-def _places(
-    workflow: Workflow,
-    run_folder: Path,
-    given: Sequence[str],
-    extracted: Mapping[str, tuple[Path, ...]],
-) -> dict[str, _Places]:
-    log = ProblemLog(file="")
-    specs = workflow.input_specs
-    options = _of_all_datasets(read_input_options(given, log), specs)
-    overridden = override_inputs(specs, options, log)
-    log.raise_any()
-    found = {name: spec for name, spec in overridden.items() if spec.is_given}
-    by_hand = resolve_input_files(dataclasses.replace(workflow, inputs=found, datasets={}))
-    roots = dict.fromkeys(
-        (Path(), run_folder, *run_folder.absolute().parents[: _FOLDERS_ABOVE - 1])
-    )
-    # The resolved workflow contains options instead of the paths in the file, and no folders.
-    written = written_files(workflow.source)
-    places: dict[str, _Places] = {}
-    # List each folder only once.
-    listed = cache(_listed)
-    for name, spec in specs.items():
-        by_name = by_hand.get(name)
-        files = by_name.paths if by_name is not None else extracted.get(name)
-        if files is not None:
-            places[name] = _Places(files=files, listed=listed)
-            continue
-        texts = (*spec.files, *written.get(name, ()))
-        named = [
-            root / folder
-            for root in roots
-            for pattern in map(Path, dict.fromkeys(texts))
-            for folder in (pattern.parent, pattern)
-        ]
-        folders = tuple(dict.fromkeys((*named, *roots)))
-        places[name] = _Places(folders=folders, listed=listed)
-    return places
-
-
-def _of_all_datasets(
-    options: Sequence[InputOption], specs: Mapping[str, WorkflowInputSpec]
-) -> tuple[InputOption, ...]:
-    """Apply `scan=FOLDER` to `scan@...` of all datasets, if there is no input `scan`."""
-
-    def meant(name: str) -> Sequence[str]:
-        own = [found for found in specs if found.partition("@")[0] == name]
-        return own if name not in specs and own else [name]
-
-    return tuple(
-        dataclasses.replace(option, name=name) for option in options for name in meant(option.name)
-    )

@@ -389,8 +389,6 @@ class _Inspection:
     def __init__(self, file: h5py.File, path: Path) -> None:
         self._file = file
         self._name = path.name
-        self._size_bytes = path.stat().st_size
-        self._stored_bytes = 0
         self._n_objects = 0
         self._unfounded_bytes = 0
         self._seen: set[tuple[int, int]] = set()
@@ -474,11 +472,8 @@ class _Inspection:
         self._refuse(place, unfounded, sizes)
         # Many datasets, each below the limit that is always allowed, could be excessive together.
         self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
-        self._stored_bytes += stored
         together = "and those before it declare more than 64 MiB that the file cannot hold"
         self._refuse(place, self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES, together)
-        together = "and the datasets before it declare more than the file can hold"
-        self._refuse(place, self._stored_bytes > self._size_bytes, together)
 
     def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
         n_attributes = h5py.h5a.get_num_attrs(item)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import h5py
 import numpy as np
@@ -135,7 +135,6 @@ def write_record(
     product_file: ProductFile,
     *,
     embed: bool = False,
-    keep_folders: bool = False,
     input_file: InputFile | None = None,
     earlier: Path | None = None,
 ) -> str:
@@ -146,7 +145,6 @@ def write_record(
         record: everything except the arrays.
         product_file: digest -> file written by `write_product_file`, or None if there is none.
         embed: embed the arrays of all outputs, not only of those marked `embedded`.
-        keep_folders: keep absolute paths in logs, messages and options.
         input_file: SHA-256 -> file with this digest, for the inputs marked `embedded`.
         earlier: another record of this run, from which outputs embedded in it are copied.
 
@@ -161,7 +159,7 @@ def write_record(
             `path` is not changed.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    written = _as_written(record, embed=embed, keep_folders=keep_folders)
+    written = _as_written(record, embed=embed)
     _check_names(written)
     text = document_text(written)
     with ExitStack() as stack:
@@ -241,34 +239,20 @@ def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
         record: the record.
         text: the document of the record.
     """
-    stated = plain_fields(record)
-    root = {"format": RUN_FORMAT, "format_version": FORMAT_VERSION, **stated}
+    root = {"format": RUN_FORMAT, "format_version": FORMAT_VERSION, **plain_fields(record)}
     nodes = {
         "/": _node({**root, CONTENT_SHA256: sha256_text(text)}),
         f"/{DOCUMENT}": _node(data=fixed_text(text)),
         "/workflow": _node(data=fixed_text(record.workflow_source)),
         "/metrics": _node(data=_metrics_table(record)),
-        "/published": _node(data=_table(record.published, ("path", "size_bytes", "sha256"))),
-        "/inputs": _node(),
-        "/environments": _node(),
         f"/{CELLS}": _node(),
     }
-    for entry in record.inputs:
-        columns = ("name", "size_bytes", "sha256")
-        nodes[f"/inputs/{entry.name}"] = _node(data=_table(entry.files, columns))
-    for environment in record.environments:
-        nodes[f"/environments/{environment.id}"] = _node(
-            plain_fields(environment),
-            _table(
-                [{"name": name, "version": one} for name, one in environment.packages.items()],
-                ("name", "version"),
-            ),
-        )
     for cell in record.cells:
         place = f"/{CELLS}/{cell.address}"
         nodes[place] = _node(plain_fields(cell))
-        for name, data in _cell_tables(cell).items():
-            nodes[f"{place}/{name}"] = _node(data=data)
+        nodes[f"{place}/params"] = _node(data=_parameter_table(cell))
+        nodes[f"{place}/outputs"] = _node(data=_output_table(cell))
+        nodes[f"{place}/log"] = _node(data=fixed_text(cell.log))
     return nodes
 
 
@@ -335,11 +319,10 @@ def extract_files(
         }
 
 
-def _as_written(record: RunRecord, *, embed: bool, keep_folders: bool) -> RunRecord:
+def _as_written(record: RunRecord, *, embed: bool) -> RunRecord:
     def clean(text: str) -> str:
         # NUL is not possible in HDF5 text, nor are unpaired surrogates in UTF-8.
-        text = text.replace("\0", "").encode("utf-8", "replace").decode("utf-8")
-        return text if keep_folders else without_folders(text)
+        return without_folders(text.replace("\0", "").encode("utf-8", "replace").decode("utf-8"))
 
     cells = tuple(
         dataclasses.replace(
@@ -368,26 +351,16 @@ def _as_written(record: RunRecord, *, embed: bool, keep_folders: bool) -> RunRec
 
 def _check_names(record: RunRecord) -> None:
     """Refuse names that cannot be the name of an HDF5 link, and duplicate names."""
-    named = {
-        "the input": [entry.name for entry in record.inputs],
-        "the environment": [entry.id for entry in record.environments],
-        "the cell": [cell.address for cell in record.cells],
-    }
-    for what, names in named.items():
-        for index, name in enumerate(names):
-            check_name(name, what)
-            if name in names[:index]:
-                raise RecordFormatError(f"{what} {name!r} is given twice")
+    addresses: set[str] = set()
     for cell in record.cells:
+        if cell.address in addresses:
+            raise RecordFormatError(f"the cell {cell.address!r} is given twice")
+        addresses.add(check_name(cell.address, "the cell"))
         for port in (*cell.inputs, *cell.outputs):
             check_name(port, "the port")
     for entry in record.inputs:
         for file in entry.files:
-            if "/" in file.name:
-                raise RecordFormatError(
-                    f"the file {file.name!r} of the input {entry.name} must be named without its "
-                    "folder"
-                )
+            check_name(file.name, f"the file of the input {entry.name}")
 
 
 def _embedded(record: RunRecord) -> Iterable[str]:
@@ -421,68 +394,47 @@ def plain_fields(entry: object) -> dict[str, str | float]:
     return found
 
 
-def _cell_tables(cell: RecordedCell) -> dict[str, NDArray[np.generic]]:
-    product = ("port", "type_name", "encoding_version", "digest")
-    params = [
-        {
-            "name": name,
-            "value": json.dumps(value, ensure_ascii=False),
-            "is_set": int(name in cell.params_set),
-        }
+def _parameter_table(cell: RecordedCell) -> NDArray[np.generic]:
+    rows = [
+        (name, json.dumps(value, ensure_ascii=False), name in cell.params_set)
         for name, value in cell.params.items()
     ]
-    inputs, outputs = (
-        [{"port": port, **vars(one), "embedded": int(one.embedded)} for port, one in found.items()]
-        for found in (cell.inputs, cell.outputs)
-    )
-    figures = [
-        {**vars(figure), "sha256": hashlib.sha256(figure.data).hexdigest()}
-        for figure in cell.figures
-    ]
-    return {
-        "params": _table(params, ("name", "value", "is_set"), numbers=("is_set",)),
-        "inputs": _table(inputs, (*product, "source"), numbers=("encoding_version",)),
-        "outputs": _table(
-            outputs, (*product, "embedded"), numbers=("encoding_version", "embedded")
-        ),
-        "figures": _table(figures, ("name", "caption", "media_type", "sha256")),
-        "warnings": _table([{"text": text} for text in cell.warnings], ("text",)),
-        "log": fixed_text(cell.log),
-    }
+    return _table({"name": "", "value": "", "is_set": "<i8"}, rows)
+
+
+def _output_table(cell: RecordedCell) -> NDArray[np.generic]:
+    rows = [(port, one.type_name, one.digest) for port, one in cell.outputs.items()]
+    return _table({"port": "", "type_name": "", "digest": ""}, rows)
 
 
 def _metrics_table(record: RunRecord) -> NDArray[np.generic]:
+    columns = {"name": "", "value": "<f8", "unit": "", "label": "", "better": ""}
     rows = [
-        {"cell": cell.address, "step": cell.step, "method": cell.method, **vars(metric)}
+        (cell.address, cell.step, cell.method, *(getattr(metric, name) for name in columns))
         for cell in record.cells
         if cell.status == "ok"
         for metric in (*cell.metrics, *cost_metrics(cell))
     ]
-    columns = ("cell", "step", "method", "name", "value", "unit", "label", "better")
-    return _table(rows, columns, reals=("value",))
+    return _table({"cell": "", "step": "", "method": "", **columns}, rows)
 
 
-def _table(
-    rows: Sequence[object],
-    columns: Sequence[str],
-    *,
-    numbers: Sequence[str] = ("size_bytes",),
-    reals: Sequence[str] = (),
-) -> NDArray[np.generic]:
-    """Return dataclasses or mappings as a flat table, with text columns as wide as needed."""
-    values = [dict(row) if isinstance(row, Mapping) else vars(row) for row in rows]
-    filled: dict[str, NDArray[np.generic]] = {}
-    for name in columns:
-        column = [row[name] for row in values]
-        if name in numbers or name in reals:
-            filled[name] = np.array(column, dtype="<f8" if name in reals else "<i8")
-        else:
-            texts = [fixed_text(text).item() for text in column]
-            width = max((len(text) for text in texts), default=1)
-            filled[name] = np.array(texts, dtype=h5py.string_dtype("utf-8", max(1, width)))
-    table = np.empty(len(rows), dtype=[(name, filled[name].dtype) for name in columns])
-    for name in columns:
-        table[name] = filled[name]
+def _table(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> NDArray[np.generic]:
+    """Return rows as a flat table.
+
+    Args:
+        columns: name -> numpy type; empty for text, which is as wide as needed.
+        rows: a value for each column.
+    """
+    kinds: list[tuple[str, Any]] = []
+    values: list[list[Any]] = []
+    for index, (name, kind) in enumerate(columns.items()):
+        column = [row[index] if kind else fixed_text(row[index]).item() for row in rows]
+        width = 1 if kind else max((len(text) for text in column), default=1)
+        kinds.append((name, kind or h5py.string_dtype("utf-8", max(1, width))))
+        values.append(column)
+    table = np.empty(len(rows), dtype=kinds)
+    for name, column in zip(columns, values, strict=True):
+        table[name] = column
     return table
 
 
@@ -598,7 +550,6 @@ def dataset_sha256(dataset: h5py.Dataset, also: Callable[[bytes], object] = len)
     Args:
         dataset: one-dimensional dataset of uint8.
         also: called with each block.
-        also: gets each block.
 
     Raises:
         RecordFormatError: the dataset is damaged.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Collection, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -150,70 +150,58 @@ def _object_findings(
 ) -> Iterator[Finding]:
     """Compare all objects that are not referenced by digest with the document."""
     places = {product_path(digest).rpartition("/")[2] for digest in _embedded(record)}
-    known = set(nodes) | {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
+    known = {*nodes, f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
     missing = set(known)
     for path, item in _objects(file):
         missing.discard(path)
         _, top, *below = path.split("/")
-        is_known = path in known
+        is_known, attributes = path in known, frozenset[str]()
         if top == PRODUCTS and below:
             is_known = below[0] in places and below[1:2] in ([], ["metadata"], ["arrays"])
+            attributes = frozenset() if below[1:] else _PRODUCT_ATTRIBUTES
         elif top == FILES and below:
             is_known = below[0] in contents
-        if not is_known:
-            yield Finding("object", path, "is in the file, but not in the document")
-            continue
-        node = nodes.get(path, Node(attributes={}))
-        is_product = top == PRODUCTS and len(below) == 1
-        try:
-            problem = next(_attribute_problems(item, node, is_product=is_product), "")
-            if not problem and node.data is not None:
-                problem = _data_problem(item, node.data)
-        except RecordFormatError as error:
-            problem = str(error)
+        problem = "is in the file, but not in the document"
+        if is_known:
+            try:
+                problem = _object_problem(item, nodes.get(path), attributes)
+            except RecordFormatError as error:
+                problem = str(error)
         if problem:
             yield Finding("object", path, problem)
     for path in sorted(missing):
         yield Finding("object", path, "is missing in the file")
 
 
-def _attribute_problems(
-    item: h5py.Group | h5py.Dataset, node: Node, *, is_product: bool
-) -> Iterator[str]:
+def _object_problem(
+    item: h5py.Group | h5py.Dataset, node: Node | None, attributes: Collection[str]
+) -> str:
+    """Return how an object differs from a node, or from an object with any content."""
     with reading(item.name):
         if isinstance(item, h5py.Group) and item.id.get_create_plist().get_link_creation_order():
-            yield "keeps its links in an order of their own, which no record does"
-        expected = _PRODUCT_ATTRIBUTES if is_product else node.attributes.keys()
-        for name in sorted(expected ^ set(item.attrs)):
-            yield (
-                f"lacks the attribute {name!r}"
-                if name in expected
-                else (f"has the attribute {name!r}, which is not in the document")
-            )
-        for name in () if is_product else expected & set(item.attrs):
-            if not _is_same(np.asarray(item.attrs[name]), node.attributes[name]):
-                yield f"its attribute {name!r} is not what the document states"
-
-
-def _data_problem(item: h5py.Group | h5py.Dataset, data: NDArray[np.generic]) -> str:
-    if not isinstance(item, h5py.Dataset):
-        return "is a group in the place of a dataset"
-    if item.shape != data.shape or item.nbytes != data.nbytes:
-        return "is not what the document states"
-    found = np.asarray(read_whole(item))
-    return "" if _is_same(found, data) else "is not what the document states"
+            return "keeps its links in an order of their own, which no record does"
+        odd = set(item.attrs) ^ set(node.attributes if node else attributes)
+        odd |= {
+            name
+            for name, value in (node.attributes if node else {}).items()
+            if name not in odd and not _is_same(np.asarray(item.attrs[name]), value)
+        }
+    if odd:
+        return f"its attribute {min(odd)!r} is not what the document states"
+    if node is None or (node.data is None and isinstance(item, h5py.Group)):
+        return ""
+    is_alike = (
+        node.data is not None
+        and isinstance(item, h5py.Dataset)
+        and (item.shape, item.nbytes) == (node.data.shape, node.data.nbytes)
+        and _is_same(np.asarray(read_whole(item)), node.data)
+    )
+    return "" if is_alike else "is not what the document states"
 
 
 def _is_same(found: NDArray[Any], expected: NDArray[Any]) -> bool:
-    if found.dtype.names is not None or expected.dtype.names is not None:
-        # Compare column by column, so that padding between the columns is ignored.
-        return found.dtype.names == expected.dtype.names and all(
-            _is_same(found[name], expected[name]) for name in expected.dtype.names or ()
-        )
-    kinds = (found.dtype.kind, found.dtype.itemsize, found.shape)
-    return kinds == (expected.dtype.kind, expected.dtype.itemsize, expected.shape) and (
-        found.astype(expected.dtype).tobytes() == expected.tobytes()
-    )
+    kinds = (found.dtype, found.shape) == (expected.dtype, expected.shape)
+    return kinds and found.tobytes() == expected.tobytes()
 
 
 def _objects(file: h5py.File) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:

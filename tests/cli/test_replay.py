@@ -83,12 +83,10 @@ def test_inputs_are_found_by_content_where_a_user_says(studio: Studio) -> None:
     renamed = studio.folder / "elsewhere" / "m.txt"
     (studio.folder / "n.txt").rename(renamed)
     missing = refused(studio, code=2)
-    assert "input number: n.txt (3 bytes, SHA-256 " in missing
-    assert "was not found; give it with --input number=PATH" in missing
+    assert "no file with the content of the recorded n.txt (3 bytes, SHA-256 " in missing
+    assert "was found; give it with --input number=PATH" in missing
     (studio.folder / "o.txt").write_text("1.6")
-    wrong = refused(studio, "--input", "number=o.txt", code=2)
-    assert "the recorded n.txt is not among the given files, " in wrong
-    assert "o.txt (expected 3 bytes with the SHA-256 " in wrong
+    assert refused(studio, "--input", "number=o.txt", code=2) == missing
     done = studio("replay", "first", "-o", "again", "--input", "number=elsewhere")
     assert done.exit_code == 0, done.output
     # The step saw it under its recorded name, which is part of what it was computed from.
@@ -98,21 +96,15 @@ def test_inputs_are_found_by_content_where_a_user_says(studio: Studio) -> None:
     assert done.exit_code == 0, done.output
 
 
-def test_an_input_is_found_under_another_name_and_where_a_run_found_it(studio: Studio) -> None:
-    (studio.folder / "n.txt").rename(studio.folder / "m.txt")
-    assert studio("export", "first", "--embed", "-o", "renamed").exit_code == 0
+def test_an_input_is_found_where_a_run_found_it(studio: Studio) -> None:
     (studio.folder / "mydata" / "deep").mkdir(parents=True)
-    (studio.folder / "m.txt").rename(studio.folder / "mydata" / "deep" / "n.txt")
+    (studio.folder / "n.txt").rename(studio.folder / "mydata" / "deep" / "m.txt")
     done = studio("export", "first", "--embed", "-o", "whole")
     assert done.exit_code == 2
     assert [*done.stderr.splitlines()[-2:-1], "error: 1 problem"] == done.stderr.splitlines()
     studio.run("second", "--input", "number=mydata/deep")
     done = studio("export", "second", "--embed", "-o", "whole")
     assert done.exit_code == 0, done.output
-    # Beside the place where it lay, too.
-    deep = studio.folder / "mydata" / "deep"
-    (deep / "n.txt").rename(deep / "k.txt")
-    assert studio("export", "second", "--embed", "-o", "beside").exit_code == 0
 
 
 def test_an_edited_parameter_is_named(studio: Studio) -> None:
