@@ -258,7 +258,7 @@ class Store:
         if not is_checked and not self.is_sound(digest):
             raise DamageError(damaged)
         try:
-            stored = read_product_file(path, map_arrays=True)
+            stored = read_product_file(path)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             if isinstance(error, OSError) and error.errno in _SHORTAGES:
                 raise StoreError(f"cannot read {path}: {error.strerror}") from error

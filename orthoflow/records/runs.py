@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Literal, TypeAlias
 
@@ -197,16 +196,23 @@ def require_unchanged(run: Run, *paths: Path) -> None:
             raise RecordError(
                 f"{path} is not listed in the record of the run, so it cannot be checked"
             )
-        state = published_state(run.folder, expected)
-        if state == "changed":
-            raise RecordError(
-                f"{path} was changed after the run: the record states the digest {expected.sha256}"
-            )
-        if state != "same":
-            raise RecordError(f"{path} cannot be read: {state}")
+        _require_same(run.folder, expected)
+
+
+def _require_same(folder: Path, file: PublishedFile) -> None:
+    state = published_state(folder, file)
+    if state == "changed":
+        raise RecordError(
+            f"{folder / file.path} was changed after the run: the record states the digest "
+            f"{file.sha256}"
+        )
+    if state != "same":
+        raise RecordError(f"{folder / file.path} cannot be read: {state}")
 
 
 REPORT_FILE: Final = "report.html"
+#: limit for report pages and the files that they refer to
+LARGEST_PAGE_BYTES: Final = 1 << 30
 _DAMAGED: Final = "the file is damaged"
 _AWAY: Final = "; use another copy, and check it with `orthoflow verify`"
 FIGURES_FOLDER: Final = "figures"
@@ -301,17 +307,18 @@ class Run:
         if len(found) == 1:
             return found[0]
         asked = ", ".join([repr(address), *(f"{step}={name}" for step, name in variants.items())])
+        known = [cell.address for cell in found or own] or dict.fromkeys(
+            cell.step for cell in every
+        )
+        listed = first_few([*known], most=_MOST_NAMED)
         if found:
-            named = first_few([cell.address for cell in found], most=_MOST_NAMED)
             raise ArgumentError(
-                f"the run {self.record.run_id} has several cells of {asked}: {named}; choose one"
+                f"the run {self.record.run_id} has several cells of {asked}: {listed}; choose one"
             )
-        steps = dict.fromkeys(cell.step for cell in every)
-        known = first_few([cell.address for cell in own] or [*steps], most=_MOST_NAMED)
-        instead = f"{did_you_mean(address, steps)}; it has"
-        if own:
-            instead = "; it has" if variants else " alone, but"
-        raise ArgumentError(f"the run {self.record.run_id} has no step {asked}{instead} {known}")
+        raise ArgumentError(
+            f"the run {self.record.run_id} has no step {asked}"
+            f"{'' if own else did_you_mean(address, [*known])}; it has {listed}"
+        )
 
     def upstream(self, address: str) -> Iterator[RecordedCell]:
         """Yield a cell and all cells upstream of it, nearest first."""
@@ -486,20 +493,16 @@ def find_record(path: str | Path) -> Path:
         inside = given / RECORD_FILE
         if inside.is_file():
             return inside
+        state = "is unfinished; repeat the run with -o {} to finish it"
         if is_running(given):
-            raise ArgumentError(
-                f"{given} contains no {RECORD_FILE} yet: its run has not ended yet; wait for it"
-            )
+            state = "has not ended yet; wait for it"
         raise ArgumentError(
-            f"{given} contains no {RECORD_FILE}: it is not a run folder, or its run is unfinished; "
-            f"repeat the run with -o {given} to finish it"
+            f"{given} contains no {RECORD_FILE}: it is not a run folder, or its run "
+            f"{state.format(given)}"
         )
-    if not given.exists():
-        raise ArgumentError(f"{given} does not exist; give a run folder or its {RECORD_FILE}")
     if not given.is_file():
-        raise ArgumentError(
-            f"{given} is a device or a pipe; give a run folder or its {RECORD_FILE}"
-        )
+        what = "is a device or a pipe" if given.exists() else "does not exist"
+        raise ArgumentError(f"{given} {what}; give a run folder or its {RECORD_FILE}")
     return given
 
 
@@ -533,9 +536,6 @@ def _with_path(path: Path, sentence: str) -> str:
     return f"{path}: {sentence}"
 
 
-_ALWAYS_COPIED_BYTES: Final = 64 << 20
-
-
 def path_inside(folder: Path, name: str) -> Path:
     """Return the path of a file whose name comes from a record.
 
@@ -555,17 +555,17 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
         RecordError: the name or type of a cell or figure cannot be used for a file.
     """
     named: list[tuple[str, RecordedFigure]] = []
-    problems: list[str] = []
+    problem = ""
     for address in addresses:
         for figure in run.cells[address].figures:
             path = f"{cell_file_name(address)}/{figure.name}{_suffix(run, figure)}"
             named.append((path, figure))
             if sentence := name_problem(figure.name) or path_problem(path):
-                problems.append(f"the figure {figure.name!r} of {address} {sentence}")
+                problem = problem or f"the figure {figure.name!r} of {address} {sentence}"
     if twice := colliding(path for path, _ in named):
-        problems.append(f"two figures have names that some systems treat as the same, {twice!r}")
-    if problems:
-        raise RecordError(f"{run.path}: {problems[0]}, so its file cannot be written")
+        problem = problem or f"two figures have names that some systems treat as one, {twice!r}"
+    if problem:
+        raise RecordError(f"{run.path}: {problem}, so its file cannot be written")
     return dict(named)
 
 
@@ -619,14 +619,15 @@ def copy_files(
     copied: list[str] = []
     known = {file.path: file for file in published}
     for path in paths:
+        if path in known and published_state(source, known[path]) != "missing":
+            _require_same(source, known[path])
         try:
             with open_below(source, path) as stream:
-                expected = known.get(path)
-                _check_size(source / path, os.fstat(stream.fileno()), expected)
+                n_bytes = os.fstat(stream.fileno()).st_size
+                if path not in known and n_bytes > LARGEST_PAGE_BYTES:
+                    raise RecordError(f"{source / path} has {n_bytes} bytes: no report is so large")
                 with creating(target, path) as copy:
                     shutil.copyfileobj(stream, copy, 1 << 20)
-                    stream.seek(0)
-                    _check_digest(source / path, stream, expected)
         except (FileNotFoundError, NotADirectoryError):
             continue
         except UnsafeFileError as error:
@@ -649,34 +650,14 @@ def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
         raise StoreError(f"cannot write to {folder}: {error}") from error
 
 
-def _check_digest(path: Path, stream: BufferedReader, expected: PublishedFile | None) -> None:
-    if expected and hashlib.file_digest(stream, "sha256").hexdigest() != expected.sha256:
-        raise RecordError(
-            f"{path} was changed after the run: the record states the digest {expected.sha256}"
-        )
-
-
-def _check_size(path: Path, found: os.stat_result, expected: PublishedFile | None) -> None:
-    if expected is not None and found.st_size != expected.size_bytes:
-        raise RecordError(
-            f"{path} has {found.st_size} bytes, but was published with {expected.size_bytes}: it "
-            "was changed"
-        )
-    # A copy of a sparse file of a terabyte would fill the disk.
-    if found.st_size > _ALWAYS_COPIED_BYTES and found.st_size > 8 * 512 * found.st_blocks:
-        raise RecordError(
-            f"{path} has {found.st_size} bytes, but most of them are not stored (a sparse file)"
-        )
-
-
 def _suffix(run: Run, figure: RecordedFigure) -> str:
-    if figure.media_type not in FIGURE_SUFFIXES:
-        raise RecordError(
-            f"{run.path}: the figure {figure.name!r} must be {', '.join(FIGURE_SUFFIXES)}, got "
-            f"{figure.media_type!r}"
-        )
     # WebP is converted to PNG for papers and word processors.
     shown = "image/png" if figure.media_type == "image/webp" else figure.media_type
+    if shown not in FIGURE_SUFFIXES:
+        raise RecordError(
+            f"{run.path}: the figure {figure.name!r} must be {', '.join(FIGURE_SUFFIXES)}, got "
+            f"{shown!r}"
+        )
     return FIGURE_SUFFIXES[shown]
 
 

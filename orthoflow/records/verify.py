@@ -31,6 +31,7 @@ from orthoflow.geometry.threads import in_order
 from orthoflow.products import Inspection
 from orthoflow.products.product import Payload
 from orthoflow.records.runs import (
+    LARGEST_PAGE_BYTES,
     PAGES_FOLDER,
     PRODUCTS_FOLDER,
     REPORT_FILE,
@@ -249,7 +250,6 @@ _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
 _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
 # Text before the digests at the end of a page.
 _PAGE_MARK: Final = "orthoflow report of"
-_LARGEST_PAGE_BYTES: Final = 1 << 30
 _WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
     "unreadable": "unreadable since it was published",
@@ -415,7 +415,7 @@ def _page_states(folder: Path, content_sha256: str) -> dict[str, bool]:
 def _is_own_page(folder: Path, name: str, content_sha256: str) -> bool:
     try:
         with open_below(folder, name) as stream:
-            if os.fstat(stream.fileno()).st_size > _LARGEST_PAGE_BYTES:
+            if os.fstat(stream.fileno()).st_size > LARGEST_PAGE_BYTES:
                 return False
             content = stream.read()
     except (OSError, UnsafeFileError):

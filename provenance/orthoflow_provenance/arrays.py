@@ -218,22 +218,21 @@ def write_product_file(path: Path, payload: PayloadLike) -> str:
     return digest.result()
 
 
-def read_product_file(path: Path, *, map_arrays: bool = True) -> StoredPayload:
+def read_product_file(path: Path) -> StoredPayload:
     """Read a file written by `write_product_file`.
 
     Args:
         path: the file; it must not be moved or changed while mapped arrays are in use.
-        map_arrays: memory-map the arrays of mapped products instead of loading them.
 
     Raises:
         RecordFormatError: the file is damaged, or of another or newer format.
         OSError: the file cannot be opened.
     """
     with safe_open(path, PRODUCT_FORMAT) as file:
-        return read_payload(open_group(file, PRODUCT_GROUP), map_arrays=map_arrays)
+        return read_payload(open_group(file, PRODUCT_GROUP))
 
 
-def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
+def read_payload(group: h5py.Group) -> StoredPayload:
     """Read a product from its group in a file opened with `safe_open`.
 
     Raises:
@@ -242,7 +241,7 @@ def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
     arrays: dict[str, NDArray[np.generic]] = {}
     for name, dataset in array_datasets(group):
         with reading(dataset.name):
-            arrays[name] = _read_array(dataset, is_mapping=map_arrays)
+            arrays[name] = _read_array(dataset)
     return StoredPayload(
         type_name=text_attribute(group, "type"),
         encoding_version=int_attribute(group, "encoding_version"),
@@ -400,11 +399,10 @@ def _chunk_shape(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
     return tuple(chunk)
 
 
-def _read_array(dataset: h5py.Dataset, *, is_mapping: bool) -> NDArray[np.generic]:
+def _read_array(dataset: h5py.Dataset) -> NDArray[np.generic]:
     offset = dataset.id.get_offset()
     is_mappable = (
-        is_mapping
-        and offset is not None
+        offset is not None
         and dataset.nbytes >= _SMALL_BYTES
         and dataset.dtype.isnative
         # Misaligned arrays, which other programs may write, are slower than a copy.

@@ -1,8 +1,6 @@
 """Safe access to files with untrusted names: never outside a folder, and only regular files.
 
-All names from records, crates, archives and plugins are converted to paths here. Reading and
-writing descend folder by folder through file descriptors, so that no folder can be replaced by a
-link between check and use.
+All names from records, crates, archives and plugins are converted to paths here.
 """
 
 from __future__ import annotations
@@ -32,12 +30,7 @@ _DEVICES: Final = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])[ ]*(\..*)?", re.IGNORECASE | re.DOTALL
 )
 _DRIVE: Final = re.compile(r"[A-Za-z]:")
-_SAFE: Final = os.O_NOFOLLOW | os.O_CLOEXEC
-_FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | _SAFE
-# The first folder is given by the user and may be a link.
-_FIRST_FLAGS: Final = _FOLDER_FLAGS & ~os.O_NOFOLLOW
-_FILE_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | _SAFE
-_NEW_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _SAFE
+_FILE_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def holds_control(text: str) -> bool:
@@ -112,7 +105,9 @@ def path_below(folder: Path, path: str) -> Path:
         UnsafeFileError: the path leads out of the folder or is not allowed on all systems:
             absolute, with `..`, empty, with control characters or reserved names, or too long.
     """
-    return folder.joinpath(*_parts(path))
+    if problem := path_problem(path):
+        raise UnsafeFileError(f"{path!r} {problem}, so it cannot be the name of a file here")
+    return folder.joinpath(*path.split("/"))
 
 
 def colliding(paths: Iterable[str]) -> str:
@@ -137,12 +132,10 @@ def open_below(folder: Path, path: str) -> BufferedReader:
         UnsafeFileError: the path leads out of the folder, or to a link, a folder or a device.
         OSError: there is no such file, or it cannot be read.
     """
-    *folders, name = _parts(path)
-    with _folder_below(folder, folders) as parent:
-        # Check before opening, because opening a device may have side effects.
-        _check_regular(os.stat(name, dir_fd=parent, follow_symlinks=False), path)
-        with _link_refused(parent, name, path):
-            descriptor = os.open(name, _FILE_FLAGS, dir_fd=parent)
+    target = _without_links(folder, path)
+    # Check before opening, because opening a device may have side effects.
+    _check_regular(target.lstat(), path)
+    descriptor = os.open(target, _FILE_FLAGS)
     try:
         _check_regular(os.fstat(descriptor), path)
         return os.fdopen(descriptor, "rb")
@@ -161,17 +154,17 @@ def create_below(folder: Path, path: str) -> Iterator[BinaryIO]:
         UnsafeFileError: the path leads out of the folder, or one of its folders is a link.
         OSError: the file cannot be written.
     """
-    *folders, name = _parts(path)
-    with _folder_below(folder, folders, is_made=True) as parent:
-        aside = f".{secrets.token_hex(8)}.part"
-        try:
-            with os.fdopen(os.open(aside, _NEW_FLAGS, 0o666, dir_fd=parent), "wb") as stream:
-                yield stream
-            os.replace(aside, name, src_dir_fd=parent, dst_dir_fd=parent)
-        except BaseException:
-            with suppress(OSError):
-                os.unlink(aside, dir_fd=parent)
-            raise
+    target = _without_links(folder, path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    aside = target.with_name(f".{secrets.token_hex(8)}.part")
+    try:
+        with aside.open("xb") as stream:
+            yield stream
+        aside.replace(target)
+    except BaseException:
+        with suppress(OSError):
+            aside.unlink()
+        raise
 
 
 def files_below(folder: Path, path: str) -> tuple[str, ...]:
@@ -183,7 +176,7 @@ def files_below(folder: Path, path: str) -> tuple[str, ...]:
         OSError: the folder cannot be read.
     """
     try:
-        with _folder_below(folder, _parts(path)) as inside, os.scandir(inside) as entries:
+        with os.scandir(_without_links(folder, f"{path}/x").parent) as entries:
             return tuple(
                 entry.name
                 for entry in entries
@@ -193,52 +186,21 @@ def files_below(folder: Path, path: str) -> tuple[str, ...]:
         return ()
 
 
-def _parts(path: str) -> list[str]:
-    if problem := path_problem(path):
-        raise UnsafeFileError(f"{path!r} {problem}, so it cannot be the name of a file here")
-    return path.split("/")
+def _without_links(folder: Path, path: str) -> Path:
+    """Return `path_below`, and refuse links among the folders; `folder` itself may be a link."""
+    target = path_below(folder, path)
+    for part in reversed(target.parents):
+        if len(part.parts) > len(folder.parts) and part.is_symlink():
+            inside = part.relative_to(folder).as_posix()
+            raise UnsafeFileError(f"{inside!r} is a link, and links are not followed")
+    return target
 
 
 def _check_regular(found: os.stat_result, path: str) -> None:
     if not stat.S_ISREG(found.st_mode):
-        raise UnsafeFileError(f"{path!r} must be a file, but {_kind_of(found)} stands there")
-
-
-def _kind_of(found: os.stat_result) -> str:
-    if stat.S_ISLNK(found.st_mode):
-        return "a link"
-    return "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
-
-
-@contextmanager
-def _folder_below(folder: Path, names: list[str], *, is_made: bool = False) -> Iterator[int]:
-    """Descend folder by folder; the first one, given by the user, may be a link."""
-    descriptor = os.open(folder, _FIRST_FLAGS)
-    try:
-        for depth, name in enumerate(names):
-            if is_made:
-                with suppress(FileExistsError):
-                    os.mkdir(name, dir_fd=descriptor)
-            with _link_refused(descriptor, name, "/".join(names[: depth + 1])):
-                inner = os.open(name, _FOLDER_FLAGS, dir_fd=descriptor)
-            os.close(descriptor)
-            descriptor = inner
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-@contextmanager
-def _link_refused(parent: int, name: str, path: str) -> Iterator[None]:
-    """Raise an error that reports a link; which OSError a link causes depends on the flags."""
-    try:
-        yield
-    except OSError as error:
-        with suppress(OSError):
-            found = os.stat(name, dir_fd=parent, follow_symlinks=False)
-            if stat.S_ISLNK(found.st_mode):
-                raise UnsafeFileError(f"{path!r} is a link, and links are not followed") from error
-        raise
+        other = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
+        kind = "a link" if stat.S_ISLNK(found.st_mode) else other
+        raise UnsafeFileError(f"{path!r} must be a file, but {kind} stands there")
 
 
 def without_folders(text: str, folders: Sequence[Path] = ()) -> str:

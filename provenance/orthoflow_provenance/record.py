@@ -119,7 +119,7 @@ class OpenRecord:
                 f"digest only, {output.digest}: it is in the store, or run again with --embed"
             )
         group = open_group(self.file, product_path(output.digest))
-        payload = read_payload(group, map_arrays=True)
+        payload = read_payload(group)
         # Check it here, because the caller may not have checked the seal of the file.
         if (found := payload_digest(payload)) != output.digest:
             raise RecordFormatError(

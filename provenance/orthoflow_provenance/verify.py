@@ -262,7 +262,7 @@ def _product_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
     for digest in _embedded(record):
         place = product_path(digest)
         try:
-            payload = read_payload(open_group(file, place), map_arrays=True)
+            payload = read_payload(open_group(file, place))
             found = payload_digest(payload)
             if found != digest or payload.digest != digest:
                 problem = f"has the digest {found}, the record states {digest}"
