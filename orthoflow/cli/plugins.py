@@ -207,7 +207,7 @@ def _print_method(method: Mapping[str, Any]) -> None:
     if method["metrics"]:
         echo()
         echo_table(
-            ("metric", "unit", "better", "what it is"),
+            ("metric", "unit", "better", "description"),
             [
                 (one["name"], one["unit"], one["better"], _metric_text(one))
                 for one in method["metrics"]

@@ -289,7 +289,7 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
         "Dataset",
         name=f"{record.name}, run {record.run_id}",
         description=f"Run of the workflow {record.name} with {record.created_by}: "
-        f"{len(record.cells)} steps, {record.status}. {RECORD_FILE} is the record of all of it. "
+        f"{len(record.cells)} steps, {record.status}. {RECORD_FILE} is the complete record. "
         f"{_how_to_read(record)}",
         datePublished=record.ended,
         license=license_text,
@@ -565,12 +565,12 @@ def _how_to_read(record: RunRecord) -> str:
     if given and all(given):
         source += ", which are embedded in it"
     return (
-        f"With the Python package {DISTRIBUTION} {version} (of an index, or its wheel from those "
-        f"who made this crate) `orthoflow verify {RECORD_FILE}` in "
-        "this folder reports whether record and products are as they were written, `orthoflow show "
-        f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o ../again` computes it "
-        f"again from {source}; any HDF5 reader opens it, too. Paths in "
-        f"{WORKFLOW_FILE} are of the machine that it ran on."
+        f"Install the Python package {DISTRIBUTION} {version}, from a package index or a wheel "
+        f"provided by the authors of this crate. In this folder, `orthoflow verify {RECORD_FILE}` "
+        "then checks that record and products have not changed since they were written, `orthoflow "
+        f"show {RECORD_FILE}` summarises the record, and `orthoflow replay {RECORD_FILE} -o "
+        f"../again` recomputes it from {source}. Any HDF5 program can open the record. Paths in "
+        f"{WORKFLOW_FILE} are those of the machine on which it ran."
     )
 
 

@@ -112,9 +112,9 @@ def _table(orientation: Cameras) -> Table:
             Column("photo", is_numeric=False),
             *(
                 Column(label, digits=3)
-                for label in ("expected error / mm", "check points, RMS / mm")
+                for label in ("expected error / mm", "withheld ties, RMS / mm")
             ),
-            *(Column(label) for label in ("check points", "control points")),
+            *(Column(label) for label in ("withheld ties", "control ties")),
             Column("status", is_numeric=False),
         ),
         rows=tuple(rows),

@@ -181,7 +181,7 @@ class InspectTruth(Method):
 
     The true orthoimage is rendered on each wall's own frame: the first surface within the buffer,
     seen square to the wall. Depths and colours are compared away from true depth steps; a band of 2
-    cells along the steps is reported separately. Displacements come from patches of 32 x 32 painted
+    cells along the steps is reported separately. Displacements come from patches of 32 x 32 covered
     cells, matched to the truth by least squares. Metrics without a prefix describe the first wall,
     those with `all_` all walls together. On large walls, colours and patches are compared in evenly
     spread blocks of 96 x 96 cells, and visibility is tested on a regular lattice of cells; depths
@@ -237,7 +237,7 @@ class InspectTruth(Method):
             lower("match_wrong_share", label="share of wrong matches"),
             lower(
                 "match_wrong_share_own_wall",
-                label="share of wrong matches with the wall that the photo shows",
+                label="share of wrong matches on the wall that covers most of the photo",
             ),
             MetricSpec("n_ties_kept", label="ties kept by the orientation"),
             lower("tie_wrong_share", label="share of wrong ties among those kept"),

@@ -114,7 +114,7 @@ class OrientColmapBundle(Method):
     weighted by the standard deviations from their matcher, ties between photos by that of their
     residuals. Uncalibrated lenses start from EXIF and are refined. Photos with the same focal
     length in EXIF share a lens; so do photos without EXIF unless their ties contradict this. The
-    gates and check points are those of `orient.pnp`.
+    gates and withheld ties are those of `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"

@@ -37,9 +37,10 @@ _LEAST: Final = 6
 class OrientPnp(Method):
     """Orient each photo separately: robust pose, then a weighted adjustment with the full lens.
 
-    Some of the ties are withheld as check points. A photo is `ok` only if it has enough ties, they
-    are well distributed, more check points agree than by chance, the camera is in front of the
-    wall, and the predicted error on the wall is small; otherwise its status is the reason why not.
+    Some ties are withheld to check the pose. A photo is `ok` only if it has enough ties, they are
+    well distributed, more withheld ties agree than by chance, the camera is in front of the wall,
+    and the predicted error on the wall is small; otherwise its status is the reason for its
+    rejection.
     """
 
     id: ClassVar[str] = "orient.pnp"

@@ -64,10 +64,10 @@ ORIENTATION_METRICS: Final = (
     MetricSpec("n_oriented", label="photos oriented", better="higher", headline=True),
     MetricSpec("n_refused", label="photos refused"),
     MetricSpec("n_ties", label="ties"),
-    MetricSpec("n_control", label="ties used as control"),
+    MetricSpec("n_control", label="control ties"),
     MetricSpec("n_check", label="withheld ties"),
     MetricSpec("rejected_share", label="share of rejected ties"),
-    *_median_and_worst("control_rmse_px", "ties used as control, RMS residual per axis"),
+    *_median_and_worst("control_rmse_px", "control ties, RMS residual per axis"),
     *_median_and_worst("check_rmse_px", "withheld ties, RMS residual per axis"),
     *_median_and_worst(
         "check_rmse_mm",

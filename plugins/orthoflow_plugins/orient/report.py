@@ -68,9 +68,9 @@ RESIDUAL_COLUMNS: Final[Mapping[str, JsonValue]] = {
     "residual": "observed minus computed; u and v of the photo",
     "unit": "px of the photo, cell of the wall's raster, or mm on the wall (px times the median "
     "pixel size on the wall)",
-    "shift_p": "probability that chance causes such a mean (two-sided Student's t test)",
-    "nmad": "1.4826 times the median absolute deviation from the median",
-    "p95": "95 % of the absolute residuals do not exceed this",
+    "shift_p": "probability of such a mean by chance (two-sided Student's t test)",
+    "nmad": "normalised median absolute deviation: 1.4826 times that from the median",
+    "p95": "95th percentile of the absolute residuals",
     "beyond_own": "share of residuals beyond twice the coordinate's own RMSE",
     "beyond_cells": "share of residuals beyond two raster cells of the wall, a fixed reference",
     "beyond_any": "share of ties whose u or v exceeds twice its own RMSE",

@@ -82,7 +82,7 @@ def test_the_page_shows_and_measures_without_a_server(
         "use('area'); points = [[0, 0], [200, 0], [200, 400], [0, 400]]; finished = true;tell()"
     )
     said = page.evaluate("document.getElementById('result').textContent")
-    assert said == "2.0000 m², around 6.0000 m"
+    assert said == "2.0000 m², perimeter 6.0000 m"
     page.evaluate("clear(); cursor = [400, 200]; tellCursor()")
     x, y, z = CORNER + GSD_M * (400 * np.array([1.0, 0.0, 0.0]) - 200 * UP)
     world = page.evaluate("document.getElementById('world').textContent")
