@@ -29,7 +29,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.geometry import frame_over
-from orthoflow.geometry.scene_views import Rendering, SceneCameras, render
+from orthoflow.geometry.scene_views import SceneCameras, render
 from orthoflow.geometry.scenes import SurfaceRole, Viewers
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask, Truth, Walls
 
@@ -74,10 +74,8 @@ def true_wall(truth: Truth, name: str) -> TrueWall:
         highest_elevation_deg=truth.highest_elevation_deg,
     )
     none = np.zeros(frame.shape, dtype=np.bool_)
-    rendering = Rendering(
-        buffer_front_m=_FRONT_M, buffer_behind_m=_BEHIND_M, viewers=viewers, coloured=none, cores=2
-    )
-    shown = render(truth.scene, frame, rendering)
+    reach = {"front_m": _FRONT_M, "behind_m": _BEHIND_M}
+    shown = render(truth.scene, frame, **reach, viewers=viewers, coloured=none, cores=2)
     # Upright axes tell the wall's surfaces from the sides of the pilasters of adjoining walls.
     along = np.abs(truth.scene.normal @ normal) > _ALONG_COSINE
     along &= np.abs(truth.scene.axis_b @ frame.v_world) > _ALONG_COSINE

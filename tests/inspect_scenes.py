@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
+from orthoflow.geometry.scene_views import TrueOrthoimage, render
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import (
     CheckPoints,
@@ -202,11 +202,11 @@ def true_planes(*, lift_m: float = 0.0) -> Planes:
 def true_orthoimage(*, right_cells: float = 0.0, down_cells: float = 0.0) -> TrueOrthoimage:
     """What there is to see, shown too far to the right and too low."""
     moved = TRUE_FRAME.world_from_wall(np.array([[-right_cells, -down_cells]]))[0]
-    image = render_frame(
+    image = render(
         truth_scene(),
         replace(TRUE_FRAME, origin_world=moved),
-        buffer_front_m=BUFFER_M,
-        buffer_behind_m=BUFFER_M,
+        front_m=BUFFER_M,
+        behind_m=BUFFER_M,
     )
     return replace(image, frame=TRUE_FRAME)
 

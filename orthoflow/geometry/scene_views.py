@@ -49,13 +49,25 @@ class TrueOrthoimage:
     behind_object: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rendering:
-    """Options of a true orthoimage.
+def render(  # noqa: PLR0913
+    scene: Scene,
+    frame: WallFrame,
+    *,
+    front_m: float,
+    behind_m: float,
+    viewers: Viewers | None = None,
+    supersample: int = 3,
+    coloured: NDArray[np.bool_] | None = None,
+    judged: NDArray[np.bool_] | None = None,
+    cores: int = 1,
+) -> TrueOrthoimage:
+    """Render the true orthoimage of a frame.
 
-    Attributes:
-        buffer_front_m: distance in front of the plane beyond which surfaces are ignored.
-        buffer_behind_m: distance behind the plane beyond which surfaces are ignored.
+    Args:
+        scene: the scene.
+        frame: the frame of the cells; it may deviate from a true wall.
+        front_m: distance in front of the plane beyond which surfaces are ignored.
+        behind_m: distance behind the plane beyond which surfaces are ignored.
         viewers: positions from which the surface is seen; if None, no cell is seen.
         supersample: colours are the mean of supersample^2 rays per cell.
         coloured: (rows, cols) bool, cells whose colour is requested; None for all cells.
@@ -63,49 +75,6 @@ class Rendering:
             all cells.
         cores: number of threads; does not change the result.
     """
-
-    buffer_front_m: float
-    buffer_behind_m: float
-    viewers: Viewers | None = None
-    supersample: int = 3
-    coloured: NDArray[np.bool_] | None = None
-    judged: NDArray[np.bool_] | None = None
-    cores: int = 1
-
-
-def render_frame(
-    scene: Scene,
-    frame: WallFrame,
-    *,
-    buffer_front_m: float,
-    buffer_behind_m: float,
-    viewers: Viewers | None = None,
-    supersample: int = 3,
-    cores: int = 1,
-) -> TrueOrthoimage:
-    """Render the true orthoimage of all cells of a frame.
-
-    Args:
-        scene: the scene.
-        frame: the frame of the cells; it may deviate from a true wall.
-        buffer_front_m: see `Rendering`.
-        buffer_behind_m: see `Rendering`.
-        viewers: see `Rendering`.
-        supersample: see `Rendering`.
-        cores: see `Rendering`.
-    """
-    rendering = Rendering(
-        buffer_front_m=buffer_front_m,
-        buffer_behind_m=buffer_behind_m,
-        viewers=viewers,
-        supersample=supersample,
-        cores=cores,
-    )
-    return render(scene, frame, rendering)
-
-
-def render(scene: Scene, frame: WallFrame, rendering: Rendering) -> TrueOrthoimage:
-    """Render the true orthoimage of a frame, which may deviate from a true wall."""
     truth = TrueOrthoimage(
         frame=frame,
         rgb=np.full((*frame.shape, 3), np.nan, dtype=np.float32),
@@ -114,17 +83,17 @@ def render(scene: Scene, frame: WallFrame, rendering: Rendering) -> TrueOrthoima
         seen=np.zeros(frame.shape, dtype=np.bool_),
         behind_object=np.zeros(frame.shape, dtype=np.bool_),
     )
-    renderer = _Renderer(scene, truth, rendering)
+    renderer = _Renderer(scene, truth, front_m=front_m, behind_m=behind_m, viewers=viewers)
 
     def render_cells(first: int, last: int) -> None:
         cells = np.arange(first, last)
         points = renderer.look(cells)
-        chosen = renderer.shows_something(cells, rendering.judged)
+        chosen = renderer.shows_something(cells, judged)
         renderer.look_back(cells[chosen], points[:, chosen])
-        renderer.colour(cells[renderer.shows_something(cells, rendering.coloured)])
+        renderer.colour(cells[renderer.shows_something(cells, coloured)], supersample)
 
     n_cells = frame.width * frame.height
-    in_runs(render_cells, n_cells, n_per_run=RAYS_AT_ONCE, threads=rendering.cores)
+    in_runs(render_cells, n_cells, n_per_run=RAYS_AT_ONCE, threads=cores)
     return truth
 
 
@@ -240,13 +209,20 @@ def pixel_directions(
 class _Renderer:
     """Computes a true orthoimage; cells are numbered row by row."""
 
-    def __init__(self, scene: Scene, truth: TrueOrthoimage, rendering: Rendering) -> None:
-        frame, front_m = truth.frame, rendering.buffer_front_m
+    def __init__(
+        self,
+        scene: Scene,
+        truth: TrueOrthoimage,
+        *,
+        front_m: float,
+        behind_m: float,
+        viewers: Viewers | None,
+    ) -> None:
+        frame = truth.frame
         self._rays = SceneRays(scene)
-        self._viewers = rendering.viewers
-        self._n_sub = rendering.supersample
+        self._viewers = viewers
         self._front_m = front_m
-        self._reach_m = front_m + rendering.buffer_behind_m
+        self._reach_m = front_m + behind_m
         # Flat views of the arrays, which share their memory.
         self._rgb = truth.rgb.reshape(-1, 3)
         self._depth_m = truth.depth_m.reshape(-1)
@@ -306,9 +282,8 @@ class _Renderer:
         by_object = self._rays.objects.cast(position, ways[:, blocked], within=within[blocked])
         self._behind_object[cells[blocked][by_object.rectangle >= 0]] = True
 
-    def colour(self, cells: NDArray[np.int64]) -> None:
-        """Set the mean colours of cells whose centre shows a surface."""
-        n_sub = self._n_sub
+    def colour(self, cells: NDArray[np.int64], n_sub: int) -> None:
+        """Set the mean colours of cells whose centre shows a surface, from n_sub^2 rays each."""
         sums, n_hits = np.zeros((3, len(cells)), dtype=np.float32), np.zeros(len(cells))
         ways = np.broadcast_to(-self._normal, (3, len(cells)))
         for sub in range(n_sub * n_sub):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry import WallFrame, frame_over, scene_rays
-from orthoflow.geometry.scene_views import Rendering, TrueOrthoimage, render, render_frame
+from orthoflow.geometry.scene_views import TrueOrthoimage, render
 from orthoflow.geometry.scenes import (
     Scene,
     SurfaceRole,
@@ -89,7 +89,7 @@ def rendered(
     scene: Scene, frame: WallFrame, buffers_m: tuple[float, float] = (0.1, 0.1), **more: Any
 ) -> TrueOrthoimage:
     front_m, behind_m = buffers_m
-    return render_frame(scene, frame, buffer_front_m=front_m, buffer_behind_m=behind_m, **more)
+    return render(scene, frame, front_m=front_m, behind_m=behind_m, **more)
 
 
 def cell_u(frame: WallFrame) -> NDArray[np.float64]:
@@ -195,9 +195,9 @@ def test_a_part_of_a_true_orthoimage_is_that_part_of_the_whole() -> None:
     scene, frame = wall_with_screen(), wall_frame()
     rng = np.random.default_rng(4)
     coloured, judged = rng.random((2, *frame.shape)) < 0.4
-    reach: dict[str, Any] = {"buffer_front_m": 0.5, "buffer_behind_m": 0.3, "viewers": viewers}
+    reach: dict[str, Any] = {"front_m": 0.5, "behind_m": 0.3, "viewers": viewers}
     masks = {"coloured": coloured, "judged": judged}
-    whole, part = (render(scene, frame, Rendering(**reach, **some)) for some in ({}, masks))
+    whole, part = (render(scene, frame, **reach, **some) for some in ({}, masks))
     np.testing.assert_array_equal(part.depth_m, whole.depth_m)
     np.testing.assert_array_equal(part.rgb, np.where(coloured[:, :, None], whole.rgb, np.nan))
     np.testing.assert_array_equal(part.seen, whole.seen & judged)

@@ -26,7 +26,7 @@ from orthoflow.products import (
     is_painted,
     is_shown,
 )
-from orthoflow_plugins.inspect.findings import count_true, rms
+from orthoflow_plugins.inspect.findings import Number, count_true, findings_of, rms
 from orthoflow_plugins.inspect.image_quality import n_shown as n_shown_of
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
 
@@ -55,8 +55,6 @@ _NAMES_BESIDE_TRACED: Final = {
     "mean_v_mm": "patch_mean_v_mm",
     "ghost_share": "ghost_colour_share",
 }
-
-_Number = tuple[str, float, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,15 +269,15 @@ def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool
     accurate.
     """
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
-    return [
-        Finding(name=renamed.get(name, name), value=value, unit=unit, wall=wall)
-        for name, value, unit in (
-            *_depth_numbers(samples),
-            *_colour_numbers(samples),
-            *_shift_numbers(samples),
-            *_share_numbers(samples),
-        )
-    ]
+    numbers = (
+        *_depth_numbers(samples),
+        *_colour_numbers(samples),
+        *_shift_numbers(samples),
+        *_share_numbers(samples),
+    )
+    return findings_of(
+        ((renamed.get(name, name), value, unit) for name, value, unit in numbers), wall
+    )
 
 
 def _square_errors(
@@ -330,7 +328,7 @@ def _inner(coloured: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.
     return coloured & np.asarray(whole, dtype=np.bool_)
 
 
-def _depth_numbers(samples: WallSamples) -> list[_Number]:
+def _depth_numbers(samples: WallSamples) -> list[Number]:
     if samples.depth_m.size == 0:
         return []
     errors_mm = 1e3 * samples.depth_m
@@ -349,7 +347,7 @@ def _depth_numbers(samples: WallSamples) -> list[_Number]:
     return numbers
 
 
-def _colour_numbers(samples: WallSamples) -> list[_Number]:
+def _colour_numbers(samples: WallSamples) -> list[Number]:
     named = (
         ("colour_rmse_grey", samples.colour),
         ("filled_colour_rmse_grey", samples.filled_colour),
@@ -360,9 +358,9 @@ def _colour_numbers(samples: WallSamples) -> list[_Number]:
     ]
 
 
-def _shift_numbers(samples: WallSamples) -> list[_Number]:
+def _shift_numbers(samples: WallSamples) -> list[Number]:
     kept = _kept_shifts(samples)
-    numbers: list[_Number] = [("n_patches", float(len(kept)), "1")]
+    numbers: list[Number] = [("n_patches", float(len(kept)), "1")]
     if not kept.any():
         return numbers
     shifts = 1e3 * samples.shift_m[kept]
@@ -386,17 +384,16 @@ def _kept_shifts(samples: WallSamples) -> NDArray[np.bool_]:
     return kept
 
 
-def _share_numbers(samples: WallSamples) -> list[_Number]:
-    numbers: list[_Number] = []
+def _share_numbers(samples: WallSamples) -> list[Number]:
+    numbers: list[Number] = []
     if samples.n_seen:
         numbers += [
             ("completeness", samples.n_seen_painted / samples.n_seen, "1"),
             ("completeness_filled", samples.n_seen_shown / samples.n_seen, "1"),
         ]
     if samples.n_painted:
-        numbers += [
-            ("unseen_painted_share", samples.n_unseen_painted / samples.n_painted, "1"),
-        ]
+        share = samples.n_unseen_painted / samples.n_painted
+        numbers.append(("unseen_painted_share", share, "1"))
     if samples.n_coloured:
         numbers += [
             ("gross_colour_share", samples.n_gross / samples.n_coloured, "1"),

@@ -41,6 +41,7 @@ from orthoflow_plugins.inspect.findings import (
     IMAGE_QUALITY,
     LENGTHS,
     check_findings,
+    findings_of,
     length_findings,
     lower,
     of_walls,
@@ -59,7 +60,7 @@ from orthoflow_plugins.inspect.point_doubts import doubts, is_own, missed_points
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
 # Maximum number of points whose residuals are logged.
-_TOLD: Final = 200
+_MAX_LOGGED: Final = 200
 MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
     severity="warning",
@@ -202,8 +203,8 @@ class InspectCheckpoints(Method):
         _warn_of_cap(findings, ctx)
         own_names = [inputs.checkpoints.names[k] for k in found]
         _draw(pictures, [points[k] for k in found], own_names, ctx)
-        _tell(shift_m, own_names, ctx)
-        for name, point in list(missed.items())[:_TOLD]:
+        _log_residuals(shift_m, own_names, ctx)
+        for name, point in list(missed.items())[:_MAX_LOGGED]:
             ctx.log(f"check point {name}: not used, {point.reason}")
         names = tuple(dict.fromkeys(classes))
         return self.Out(
@@ -300,11 +301,13 @@ def _findings_in_space(
     apart = 1e3 * apart[np.isfinite(apart)]
     if not len(apart):
         return []
-    return [
-        Finding(name="n_3d", value=float(len(apart)), unit="1"),
-        Finding(name="rms_3d_mm", value=rms(apart), unit="mm"),
-        Finding(name="max_3d_mm", value=float(apart.max()), unit="mm"),
-    ]
+    return findings_of(
+        [
+            ("n_3d", len(apart), "1"),
+            ("rms_3d_mm", rms(apart), "mm"),
+            ("max_3d_mm", apart.max(), "mm"),
+        ]
+    )
 
 
 def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) -> list[Finding]:
@@ -326,9 +329,9 @@ def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
         ctx.report(CAPPED_RULE, numbers=numbers)
 
 
-def _tell(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:
+def _log_residuals(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:
     """Log the residuals, the largest first."""
-    for k in np.argsort(-np.linalg.norm(shift_m, axis=1), kind="stable")[:_TOLD]:
+    for k in np.argsort(-np.linalg.norm(shift_m, axis=1), kind="stable")[:_MAX_LOGGED]:
         u_mm, v_mm = 1e3 * shift_m[k]
         ctx.log(f"check point {names[k]}: u {u_mm:+.2f} mm, v {v_mm:+.2f} mm")
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import fnmatch
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,8 @@ from orthoflow.products import Finding
 from orthoflow.sdk import MetricSpec, StepContext
 
 _Samples = TypeVar("_Samples")
+# Name, value and unit of a metric.
+Number: TypeAlias = tuple[str, float, str]
 
 lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "higher"))
 
@@ -88,6 +90,14 @@ IMAGE_QUALITY: Final = (
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 
 
+def findings_of(numbers: Iterable[Number], wall: int = -1, *, prefix: str = "") -> list[Finding]:
+    """Return metrics of a wall, or of all walls together (wall -1)."""
+    return [
+        Finding(name=f"{prefix}{name}", value=float(value), unit=unit, wall=wall)
+        for name, value, unit in numbers
+    ]
+
+
 def displacement_findings(
     shift_m: NDArray[np.float64], gsd_m: float, wall: int, *, prefix: str = ""
 ) -> list[Finding]:
@@ -103,26 +113,26 @@ def displacement_findings(
         wall: index of the wall, -1 for all walls together.
         prefix: prefix of the names.
     """
-    findings = []
-
-    def say(name: str, value: float, unit: str) -> None:
-        findings.append(Finding(name=f"{prefix}{name}", value=float(value), unit=unit, wall=wall))
-
+    numbers: list[Number] = []
     shift_mm = 1e3 * shift_m
     for axis, name in enumerate(_AXES):
         values = shift_mm[:, axis]
         rmse = rms(values)
-        say(f"rmse_{name}_mm", rmse, "mm")
-        say(f"rmse_{name}_cells", rmse / (1e3 * gsd_m), "cells")
-        say(f"mean_{name}_mm", values.mean(), "mm")
-        say(f"nmad_{name}_mm", median_deviation(values), "mm")
-        say(f"max_{name}_mm", np.abs(values).max(), "mm")
-        say(f"beyond_2rmse_{name}_share", float(np.mean(np.abs(values) > 2.0 * rmse)), "1")
+        numbers += [
+            (f"rmse_{name}_mm", rmse, "mm"),
+            (f"rmse_{name}_cells", rmse / (1e3 * gsd_m), "cells"),
+            (f"mean_{name}_mm", values.mean(), "mm"),
+            (f"nmad_{name}_mm", median_deviation(values), "mm"),
+            (f"max_{name}_mm", np.abs(values).max(), "mm"),
+            (f"beyond_2rmse_{name}_share", float(np.mean(np.abs(values) > 2.0 * rmse)), "1"),
+        ]
     both = np.any(np.abs(shift_mm) > 2.0 * np.sqrt(np.mean(shift_mm**2, axis=0)), axis=1)
-    say("beyond_2rmse_any_share", both.mean(), "1")
     length = np.linalg.norm(shift_mm, axis=1)
-    say("p95_mm", np.percentile(length, 95), "mm")
-    return findings
+    numbers += [
+        ("beyond_2rmse_any_share", both.mean(), "1"),
+        ("p95_mm", float(np.percentile(length, 95)), "mm"),
+    ]
+    return findings_of(numbers, wall, prefix=prefix)
 
 
 def check_findings(
@@ -140,7 +150,7 @@ def check_findings(
     """
     length = np.linalg.norm(shift_m, axis=1)
     mean_shift = float(np.linalg.norm(shift_m.mean(axis=0)))
-    numbers = [("n_found", float(len(length)), "1"), ("rms_mm", 1e3 * rms(length), "mm")]
+    numbers: list[Number] = [("n_found", len(length), "1"), ("rms_mm", 1e3 * rms(length), "mm")]
     if len(length) > 1:
         numbers.append(("sd_mm", 1e3 * float(length.std(ddof=1)), "mm"))
     numbers += [
@@ -153,13 +163,13 @@ def check_findings(
         (f"iterated{CAPPED}" if is_capped else "iterated", outliers_iterated(length)),
     ):
         numbers += [
-            (f"n_outliers_{name}", float(np.count_nonzero(out)), "1"),
+            (f"n_outliers_{name}", count_true(out), "1"),
             (f"rms_after_{name}_mm", 1e3 * rms(length[~out]), "mm"),
         ]
-    table = [
-        Finding(name=f"{prefix}{name}", value=value, unit=unit) for name, value, unit in numbers
+    return [
+        *findings_of(numbers, prefix=prefix),
+        *displacement_findings(shift_m, gsd_m, -1, prefix=prefix),
     ]
-    return table + displacement_findings(shift_m, gsd_m, -1, prefix=prefix)
 
 
 def length_findings(
@@ -185,11 +195,8 @@ def length_findings(
     share = np.concatenate(errors)
     if not len(share):
         return []
-    values = (float(len(share)), rms(share), float(share.max()))
-    return [
-        Finding(name=name, value=value, unit="1")
-        for name, value in zip([spec.name for spec in LENGTHS], values, strict=True)
-    ]
+    values = (len(share), rms(share), share.max())
+    return findings_of((spec.name, value, "1") for spec, value in zip(LENGTHS, values, strict=True))
 
 
 def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -211,8 +218,7 @@ def cap_binds(length_m: NDArray[np.float64]) -> bool:
     """Return whether the cap stops the iterated rule before it would end."""
     n_most = math.floor(_OUTLIERS_MOST * len(length_m))
     n_capped, n_all = (
-        int(np.count_nonzero(_iterated(length_m, share)))
-        for share in (_OUTLIERS_MOST, _MOST_WITHOUT_CAP)
+        count_true(_iterated(length_m, share)) for share in (_OUTLIERS_MOST, _MOST_WITHOUT_CAP)
     )
     return n_capped == n_most < n_all
 

@@ -31,6 +31,7 @@ from orthoflow.products import (
     is_painted,
     is_shown,
 )
+from orthoflow_plugins.inspect.findings import findings_of
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
 # A pixel is stretched, or smeared, if it covers more cells than this in its longest direction.
@@ -121,12 +122,14 @@ def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
     spread = np.median(profiles, axis=0)
     if spread[0] > _LOW or spread[-1] < _HIGH:
         return []
-    numbers = [
-        ("n_edges", float(len(profiles)), "1"),
-        ("edge_width_cells", _width_cells(spread), "cells"),
-        ("mtf50_per_cell", _mtf50(spread), "cycles/cell"),
-    ]
-    return [Finding(name=name, value=value, unit=unit, wall=wall) for name, value, unit in numbers]
+    return findings_of(
+        [
+            ("n_edges", len(profiles), "1"),
+            ("edge_width_cells", _width_cells(spread), "cells"),
+            ("mtf50_per_cell", _mtf50(spread), "cycles/cell"),
+        ],
+        wall,
+    )
 
 
 def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
@@ -147,15 +150,11 @@ def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
     )
     if not len(spread_cells):
         return []
-    return [
-        Finding(
-            name=name, value=float(np.mean(spread_cells > most_cells)), unit="1", wall=image.wall
-        )
-        for name, most_cells in (
-            ("stretch_share", _STRETCHED_CELLS),
-            ("smear_share", _SMEARED_CELLS),
-        )
-    ]
+    limits = {"stretch_share": _STRETCHED_CELLS, "smear_share": _SMEARED_CELLS}
+    return findings_of(
+        ((name, float(np.mean(spread_cells > most)), "1") for name, most in limits.items()),
+        image.wall,
+    )
 
 
 def cells_per_pixel(

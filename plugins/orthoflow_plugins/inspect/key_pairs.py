@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import partial
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,11 @@ _AGREEING: Final = 2
 _AGREEING_SHARE: Final = 0.25
 _AGREE_CELLS: Final = 1.0
 _SURF_THRESHOLD: Final = 0.1
-# Larger images are processed in tiles, each needing about 2 GB with its margin. The margin holds
-# the support of the widest key points, or a patch with its largest displacement.
+# Larger images are processed in tiles, each needing about 2 GB with its margin, which holds the
+# support of the widest key points.
 _WHOLE_CELLS: Final = 1 << 24
 _TILE_CELLS: Final = 3072
-_SURF_RIM_CELLS: Final = 512
-_RIM_CELLS: Final = 96
+_RIM_CELLS: Final = 512
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,29 +103,83 @@ def find_key_pairs(
         radius_cells: maximum displacement.
         threads: number of threads; it does not change the pairs.
     """
-    first: GreyCells = _Levelled(shown)
-    second: GreyCells = _Levelled(reference)
-    is_whole = len([*_tiles(shown.shape)]) == 1
-    if is_whole:
-        first, second = in_order(GreyCells.whole, (first, second), threads=threads)
-    # Process large images one after the other, since tiles of both would need too much memory.
-    points = tuple(in_order(_key_points, (first, second), threads=threads if is_whole else 1))
-    matches = _matches(points[0], points[1], radius_cells)
-    places = points[0].places[matches[:, 0]]
-    found = places - points[1].places[matches[:, 1]]
-    start = unrefined(np.round(places), found)
-    rim = math.ceil(radius_cells) + _RIM_CELLS
-    refined = _refined(first, second, start, rim=rim, threads=threads)
-    alike = refined.correlation >= _LEAST_CORRELATION
-    places, shift = refined.centre[alike], refined.shift[alike]
-    kept = _agreed(places, shift)
+    shape = shown.shape
+    is_whole = math.prod(shape) <= _WHOLE_CELLS
+    found = [
+        _pairs_of_tile(shown, reference, tile, radius_cells, threads=threads, is_whole=is_whole)
+        for tile in tiles(shape, max(shape) if is_whole else _TILE_CELLS)
+    ]
+    refined = PatchShifts.joined([tile.refined for tile in found])
+    kept = _agreed(refined.centre, refined.shift)
     return KeyPairs(
-        places=places[kept],
-        shift=shift[kept],
-        found=refined.found[alike][kept],
-        n_points=(len(points[0].places), len(points[1].places)),
+        places=refined.centre[kept],
+        shift=refined.shift[kept],
+        found=refined.found[kept],
+        n_points=(sum(tile.n_points[0] for tile in found), sum(tile.n_points[1] for tile in found)),
+        n_matched=sum(tile.n_matched for tile in found),
+    )
+
+
+class _TilePairs(NamedTuple):
+    """Refined pairs whose first point is in a tile; numbers of its key points and matches."""
+
+    refined: PatchShifts
+    n_points: tuple[int, int]
+    n_matched: int
+
+
+def _pairs_of_tile(
+    shown: GreyCells,
+    reference: GreyCells,
+    tile: tuple[slice, slice],
+    radius_cells: float,
+    *,
+    threads: int,
+    is_whole: bool,
+) -> _TilePairs:
+    """Find the pairs of a tile in the tile with its margin."""
+    rows, columns = (
+        slice(max(0, part.start - _RIM_CELLS), min(size, part.stop + _RIM_CELLS))
+        for part, size in zip(tile, shown.shape, strict=True)
+    )
+    corner = np.array([columns.start, rows.start])
+    low = (tile[1].start, tile[0].start) - corner
+    end = (tile[1].stop, tile[0].stop) - corner
+
+    def lies_in_tile(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+        inside: NDArray[np.bool_] = np.all((places >= low) & (places < end), axis=1)
+        return inside
+
+    images = [cells.cut((rows, columns)) for cells in (shown, reference)]
+    first, second = in_order(_levelled, images, threads=threads)
+    share = images[0].grey.size / math.prod(shown.shape)
+    # SURF of two tiles at once would need too much memory.
+    key_points = partial(_key_points, n_most=round(share * _n_most(shown.shape)))
+    one, other = in_order(key_points, (first, second), threads=threads if is_whole else 1)
+    matches = _matches(one, other, radius_cells)
+    matches = matches[lies_in_tile(one.places[matches[:, 0]])]
+    places = one.places[matches[:, 0]]
+    refined = refine_shifts(
+        first,
+        second,
+        unrefined(np.round(places), places - other.places[matches[:, 1]]),
+        sigma_most_cells=_SIGMA_MOST_CELLS,
+        threads=threads,
+    )
+    refined = refined.take(refined.correlation >= _LEAST_CORRELATION)
+    return _TilePairs(
+        refined=replace(refined, centre=refined.centre + corner),
+        n_points=(
+            int(np.count_nonzero(lies_in_tile(one.places))),
+            int(np.count_nonzero(lies_in_tile(other.places))),
+        ),
         n_matched=len(matches),
     )
+
+
+def _n_most(shape: tuple[int, int]) -> int:
+    """Return the maximum number of key points in an image."""
+    return int(np.clip(math.prod(shape) // _CELLS_PER_POINT, _POINTS_LEAST, _POINTS_MOST))
 
 
 def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -152,70 +205,8 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
         agreed = kept
 
 
-def _refined(
-    first: GreyCells, second: GreyCells, start: PatchShifts, *, rim: int, threads: int
-) -> PatchShifts:
-    """Refine displacements tile by tile, each tile with a margin."""
-    parts = [unrefined(*np.zeros((2, 0, 2)))]
-    for tile in _tiles(first.shape):
-        own = _lies_in(tile, start.centre)
-        if not own.any():
-            continue
-        window = _widened(tile, rim, first.shape)
-        corner = np.array([window[1].start, window[0].start])
-        one, other = first.cut(window), second.cut(window)
-        refined = refine_shifts(
-            one,
-            other,
-            unrefined(start.centre[own] - corner, start.shift[own]),
-            sigma_most_cells=_SIGMA_MOST_CELLS,
-            threads=threads,
-        )
-        parts.append(replace(refined, centre=refined.centre + corner))
-    return PatchShifts.joined(parts)
-
-
-def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
-    """Yield the tiles in which an image is processed: a single one unless it is large."""
-    return tiles(shape, max(shape) if math.prod(shape) <= _WHOLE_CELLS else _TILE_CELLS)
-
-
-def _widened(tile: tuple[slice, slice], rim: int, shape: tuple[int, int]) -> tuple[slice, slice]:
-    rows, columns = (
-        slice(max(0, part.start - rim), min(size, part.stop + rim))
-        for part, size in zip(tile, shape, strict=True)
-    )
-    return rows, columns
-
-
-def _lies_in(tile: tuple[slice, slice], places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which positions (n, 2) = (column, row) are in a tile."""
-    rows, columns = tile
-    low, end = (columns.start, rows.start), (columns.stop, rows.stop)
-    inside: NDArray[np.bool_] = np.all((places >= low) & (places < end), axis=1)
-    return inside
-
-
-@dataclass(frozen=True)
-class _Levelled(GreyCells):
-    """An image normalised to local mean 128 and standard deviation 40; invalid cells are 128."""
-
-    cells: GreyCells
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.cells.shape
-
-    def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        window = _widened(part, 2 * _LEVEL_REACH, self.shape)
-        rows, columns = (
-            slice(inner.start - outer.start, inner.stop - outer.start)
-            for inner, outer in zip(part, window, strict=True)
-        )
-        return _levelled(self.cells.cut(window)).cut((rows, columns))
-
-
 def _levelled(image: GreyImage) -> GreyImage:
+    """Normalise to local mean 128 and standard deviation 40; invalid cells are 128."""
     valid = image.valid.astype(np.float32)
     grey = np.where(image.valid, image.grey, 0.0).astype(np.float32)
     weight = np.maximum(_smooth(valid), np.float32(1e-6))
@@ -240,64 +231,27 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(twice, dtype=np.float32)
 
 
-def _key_points(cells: GreyCells) -> _KeyPoints:
-    """Return key points whose patch is inside the image and mostly valid."""
-    rows, columns = cells.shape
-    half, parts = PATCH_CELLS // 2, []
-    for image, corner, found in _strongest(cells):
-        # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 descriptor values;
-        # as in OpenCV, coordinates refer to the centres of cells.
-        places = from_opencv(found[:, 1::-1])
-        inside = np.all(
-            (places + corner > half) & (places + corner < (columns - half, rows - half)), axis=1
-        )
-        share = _patch_means(image.valid.astype(np.float32), places[inside])
-        kept = np.flatnonzero(inside)[share >= _LEAST_VALID_SHARE]
-        parts.append((places[kept] + corner, found[kept]))
-    found = np.concatenate([item[1] for item in parts])
-    return _KeyPoints(
-        places=np.concatenate([item[0] for item in parts]),
-        scale=found[:, 2],
-        sign=found[:, 4],
-        descriptors=found[:, 6:],
-    )
-
-
-def _strongest(
-    cells: GreyCells,
-) -> Iterator[tuple[GreyImage, NDArray[np.int64], NDArray[np.float64]]]:
-    """Yield the strongest key points of an image, tile by tile.
-
-    Yields:
-        The tile with its margin, the first column and row of that part, and the key points (n, 70)
-        of the tile, with positions relative to the part.
-    """
+def _key_points(image: GreyImage, *, n_most: int) -> _KeyPoints:
+    """Return the strongest key points whose patch is inside the image and mostly valid."""
     from mahotas.features import surf
 
-    n_cells = math.prod(cells.shape)
-    n_most = int(np.clip(n_cells // _CELLS_PER_POINT, _POINTS_LEAST, _POINTS_MOST))
-    windows = [(tile, _widened(tile, _SURF_RIM_CELLS, cells.shape)) for tile in _tiles(cells.shape)]
-    if len(windows) == 1:
-        image = cells.whole()
-        found = surf.surf(image.grey, threshold=_SURF_THRESHOLD, max_points=n_most)
-        yield image, np.zeros(2, dtype=np.int64), found
-        return
-    points = []
-    for tile, window in windows:
-        corner = np.array([window[1].start, window[0].start])
-        found = surf.interest_points(cells.cut(window).grey, threshold=_SURF_THRESHOLD)
-        place = from_opencv(found[:, 1::-1]) + corner
-        points.append(found[_lies_in(tile, place)])
-    strength = np.concatenate([found[:, 3] for found in points])
-    is_strong = np.zeros(len(strength), dtype=np.bool_)
-    is_strong[np.argsort(-strength, kind="stable")[:n_most]] = True
-    first = 0
-    for (_, window), found in zip(windows, points, strict=True):
-        chosen = found[is_strong[first : first + len(found)]]
-        first += len(found)
-        image = cells.cut(window)
-        corner = np.array([window[1].start, window[0].start])
-        yield image, corner, surf.descriptors(image.grey, chosen)
+    # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 descriptor values;
+    # as in OpenCV, coordinates refer to the centres of cells.
+    found = surf.surf(image.grey, threshold=_SURF_THRESHOLD, max_points=n_most)
+    places = from_opencv(found[:, 1::-1])
+    rows, columns = image.shape
+    half = PATCH_CELLS // 2
+    inside = np.flatnonzero(
+        np.all((places > half) & (places < (columns - half, rows - half)), axis=1)
+    )
+    share = _patch_means(image.valid.astype(np.float32), places[inside])
+    kept = inside[share >= _LEAST_VALID_SHARE]
+    return _KeyPoints(
+        places=places[kept],
+        scale=found[kept, 2],
+        sign=found[kept, 4],
+        descriptors=found[kept, 6:],
+    )
 
 
 def _patch_means(values: NDArray[np.float32], places: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -17,13 +17,13 @@ from orthoflow.geometry.scenes import Scene, SurfaceRole
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Finding, Inspection, Opening, Openings, OutlineSource, Truth, Walls
 from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
-from orthoflow_plugins.inspect.findings import higher, lower, rms
+from orthoflow_plugins.inspect.findings import Number, findings_of, higher, lower, rms
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
 # Walls with more cells are sampled more coarsely, except along the borders of openings.
-_CELLS_TOLD: Final = 1 << 24
+_MAX_SAMPLES: Final = 1 << 24
 # Maximum depth of a recess in the scene.
 _BEHIND_MOST_M: Final = 2.0
 # A recess belongs to a wall if this share of the cells around it is the face of the wall.
@@ -193,21 +193,22 @@ def _true_wall(
     views: SceneCameras,
     cores: int,
 ) -> _TrueWall:
-    from orthoflow.geometry.scene_views import Rendering, render
+    from orthoflow.geometry.scene_views import render
 
     scene, slab = inputs.truth.scene, inputs.walls.slab(place)
     step = _step(slab.n_cells)
     rows, columns = (-(-count // step) for count in slab.frame.shape)
-    told = replace(slab.frame, gsd_m=step * slab.frame.gsd_m, width=columns, height=rows)
-    nowhere = np.zeros(told.shape, dtype=np.bool_)
-    rendering = Rendering(
-        buffer_front_m=slab.front_m,
-        buffer_behind_m=_BEHIND_MOST_M,
+    sampled = replace(slab.frame, gsd_m=step * slab.frame.gsd_m, width=columns, height=rows)
+    nowhere = np.zeros(sampled.shape, dtype=np.bool_)
+    true = render(
+        scene,
+        sampled,
+        front_m=slab.front_m,
+        behind_m=_BEHIND_MOST_M,
         coloured=nowhere,
         judged=nowhere,
         cores=cores,
     )
-    true = render(scene, told, rendering)
     # Rays that hit nothing have no depth.
     role = scene.role[true.rectangle]
     of_face = true.depth_m[(role == SurfaceRole.WALL) & (true.depth_m >= -slab.behind_m)]
@@ -220,7 +221,7 @@ def _true_wall(
         slab=slab,
         place=place,
         step=step,
-        labels=_labelled(is_open, is_face, params.area_least_m2 / told.gsd_m**2),
+        labels=_labelled(is_open, is_face, params.area_least_m2 / sampled.gsd_m**2),
         face_m=face_m,
         deep_m=deep_m,
         scene=scene,
@@ -231,7 +232,7 @@ def _true_wall(
 def _step(n_cells: int) -> int:
     """Return how many raster cells to merge along each side, to limit the number of samples."""
     step = 1
-    while n_cells // step**2 > _CELLS_TOLD:
+    while n_cells // step**2 > _MAX_SAMPLES:
         step += 1
     return step
 
@@ -269,7 +270,7 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
     sides: list[_SideError] = []
     n_false = n_stray = 0
     for opening in openings:
-        cells = _cells_of(opening, wall.frame)
+        cells = wall.frame.wall_from_world(opening.outline_world)[:, :2]
         is_own = filled((cells / wall.step,), wall.labels.shape)
         shared = np.bincount(wall.labels[is_own], minlength=len(sizes))
         shared[0] = 0
@@ -288,15 +289,12 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
             true_m = wall.face_m - float(np.nanmedian(middle))
             depth_errors_m.append(opening.depth_m - true_m)
         for k in np.flatnonzero(opening.side_source != OutlineSource.UNSEEN):
-            found = _side_error(wall, cells[k], cells[(k + 1) % len(cells)])
+            begin, end = cells[k], cells[(k + 1) % len(cells)]
+            found = _side_error(wall, begin, end, float(opening.side_sigma_m[k]))
             if found is None:
                 n_stray += 1
             else:
-                sigma_m = float(opening.side_sigma_m[k])
-                point, outwards, error = found
-                sides.append(
-                    _SideError(point_world=point, outwards=outwards, error_m=error, sigma_m=sigma_m)
-                )
+                sides.append(found)
     return _Verdict(
         place=wall.place,
         gsd_m=wall.frame.gsd_m,
@@ -308,18 +306,10 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
     )
 
 
-def _cells_of(opening: Opening, frame: WallFrame) -> NDArray[np.float64]:
-    """Return the corners (n, 2) of an outline as (column, row)."""
-    return frame.wall_from_world(opening.outline_world)[:, :2]
-
-
 def _side_error(
-    wall: _TrueWall, begin: NDArray[np.float64], end: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
-    """Return middle (3,), outward direction (2,) and error in metres of a side.
-
-    The result is None if most lines across the side meet no true border.
-    """
+    wall: _TrueWall, begin: NDArray[np.float64], end: NDArray[np.float64], sigma_m: float
+) -> _SideError | None:
+    """Measure a side; return None if most lines across it meet no true border."""
     way = end - begin
     length = float(np.linalg.norm(way))
     if length <= 0.0:
@@ -339,15 +329,19 @@ def _side_error(
             borders.append(float(middles[np.abs(middles).argmin()]))
     if len(borders) < 0.5 * _LINES:
         return None
-    middle = wall.frame.world_from_wall((0.5 * (begin + end))[None])[0]
-    return middle, outwards, -wall.frame.gsd_m * float(np.median(borders))
+    return _SideError(
+        point_world=wall.frame.world_from_wall((0.5 * (begin + end))[None])[0],
+        outwards=outwards,
+        error_m=-wall.frame.gsd_m * float(np.median(borders)),
+        sigma_m=sigma_m,
+    )
 
 
 def _findings(verdicts: Sequence[_Verdict]) -> tuple[Finding, ...]:
     ious = [iou for verdict in verdicts for iou in verdict.ious]
     sides = [side for verdict in verdicts for side in verdict.sides]
     depth_errors_m = [error for verdict in verdicts for error in verdict.depth_errors_m]
-    numbers: list[tuple[str, float, str]] = [
+    numbers: list[Number] = [
         ("n_true_openings", len(ious), "1"),
         ("n_found_openings", sum(iou >= _SAME_IOU for iou in ious), "1"),
         ("n_false_openings", sum(verdict.n_false for verdict in verdicts), "1"),
@@ -359,20 +353,20 @@ def _findings(verdicts: Sequence[_Verdict]) -> tuple[Finding, ...]:
             ("opening_iou_min", min(ious), "1"),
         ]
     if depth_errors_m:
-        worst = float(np.abs(depth_errors_m).max())
-        numbers.append(("opening_depth_error_max_mm", 1e3 * worst, "mm"))
+        worst_m = np.abs(depth_errors_m).max()
+        numbers.append(("opening_depth_error_max_mm", 1e3 * worst_m, "mm"))
     if sides:
         errors_m = np.array([side.error_m for side in sides])
         sigmas_m = np.array([side.sigma_m for side in sides])
         cells = [side.error_m / verdict.gsd_m for verdict in verdicts for side in verdict.sides]
         numbers += [
             ("side_rmse_mm", 1e3 * rms(errors_m), "mm"),
-            ("side_mean_mm", 1e3 * float(errors_m.mean()), "mm"),
-            ("side_max_mm", 1e3 * float(np.abs(errors_m).max()), "mm"),
+            ("side_mean_mm", 1e3 * errors_m.mean(), "mm"),
+            ("side_max_mm", 1e3 * np.abs(errors_m).max(), "mm"),
             ("side_rmse_cells", rms(cells), "cells"),
             ("side_error_over_sigma", rms(errors_m / sigmas_m), "1"),
         ]
-    return tuple(Finding(name=name, value=value, unit=unit) for name, value, unit in numbers)
+    return tuple(findings_of(numbers))
 
 
 def _inspection(verdicts: Sequence[_Verdict], findings: tuple[Finding, ...]) -> Inspection:

@@ -28,7 +28,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.findings import Number, findings_of, rms
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, SeenPoints
@@ -118,10 +118,10 @@ def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
         for error in known
         if error.wall_m is not None and error.sigma_wall_m
     ]
-    findings = [
-        Finding(name="n_photos", value=len(errors), unit="1"),
-        Finding(name="n_oriented", value=len(good), unit="1"),
-        Finding(name="n_misoriented", value=sum(error.is_wrong for error in errors), unit="1"),
+    numbers: list[Number] = [
+        ("n_photos", len(errors), "1"),
+        ("n_oriented", len(good), "1"),
+        ("n_misoriented", sum(error.is_wrong for error in errors), "1"),
     ]
     for name, values, unit in (
         ("pose_centre", centres, "mm"),
@@ -129,15 +129,15 @@ def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
         ("pose_wall", on_wall, "mm"),
     ):
         if values:
-            findings += [
-                Finding(name=f"{name}_max_{unit}", value=max(values), unit=unit),
-                Finding(name=f"{name}_median_{unit}", value=float(np.median(values)), unit=unit),
+            numbers += [
+                (f"{name}_max_{unit}", max(values), unit),
+                (f"{name}_median_{unit}", np.median(values), unit),
             ]
     if on_wall:
-        findings.append(Finding(name="pose_wall_rms_mm", value=rms(on_wall), unit="mm"))
+        numbers.append(("pose_wall_rms_mm", rms(on_wall), "mm"))
     if ratios:
-        findings.append(Finding(name="pose_error_over_sigma", value=rms(ratios), unit="1"))
-    return findings
+        numbers.append(("pose_error_over_sigma", rms(ratios), "1"))
+    return findings_of(numbers)
 
 
 def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
@@ -163,21 +163,16 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
     errors = tie_errors_cells(ties, walls, truth)
     own = _with_own_wall(ties, walls, truth)
     kept = ties.role != TieRole.REJECTED
-    findings = [
-        Finding(name="match_wrong_share", value=float((errors > _WRONG_CELLS).mean()), unit="1"),
-        Finding(name="n_ties_kept", value=int(kept.sum()), unit="1"),
-    ]
+    is_wrong = errors > _WRONG_CELLS
+    numbers = [("match_wrong_share", is_wrong.mean()), ("n_ties_kept", kept.sum())]
     if own.any():
-        wrong = float((errors[own] > _WRONG_CELLS).mean())
-        findings.append(Finding(name="match_wrong_share_own_wall", value=wrong, unit="1"))
+        numbers.append(("match_wrong_share_own_wall", is_wrong[own].mean()))
     if kept.any():
-        wrong = float((errors[kept] > _WRONG_CELLS).mean())
-        median = float(np.median(errors[kept]))
-        findings += [
-            Finding(name="tie_wrong_share", value=wrong, unit="1"),
-            Finding(name="tie_error_median_cells", value=median, unit="1"),
+        numbers += [
+            ("tie_wrong_share", is_wrong[kept].mean()),
+            ("tie_error_median_cells", np.median(errors[kept])),
         ]
-    return findings
+    return findings_of((*number, "1") for number in numbers)
 
 
 def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane, angle_between_deg
 from orthoflow.products import Finding, Inspection, Planes, PointCloud, PointLabels, Truth
 from orthoflow.sdk import DiagnosticSpec, StepContext
+from orthoflow_plugins.inspect.findings import Number, findings_of
 
 _FOUND_ANGLE_DEG: Final = 1.0
 _FOUND_OFFSET_M: Final = 0.015
@@ -67,15 +68,15 @@ def inspect_planes(
     findings = found_planes(planes, truth.planes)
     main = nearest[0]
     ctx.metric("main_found", float(main is not None), "1")
-    if main is not None:
-        findings += _plane_findings(main, 0)
-    else:
+    if main is None:
         ctx.report(
             MAIN_MISSED,
             n_planes=len(planes),
             angle_deg=_FOUND_ANGLE_DEG,
             offset_m=_FOUND_OFFSET_M,
         )
+    else:
+        findings += findings_of(main.numbers(), 0)
     seen = [distance for distance in nearest if distance is not None]
     if seen:
         worst = _PlaneDistance(
@@ -83,16 +84,10 @@ def inspect_planes(
             offset_m=max(abs(distance.offset_m) for distance in seen),
             corner_m=max(distance.corner_m for distance in seen),
         )
-        findings += [
-            Finding(name=f"worst_{item.name}", value=item.value, unit=item.unit)
-            for item in _plane_findings(worst, 0)
-        ]
-    for name, distance in zip(truth.planes.names, nearest, strict=True):
+        findings += findings_of(worst.numbers(), prefix="worst_")
+    for plane, distance in zip(truth.planes.names, nearest, strict=True):
         if distance is not None:
-            findings += [
-                Finding(name=f"{item.name}[{name}]", value=item.value, unit=item.unit)
-                for item in _plane_findings(distance, 0)
-            ]
+            findings += findings_of(distance.numbers(f"[{plane}]"))
     if labels is not None:
         findings += _with_those_of_the_main_wall(label_findings(labels, cloud, truth, ctx), truth)
     for item in findings:
@@ -114,17 +109,16 @@ def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Fi
         return []
     values = {item.name: item.value for item in scores}
     main = truth.planes.names[0]
-    return scores + [
-        Finding(name=f"label_{score}", value=values[f"label_{score}[{main}]"], unit="1")
-        for score in LABEL_SCORES
-    ]
+    return scores + findings_of(
+        (f"label_{score}", values[f"label_{score}[{main}]"], "1") for score in LABEL_SCORES
+    )
 
 
 def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
     """Return the errors of the plane of one wall; empty if it matches no true plane."""
     distances = (_plane_distance(plane, true, index) for index in range(len(true)))
     nearest = _nearest(distances, angle_deg=_SAME_ANGLE_DEG, offset_m=_SAME_OFFSET_M)
-    return [] if nearest is None else _plane_findings(nearest, wall)
+    return [] if nearest is None else findings_of(nearest.numbers(), wall)
 
 
 def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
@@ -144,10 +138,7 @@ def found_planes(planes: Planes, true: Planes) -> list[Finding]:
         any(d.is_within(_FOUND_ANGLE_DEG, _FOUND_OFFSET_M) for d in _distances(planes, true, index))
         for index in range(len(true))
     )
-    return [
-        Finding(name="true_planes", value=len(true), unit="1"),
-        Finding(name="true_planes_found", value=n_found, unit="1"),
-    ]
+    return findings_of([("true_planes", len(true), "1"), ("true_planes_found", n_found, "1")])
 
 
 def label_findings(
@@ -192,16 +183,14 @@ def label_findings(
             2.0 * hits / max(n_found[column] + n_true[index], 1),
             iou[index, column],
         )
-    findings = []
-    for place, kind in enumerate(LABEL_SCORES):
-        findings.append(
-            Finding(name=f"label_{kind}_mean", value=float(scores[:, place].mean()), unit="1")
-        )
-        findings += [
-            Finding(name=f"label_{kind}[{name}]", value=float(scores[k, place]), unit="1")
-            for k, name in enumerate(truth.planes.names)
+    numbers: list[Number] = []
+    for kind, values in zip(LABEL_SCORES, scores.T, strict=True):
+        numbers.append((f"label_{kind}_mean", values.mean(), "1"))
+        numbers += [
+            (f"label_{kind}[{name}]", value, "1")
+            for name, value in zip(truth.planes.names, values, strict=True)
         ]
-    return findings
+    return findings_of(numbers)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,6 +210,14 @@ class _PlaneDistance:
     def is_within(self, angle_deg: float, offset_m: float) -> bool:
         """Return whether angle and offset are within limits."""
         return self.angle_deg <= angle_deg and abs(self.offset_m) <= offset_m
+
+    def numbers(self, suffix: str = "") -> list[Number]:
+        """Return metrics of the plane."""
+        return [
+            (f"plane_angle_deg{suffix}", self.angle_deg, "deg"),
+            (f"plane_offset_mm{suffix}", 1e3 * self.offset_m, "mm"),
+            (f"plane_corner_max_mm{suffix}", 1e3 * self.corner_m, "mm"),
+        ]
 
     @property
     def score(self) -> float:
@@ -250,15 +247,6 @@ def _nearest(
     """Return the smallest difference within the limits."""
     near = (distance for distance in distances if distance.is_within(angle_deg, offset_m))
     return min(near, key=lambda distance: distance.score, default=None)
-
-
-def _plane_findings(distance: _PlaneDistance, wall: int) -> list[Finding]:
-    """Return metrics of the plane of one wall."""
-    return [
-        Finding(name="plane_angle_deg", value=distance.angle_deg, unit="deg", wall=wall),
-        Finding(name="plane_offset_mm", value=1e3 * distance.offset_m, unit="mm", wall=wall),
-        Finding(name="plane_corner_max_mm", value=1e3 * distance.corner_m, unit="mm", wall=wall),
-    ]
 
 
 def _joint_counts(

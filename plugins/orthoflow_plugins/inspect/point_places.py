@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -31,7 +31,6 @@ _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 1.0
 # Targets are not quite flat: the depth of the centre is taken from this share of their radius.
 _DEPTH_SHARE: Final = 0.5
-_NOWHERE: Final = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,16 +40,16 @@ class ShownPoint:
     Attributes:
         how: how it was found, or why not.
         wall: index of the wall in `Walls`; -1 if the point is on no wall.
-        expected: (2,) column and row of the surveyed position.
+        expected: (2,) column and row of the surveyed position; NaN if the point is on no wall.
         place: (2,) column and row where the image shows it; NaN if not found.
         point_world: (3,) metres, that position on the surface; NaN if unknown.
     """
 
     how: How
-    wall: int
-    expected: NDArray[np.float64]
-    place: NDArray[np.float64]
-    point_world: NDArray[np.float64]
+    wall: int = -1
+    expected: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.nan))
+    place: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.nan))
+    point_world: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.nan))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,10 +98,7 @@ class PointFinder:
         wall = int(points.wall[index])
         picture = self._picture_of(world, wall if wall >= 0 else None)
         if picture is None:
-            nowhere = _NOWHERE[:2]
-            return ShownPoint(
-                how="outside", wall=-1, expected=nowhere, place=nowhere, point_world=_NOWHERE
-            )
+            return ShownPoint(how="outside")
         frame = picture.frame
         expected = frame.wall_from_world(world[None])[0, :2]
         measured = points.pixels_wall[index]
@@ -111,13 +107,7 @@ class PointFinder:
         if points.shown_world is not None and np.isfinite(points.shown_world[index]).all():
             measured = frame.wall_from_world(points.shown_world[index][None])[0, :2]
         if np.isfinite(measured).all():
-            return ShownPoint(
-                how="measured",
-                wall=picture.wall,
-                expected=expected,
-                place=measured,
-                point_world=_NOWHERE,
-            )
+            return ShownPoint(how="measured", wall=picture.wall, expected=expected, place=measured)
         if self.truth is not None:
             return self._by_truth(picture, expected, self.truth)
         return self._target(picture, expected)
@@ -148,13 +138,9 @@ class PointFinder:
             buffers_m=(slab.front_m, slab.behind_m),
             search_cells=int(np.clip(np.ceil(self.search_m / picture.frame.gsd_m), 2, 12)),
         )
-        return ShownPoint(
-            how="not found" if place is None else "truth",
-            wall=picture.wall,
-            expected=expected,
-            place=_NOWHERE[:2] if place is None else place,
-            point_world=_NOWHERE,
-        )
+        if place is None:
+            return ShownPoint(how="not found", wall=picture.wall, expected=expected)
+        return ShownPoint(how="truth", wall=picture.wall, expected=expected, place=place)
 
     def _target(self, picture: Picture, expected: NDArray[np.float64]) -> ShownPoint:
         gsd_m = picture.frame.gsd_m
@@ -165,22 +151,11 @@ class PointFinder:
             radius_cells=self.target_radius_m / gsd_m,
         )
         if crossing is None:
-            return ShownPoint(
-                how="not found",
-                wall=picture.wall,
-                expected=expected,
-                place=_NOWHERE[:2],
-                point_world=_NOWHERE,
-            )
+            return ShownPoint(how="not found", wall=picture.wall, expected=expected)
         radius_m = _DEPTH_SHARE * self.target_radius_m
+        found = ShownPoint(how="target", wall=picture.wall, expected=expected, place=crossing)
         point = point_on_surface(picture.surface, crossing, radius_m)
-        return ShownPoint(
-            how="target",
-            wall=picture.wall,
-            expected=expected,
-            place=crossing,
-            point_world=_NOWHERE if point is None else point,
-        )
+        return found if point is None else replace(found, point_world=point)
 
 
 def find_by_truth(
@@ -205,7 +180,7 @@ def find_by_truth(
     Returns:
         (2,) column and row, or None if no position correlates.
     """
-    from orthoflow.geometry.scene_views import render_frame
+    from orthoflow.geometry.scene_views import render
 
     rim = search_cells + 4
     side = PATCH_CELLS + 2 * rim
@@ -216,9 +191,7 @@ def find_by_truth(
         width=side,
         height=side,
     )
-    true = render_frame(
-        truth.scene, part, buffer_front_m=buffers_m[0], buffer_behind_m=buffers_m[1]
-    )
+    true = render(truth.scene, part, front_m=buffers_m[0], behind_m=buffers_m[1])
     known = np.asarray(np.isfinite(true.rgb).all(axis=2), dtype=np.bool_)
     reference = GreyImage(
         grey=np.where(known, np.nan_to_num(true.rgb) @ REC_601, 0.0), valid=known, region=known

@@ -12,7 +12,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, Truth, Wall, is_painted
-from orthoflow_plugins.inspect.findings import count_true, rms
+from orthoflow_plugins.inspect.findings import Number, count_true, findings_of, rms
 from orthoflow_plugins.inspect.orientation_errors import true_camera
 
 if TYPE_CHECKING:
@@ -176,21 +176,21 @@ def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
     """
     if not samples.n_traced:
         return []
-    numbers = [("n_traced", float(samples.n_traced), "1")]
+    numbers: list[Number] = [("n_traced", samples.n_traced, "1")]
     for name, away, step in zip("uv", 1e3 * samples.away_m.T, 1e3 * samples.step_m.T, strict=True):
         if len(away):
             numbers += [
                 (f"rmse_{name}_mm", rms(away), "mm"),
-                (f"mean_{name}_mm", float(away.mean()), "mm"),
+                (f"mean_{name}_mm", away.mean(), "mm"),
                 (f"nmad_{name}_mm", median_deviation(away), "mm"),
-                (f"p99_{name}_mm", float(np.percentile(np.abs(away), 99.0)), "mm"),
+                (f"p99_{name}_mm", np.percentile(np.abs(away), 99.0), "mm"),
             ]
         if len(step):
             numbers.append((f"step_rmse_{name}_mm", rms(step), "mm"))
     numbers += [
         ("far_source_share", samples.n_far / samples.n_traced, "1"),
         ("ghost_share", samples.n_ghosts / samples.n_traced, "1"),
-        ("n_ghost_cells", float(samples.n_ghosts), "1"),
+        ("n_ghost_cells", samples.n_ghosts, "1"),
     ]
     if samples.n_stated:
         numbers += [
@@ -200,7 +200,7 @@ def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
     if samples.n_seen_by_both:
         share = samples.n_seen_painted / samples.n_seen_by_both
         numbers.append(("completeness_seen_by_both", share, "1"))
-    return [Finding(name=name, value=value, unit=unit, wall=wall) for name, value, unit in numbers]
+    return findings_of(numbers, wall)
 
 
 def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:

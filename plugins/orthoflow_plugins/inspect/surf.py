@@ -32,7 +32,9 @@ from orthoflow_plugins.inspect.figures import draw_arrows
 from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
     IMAGE_QUALITY,
+    Number,
     displacement_findings,
+    findings_of,
     lower,
     of_walls,
     prefixed,
@@ -180,18 +182,14 @@ class _Verdict:
         """Return the wall's metrics."""
         wall = self.image.wall
         gsd_m = self.image.frame.gsd_m
-        counts = [
-            ("n_pairs", float(len(self.pairs))),
-            ("n_key_points", float(self.pairs.n_points[0])),
-            ("n_key_points_intensity", float(self.pairs.n_points[1])),
-            ("matched_kept_share", len(self.pairs) / max(1, self.pairs.n_matched)),
-            ("floor_n_pairs", float(len(self.floor))),
+        counts: list[Number] = [
+            ("n_pairs", len(self.pairs), "1"),
+            ("n_key_points", self.pairs.n_points[0], "1"),
+            ("n_key_points_intensity", self.pairs.n_points[1], "1"),
+            ("matched_kept_share", len(self.pairs) / max(1, self.pairs.n_matched), "1"),
+            ("floor_n_pairs", len(self.floor), "1"),
         ]
-        return [
-            *(Finding(name=name, value=value, unit="1", wall=wall) for name, value in counts),
-            *_numbers([self], wall, gsd_m),
-            *self.quality,
-        ]
+        return [*findings_of(counts, wall), *_numbers([self], wall, gsd_m), *self.quality]
 
     def draw(self, ctx: StepContext) -> None:
         """Draw the displacements (markiewicz2015, Figure 25)."""
@@ -290,12 +288,9 @@ def _numbers(items: list[_Verdict], wall: int, gsd_m: float) -> list[Finding]:
 
 
 def _together(items: list[_Verdict]) -> list[Finding]:
-    n_pairs = float(sum(len(item.pairs) for item in items))
+    n_pairs = sum(len(item.pairs) for item in items)
     coarsest = max(item.image.frame.gsd_m for item in items)
-    return [
-        Finding(name="n_pairs", value=n_pairs, unit="1"),
-        *_numbers(items, -1, coarsest),
-    ]
+    return [*findings_of([("n_pairs", n_pairs, "1")]), *_numbers(items, -1, coarsest)]
 
 
 def _inspection(items: list[_Verdict], findings: list[Finding], reason: str | None) -> Inspection:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -302,14 +302,10 @@ class InspectTruth(Method):
         rule = SamplingRule.of(orthoimages.images)
         _warn_of_untraced(inputs.orthoimages, inputs.cameras, ctx)
         views = _views(inputs, ctx.cores)
-        poses = _pose_errors(inputs, views)
-        judge = _Judge(
-            inputs=inputs,
-            walls=inputs.walls,
-            rule=rule,
-            views=views,
-            ctx=ctx,
-        )
+        poses: tuple[PoseError, ...] = ()
+        if inputs.cameras is not None and views is not None:
+            poses = pose_errors(inputs.cameras, inputs.walls, inputs.truth, views)
+        judge = _Judge(inputs=inputs, walls=inputs.walls, rule=rule, views=views, ctx=ctx)
         verdicts: list[_Verdict] = []
         findings: list[Finding] = []
         for place, image in enumerate(orthoimages.images):
@@ -406,12 +402,6 @@ def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
     return SceneCameras(inputs.truth.scene, cores=cores)
 
 
-def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[PoseError, ...]:
-    if inputs.cameras is None or views is None or inputs.walls is None:
-        return ()
-    return pose_errors(inputs.cameras, inputs.walls, inputs.truth, views)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Judge:
     """Compares walls one by one; `views` is None without cameras."""
@@ -430,16 +420,16 @@ class _Judge:
         bands = [self._of_band(image, wall, band, cell_step) for band in _bands(image)]
         sources = [band.sources for band in bands if band.sources is not None]
         together = pooled(sources) if sources else None
+        names = ("depth_m", "grey", "length_m", "cells", "cell_shift_m")
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(band, name) for band in bands]) for name in names
+        }
         return _Verdict(
             samples=pooled([band.samples for band in bands]),
             sources=together if together is not None and together.n_traced else None,
             patches=PatchShifts.joined([band.patches for band in bands]),
-            depth_m=np.concatenate([band.depth_m for band in bands]),
-            grey=np.concatenate([band.grey for band in bands]),
-            length_m=np.concatenate([band.length_m for band in bands]),
-            cells=np.concatenate([band.cells for band in bands]),
-            cell_shift_m=np.concatenate([band.cell_shift_m for band in bands]),
             quality=tuple(quality_findings(image, wall, self.inputs.cameras)),
+            **arrays,
         )
 
     def _of_band(self, image: Orthoimage, wall: Wall, band: Band, cell_step: int) -> _Verdict:
@@ -488,7 +478,7 @@ class _Judge:
         )
 
     def _true_orthoimage(self, image: Orthoimage, chosen: Sampling) -> TrueOrthoimage:
-        from orthoflow.geometry.scene_views import Rendering, render
+        from orthoflow.geometry.scene_views import render
 
         truth = self.inputs.truth
         viewers = Viewers(
@@ -498,16 +488,17 @@ class _Judge:
             highest_elevation_deg=truth.highest_elevation_deg,
         )
         slab = self.walls.slab(image.wall)
-        rendering = Rendering(
-            buffer_front_m=slab.front_m,
-            buffer_behind_m=slab.behind_m,
+        return render(
+            truth.scene,
+            image.frame,
+            front_m=slab.front_m,
+            behind_m=slab.behind_m,
             viewers=viewers,
             supersample=_SUPERSAMPLE,
             coloured=chosen.coloured,
             judged=chosen.coloured | chosen.lattice,
             cores=self.ctx.cores,
         )
-        return render(truth.scene, image.frame, rendering)
 
 
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, MethodError
+from orthoflow.files.polygons import filled
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, signed_area
@@ -82,15 +83,8 @@ def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
     corners = outline_m(crop) / wall.frame.gsd_m
     # Relative to the first cell of the cropped grid.
     corners -= np.floor(corners.min(axis=0) + 1e-6).clip(0, None)
-    columns = np.arange(wall.frame.width) + 0.5
     for rows in row_bands(wall.mask.shape):
-        centres = np.arange(rows.start, rows.stop)[:, None] + 0.5
-        outside = np.ones(wall.mask[rows].shape, dtype=np.bool_)
-        for (x, y), (next_x, next_y) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            crosses = (y > centres) != (next_y > centres)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                at = x + (centres - y) * (next_x - x) / (next_y - y)
-            outside ^= crosses & (columns < at)
+        outside = ~filled((corners - [0.0, rows.start],), wall.mask[rows].shape)
         wall.mask[rows][outside] = SurfaceMask.VOID
         for values in (wall.depth_m, wall.sigma_m, wall.intensity, wall.percentiles_m):
             if values is not None:

@@ -41,7 +41,6 @@ from orthoflow_plugins.raster.reporting import (
 )
 from orthoflow_plugins.raster.selection import (
     chosen_planes,
-    chosen_relief,
     covered_planes,
     distance_m,
     frame_of,
@@ -54,13 +53,14 @@ ExtentOf = Callable[[int], Extent]
 # Points of `near` farther from the wall than this are probably wrong.
 _FAR_M: Final = 1.0
 # A larger missing width would be noticed in a drawing.
-_LARGE_CUT_M: Final = 0.05
-NEAR_RELIEF: Final = DiagnosticSpec(
-    code="near-takes-relief",
+_CUT_WORTH_WORDS_M: Final = 0.05
+OBLIQUE: Final = DiagnosticSpec(
+    code="wall-beside-an-oblique-surface",
     severity="warning",
-    text="near selects {subject}, which is part of the relief of {wall}",
-    remedy="to select that wall, set {step}.ranks=[{index}] and omit near "
-    "({step}.skip_covered=false confirms that the relief is meant)",
+    text="{subject}: the adjoining surface at its {side} is oblique, and the raster ends at its "
+    "nearest point: up to {cut_m:.2f} m of its plane are left out there",
+    remedy="{step}.margin_m adds them",
+    rank_by="cut_m",
 )
 NEAR_FAR: Final = DiagnosticSpec(
     code="near-is-far",
@@ -248,9 +248,6 @@ def _frames(
     chosen = chosen_planes(planes, params, buffer_m)
     covered = covered_planes(planes, params, buffer_m, chosen)
     warn_of_covered(ctx, planes.names, covered)
-    for index, wall in chosen_relief(planes, params, buffer_m, chosen).items():
-        names = planes.names
-        ctx.report(NEAR_RELIEF, subject=names[index], wall=names[wall], index=wall)
     frames = {
         index: frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m)
         for index in chosen
@@ -258,15 +255,8 @@ def _frames(
     if params.crs is not None:
         reach_m = max(max(buffer_m(index)) for index in frames)
         frames = mapped(frames, planes, params.crs, reach_m=reach_m, ctx=ctx)
-    _log_cuts(frames, planes, params, extent_of, ctx)
     frames = {index: extent_of(index).widened(frame) for index, frame in frames.items()}
-    for place in params.near:
-        index = nearest_plane(planes, list(frames), np.array(place))
-        apart_m = distance_m(planes, index, np.array(place))
-        ctx.log(f"near {list(place)}: {planes.names[index]}, {apart_m:.3f} m away")
-        if apart_m > _FAR_M:
-            name = planes.names[index]
-            ctx.report(NEAR_FAR, subject=name, place=str(list(place)), apart_m=apart_m)
+    _report_doubts(list(frames), planes, params, extent_of, ctx)
     if params.crop is None:
         return frames, covered
     parts = {index: cropped(frame, params.crop) for index, frame in frames.items()}
@@ -283,24 +273,21 @@ def _frames(
     return crops, covered
 
 
-def _log_cuts(
-    frames: dict[int, WallFrame],
-    planes: Planes,
-    params: RasterParams,
-    extent_of: ExtentOf,
-    ctx: StepContext,
+def _report_doubts(
+    chosen: list[int], planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> None:
-    """Report the parts of walls outside their rectangles because adjoining planes are oblique."""
-    for index, frame in frames.items():
+    """Report walls cut by oblique neighbours, and points of `near` far from all walls."""
+    for index in chosen:
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - params.margin_m
-            if cut_m > frame.gsd_m:
-                notify = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
-                notify(
-                    f"{planes.names[index]}: the adjoining surface at its {side} is oblique, and "
-                    f"the raster ends at its nearest point: up to {1e3 * cut_m:.0f} mm of its "
-                    "plane are left out there, and more of its relief; margin_m adds them"
-                )
+            if cut_m >= _CUT_WORTH_WORDS_M:
+                ctx.report(OBLIQUE, subject=planes.names[index], side=side, cut_m=cut_m)
+    for place in params.near:
+        index = nearest_plane(planes, chosen, np.array(place))
+        apart_m = distance_m(planes, index, np.array(place))
+        if apart_m > _FAR_M:
+            name = planes.names[index]
+            ctx.report(NEAR_FAR, subject=name, place=str(list(place)), apart_m=apart_m)
 
 
 def _allocated(

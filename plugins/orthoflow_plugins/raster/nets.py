@@ -31,9 +31,7 @@ def interpolate_net(
 ) -> Net:
     """Interpolate values at all cell centres linearly in a Delaunay triangulation.
 
-    The triangulation closes gaps, including windows, and turns steps into slopes. The result is
-    that of scipy's LinearNDInterpolator, which is slow because it tests all triangles for positions
-    outside them.
+    The triangulation closes gaps, including windows, and turns steps into slopes.
 
     Args:
         cloud: the points.
@@ -77,30 +75,17 @@ def _interpolate(
     delaunay: Delaunay, table: NDArray[np.float64], slab: Slab, found: NDArray[np.float32]
 ) -> None:
     """Interpolate values (cells, channels) of cells in triangles from those of the vertices."""
-    hull = delaunay.points[delaunay.convex_hull]
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import ConvexHull
+
+    interpolator = LinearNDInterpolator(delaunay, table)
+    sides = ConvexHull(delaunay.points).equations
     for top in range(0, slab.frame.height, _ROWS_AT_ONCE):
         bottom = min(top + _ROWS_AT_ONCE, slab.frame.height)
         rows, columns = (axis.ravel() for axis in np.mgrid[top:bottom, : slab.frame.width] + 0.5)
-        centres = np.column_stack([columns, rows])
-        near = _within(hull, centres)
-        simplex = delaunay.find_simplex(centres[near])
-        inside, simplex = near[simplex >= 0], simplex[simplex >= 0]
-        transform = delaunay.transform[simplex]
-        shares = np.einsum("nij,nj->ni", transform[:, :2], centres[inside] - transform[:, 2])
-        shares = np.column_stack([shares, 1.0 - shares.sum(axis=1)])
-        corners = delaunay.simplices[simplex]
-        found[top * slab.frame.width + inside] = np.einsum("nk,nkc->nc", shares, table[corners])
-
-
-def _within(hull: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return which positions (n, 2) are inside a convex outline of segments (k, 2, 2)."""
-    lines, line = np.unique(centres[:, 1], return_inverse=True)
-    ends = np.take_along_axis(hull, hull[:, :, 1:].argsort(axis=1), axis=1)
-    (left, upper), (right, lower) = ends[:, 0].T, ends[:, 1].T
-    with np.errstate(all="ignore"):
-        share = (lines[:, np.newaxis] - upper) / (lower - upper)
-    crosses = (share >= 0.0) & (share <= 1.0)
-    at = left + share * (right - left)
-    first = np.where(crosses, at, np.inf).min(axis=1) - _ROUNDING_CELLS
-    last = np.where(crosses, at, -np.inf).max(axis=1) + _ROUNDING_CELLS
-    return np.flatnonzero((centres[:, 0] >= first[line]) & (centres[:, 0] <= last[line]))
+        # scipy tests all triangles for positions outside them, which is slow.
+        inside = np.ones(rows.size, dtype=np.bool_)
+        for right, down, offset in sides:
+            inside &= right * columns + down * rows + offset <= _ROUNDING_CELLS
+        near = np.flatnonzero(inside)
+        found[top * slab.frame.width + near] = interpolator(columns[near], rows[near])

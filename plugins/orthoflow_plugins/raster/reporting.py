@@ -185,35 +185,22 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
             scales[f"{scale['low']} to {scale['high']} ({scale['rule']})"] = None
         if isinstance(scan, dict) and scan.get("rgb_scale"):
             colours[str(scan["rgb_scale"])] = None
+    scaled = f"the scans' intensities are scaled from {', '.join(scales) or '0 to 1'}"
+    read_as = f", read as {', '.join(colours)}" if colours else ""
     for wall in walls:
-        states = (SurfaceMask.MEASURED, SurfaceMask.RECOVERED)
-        found = None
         if wall.intensity is not None:
-            found = plain_tone(wall.intensity, wall.mask, states, white=1.0)
-        if found is not None:
-            ctx.report(
-                PLAIN,
-                subject=wall.name,
-                what="intensity",
-                tone=found[0],
-                share=found[1],
-                cause=f"the scans' intensities are scaled from {', '.join(scales) or '0 to 1'}",
-                way="{step[read.scan]}.intensity_max=NUMBER sets the value of white",
-            )
+            states = (SurfaceMask.MEASURED, SurfaceMask.RECOVERED)
+            if found := plain_tone(wall.intensity, wall.mask, states, white=1.0):
+                way = "{step[read.scan]}.intensity_max=NUMBER sets the value of white"
+                words = {"what": "intensity", "cause": scaled, "way": way}
+                ctx.report(PLAIN, subject=wall.name, tone=found[0], share=found[1], **words)
         if wall.rgb is None or wall.rgb_mask is None:
             continue
-        found = plain_tone(wall.rgb, wall.rgb_mask, (1,), white=255.0)
-        if found is not None:
-            read_as = f", read as {', '.join(colours)}" if colours else ""
-            ctx.report(
-                PLAIN,
-                subject=wall.name,
-                what="colour",
-                tone=found[0],
-                share=found[1],
-                cause=f"so are the colours of its points{read_as}",
-                way="check whether the program that wrote the scan exported colours",
-            )
+        if found := plain_tone(wall.rgb, wall.rgb_mask, (1,), white=255.0):
+            cause = f"so are the colours of its points{read_as}"
+            way = "check whether the program that wrote the scan exported colours"
+            words = {"what": "colour", "cause": cause, "way": way}
+            ctx.report(PLAIN, subject=wall.name, tone=found[0], share=found[1], **words)
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:

@@ -103,28 +103,6 @@ def covered_planes(
     return found
 
 
-def chosen_relief(
-    planes: Planes, params: RasterParams, buffer_m: BufferOf, chosen: Sequence[int]
-) -> dict[int, int]:
-    """Return the wall with more points that shows each plane selected by `near`, by plane index.
-
-    Args:
-        planes: all planes, those with the most points first.
-        params: the criteria; the result is empty if `near` is empty or relief is not omitted.
-        buffer_m: returns the buffers of walls.
-        chosen: result of `chosen_planes`.
-    """
-    if not params.skip_covered or not params.near:
-        return {}
-    found: dict[int, int] = {}
-    for index in chosen:
-        others = (wall for wall in range(index) if _fits(planes, wall, params.constraint))
-        walls = (wall for wall in others if _covers(planes, wall, index, buffer_m))
-        if (wall := next(walls, index)) not in chosen:
-            found[index] = wall
-    return found
-
-
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
     """Return the plane nearest to a point (3,); if several are, the one with the most points."""
     return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))

@@ -15,7 +15,7 @@ from scipy.ndimage import binary_erosion
 from orthoflow.files.images import decode_image, encode_webp
 from orthoflow.geometry import Plane, frame_over, wall_axes
 from orthoflow.geometry.rows import Rows
-from orthoflow.geometry.scene_views import SceneCameras, render_frame
+from orthoflow.geometry.scene_views import SceneCameras, render
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints, JsonValue, Photos, Planes, PointCloud, Truth
 from orthoflow.sdk import StepContext
@@ -219,9 +219,7 @@ def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> tuple[float, f
 def _picture(truth: Truth, plane: int, cores: int) -> bytes:
     corners, normal = truth.planes.corners[plane], truth.planes.normal[plane]
     frame = frame_over(corners, normal, gsd_m=_PICTURE_GSD_M)
-    image = render_frame(
-        truth.scene, frame, buffer_front_m=0.3, buffer_behind_m=0.3, supersample=2, cores=cores
-    )
+    image = render(truth.scene, frame, front_m=0.3, behind_m=0.3, supersample=2, cores=cores)
     return encode_webp(np.nan_to_num(image.rgb).round().astype(np.uint8))
 
 

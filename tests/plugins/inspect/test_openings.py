@@ -40,14 +40,14 @@ def test_the_true_outline_has_no_error(tmp_path: Path) -> None:
 
 
 # The wall has 15 000 cells; of the raster, two by two are one.
-@pytest.mark.parametrize(("n_told", "apart"), [(15_000, 0.0), (4_000, 0.05)])
+@pytest.mark.parametrize(("n_samples", "apart"), [(15_000, 0.0), (4_000, 0.05)])
 def test_large_walls_are_judged_in_coarser_cells_but_sides_as_exactly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_told: int, apart: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_samples: int, apart: float
 ) -> None:
     walls = scene()[1]
     found = opening(walls, outwards_m=0.03), opening(walls, right_m=0.9)
     whole, inspection = judged(tmp_path, *found)
-    monkeypatch.setattr(inspected, "_CELLS_TOLD", n_told)
+    monkeypatch.setattr(inspected, "_MAX_SAMPLES", n_samples)
     coarse, again = judged(tmp_path, *found)
     np.testing.assert_array_equal(again.displacement_m, inspection.displacement_m)
     np.testing.assert_array_equal(again.points_world, inspection.points_world)
@@ -93,4 +93,4 @@ def test_an_outline_is_of_what_it_shares_half_of_its_area_with(
 
 def test_a_side_without_length_has_no_error() -> None:
     wall: Any = None
-    assert inspected._side_error(wall, np.ones(2), np.ones(2)) is None
+    assert inspected._side_error(wall, np.ones(2), np.ones(2), 0.01) is None

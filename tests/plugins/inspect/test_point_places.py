@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter
 
 from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.geometry.levels import REC_601
-from orthoflow.geometry.scene_views import render_frame
+from orthoflow.geometry.scene_views import render
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from orthoflow.products import Truth, Wall
 from orthoflow.testing.examples import example
@@ -70,7 +70,7 @@ def shown_grey(right: float, down: float) -> GreyImage:
     truth, where = painted()
     moved = -CELL_M * (right * where.u_world + down * where.v_world)
     shown = replace(where, origin_world=where.origin_world + moved)
-    true = render_frame(truth.scene, shown, buffer_front_m=0.1, buffer_behind_m=0.1)
+    true = render(truth.scene, shown, front_m=0.1, behind_m=0.1)
     known = np.isfinite(true.rgb).all(axis=2)
     return GreyImage(
         grey=np.where(known, np.nan_to_num(true.rgb) @ REC_601, 0.0), valid=known, region=known

@@ -150,7 +150,7 @@ def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
     monkeypatch.setattr(key_pairs, "_WHOLE_CELLS", 1000)
     monkeypatch.setattr(key_pairs, "_TILE_CELLS", 150)
     # What the widest descriptors look at fits in, so that all points are those of the whole.
-    monkeypatch.setattr(key_pairs, "_SURF_RIM_CELLS", 400)
+    monkeypatch.setattr(key_pairs, "_RIM_CELLS", 400)
     tiled = find_key_pairs(shown, true, radius_cells=40.0)
     assert tiled.n_points == whole.n_points
     assert tiled.n_matched == whole.n_matched

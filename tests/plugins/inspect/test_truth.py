@@ -16,7 +16,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
-from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
+from orthoflow.geometry.scene_views import TrueOrthoimage, render
 from orthoflow.products import (
     Cameras,
     Inspection,
@@ -53,9 +53,7 @@ def rendered(truth: Truth, shift_cells: tuple[float, float] = (0.0, 0.0)) -> Tru
         frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=GSD_M)
         displacement = shift_cells[0] * frame.u_world + shift_cells[1] * frame.v_world
         moved = replace(frame, origin_world=frame.origin_world - GSD_M * displacement)
-        image = render_frame(
-            truth.scene, moved, buffer_front_m=BUFFER_M, buffer_behind_m=BUFFER_M, cores=2
-        )
+        image = render(truth.scene, moved, front_m=BUFFER_M, behind_m=BUFFER_M, cores=2)
         _RENDERED[shift_cells] = replace(image, frame=frame)
     return _RENDERED[shift_cells]
 

@@ -148,8 +148,8 @@ def test_a_floor_that_slopes_ends_the_wall_at_its_highest_place_and_this_is_said
     walls, ctx = scenes.rastered(cloud, planes, tmp_path, gsd_m=GSD_M, ranks=[0])
     lowest_m = walls.walls[0].frame.corners_world()[:, 2].min()
     assert lowest_m == pytest.approx(rise * WIDTH_M, abs=CORNER_M)
-    (warning,) = [text for text in ctx.warnings if "oblique" in text]
-    assert "up to 80 mm of its plane are left out there" in warning
+    (one,) = [one for one in ctx.diagnostics if one.code == "wall-beside-an-oblique-surface"]
+    assert one.values["cut_m"] == pytest.approx(0.08, abs=0.0005)
 
 
 def test_where_no_plane_ends_it_a_wall_ends_with_its_points() -> None:

@@ -212,13 +212,11 @@ def test_what_an_adjoining_plane_cuts_off_is_warned_of_from_5_cm(
     tmp_path: Path, askew_m: float, n_warnings: int
 ) -> None:
     known, ctx = scenes.leaning_wall(), scenes.context(tmp_path)
-    frame = samples.facing_south(0.01, 20, 10)
     extent = Extent(front_m=0.1, behind_m=0.1, cut_m={"left": askew_m})
     # Of which a margin takes two centimetres.
     params = RasterGrid.Params(margin_m=0.02)
-    grid._log_cuts({0: frame}, known.planes(), params, lambda _: extent, ctx)
-    assert len(ctx.warnings) == n_warnings
-    assert all("left is oblique" in text and "51 mm" in text for text in ctx.warnings)
+    grid._report_doubts([0], known.planes(), params, lambda _: extent, ctx)
+    assert [one.values["cut_m"] for one in ctx.diagnostics] == [pytest.approx(0.051)] * n_warnings
 
 
 def test_a_wall_of_one_tone_is_reported_with_its_cause(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.selection import (
     chosen_planes,
-    chosen_relief,
     covered_planes,
 )
 
@@ -138,11 +137,6 @@ def test_a_covered_or_small_wall_is_chosen_when_a_point_is_near_it() -> None:
     assert chosen_planes(both, CHOICE, buffer_m) == [0]
     choice = but(CHOICE, near=((1.1, 2.9, 1.0),))
     assert chosen_planes(both, choice, buffer_m) == [1]
-    assert chosen_relief(both, choice, buffer_m, [1]) == {1: 0}
-    # Who wants both, or says that relief counts, needs no word.
-    assert chosen_relief(both, choice, buffer_m, [0, 1]) == {}
-    assert chosen_relief(both, but(choice, skip_covered=False), buffer_m, [1]) == {}
-    assert chosen_relief(both, CHOICE, buffer_m, [0]) == {}
 
 
 def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:

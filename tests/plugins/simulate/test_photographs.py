@@ -22,7 +22,7 @@ from scipy.ndimage import map_coordinates
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, render_frame
+from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, render
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Truth
 from orthoflow.sdk import StepContext
@@ -66,11 +66,11 @@ def wall(room: SimulateRoom.Out) -> TrueOrthoimage:
     """The main wall as it is, in cells as large as pixels."""
     planes = room.truth.planes
     frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=0.004)
-    return render_frame(
+    return render(
         room.truth.scene,
         frame,
-        buffer_front_m=0.02,
-        buffer_behind_m=0.02,
+        front_m=0.02,
+        behind_m=0.02,
         supersample=2,
         cores=2,
     )
