@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +26,11 @@ from orthoflow.products import (
     PointCloud,
     Walls,
 )
-from orthoflow.sdk import Ports
+from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
-from tests.raster_scenes import SURVEY, UP, cloud_of
-
-_Ports = TypeVar("_Ports", bound=Ports)
+from tests.method_runs import run
+from tests.raster_scenes import SURVEY, UP, cloud_of, context
 
 GSD_M = 0.004
 SHAPE = (240, 320)
@@ -210,23 +210,33 @@ def truth(where: WallFrame, viewer: ViewingCamera) -> Seen:
     return cast(where, origins, points - viewer.centre_world)
 
 
+# Any: ports and parameters differ by method.
 def inputs(
-    method: type[_Ports],
-    *pictures: NDArray[np.uint8],
-    viewers: Sequence[ViewingCamera] = (),
-    **known: object,
-) -> _Ports:
+    *pictures: NDArray[np.uint8], viewers: Sequence[ViewingCamera] = (), **known: Any
+) -> dict[str, Any]:
     """Inputs of a method: pictures of the wall, rendered unless given, and the cloud."""
     where = frame()
-    return method(
-        **{
-            "walls": walls(where),
-            "photos": photos(*(pictures or (rendered(),))),
-            "cameras": cameras(*(viewers or (camera(where),))),
-            "cloud": cloud(where),
-            **known,
-        }
-    )
+    return {
+        "walls": walls(where),
+        "photos": photos(*(pictures or (rendered(),))),
+        "cameras": cameras(*(viewers or (camera(where),))),
+        "cloud": cloud(where),
+        **known,
+    }
+
+
+def laid(
+    method: Any, folder: Path, given: dict[str, Any] | None = None, *, cores: int = 2, **params: Any
+) -> tuple[tuple[Layer, ...], StepContext]:
+    """Layers that a method makes of the scene, or of given inputs, and what it reported."""
+    ctx = context(folder, cores=cores)
+    return run(method, ctx, given or inputs(), **params).layers.layers, ctx
+
+
+def visible(viewer: ViewingCamera) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Cells that a camera sees, and cells that the board hides from it."""
+    surface = truth(frame(), viewer).surface.reshape(SHAPE)
+    return np.isin(surface, (BASE, RAISED)), surface == BOARD
 
 
 def places_off(layer: Layer) -> NDArray[np.float64]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,10 @@ from orthoflow.files.images import encode_png
 from orthoflow.files.publishing import publish_layers, publish_orthoimages
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.levels import sixteen_bits
-from orthoflow.products import LayerMask, Layers, Orthoimages, OrthoMask, Photos
-from orthoflow.sdk import StepContext
+from orthoflow.products import Layer, LayerMask, Layers, Orthoimages, OrthoMask, Photos
+from orthoflow.testing import photographed as ms
 from tests import ortho_scenes as scenes
+from tests.method_runs import run
 from tests.raster_scenes import context
 
 SIDE_PX = (1000, 800)
@@ -34,25 +35,14 @@ def ramp() -> NDArray[np.uint16]:
 
 def deep_photos(*pictures: NDArray[np.uint16] | NDArray[np.uint8]) -> Photos:
     plain = scenes.photos(*(np.zeros((*picture.shape[:2], 3), np.uint8) for picture in pictures))
-    return Photos(
-        photos=tuple(
-            dataclasses.replace(photo, encoded=encode_png(picture))
-            for photo, picture in zip(plain.photos, pictures, strict=True)
-        )
-    )
+    pairs = zip(plain.photos, pictures, strict=True)
+    return ms.photos(*(replace(photo, encoded=encode_png(picture)) for photo, picture in pairs))
 
 
-def laid(ctx: StepContext, photos: Photos, *viewers: ViewingCamera, **params: object) -> Layers:
-    inputs = scenes.inputs(DsmBackward.In, viewers=viewers, photos=photos)
-    return DsmBackward().run(inputs, DsmBackward.Params.model_validate(params), ctx).layers
-
-
-def joined(folder: Path, layers: Layers, **params: object) -> tuple[Orthoimages, StepContext]:
-    (folder / "mosaic").mkdir()
-    ctx = context(folder / "mosaic")
-    inputs = MosaicSeams.In(layers=layers, walls=None)
-    made = MosaicSeams().run(inputs, MosaicSeams.Params.model_validate(params), ctx)
-    return made.orthoimages, ctx
+def joined(folder: Path, layers: tuple[Layer, ...], **params: object) -> Orthoimages:
+    inputs = {"layers": Layers(layers=layers)}
+    images: Orthoimages = run(MosaicSeams, context(folder), inputs, **params).orthoimages
+    return images
 
 
 def seen_at(viewer: ViewingCamera) -> NDArray[np.float64]:
@@ -66,10 +56,11 @@ def seen_at(viewer: ViewingCamera) -> NDArray[np.float64]:
 
 def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> None:
     viewer = scenes.camera(scenes.frame())
-    layers = laid(context(tmp_path), deep_photos(ramp()), viewer, resampling="nearest")
-    images, _ = joined(tmp_path, layers)
+    deep = scenes.inputs(photos=deep_photos(ramp()))
+    layers, _ = scenes.laid(DsmBackward, tmp_path, deep, resampling="nearest")
+    images = joined(tmp_path, layers)
     publish_orthoimages(images, tmp_path, "sha256:0")
-    publish_layers(layers, tmp_path, "sha256:0")
+    publish_layers(Layers(layers=layers), tmp_path, "sha256:0")
     (image,) = images.images
     shown = image.mask == OrthoMask.PAINTED
     u, v = np.floor(seen_at(viewer)[shown]).astype(int).T
@@ -88,8 +79,8 @@ def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> Non
 
 
 def test_forward_paints_the_photos_own_levels(tmp_path: Path) -> None:
-    inputs = scenes.inputs(DsmForward.In, photos=deep_photos(ramp()))
-    (layer,) = DsmForward().run(inputs, DsmForward.Params(), context(tmp_path)).layers.layers
+    deep = scenes.inputs(photos=deep_photos(ramp()))
+    ((layer,), _) = scenes.laid(DsmForward, tmp_path, deep)
     assert layer.rgb.dtype == np.uint16
     assert layer.filled is not None
     own = (layer.mask == LayerMask.PAINTED) & (layer.filled == 0)
@@ -101,17 +92,15 @@ def test_forward_paints_the_photos_own_levels(tmp_path: Path) -> None:
 
 
 def test_a_block_of_both_depths_has_sixteen_bits_and_says_so(tmp_path: Path) -> None:
-    where, ctx = scenes.frame(), context(tmp_path)
-    viewers = [scenes.camera(where, aside_m=aside) for aside in (-0.7, 0.7)]
+    viewers = [scenes.camera(scenes.frame(), aside_m=aside) for aside in (-0.7, 0.7)]
     plain = scenes.rendered(aside_m=0.7)
-    layers = laid(ctx, deep_photos(ramp(), plain), *viewers, resampling="nearest")
-    (tmp_path / "alone").mkdir()
-    alone = laid(context(tmp_path / "alone"), deep_photos(plain), viewers[1], resampling="nearest")
-    assert [layer.rgb.dtype for layer in layers.layers] == [np.uint16, np.uint16]
-    assert alone.layers[0].rgb.dtype == np.uint8
-    np.testing.assert_array_equal(layers.layers[1].rgb, sixteen_bits(alone.layers[0].rgb))
-    assert [(one.code, one.values["n"]) for one in ctx.diagnostics] == [
-        ("photos-of-mixed-depth", 1)
-    ]
-    images, _ = joined(tmp_path, layers, seams="graph-cut")
-    assert images.images[0].rgb.dtype == np.uint16
+    both = scenes.inputs(viewers=viewers, photos=deep_photos(ramp(), plain))
+    layers, ctx = scenes.laid(DsmBackward, tmp_path, both, resampling="nearest")
+    one = scenes.inputs(plain, viewers=viewers[1:])
+    ((alone,), _) = scenes.laid(DsmBackward, tmp_path, one, resampling="nearest")
+    assert [layer.rgb.dtype for layer in layers] == [np.uint16, np.uint16]
+    assert alone.rgb.dtype == np.uint8
+    np.testing.assert_array_equal(layers[1].rgb, sixteen_bits(alone.rgb))
+    found = [(told.code, told.values["n"]) for told in ctx.diagnostics]
+    assert found == [("photos-of-mixed-depth", 1)]
+    assert joined(tmp_path, layers, seams="graph-cut").images[0].rgb.dtype == np.uint16

@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pytest
@@ -23,36 +23,33 @@ from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Layer, LayerMask, PointCloud
+from orthoflow.products import Layer, LayerMask
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes
 from tests.long_loops import seeds
+from tests.method_runs import run
 from tests.raster_scenes import context
 
 
-def inputs(*, aside_m: float, width: int = 1000, cloud: PointCloud | None) -> DsmForward.In:
-    where = scenes.frame()
-    return DsmForward.In(
-        walls=scenes.walls(where),
-        photos=scenes.photos(scenes.rendered(aside_m=aside_m, width=width)),
-        cameras=scenes.cameras(scenes.camera(where, aside_m=aside_m, width=width)),
-        cloud=cloud,
-    )
+def given(*, aside_m: float, width: int = 1000, **known: Any) -> dict[str, Any]:
+    viewer = scenes.camera(scenes.frame(), aside_m=aside_m, width=width)
+    return scenes.inputs(scenes.rendered(aside_m=aside_m, width=width), viewers=[viewer], **known)
 
 
-def thrown(given: DsmForward.In, ctx: StepContext, **params: object) -> Layer:
-    (layer,) = DsmForward().run(given, DsmForward.Params.model_validate(params), ctx).layers.layers
-    return layer
+def thrown(of: dict[str, Any], folder: Path, **params: Any) -> tuple[Layer, StepContext]:
+    ((layer,), ctx) = scenes.laid(DsmForward, folder, of, **params)
+    return layer, ctx
 
 
-@lru_cache(maxsize=4)
-def layer_of(aside_m: float, width: int = 1000) -> Layer:
-    given = inputs(aside_m=aside_m, width=width, cloud=scenes.cloud(scenes.frame()))
-    return thrown(given, context(Path(mkdtemp())))
+@cache
+def layer_of(aside_m: float) -> Layer:
+    return thrown(given(aside_m=aside_m), Path(mkdtemp()))[0]
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.9])
-def test_every_pixel_paints_the_cell_that_it_shows(aside_m: float) -> None:
+def test_every_pixel_paints_the_cell_that_it_shows_and_nothing_that_is_hidden(
+    aside_m: float,
+) -> None:
     layer = layer_of(aside_m)
     assert layer.filled is not None
     taken = (layer.mask == LayerMask.PAINTED) & (layer.filled == 0)
@@ -61,14 +58,7 @@ def test_every_pixel_paints_the_cell_that_it_shows(aside_m: float) -> None:
     assert np.mean(layer.rgb[..., 2][taken] == expected[taken]) > 0.999
     # Half a cell, half of the quarter cell that a grey level is, and a hundredth of a pixel.
     assert np.quantile(np.abs(scenes.places_off(layer)[taken]), 0.999) <= 0.5 + 0.125 + 0.01
-
-
-@pytest.mark.parametrize("aside_m", [-0.7, 0.9])
-def test_what_is_hidden_stays_unpainted_and_nearly_all_else_is_painted(aside_m: float) -> None:
-    where, layer = scenes.frame(), layer_of(aside_m)
-    seen = scenes.truth(where, scenes.camera(where, aside_m=aside_m))
-    is_visible = np.isin(seen.surface, (scenes.BASE, scenes.RAISED)).reshape(scenes.SHAPE)
-    is_behind_board = (seen.surface == scenes.BOARD).reshape(scenes.SHAPE)
+    is_visible, is_behind_board = scenes.visible(scenes.camera(scenes.frame(), aside_m=aside_m))
     assert not (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).any()
     # A gap of one cell at a rim is filled.
     assert np.mean(layer.mask[is_behind_board] == LayerMask.OCCLUDED) > 0.99
@@ -78,11 +68,8 @@ def test_what_is_hidden_stays_unpainted_and_nearly_all_else_is_painted(aside_m: 
 
 
 def test_quality_and_reach_are_those_of_the_backward_projection(tmp_path: Path) -> None:
-    given, layer = inputs(aside_m=0.9, cloud=scenes.cloud(scenes.frame())), layer_of(0.9)
-    looked = DsmBackward.In(
-        walls=given.walls, photos=given.photos, cameras=given.cameras, cloud=given.cloud
-    )
-    (back,) = DsmBackward().run(looked, DsmBackward.Params(), context(tmp_path)).layers.layers
+    layer = layer_of(0.9)
+    ((back,), _) = scenes.laid(DsmBackward, tmp_path, given(aside_m=0.9))
     both = (layer.mask == LayerMask.PAINTED) & (back.mask == LayerMask.PAINTED)
     assert both.sum() > 0.9 * (back.mask == LayerMask.PAINTED).sum()
     np.testing.assert_allclose(layer.quality[both], back.quality[both], rtol=1e-3, atol=1e-4)
@@ -90,57 +77,40 @@ def test_quality_and_reach_are_those_of_the_backward_projection(tmp_path: Path) 
 
 
 def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -> None:
-    where = scenes.frame()
-    given = inputs(aside_m=0.0, width=300, cloud=None)
-    (tmp_path / "closed").mkdir()
-    ctx = context(tmp_path)
-    holed = thrown(given, ctx, fill_gap_cells=0)
+    coarse = given(aside_m=0.0, width=300, cloud=None)
+    holed, ctx = thrown(coarse, tmp_path, fill_gap_cells=0)
     assert "occluders-unknown" in [one.code for one in ctx.diagnostics]
     assert holed.filled is not None
     assert not holed.filled.any()
     # Pixels of 5 mm and more on cells of 4 mm.
-    gsd = 2.0 / (1.5 * 300)
-    painted = np.mean(holed.mask == LayerMask.PAINTED)
-    assert painted <= 1.1 * (where.gsd_m / gsd) ** 2
-    clock = count()
-    ctx = replace(context(tmp_path / "closed"), clock_s=lambda: float(next(clock)))
-    closed = thrown(given, ctx, fill_gap_cells=2)
+    gsd_m = 2.0 / (1.5 * 300)
+    assert np.mean(holed.mask == LayerMask.PAINTED) <= 1.1 * (scenes.GSD_M / gsd_m) ** 2
     # Of a clock that goes on when it is asked: once for all photos, and for each.
+    clock = count()
+    ctx = replace(context(tmp_path), clock_s=lambda: float(next(clock)))
+    (closed,) = run(DsmForward, ctx, coarse, fill_gap_cells=2).layers.layers
     told = {metric.name: metric.value for metric in ctx.metrics}
     assert (told["occluders_s"], told["painting_s"]) == (2.0, 1.0)
-    assert closed.filled is not None
     assert np.mean(closed.mask == LayerMask.PAINTED) > 0.97
     is_old = (closed.mask == LayerMask.PAINTED) & (closed.filled == 0)
     np.testing.assert_array_equal(is_old, holed.mask == LayerMask.PAINTED)
 
 
 def test_bands_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = inputs(aside_m=0.0, width=300, cloud=None)
-    layers = []
-    for n_cells in (1 << 24, 25 * scenes.SHAPE[1]):
-        monkeypatch.setattr(dsm_forward, "_BAND_CELLS", n_cells)
-        folder = tmp_path / str(n_cells)
-        folder.mkdir()
-        layers.append(thrown(given, context(folder), fill_gap_cells=3))
+    coarse = given(aside_m=0.0, width=300, cloud=None)
+    whole, _ = thrown(coarse, tmp_path, fill_gap_cells=3)
+    monkeypatch.setattr(dsm_forward, "_BAND_CELLS", 25 * scenes.SHAPE[1])
+    banded, _ = thrown(coarse, tmp_path, fill_gap_cells=3)
     for name in ("rgb", "mask", "quality", "filled"):
-        np.testing.assert_array_equal(*(getattr(layer, name) for layer in layers), err_msg=name)
+        np.testing.assert_array_equal(getattr(banded, name), getattr(whole, name), err_msg=name)
 
 
 def test_a_camera_behind_the_wall_is_refused(tmp_path: Path) -> None:
     where = scenes.frame()
-    given = inputs(aside_m=0.0, width=300, cloud=None)
-    behind = scenes.camera(where, width=300)
-    flipped = type(behind)(
-        **{
-            **{name: getattr(behind, name) for name in behind.__dataclass_fields__},
-            "translation": behind.translation + behind.rotation @ (4.0 * where.normal_world),
-        }
-    )
-    moved = DsmForward.In(
-        walls=given.walls, photos=given.photos, cameras=scenes.cameras(flipped), cloud=None
-    )
+    viewer = scenes.camera(where)
+    moved = viewer.translation + viewer.rotation @ (4.0 * where.normal_world)
     with pytest.raises(MethodError, match="no oriented photo sees a wall"):
-        thrown(moved, context(tmp_path))
+        thrown(scenes.inputs(viewers=[replace(viewer, translation=moved)]), tmp_path)
 
 
 TOLERANCE_M: Final = 0.008
