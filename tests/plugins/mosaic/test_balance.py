@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import balance as balancing
-from orthoflow_plugins.mosaic import balance as module
 from orthoflow_plugins.mosaic.balance import (
     Balance,
     Exposures,
@@ -24,9 +23,11 @@ from scipy.ndimage import map_coordinates
 
 from orthoflow.geometry.cameras import looking_at
 from orthoflow.geometry.levels import light_of_levels, lit, lit_shares
-from orthoflow.products import Camera, Intrinsics, Layer, LayerMask, Layers, Orthoimages, Walls
+from orthoflow.products import Camera, Layer, LayerMask, Layers, Orthoimages, Walls
+from orthoflow.testing import photographed as ms
 from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
+from tests.method_runs import run
 
 SHAPE = (120, 240)
 
@@ -40,10 +41,14 @@ def texture(seed: int = 5) -> NDArray[np.float64]:
     return np.asarray(0.12 + 0.25 * coarse + 0.13 * rng.uniform(0.0, 1.0, (*SHAPE, 3)))
 
 
+def levels_of(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares of the highest level, as IEC 61966-2-1 has it."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+
+
 def layer(name: str, columns: slice, light: NDArray[np.float64], quality: float) -> Layer:
     """A layer of 16 bits that paints some columns."""
-    level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    rgb = np.rint(65535.0 * level).astype(np.uint16)
+    rgb = np.rint(65535.0 * levels_of(light)).astype(np.uint16)
     return inspect_scenes.painted_layer(name, columns, rgb, quality)
 
 
@@ -59,12 +64,11 @@ def two_photos(
 
 
 def mosaic(
-    folder: Path, layers: tuple[Layer, ...], walls: Walls | None = None, **params: object
+    folder: Path, layers: tuple[Layer, ...], walls: Walls | None = None
 ) -> tuple[Orthoimages, dict[str, float]]:
     ctx = scenes.context(folder)
-    chosen = MosaicSeams.Params.model_validate({"island_cells_min": 1} | params)
-    out = MosaicSeams().run(MosaicSeams.In(layers=Layers(layers=layers), walls=walls), chosen, ctx)
-    return out.orthoimages, {metric.name: metric.value for metric in ctx.metrics}
+    inputs = {"layers": Layers(layers=layers), "walls": walls}
+    return run(MosaicSeams, ctx, inputs, island_cells_min=1).orthoimages, scenes.numbers(ctx)
 
 
 def factors(images: Orthoimages, layers: tuple[Layer, ...]) -> NDArray[np.float64]:
@@ -75,15 +79,18 @@ def factors(images: Orthoimages, layers: tuple[Layer, ...]) -> NDArray[np.float6
     return np.log(light[image.rgb]).astype(np.float64) - np.log(light[own])
 
 
-def test_steps_along_seams_vanish_and_sixteen_bits_stay(tmp_path: Path) -> None:
+def test_steps_along_seams_vanish_and_colours_are_those_of_one_exposure(tmp_path: Path) -> None:
     columns = np.linspace(-1.0, 1.0, SHAPE[1])[None, :, None]
-    layers = two_photos(1.3 * (1.0 - 0.15 * columns**2))
-    images, metrics = mosaic(tmp_path, layers)
+    images, metrics = mosaic(tmp_path, two_photos(1.3 * (1.0 - 0.15 * columns**2)))
     assert metrics["seam_step_mean_delta_e"] < 0.1 * metrics["seam_step_untouched_delta_e"]
     assert images.images[0].rgb.dtype == np.uint16
     gains = images.details["gains"]
     assert isinstance(gains, dict)
     assert set(gains["wall 0"]) == {"left", "right"}
+    images, _ = mosaic(tmp_path, two_photos(1.3 + 0.05 * columns))
+    ratio = np.log(light_of_levels(65535)[images.images[0].rgb] / texture()).mean(axis=2)
+    # What no overlap shows of a field, a few hundredths at the far rim, stays as it is.
+    assert np.abs(ratio - np.median(ratio)).max() < 0.04
 
 
 def test_detail_is_of_one_photo_everywhere(tmp_path: Path) -> None:
@@ -100,28 +107,23 @@ def test_detail_is_of_one_photo_everywhere(tmp_path: Path) -> None:
         assert steps[~np.broadcast_to(is_seam, steps.shape)].max() < 0.01
 
 
-def test_colours_are_those_of_one_exposure(tmp_path: Path) -> None:
-    columns = np.linspace(-1.0, 1.0, SHAPE[1])[None, :, None]
-    layers = two_photos(1.3 + 0.05 * columns)
-    images, _ = mosaic(tmp_path, layers)
-    light = light_of_levels(65535)[images.images[0].rgb]
-    ratio = np.log(light / texture()).mean(axis=2)
-    # What no overlap shows of a field, a few hundredths at the far rim, stays as it is.
-    assert np.abs(ratio - np.median(ratio)).max() < 0.04
-
-
 def test_photos_that_agree_stay_untouched(tmp_path: Path) -> None:
     layers = two_photos(1.005)
     images, metrics = mosaic(tmp_path, layers)
     assert not factors(images, layers).any()
     assert "gain_max" not in metrics
     assert images.details == {}
+    # One layer needs no balance, and lenses count where fields do.
+    pair, cameras = two_photos(0.5), [photographed(900.0)] * 2
+    assert balance_of(pair[:1], None, [None], is_local=True) is None
+    for is_local in (False, True):
+        found = balance_of(pair, None, cameras, is_local=is_local)
+        assert found is not None
+        assert len(found.exposures.lenses) == is_local
 
 
 def surface(depth_m: NDArray[np.float32]) -> Walls:
-    frame = inspect_scenes.frame(shape=SHAPE)
-    wall = samples.wall(frame, depth_m=depth_m, mask=np.ones(SHAPE, dtype=np.uint8))
-    return replace(inspect_scenes.walls(), walls=(wall,))
+    return samples.walls(samples.wall(inspect_scenes.frame(shape=SHAPE), depth_m=depth_m))
 
 
 def test_what_parallax_separates_is_not_taken_for_light(tmp_path: Path) -> None:
@@ -147,23 +149,27 @@ def radial(shape: tuple[int, int], at: tuple[float, float]) -> NDArray[np.float3
     return (np.hypot(rows - at[0], columns - at[1]) / 40.0).astype(np.float32)
 
 
+def nothing_added(n_layers: int) -> Exposures:
+    return Exposures(
+        exposures=np.zeros((n_layers, 3)),
+        lenses=np.zeros((0, 2)),
+        nodes=np.zeros((n_layers, 4, 4, 3)),
+    )
+
+
 def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> None:
     rng = np.random.default_rng(2)
     wall = rng.normal(-1.5, 0.4, (40, 100, 3))
     true = np.array([0.2, -0.3, 0.1])
-    lights, radii = [], []
-    for k, first in enumerate((0, 25, 50)):
-        seen = radial((40, 50), (19.5, 24.5))
-        bent = 0.1 * seen.astype(np.float64) ** 2 + 0.3 * seen.astype(np.float64) ** 4
-        logs = wall[:, first : first + 50] + true[k] - bent[..., None]
+    seen = radial((40, 50), (19.5, 24.5))
+    bent = 0.1 * seen.astype(np.float64) ** 2 + 0.3 * seen.astype(np.float64) ** 4
+    lights, radii = [], [Radii(values=seen, lens=0)] * 3
+    for exposure, first in zip(true, (0, 25, 50), strict=True):
+        columns = slice(first, first + 50)
+        logs = wall[:, columns] + exposure - bent[..., None]
         logs += rng.normal(0.0, 0.01, logs.shape)
         logs[rng.random(logs.shape[:2]) < 0.05] += 0.8
-        lights.append(
-            BlockLight(
-                box=(slice(0, 40), slice(first, first + 50)), log_light=logs.astype(np.float32)
-            )
-        )
-        radii.append(Radii(values=seen, lens=0))
+        lights.append(BlockLight(box=(slice(0, 40), columns), log_light=logs.astype(np.float32)))
     found = estimate(lights, radii)
     apart = found.exposures.mean(axis=1) + true
     np.testing.assert_allclose(apart, apart.mean(), atol=0.02)
@@ -171,8 +177,8 @@ def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> No
     loss = found.lenses[0, 0] * at**2 + found.lenses[0, 1] * at**4
     np.testing.assert_allclose(loss, 0.1 * at**2 + 0.3 * at**4, atol=0.02)
     balanced = [
-        one.log_light + found.logs(k, one, seen)
-        for k, (one, seen) in enumerate(zip(lights, radii, strict=True))
+        one.log_light + found.logs(k, one, radius)
+        for k, (one, radius) in enumerate(zip(lights, radii, strict=True))
     ]
     for i, j, shared in pairs(lights):
         one, other = (balanced[k][inside(shared, lights[k].box)] for k in (i, j))
@@ -202,10 +208,7 @@ def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slic
     shape = tuple(part.stop - part.start for part in box)
     logs = np.random.default_rng(1).normal(size=(*shape, 3)).astype(np.float32)
     light = BlockLight(box=box, log_light=np.zeros((*shape, 3), np.float32))
-    nothing = Exposures(
-        exposures=np.zeros((1, 3)), lenses=np.zeros((0, 2)), nodes=np.zeros((1, 4, 4, 3))
-    )
-    balance = Balance(blocks=blocks, lights=(light,), logs=(logs,), exposures=nothing)
+    balance = Balance(blocks=blocks, lights=(light,), logs=(logs,), exposures=nothing_added(1))
     rows, columns = (grid.ravel() for grid in np.indices((48, 70)))
     found = balance.log_gains(0, rows, columns)
     middles = [centres[part] for centres, part in zip(blocks.centres(), box, strict=True)]
@@ -232,15 +235,6 @@ def test_photos_differ_where_either_has_to_change_by_two_percent(
     if found is not None:
         apart = found.exposures.exposures[0] - found.exposures.exposures[1]
         np.testing.assert_allclose(apart, np.log(factor), atol=2e-3)
-
-
-def test_one_layer_needs_no_balance_and_lenses_count_where_fields_do() -> None:
-    pair, cameras = two_photos(0.5), [photographed(900.0)] * 2
-    assert balance_of(pair[:1], None, [None], is_local=True) is None
-    for is_local in (False, True):
-        found = balance_of(pair, None, cameras, is_local=is_local)
-        assert found is not None
-        assert len(found.exposures.lenses) == is_local
 
 
 def test_near_a_seam_layers_go_over_to_each_other_unless_depths_leap_everywhere() -> None:
@@ -273,9 +267,7 @@ def test_layers_meet_at_a_seam_by_what_each_paints_about_it(apart: float) -> Non
         blocks=Blocks.over((160, 240), 10),
         lights=tuple(BlockLight(box=box, log_light=one) for one in logs),
         logs=(np.zeros((*shape, 3), np.float32),) * 2,
-        exposures=Exposures(
-            exposures=np.zeros((2, 3)), lenses=np.zeros((0, 2)), nodes=np.zeros((2, 4, 4, 3))
-        ),
+        exposures=nothing_added(2),
     )
     source = np.repeat([[0, 1]], 120, axis=1).repeat(160, axis=0).astype(np.int16)
     one, other = with_seams(found, source, None, feather_cells=40).logs
@@ -305,25 +297,16 @@ def photographed(fx: float, width: int = 400, height: int = 300) -> Camera:
     frame = inspect_scenes.frame(shape=SHAPE)
     middle = frame.world_from_wall(np.array([[120.0, 60.0]]))[0]
     centre = middle + 3.0 * frame.normal_world
-    rotation = looking_at(centre, middle, np.array([0.0, 0.0, 1.0]))
-    lens = Intrinsics(
-        width=width, height=height, fx=fx, fy=fx, cx=0.5 * width - 7.0, cy=0.5 * height + 3.0
-    )
-    return Camera(
-        photo="a.jpg",
-        status="ok",
-        intrinsics=lens,
-        rotation_camera_from_world=rotation,
-        translation_camera_from_world=-rotation @ centre,
-    )
+    cx, cy = 0.5 * width - 7.0, 0.5 * height + 3.0
+    size = {"width": width, "height": height}
+    rotation = looking_at(centre, middle, samples.UP)
+    return ms.oriented(samples.camera(rotation, centre, fx=fx, fy=fx, cx=cx, cy=cy, **size))
 
 
 def test_photos_of_one_lens_lose_light_alike_however_it_was_adjusted() -> None:
     lights = [block_light(one, Blocks.over(SHAPE, 8)) for one in two_photos(1.0)] * 3
-    cameras = [
-        *(photographed(1000.0), photographed(1010.0), photographed(1200.0)),
-        *(photographed(1000.0, width=800), None, photographed(1000.0)),
-    ]
+    cameras = [photographed(fx) for fx in (1000.0, 1010.0, 1200.0)]
+    cameras += [photographed(1000.0, width=800), None, cameras[0]]
     frame = inspect_scenes.frame(shape=SHAPE)
     found = balancing._radii(frame, None, cameras, Blocks.over(SHAPE, 8), lights)
     lenses = [None if one is None else one.lens for one in found]
@@ -339,7 +322,7 @@ def test_radii_are_told_from_the_middle_of_the_photo(*, has_depths: bool) -> Non
     camera = photographed(900.0)
     depth_m = np.full(SHAPE, 0.4, dtype=np.float32)
     depth_m[:40] = np.nan
-    wall = samples.wall(frame, depth_m=depth_m, mask=np.ones(SHAPE, dtype=np.uint8))
+    wall = samples.wall(frame, depth_m=depth_m)
     (found,) = balancing._radii(frame, wall if has_depths else None, [camera], blocks, [light])
     assert found is not None
     down, right = blocks.centres()
@@ -360,44 +343,28 @@ def light(rows: slice, columns: slice, seed: int, unknown: float = 0.0) -> Block
     return BlockLight(box=(rows, columns), log_light=logs)
 
 
-def radii(of: BlockLight, seed: int, lens: int) -> Radii:
-    values = np.random.default_rng(seed).uniform(0.0, 1.0, of.log_light.shape[:2])
-    return Radii(values=values.astype(np.float32), lens=lens)
-
-
-LIGHTS = [
-    light(slice(0, 9), slice(0, 12), 1, 0.2),
-    light(slice(3, 14), slice(5, 20), 2, 0.2),
-    light(slice(2, 7), slice(8, 30), 3),
-    # Beside all others.
-    light(slice(40, 44), slice(0, 4), 4),
-]
-RADII: list[Radii | None] = [radii(LIGHTS[0], 5, 1), None, radii(LIGHTS[2], 6, 0), None]
-
-
-def some_exposures(seed: int) -> Exposures:
-    rng = np.random.default_rng(seed)
-    return Exposures(
-        exposures=rng.normal(size=(4, 3)),
+@pytest.mark.parametrize("lens", [1, None])
+def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(lens: int | None) -> None:
+    rng = np.random.default_rng(7)
+    given = light(slice(3, 14), slice(5, 20), 2, 0.2)
+    rows, columns = given.log_light.shape[:2]
+    radii = None
+    if lens is not None:
+        radii = Radii(values=rng.uniform(0.0, 1.0, (rows, columns)).astype(np.float32), lens=lens)
+    found = Exposures(
+        exposures=rng.normal(size=(2, 3)),
         lenses=rng.normal(size=(2, 2)),
-        nodes=rng.normal(size=(4, 4, 4, 3)),
+        nodes=rng.normal(size=(2, 4, 4, 3)),
     )
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(index: int) -> None:
-    found = some_exposures(7)
-    logs = found.logs(index, LIGHTS[index], RADII[index])
-    rows, columns = LIGHTS[index].log_light.shape[:2]
+    logs = found.logs(1, given, radii)
     places = np.linspace(0.0, 1.0, 4)
     for row, column in ((0, 0), (4, 7), (rows - 1, columns - 1)):
         down, across = (row + 0.5) / rows, (column + 0.5) / columns
         for channel in range(3):
-            sides = [np.interp(across, places, side) for side in found.nodes[index, :, :, channel]]
-            wanted = found.exposures[index, channel] + np.interp(down, places, sides)
-            seen = RADII[index]
-            if seen is not None:
-                square = float(seen.values[row, column]) ** 2
+            sides = [np.interp(across, places, side) for side in found.nodes[1, :, :, channel]]
+            wanted = found.exposures[1, channel] + np.interp(down, places, sides)
+            if radii is not None:
+                square = float(radii.values[row, column]) ** 2
                 wanted += found.lenses[1] @ [square, square**2]
             assert logs[row, column, channel] == pytest.approx(wanted, abs=1e-9)
 
@@ -406,7 +373,7 @@ def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(index: int) -> No
 def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_taken: int) -> None:
     one = light(slice(0, 1), slice(0, n_shared), 1)
     other = light(slice(0, 1), slice(0, n_shared + 5), 2)
-    overlaps = module._overlaps([one, other])
+    overlaps = balancing._overlaps([one, other])
     assert sum(len(item.apart) for item in overlaps) == n_taken
     if n_taken:
         columns = overlaps[0].places[0][:, 1]
@@ -415,24 +382,15 @@ def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_tak
         assert set(np.diff(columns)) <= {n_shared // n_taken, -(-n_shared // n_taken)}
 
 
-def two(apart: NDArray[np.float64], n_columns: int = 40) -> list[BlockLight]:
-    """Two layers over the same blocks; the second is brighter by so much, in logarithms."""
-    box = (slice(0, 10), slice(0, n_columns))
-    logs = np.random.default_rng(3).normal(-1.0, 0.4, (10, n_columns, 3))
-    pair = (logs, logs + apart)
-    return [BlockLight(box=box, log_light=one.astype(np.float32)) for one in pair]
-
-
 def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
     # From left to right by a tenth, once as much on either side of the middle.
-    slope = np.linspace(-0.05, 0.05, 40)[None, :, None]
-    lights = two(np.broadcast_to(slope, (10, 40, 3)))
-    found = estimate(lights, [None, None])
-    added = found.logs(0, lights[0], None) - found.logs(1, lights[1], None)
-    np.testing.assert_allclose(added, np.broadcast_to(slope, added.shape), atol=0.015)
-    flat = estimate(lights, [None, None], is_local=False)
-    left = flat.logs(0, lights[0], None) - flat.logs(1, lights[1], None)
-    assert np.abs(left).max() < 0.01
+    slope = np.broadcast_to(np.linspace(-0.05, 0.05, 40)[None, :, None], (10, 40, 3))
+    first = light(slice(0, 10), slice(0, 40), 3)
+    lights = [first, replace(first, log_light=first.log_light + slope.astype(np.float32))]
+    for is_local, wanted, atol in ((True, slope, 0.015), (False, 0.0 * slope, 0.01)):
+        found = estimate(lights, [None, None], is_local=is_local)
+        added = found.logs(0, lights[0], None) - found.logs(1, lights[1], None)
+        np.testing.assert_allclose(added, wanted, atol=atol)
 
 
 SMALL_SHAPE = (40, 60)
@@ -440,13 +398,8 @@ BLOCKS = Blocks.over(SMALL_SHAPE, 10)
 
 
 def light_of(levels: NDArray[np.generic], highest: int) -> NDArray[np.float64]:
-    """As IEC 61966-2-1 has it, cell by cell."""
     share = np.asarray(levels, dtype=np.float64) / highest
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-
-
-def lit_layer(rgb: NDArray[np.generic], mask: NDArray[np.uint8] | None = None) -> Layer:
-    return samples.layer(SMALL_SHAPE if mask is None else mask, rgb=rgb)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -458,13 +411,11 @@ def test_light_is_multiplied_and_clipped(dtype: type[np.unsignedinteger], gain: 
     logs = np.full((500, 3), np.log(gain), np.float32)
     found = lit(colours, logs)
     assert found.dtype == dtype
-    light = np.clip(gain * light_of(colours, highest), 0.0, 1.0)
-    level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    level = levels_of(np.clip(gain * light_of(colours, highest), 0.0, 1.0))
     # Rounded to whole levels, of 16 bits to about one.
     limit = 0.51 if dtype is np.uint8 else 1.5
     assert np.abs(found - highest * level).max() <= limit
-    shares = lit_shares(colours / highest, logs)
-    np.testing.assert_allclose(shares, level, atol=2e-5)
+    np.testing.assert_allclose(lit_shares(colours / highest, logs), level, atol=2e-5)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -478,7 +429,7 @@ def test_blocks_have_the_mean_light_of_what_a_layer_paints_wholly(
     # Nothing in the outermost blocks, and a cell is missing in one within.
     mask[:10] = mask[:, 50:] = LayerMask.OCCLUDED
     mask[25, 15] = LayerMask.NO_SURFACE
-    found = block_light(lit_layer(rgb, mask), BLOCKS)
+    found = block_light(samples.layer(mask, rgb=rgb), BLOCKS)
     assert found.box == (slice(1, 4), slice(0, 5))
     for row, column in np.ndindex(3, 5):
         part = np.s_[10 * row + 10 : 10 * row + 20, 10 * column : 10 * column + 10]
@@ -500,9 +451,8 @@ def test_black_and_white_say_nothing(
     rgb = np.full((*SMALL_SHAPE, 3), 100, np.uint16 if scale > 1 else np.uint8) * scale
     # One channel is enough.
     rgb[..., channel] = level * scale
-    found = block_light(lit_layer(rgb), BLOCKS)
-    assert found.is_known.all() == is_said
-    assert found.is_known.any() == is_said
+    found = block_light(samples.layer(SMALL_SHAPE, rgb=rgb), BLOCKS)
+    assert found.is_known.all() == found.is_known.any() == is_said
 
 
 @pytest.mark.parametrize(("n_white", "is_said"), [(5, True), (6, False)])
@@ -510,22 +460,20 @@ def test_a_twentieth_of_a_block_may_be_white(n_white: int, *, is_said: bool) -> 
     rgb = np.full((*SMALL_SHAPE, 3), 100, np.uint8)
     # Of the hundred cells of the first block.
     rgb[0, :n_white] = 255
-    found = block_light(lit_layer(rgb), BLOCKS)
+    found = block_light(samples.layer(SMALL_SHAPE, rgb=rgb), BLOCKS)
     assert found.is_known[0, 0] == is_said
     assert found.is_known.sum() == 24 - (not is_said)
 
 
-# --- boxes ---
-
-
-def box(*sides: int) -> tuple[slice, slice]:
-    return slice(sides[0], sides[1]), slice(sides[2], sides[3])
-
-
 def test_boxes_share_what_lies_in_both() -> None:
-    assert common(box(0, 5, 2, 9), box(3, 8, 0, 4)) == box(3, 5, 2, 4)
-    assert common(box(0, 5, 2, 9), box(1, 2, 3, 4)) == box(1, 2, 3, 4)
-    # Beside each other, or in a corner, they share nothing.
-    assert common(box(0, 5, 2, 9), box(5, 8, 2, 9)) is None
-    assert common(box(0, 5, 2, 9), box(0, 5, 9, 12)) is None
+    def box(*sides: int) -> tuple[slice, slice]:
+        return slice(sides[0], sides[1]), slice(sides[2], sides[3])
+
+    for other, shared in (
+        ((3, 8, 0, 4), box(3, 5, 2, 4)),
+        ((1, 2, 3, 4), box(1, 2, 3, 4)),
+        # Beside each other, or in a corner, they share nothing.
+        *(((5, 8, 2, 9), None), ((0, 5, 9, 12), None)),
+    ):
+        assert common(box(0, 5, 2, 9), box(*other)) == shared
     assert inside(box(3, 5, 4, 6), box(1, 9, 4, 9)) == box(2, 4, 0, 2)
