@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,19 +15,20 @@ from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.geometry.bands import in_memory
 from orthoflow.products import Layer, LayerMask, Layers, OrthoMask, Wall, is_shown
-from orthoflow.sdk import StepContext
 from tests import samples
+from tests.method_runs import run
+from tests.raster_scenes import context, numbers
 
 SHAPE, GSD_M = (240, 400), 0.01
 FRAME = samples.facing_south(GSD_M, SHAPE[1], SHAPE[0])
 # A person of 0.5 x 1.7 m.
 PERSON = (slice(60, 230), slice(180, 230))
+IS_PERSON = np.zeros(SHAPE, np.bool_)
+IS_PERSON[PERSON] = True
 
 
 def painted_wall(seed: int = 3) -> NDArray[np.float64]:
     """Levels (rows, cols, 3) of a wall with stains and joints."""
-    import cv2
-
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(90.0, 200.0, (12, 20, 3))
     wall = cv2.resize(coarse, (SHAPE[1], SHAPE[0]), interpolation=cv2.INTER_CUBIC)
@@ -66,6 +69,9 @@ def scanned(levels: NDArray[np.float64] | None, *, intensity: bool = False) -> W
     return replace(wall, rgb=rgb, rgb_mask=np.ones(SHAPE, np.uint8))
 
 
+found = partial(consensus, allocate=in_memory)
+
+
 def outvoted(before: Layer, after: Layer) -> NDArray[np.bool_]:
     return (before.mask == LayerMask.PAINTED) & (after.mask != LayerMask.PAINTED)
 
@@ -77,24 +83,22 @@ def test_a_passer_by_yields_to_what_others_show(witness: str, place: int) -> Non
     photos = [photo(f"{k}.jpg", levels, seed=k) for k in range(3 if "photo" in witness else 2)]
     photos[place] = photo("passed.jpg", with_person(levels), seed=7)
     wall = scanned(levels if "photo" not in witness else None, intensity=witness == "laser")
-    kept, n_outvoted, _ = consensus(photos, wall, allocate=in_memory)
+    kept, n_outvoted, _ = found(photos, wall)
     for k, (before, after) in enumerate(zip(photos, kept, strict=True)):
         lost = outvoted(before, after)
         if k != place:
             assert not lost.any()
             continue
-        person = np.zeros(SHAPE, np.bool_)
-        person[PERSON] = True
         # At most a cell in a thousand still shows him, and little beside him is lost.
-        assert np.count_nonzero(person & ~lost) <= 1e-3 * person.size
-        assert np.count_nonzero(lost & ~person) < 0.5 * np.count_nonzero(person)
+        assert np.count_nonzero(IS_PERSON & ~lost) <= 1e-3 * IS_PERSON.size
+        assert np.count_nonzero(lost & ~IS_PERSON) < 0.5 * np.count_nonzero(IS_PERSON)
     assert n_outvoted == np.count_nonzero(outvoted(photos[place], kept[place]))
 
 
 def test_two_photos_alone_cannot_say_who_is_right() -> None:
     levels = painted_wall()
     photos = [photo("a.jpg", levels, seed=1), photo("b.jpg", with_person(levels), seed=2)]
-    kept, n_outvoted, _ = consensus(photos, None, allocate=in_memory)
+    kept, n_outvoted, _ = found(photos, None)
     assert n_outvoted == 0
     assert all(one is other for one, other in zip(photos, kept, strict=True))
 
@@ -105,28 +109,23 @@ def test_what_one_photo_alone_shows_stays_in_a_class_of_its_own(tmp_path: Path) 
         photo("a.jpg", with_person(levels), seed=1),
         photo("b.jpg", levels, seed=2, columns=slice(0, 150)),
     ]
-    _, n_outvoted, contradicted = consensus(photos, scanned(levels), allocate=in_memory)
+    _, n_outvoted, contradicted = found(photos, scanned(levels))
     assert n_outvoted == 0
-    person = np.zeros(SHAPE, np.bool_)
-    person[PERSON] = True
     assert contradicted is not None
     # Regions are of whole blocks, so its border may be missing.
-    assert contradicted[person].mean() > 0.85
-    assert np.count_nonzero(contradicted & ~person) < 0.5 * np.count_nonzero(person)
+    assert contradicted[IS_PERSON].mean() > 0.85
+    assert np.count_nonzero(contradicted & ~IS_PERSON) < 0.5 * np.count_nonzero(IS_PERSON)
     # In the mask of the orthoimage they are a class of their own, and its share is reported.
-    inputs = MosaicSeams.In(
-        layers=Layers(layers=tuple(photos)), walls=samples.walls(scanned(levels))
-    )
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    (image,) = MosaicSeams().run(inputs, MosaicSeams.Params(), ctx).orthoimages.images
+    inputs = {"layers": Layers(layers=tuple(photos)), "walls": samples.walls(scanned(levels))}
+    ctx = context(tmp_path)
+    (image,) = run(MosaicSeams, ctx, inputs).orthoimages.images
     is_alone = image.mask == OrthoMask.CONTRADICTED
     np.testing.assert_array_equal(is_alone, contradicted)
     assert (image.source[is_alone] == 0).all()
     assert is_shown(image.mask).all()
-    metrics = {metric.name: metric.value for metric in ctx.metrics}
-    assert metrics["contradicted_share"] == pytest.approx(is_alone.mean())
+    assert numbers(ctx)["contradicted_share"] == pytest.approx(is_alone.mean())
     clean = [photo("a.jpg", levels, seed=1), photos[1]]
-    *_, nothing = consensus(clean, scanned(levels), allocate=in_memory)
+    *_, nothing = found(clean, scanned(levels))
     assert nothing is not None
     assert not nothing.any()
 
@@ -139,7 +138,7 @@ def test_light_that_changes_smoothly_is_no_contradiction() -> None:
         photo("b.jpg", levels * across[:, ::-1], seed=2),
         photo("c.jpg", 0.8 * levels, seed=3),
     ]
-    _, n_outvoted, contradicted = consensus(photos, scanned(levels), allocate=in_memory)
+    _, n_outvoted, contradicted = found(photos, scanned(levels))
     assert (n_outvoted, contradicted is None or contradicted.any()) == (0, False)
 
 
@@ -147,4 +146,4 @@ def test_a_scan_that_sees_other_patterns_bears_no_witness() -> None:
     levels = painted_wall()
     photos = [photo("a.jpg", levels, seed=1), photo("b.jpg", with_person(levels), seed=2)]
     other = scanned(painted_wall(seed=99)[::-1, ::-1], intensity=True)
-    assert consensus(photos, other, allocate=in_memory)[1] == 0
+    assert found(photos, other)[1] == 0
