@@ -16,6 +16,7 @@ from orthoflow_plugins.orient.photos import pose_by_hand
 from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.pose import Estimate, Start
 from orthoflow_plugins.read.cameras import ReadCameras
+from scipy import stats
 
 from orthoflow.errors import MethodError
 from orthoflow.files.publishing import publish_cameras
@@ -168,41 +169,33 @@ def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
     assert error_share(cameras.cameras[0]) < 3.0
 
 
-# --- which of them fit together ---
-
-
-def by(points: NDArray[np.float64]) -> SeenPoints:
-    return SeenPoints(
-        pixels_photo=CAMERA.project(points)[:, :2],
+def by_hand(
+    points: NDArray[np.float64], noise_px: float = 0.0, **sigmas: NDArray[np.float64]
+) -> tuple[Estimate, Start] | str:
+    """The pose by exact ties to points, but for noise."""
+    n = len(points)
+    noise = noise_px * np.random.default_rng(3).normal(size=(n, 2))
+    seen = SeenPoints(
+        pixels_photo=CAMERA.project(points)[:, :2] + noise,
         points_world=points,
-        sigma_px=np.full(len(points), SIGMA_PX),
-        sigma_m=np.full(len(points), 1e-4),
+        **{"sigma_px": np.full(n, SIGMA_PX), "sigma_m": np.full(n, 1e-4), **sigmas},
     )
-
-
-def by_hand(seen: SeenPoints) -> tuple[Estimate, Start] | str:
-    everyone = np.ones(len(seen), dtype=np.bool_)
-    return pose_by_hand(tp.tied(tp.photo(CAMERA), seen, by_hand=everyone))
+    return pose_by_hand(tp.tied(tp.photo(CAMERA), seen, by_hand=np.ones(n, dtype=np.bool_)))
 
 
 @pytest.mark.parametrize(("chance", "fits"), [(0.0012, True), (0.0008, False)])
 def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
     chance: float, fits: bool
 ) -> None:
-    from scipy import stats
-
-    rng = np.random.default_rng(2)
     # Of six none may be left out.
-    points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (6, 3))
-    seen = replace(by(points), sigma_m=np.zeros(6))
-    seen.pixels_photo[:] += rng.normal(size=(6, 2))
-    found = by_hand(replace(seen, sigma_px=np.full(6, 3.0)))
+    points = np.random.default_rng(2).uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (6, 3))
+    exact = {"sigma_m": np.zeros(6)}
+    found = by_hand(points, 1.0, sigma_px=np.full(6, 3.0), **exact)
     assert not isinstance(found, str)
     # In pixels, as none of the residuals is so small by luck that it is taken as larger.
     squares = float((found[0].fit.residuals_px ** 2).sum())
     sigma_px = np.full(6, np.sqrt(squares / stats.chi2.isf(chance, 6)))
-    found = by_hand(replace(seen, sigma_px=sigma_px))
-    assert isinstance(found, str) != fits
+    assert isinstance(by_hand(points, 1.0, sigma_px=sigma_px, **exact), str) != fits
 
 
 @pytest.mark.parametrize("relief_m", [0.0, 0.0004])
@@ -215,7 +208,7 @@ def test_a_small_plate_seen_from_afar_may_be_turned_either_way(relief_m: float) 
     along = across * np.cos(turn) - relief * np.sin(turn)
     away = across * np.sin(turn) + relief * np.cos(turn)
     points = np.array([1.3, 0.0, 1.1]) + np.stack([along, away, up], axis=1)
-    reason = by_hand(by(points))
+    reason = by_hand(points)
     assert isinstance(reason, str)
     assert reason.startswith("two different poses")
 

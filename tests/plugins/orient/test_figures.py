@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import report
+from orthoflow_plugins.orient.gates import KnownWall
 from orthoflow_plugins.orient.report import (
     Oriented,
     draw_positions,
@@ -21,6 +22,7 @@ from orthoflow_plugins.orient.report import (
 from orthoflow.files.drawing import COLUMN_INCHES
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Camera, Photo, TieRole
+from tests import samples
 from tests.tied_photos import context
 
 
@@ -66,41 +68,38 @@ def test_ties_are_marked_on_a_dimmed_photo_in_the_colour_of_their_role(
 def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
     tmp_path: Path,
 ) -> None:
-    ctx = context(tmp_path)
-    image = np.zeros((4, 6, 3), dtype=np.uint8)
-    nothing = np.empty((0, 2)), np.empty(0, dtype=np.uint8)
-    for name in ("a.jpg", "a.tif", "noending"):
-        draw_ties(ctx, photo_of(image, name), *nothing, "ok")
-    assert [figure.name for figure in ctx.figures] == ["ties_a", "ties_a-1", "ties_noending"]
-    for k in range(30):
-        draw_ties(ctx, photo_of(image, f"{k}.jpg"), *nothing, "ok")
-    assert len(ctx.figures) == 24
+    ctx, image = context(tmp_path), np.zeros((4, 6, 3), dtype=np.uint8)
+    names = ["a.jpg", "a.tif", "noending", *(f"{k}.jpg" for k in range(30))]
+    for name in names:
+        draw_ties(ctx, photo_of(image, name), np.empty((0, 2)), np.empty(0, np.uint8), "ok")
+    found = [figure.name for figure in ctx.figures]
+    assert found[:3] == ["ties_a", "ties_a-1", "ties_noending"]
+    assert len(found) == 24
 
 
 # --- predicted errors ---
 
 
-def wall_of(left: float, right: float, *, number: int = 0) -> Any:
+def wall_of(left: float, right: float, *, number: int = 0) -> KnownWall:
     """A wall of two metres in the plane y = 0."""
     corners = [[left, 0.0, 2.0], [left, 0.0, 0.0], [right, 0.0, 0.0], [right, 0.0, 2.0]]
-    return SimpleNamespace(
+    return KnownWall(
         index=number,
         number=number,
         name=f"wall {number}",
         corners_world=np.array(corners),
-        normal=np.array([0.0, -1.0, 0.0]),
+        normal=-samples.NORTH,
+        gsd_m=None,
+        has_side=True,
     )
 
 
 def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     drawings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wall, hidden = wall_of(0.0, 9.0, number=8), wall_of(0.0, 9.0, number=9)
-    shape = (20, 90)
-    rng = np.random.default_rng(0)
-    first, second = rng.uniform(0.001, 0.01, (2, *shape))
-    first[:5], second[3:, :4] = np.inf, np.nan
-    sigmas = {1: first, 2: second}
+    wall, hidden, shape = wall_of(0.0, 9.0, number=8), wall_of(0.0, 9.0, number=9), (20, 90)
+    sigmas = np.random.default_rng(0).uniform(0.001, 0.01, (2, *shape))
+    sigmas[0, :5], sigmas[1, 3:, :4] = np.inf, np.nan
 
     def sigmas_of(photo: int, on: Any, asked: tuple[int, int]) -> NDArray[np.float64]:
         assert asked == shape
@@ -108,20 +107,18 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
 
     monkeypatch.setattr(report, "sigmas_on_wall", sigmas_of)
     candidates: Any = [
-        SimpleNamespace(known=(wall, hidden), estimate=SimpleNamespace(resection=k)) for k in (1, 2)
+        SimpleNamespace(known=(wall, hidden), estimate=SimpleNamespace(resection=k)) for k in (0, 1)
     ]
     draw_wall_errors(context(tmp_path), candidates)
     # Nobody sees the other wall.
     assert list(drawings) == ["wall_8_predicted_error"]
-    best = np.minimum(first, np.where(np.isnan(second), np.inf, second))
-    seen = np.isfinite(best)
-    assert not seen.all()
-    high = np.percentile(best[seen], 98.0)
+    best = np.fmin(*np.where(np.isfinite(sigmas), sigmas, np.nan))
+    assert np.isnan(best).any()
     drawn = drawings["wall_8_predicted_error"]
-    np.testing.assert_array_equal(drawn.args[0], np.where(seen, 1e3 * best, np.nan))
+    np.testing.assert_array_equal(drawn.args[0], 1e3 * best)
     # 1, 2 or 5 times a power of ten above it, so that maps that are compared have one scale.
     assert drawn.keywords == {"low": 0.0, "high": 10.0}
-    assert 5.0 < 1e3 * high <= 10.0
+    assert 5.0 < 1e3 * np.nanpercentile(best, 98.0) <= 10.0
     assert decode_image(drawn(), "map").shape[1] == 1003
 
 
@@ -167,16 +164,15 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
     pooled = drawings["residuals"]
     assert pooled.get_size_inches()[0] == pytest.approx(COLUMN_INCHES)
     panels = np.array(pooled.axes).reshape(2, 2)
+    # One scale for all panels.
     reach = panels[0, 0].patches[0].get_data()[1][-1]
-    for row, kind in enumerate((TieRole.CONTROL, TieRole.CHECK)):
+    for row, kind, n in zip(panels, (TieRole.CONTROL, TieRole.CHECK), (716, 180), strict=True):
         values = np.vstack([photo.residuals_of(kind) for photo in photos])
-        assert len(values) == (3 * 239 - 1 if row == 0 else 180)
-        assert panels[row, 0].get_ylabel() == "ties per bar"
-        for column in range(2):
-            axes = panels[row, column]
+        assert len(values) == n
+        assert row[0].get_ylabel() == "ties per bar"
+        for axes, column in zip(row, values.T, strict=True):
             counts, edges, _ = axes.patches[0].get_data()
-            # One scale for all panels.
-            expected = np.histogram(values[:, column], bins=40, range=(-reach, reach))
+            expected = np.histogram(column, bins=40, range=(-reach, reach))
             np.testing.assert_array_equal(counts, expected[0])
             np.testing.assert_allclose(edges, expected[1])
 

@@ -156,20 +156,23 @@ def test_a_good_orientation_is_ok_without_a_note() -> None:
     good = candidate()
     assert gated() is gated(GATES_BEFORE_BLOCK) is None
     assert warnings_for(good) == []
-    assert good.control.sum() == 64
-    assert good.checked.sum() == 16
+    assert (good.control.sum(), good.checked.sum(), good.gsd_m) == (64, 16, 0.002)
     assert sum(good.quadrant_counts) == 80
-    assert good.gsd_m == 0.002
     # 8 of 10 cells' distance in each direction of a grid, over 19 of 20.
     assert good.hull_ratio == pytest.approx((0.9 / 0.95) ** 2, rel=0.05)
-
-
-def test_what_is_control_once_more_checks_nothing() -> None:
+    # What is control once more checks nothing.
     pixels = grid()
     pixels[10] = pixels[11]  # withheld, and control
     twice = candidate(pixels=pixels)
-    assert twice.withheld.sum() == 16
     assert np.flatnonzero(twice.withheld & ~twice.checked).tolist() == [10]
+
+
+def test_check_points_in_one_place_are_one() -> None:
+    good = candidate()
+    pixels = good.seen.pixels_photo.copy()
+    pixels[good.is_check] = (100.0, 100.0)
+    assert gated(pixels=pixels, search_radius_px=20.0) == "chance"
+    assert gated(search_radius_px=20.0) != "chance"
 
 
 def params(**changes: Any) -> OrientParams:
@@ -228,14 +231,6 @@ def test_check_ties_may_deviate_twice_as_much_as_the_control(
     few = np.isin(np.arange(N_TIES), [6, 7, 8, 9])
     loose = np.where(good.estimate.agreeing, np.where(few, 2.0, 0.5), 8.0)
     assert gated(is_check=few, normalised=loose) != "check-rms"
-
-
-def test_check_points_in_one_place_are_one() -> None:
-    good = candidate()
-    pixels = good.seen.pixels_photo.copy()
-    pixels[good.is_check] = (100.0, 100.0)
-    assert gated(pixels=pixels, search_radius_px=20.0) == "chance"
-    assert gated(search_radius_px=20.0) != "chance"
 
 
 def six_agree(length: float) -> tuple[np.ndarray, np.ndarray]:
@@ -374,14 +369,18 @@ def centres(shape: tuple[int, int], half_m: tuple[float, float]) -> NDArray[np.f
     return np.stack(np.meshgrid(right, down), axis=-1)
 
 
-def test_a_camera_that_may_stand_aside_shows_the_wall_as_much_aside() -> None:
-    found = wall_error(posed((0.003, 0.004, 0.0)), [wall()])
+def error_of(sigmas_m: tuple[float, float, float], half_m: tuple[float, float]) -> WallError:
+    found = wall_error(posed(sigmas_m), [wall(half_m)])
     assert found is not None
+    return found
+
+
+def test_a_camera_that_may_stand_aside_shows_the_wall_as_much_aside() -> None:
+    found = error_of((0.003, 0.004, 0.0), (1.0, 0.5))
     # Of a coordinate: the root of the mean of both.
     expected = math.sqrt(0.5 * (0.003**2 + 0.004**2))
     np.testing.assert_allclose(found.sigmas_m, expected, rtol=1e-6)
-    assert found.rms_m == pytest.approx(expected)
-    assert found.worst_m == pytest.approx(expected)
+    assert (found.rms_m, found.worst_m) == pytest.approx((expected, expected))
     # The photo is 4 m x 3 m wide there: its corners show nothing of 2 m x 1 m.
     assert np.isnan(found.corners_m).all()
     assert len(found.footprint_px) == len(found.sigmas_m) == 15 * 15
@@ -390,25 +389,18 @@ def test_a_camera_that_may_stand_aside_shows_the_wall_as_much_aside() -> None:
 
 
 def test_a_camera_that_may_stand_nearer_is_worst_far_from_the_middle() -> None:
-    resection = posed((0.0, 0.0, 0.006))
-    grid = sigmas_on_wall(resection, wall(), (4, 6))
+    nearer = (0.0, 0.0, 0.006)
+    grid = sigmas_on_wall(posed(nearer), wall(), (4, 6))
     aside = np.linalg.norm(centres((4, 6), (1.0, 0.5)), axis=2)
     np.testing.assert_allclose(grid, 0.006 * aside / DISTANCE_M / math.sqrt(2.0), rtol=1e-6)
-    found = wall_error(resection, [wall()])
-    assert found is not None
-    assert found.rms_m == pytest.approx(float(np.sqrt(np.mean(found.sigmas_m**2))))
-    assert found.worst_m == pytest.approx(float(found.sigmas_m.max()))
-
-
-def test_corners_of_the_photo_count_where_they_show_a_wall() -> None:
-    # 2 m and 1.5 m from the middle, but for half a pixel.
-    for half_m in ((2.5, 1.3), (1.7, 2.0)):
-        found = wall_error(posed((0.0, 0.0, 0.006)), [wall(half_m)])
-        assert found is not None
+    # Corners of the photo count where they show a wall: 2 m and 1.5 m from the middle, but for
+    # half a pixel.
+    for half_m in ((1.0, 0.5), (2.5, 1.3), (1.7, 2.0)):
+        found = error_of(nearer, half_m)
         assert np.isnan(found.corners_m).all()
+        assert found.rms_m == pytest.approx(float(np.sqrt(np.mean(found.sigmas_m**2))))
         assert found.worst_m == pytest.approx(float(found.sigmas_m.max()))
-    found = wall_error(posed((0.0, 0.0, 0.006)), [wall((2.5, 2.0))])
-    assert found is not None
+    found = error_of(nearer, (2.5, 2.0))
     aside = math.hypot(399.5, 299.5) / 600.0 * DISTANCE_M
     expected = 0.006 * aside / DISTANCE_M / math.sqrt(2.0)
     np.testing.assert_allclose(found.corners_m, expected, rtol=1e-6)
