@@ -69,11 +69,6 @@ def picture(shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float32]:
     return texture(columns - shift[0], rows - shift[1]).astype(np.float32)
 
 
-def rooms(side: int) -> tuple[NDArray[np.float64], ...]:
-    shapes = ((side, side), (side + 3, side, 2), (side, side, 2))
-    return tuple(np.empty(shape) for shape in shapes)
-
-
 # --- whole cells ---
 
 
@@ -86,32 +81,31 @@ def test_the_shift_of_highest_correlation_is_found_with_its_lead(seed: int) -> N
     noise = rng.normal(size=first.shape).astype(np.float32)
     second = np.roll(first, tuple(shift[::-1]), axis=(0, 1)) + 0.5 * noise
     places = rng.integers(half + radius, [34 - half - radius, 30 - half - radius], (6, 2))
+
+    def patch(of: NDArray[np.float32], column: int, row: int) -> NDArray[np.float64]:
+        """Every second cell of a patch, less the mean of each channel."""
+        steps = np.arange(-half, half + 1, 2)
+        part = of[np.ix_(row + steps, column + steps)].astype(np.float64)
+        return part - part.mean(axis=(0, 1))
+
     # The last one has its best place on the rim.
     edge = np.roll(first, (0, radius), axis=(0, 1))
     for other, wanted in ((second, shift), (edge, (radius, 0))):
         found = np.zeros((6, 4))
         search_shifts(first, other, places, (half, radius), found)
         for (column, row), result in zip(places, found, strict=True):
-            steps = np.arange(-half, half + 1, 2)
-            scores = np.empty((7, 7))
-            own = first[np.ix_(row + steps, column + steps)].astype(np.float64)
-            own = own - own.mean(axis=(0, 1))
+            scores, own = np.empty((7, 7)), patch(first, column, row)
             for down, across in np.ndindex(7, 7):
-                at = (row + down - radius + steps, column + across - radius + steps)
-                there = other[np.ix_(*at)].astype(np.float64)
-                there -= there.mean(axis=(0, 1))
+                there = patch(other, column + across - radius, row + down - radius)
                 length = math.sqrt((own**2).sum() * (there**2).sum())
                 scores[down, across] = (own * there).sum() / length
             down, across = np.unravel_index(scores.argmax(), scores.shape)
             np.testing.assert_array_equal(result[:2], [across - radius, down - radius])
             np.testing.assert_array_equal(result[:2], wanted)
             assert result[2] == pytest.approx(scores.max(), abs=1e-6)
-            if other is edge:
-                assert result[3] == -1.0
-                continue
             rows, columns = np.indices(scores.shape)
             away = np.maximum(np.abs(rows - down), np.abs(columns - across)) > 2
-            lead = scores.max() - scores[away].max()
+            lead = -1.0 if other is edge else scores.max() - scores[away].max()
             assert result[3] == pytest.approx(lead, abs=1e-6)
 
 
@@ -126,9 +120,10 @@ def _window(half: int) -> NDArray[np.float64]:
 def matched(
     first: Channels, second: Channels, start: tuple[float, float], place: tuple[int, int] = (22, 20)
 ) -> NDArray[np.float64]:
-    window = _window(HALF)
-    found = np.array([[*start, 0.0, 0.0]])
-    match_patches(first, second, np.array([place]), window, rooms(len(window)), found)
+    window, found = _window(HALF), np.array([[*start, 0.0, 0.0]])
+    side = len(window)
+    work = tuple(np.empty(shape) for shape in ((side, side), (side + 3, side, 2), (side, side, 2)))
+    match_patches(first, second, np.array([place]), window, work, found)
     return found[0]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from orthoflow_plugins.match.sides import FaceByPhotos
 
-from orthoflow.products import Photos, Planes, PointCloud
+from orthoflow.products import Planes, PointCloud
 from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
 from tests import samples
@@ -17,10 +17,6 @@ from tests.method_runs import run
 
 SCENE = ms.textured_wall(1)
 CLOUD = ms.cloud_of(SCENE)
-
-
-def photos_of(scene: ms.TexturedWall) -> Photos:
-    return ms.photos(ms.photo_of(scene, ms.camera_before(scene)))
 
 
 def planes(viewpoint: str = "guess") -> Planes:
@@ -46,15 +42,20 @@ def faced(
     given: Planes, folder: Path, *, cloud: PointCloud = CLOUD, shown: ms.TexturedWall = SCENE
 ) -> tuple[Planes, dict[str, float]]:
     ctx = mw.context(folder)
-    inputs = {"planes": given, "cloud": cloud, "photos": photos_of(shown)}
+    photos = ms.photos(ms.photo_of(shown, ms.camera_before(shown)))
+    inputs = {"planes": given, "cloud": cloud, "photos": photos}
     found = run(FaceByPhotos, ctx, inputs).planes
     return found, {metric.name: metric.value for metric in ctx.metrics}
 
 
-@pytest.mark.parametrize("is_wrong", [True, False], ids=["guessed from behind", "guessed rightly"])
-def test_photos_show_the_side_of_a_wall(tmp_path: Path, is_wrong: bool) -> None:
+@pytest.mark.parametrize(
+    ("is_wrong", "cloud"),
+    [(True, CLOUD), (False, CLOUD), (True, replace(CLOUD, intensity=None))],
+    ids=["guessed from behind", "guessed rightly", "points with colour alone"],
+)
+def test_photos_show_the_side_of_a_wall(tmp_path: Path, is_wrong: bool, cloud: PointCloud) -> None:
     right = planes()
-    found, metrics = faced(right.turned(0) if is_wrong else right, tmp_path)
+    found, metrics = faced(right.turned(0) if is_wrong else right, tmp_path, cloud=cloud)
     for name in ("normal", "offset", "corners", "part_corners"):
         np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
     assert found.side_from == ("photos", "guess")
@@ -74,12 +75,6 @@ def test_photos_that_show_something_else_leave_the_guess(tmp_path: Path) -> None
     found, metrics = faced(wrong, tmp_path, shown=ms.textured_wall(2))
     assert found is wrong
     assert metrics == {"n_planes_guessed": 1, "n_planes_turned": 0, "n_planes_seen": 0}
-
-
-def test_points_with_colour_alone_show_the_side_too(tmp_path: Path) -> None:
-    coloured = replace(CLOUD, intensity=None)
-    found, _ = faced(planes().turned(0), tmp_path, cloud=coloured)
-    np.testing.assert_array_equal(found.normal, planes().normal)
 
 
 @pytest.mark.parametrize(("moved_m", "is_turned"), [(1.0, True), (3.0, False)])

@@ -25,14 +25,19 @@ from tests.method_runs import run
 SCENE = ms.textured_wall(1)
 
 
-def inputs_of(photo: Photo, walls: Walls | None = None) -> dict[str, object]:
-    return {"photos": ms.photos(photo), "walls": walls or mw.walls(1)}
+def sift(
+    folder: Path, photo: Photo, walls: Walls | None = None, hand: Ties | None = None
+) -> tuple[Ties, list[str]]:
+    """Ties of a photo, and the codes of what was reported."""
+    ctx = mw.context(folder)
+    inputs = {"photos": ms.photos(photo), "walls": walls or mw.walls(1), "hand": hand}
+    return run(MatchSift, ctx, inputs).ties, [each.code for each in ctx.diagnostics]
 
 
 @pytest.mark.parametrize("roll", [0.0, 1.57], ids=["level", "portrait"])
 def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: float) -> None:
     camera = ms.camera_before(SCENE, roll=roll)
-    ties = mw.ties_of(MatchSift, tmp_path, inputs_of(ms.photo_of(SCENE, camera)))
+    ties, _ = sift(tmp_path, ms.photo_of(SCENE, camera))
     error = mw.off_px(ties, camera)
     length = np.linalg.norm(error, axis=1)
     right = error[length < 3.0]
@@ -49,10 +54,9 @@ def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: 
 def test_a_photo_of_nothing_known_is_warned_of(tmp_path: Path) -> None:
     photo = ms.photo_of(SCENE, ms.camera_before(SCENE))
     blank = replace(photo, encoded=encode_png(np.full((photo.height, photo.width), 128, np.uint8)))
-    ctx = mw.context(tmp_path)
-    ties = run(MatchSift, ctx, inputs_of(blank)).ties
+    ties, codes = sift(tmp_path, blank)
     assert not (ties.role != TieRole.REJECTED).any()
-    assert [each.code for each in ctx.diagnostics] == ["photo-shows-no-wall"]
+    assert codes == ["photo-shows-no-wall"]
 
 
 def test_a_mirrored_photo_is_recognised_as_such(tmp_path: Path) -> None:
@@ -67,10 +71,9 @@ def test_a_mirrored_photo_is_recognised_as_such(tmp_path: Path) -> None:
     grey = np.nan_to_num(symmetric * 255.0).clip(0, 255).astype(np.uint8)
     size = {"width": grey.shape[1], "height": grey.shape[0]}
     photo = Photo(name="a.png", encoded=encode_png(grey[:, ::-1].copy()), **size)
-    ctx = mw.context(tmp_path)
-    ties = run(MatchSift, ctx, inputs_of(photo, palace)).ties
+    ties, codes = sift(tmp_path, photo, palace)
     assert not (ties.role != TieRole.REJECTED).any()
-    assert [each.code for each in ctx.diagnostics] == ["photo-mirrored"]
+    assert codes == ["photo-mirrored"]
 
 
 @pytest.mark.parametrize("n_even", [0, 400], ids=["steps alone", "some elsewhere"])
@@ -97,7 +100,7 @@ HAND_SCENE = ms.textured_wall(0)
 HAND_CAMERA = ms.camera_before(HAND_SCENE, centre=(1.3, -2.6, 1.1))
 
 
-PHOTOS = ms.photos(ms.photo_of(HAND_SCENE, HAND_CAMERA))
+HAND_PHOTO = ms.photo_of(HAND_SCENE, HAND_CAMERA)
 WALLS = mw.walls(0)
 
 
@@ -115,43 +118,40 @@ def measured(*names: str) -> Ties:
     )
 
 
-def sift(folder: Path, walls: Walls, hand: Ties | None) -> Ties:
-    return mw.ties_of(MatchSift, folder, {"photos": PHOTOS, "walls": walls, "hand": hand})
-
-
 def test_ties_by_hand_stand_behind_those_that_are_found(tmp_path: Path) -> None:
-    alone = sift(tmp_path, WALLS, None)
+    alone, _ = sift(tmp_path, HAND_PHOTO, WALLS)
     assert alone.by_hand is None
     hand = measured("a.png", "stranger.png", "a.png")
-    both = sift(tmp_path, WALLS, hand)
+    both, _ = sift(tmp_path, HAND_PHOTO, WALLS, hand)
     count = len(alone.photo)
     np.testing.assert_array_equal(both.pixels_photo[:count], alone.pixels_photo)
     np.testing.assert_array_equal(both.pixels_photo[count:], hand.pixels_photo[[0, 2]])
     np.testing.assert_array_equal(both.points_world[count:], hand.points_world[[0, 2]])
     assert both.photo_names == ("a.png",)
-    np.testing.assert_array_equal(both.photo[count:], [0, 0])
-    np.testing.assert_array_equal(both.wall[count:], [0, 0])
-    np.testing.assert_array_equal(both.by_hand, [0] * count + [1, 1])
+    for name, value in (("photo", 0), ("wall", 0), ("by_hand", 1)):
+        np.testing.assert_array_equal(getattr(both, name)[count:], [value, value])
+    assert not both.by_hand[:count].any()
 
 
 def test_a_tie_by_hand_lies_on_the_nearest_wall(tmp_path: Path) -> None:
     (wall,) = WALLS.walls
-    beside = replace(wall.frame, origin_world=wall.frame.origin_world + np.array([5.0, 0, 0]))
-    behind = replace(wall.frame, origin_world=wall.frame.origin_world + np.array([0, 1.0, 0]))
-    walls = replace(
-        WALLS,
-        walls=tuple(replace(wall, frame=f, intensity=None) for f in (behind, beside, wall.frame)),
+    moves = np.array([[0.0, 1.0, 0.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    frames = [replace(wall.frame, origin_world=wall.frame.origin_world + move) for move in moves]
+    walls = tuple(replace(wall, frame=frame, intensity=None) for frame in frames)
+    hand = replace(
+        measured("a.png", "a.png", "a.png"),
+        points_world=np.array([[1.0, 0.9, 1], [5.5, 0.2, 1], [1.0, 0.3, 1]]),
     )
-    hand = measured("a.png", "a.png", "a.png")
-    hand = replace(hand, points_world=np.array([[1.0, 0.9, 1], [5.5, 0.2, 1], [1.0, 0.3, 1]]))
-    np.testing.assert_array_equal(sift(tmp_path, walls, hand).wall, [0, 1, 2])
+    ties, _ = sift(tmp_path, HAND_PHOTO, replace(WALLS, walls=walls), hand)
+    np.testing.assert_array_equal(ties.wall, [0, 1, 2])
 
 
 def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
     bare = replace(WALLS, walls=tuple(replace(wall, intensity=None) for wall in WALLS.walls))
     with pytest.raises(MethodError, match="neither intensity nor colour"):
-        sift(tmp_path, bare, None)
-    inputs = {"photos": PHOTOS, "walls": bare, "hand": measured("a.png", "a.png")}
+        sift(tmp_path, HAND_PHOTO, bare)
+    hand = measured("a.png", "a.png")
+    inputs = {"photos": ms.photos(HAND_PHOTO), "walls": bare, "hand": hand}
     cameras = {"cameras": ms.cameras(ms.oriented(HAND_CAMERA))}
     for method, more in ((MatchSift, {}), (MatchGuided, cameras)):
         ctx = mw.context(tmp_path)
@@ -167,47 +167,39 @@ CAMERA = replace(
 )
 
 
-def sifted(photo: Photo, walls: Walls, folder: Path) -> Ties:
-    return mw.ties_of(MatchSift, folder, {"photos": ms.photos(photo), "walls": walls})
-
-
 def grey_of(seed: int) -> NDArray[np.uint8]:
     """The wall of one texture as a camera sees it; all textures lie on the same relief."""
     return decode_image(ms.photo_of(ms.textured_wall(seed), CAMERA).encoded, "a.png")[:, :, 0]
 
 
 def photo_with(rgb: NDArray[np.uint8]) -> Photo:
-    return replace(ms.photo_of(ms.textured_wall(1), CAMERA), encoded=encode_png(rgb))
+    return Photo(name="a.png", encoded=encode_png(rgb), width=CAMERA.width, height=CAMERA.height)
 
 
 def wall_with(red: float, green: float) -> Walls:
     """The wall as a laser sees it that answers so to the textures 1 (red) and 2 (green)."""
-    both = [mw.walls(seed) for seed in (1, 2)]
-    first, second = (each.walls[0].intensity for each in both)
-    assert first is not None
-    assert second is not None
-    intensity = (0.5 + red * (first - 0.45) + green * (second - 0.45)).astype(np.float32)
-    return replace(both[0], walls=(replace(both[0].walls[0], intensity=intensity),))
+    first, second = (mw.walls(seed).walls[0] for seed in (1, 2))
+    intensity = 0.5 + red * (first.intensity - 0.45) + green * (second.intensity - 0.45)
+    return replace(mw.walls(1), walls=(replace(first, intensity=intensity.astype(np.float32)),))
 
 
 def test_a_photo_is_found_in_the_mixture_that_the_laser_sees(tmp_path: Path) -> None:
     rgb = np.stack([grey_of(1), grey_of(2), grey_of(1)], axis=-1)
-    ties = sifted(photo_with(rgb), wall_with(0.6, -0.6), tmp_path)
+    ties, _ = sift(tmp_path, photo_with(rgb), wall_with(0.6, -0.6))
     assert right(ties) > 150
     assert right(ties) > 0.9 * (ties.role != TieRole.REJECTED).sum()
     assert picture_of(ties) == "red less green"
 
 
 def test_a_negative_is_found_in_a_photo_without_colours(tmp_path: Path) -> None:
-    photo = ms.photo_of(ms.textured_wall(1), CAMERA)
-    ties = sifted(photo, wall_with(-1.0, 0.0), tmp_path)
+    ties, _ = sift(tmp_path, photo_with(np.stack([grey_of(1)] * 3, axis=-1)), wall_with(-1.0, 0.0))
     assert right(ties) > 500
     assert picture_of(ties) != "grey"
 
 
 def test_a_photo_of_something_else_gets_no_ties_in_any_mixture(tmp_path: Path) -> None:
     rgb = np.stack([grey_of(seed) for seed in (3, 4, 5)], axis=-1)
-    ties = sifted(photo_with(rgb), wall_with(1.0, 0.0), tmp_path)
+    ties, _ = sift(tmp_path, photo_with(rgb), wall_with(1.0, 0.0))
     assert (ties.role != TieRole.REJECTED).sum() == 0
 
 
@@ -227,9 +219,9 @@ def picture_of(ties: Ties) -> str:
 
 @pytest.mark.parametrize(("levels", "shows"), [(7, False), (9, True)])
 def test_a_mixture_of_hardly_any_contrast_shows_nothing(levels: int, *, shows: bool) -> None:
-    ramp = np.rint(np.linspace(100, 100 + levels, 400)).astype(np.uint8)
-    rgb = np.stack([np.full((40, 400), 50), *[np.tile(ramp, (40, 1))] * 2], axis=-1)
-    found = mixed(rgb.astype(np.uint8), "green less red")
+    ramp = np.rint(np.linspace(100, 100 + levels, 400))
+    colours = np.stack([np.full_like(ramp, 50), ramp, ramp], axis=-1)
+    found = mixed(np.tile(colours, (40, 1, 1)).astype(np.uint8), "green less red")
     assert (found is not None) is shows
     if found is not None:
         assert (found.min(), found.max()) == (0, 255)

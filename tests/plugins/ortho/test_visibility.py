@@ -39,6 +39,7 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     TileVisibility,
     WallView,
 )
+from scipy.ndimage import map_coordinates
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
@@ -75,9 +76,7 @@ def surface_of(
 
 
 def seen_of(
-    surface: Surface,
-    camera: ViewingCamera,
-    buffer: DepthBuffer | None = None,
+    surface: Surface, camera: ViewingCamera, buffer: DepthBuffer | None = None
 ) -> TileVisibility:
     view = view_of(camera, surface, PARAMS)
     rows, columns = (slice(0, size) for size in scenes.SHAPE)
@@ -112,7 +111,7 @@ def are_hidden(view: WallView, relief: Relief, cells: NDArray[np.intp]) -> NDArr
 
     They rise, so that nothing of the relief meets a ray that is above all of it.
     """
-    heights, highest = relief.occluding, float(relief.occluding.max())
+    heights, highest = relief.occluding.astype(np.float64), float(relief.occluding.max())
     assert view.height_m > highest
     depths = relief.depth[tuple(cells.T)].astype(np.float64)
     ways = np.array([view.row, view.column]) - cells
@@ -124,18 +123,13 @@ def are_hidden(view: WallView, relief: Relief, cells: NDArray[np.intp]) -> NDArr
         way = k / along[followed]
         at = cells[followed] + way[:, None] * ways[followed]
         at = np.where(is_main[followed], np.round(at), at)
-        first, second = np.floor(at).astype(int), np.ceil(at).astype(int)
-        inside = (first >= 0).all(axis=1) & (second < heights.shape).all(axis=1)
-        followed, way, at, first, second = (
-            each[inside] for each in (followed, way, at, first, second)
-        )
-        one, other = (heights[tuple(places.T)].astype(np.float64) for places in (first, second))
-        share = (at - first).sum(axis=1)
+        inside = (np.floor(at) >= 0).all(axis=1) & (np.ceil(at) < heights.shape).all(axis=1)
+        followed, way, at = followed[inside], way[inside], at[inside]
+        # A void on either side makes it unknown, however near the other cell is.
         with np.errstate(invalid="ignore"):
-            surface = np.where(share == 0.0, one, (1.0 - share) * one + share * other)
+            surface = map_coordinates(heights, at.T, order=1)
         ray = depths[followed] + way * (view.height_m - depths[followed])
-        is_known = np.isfinite(one) & np.isfinite(other)
-        is_met = is_known & (surface > ray + view.tolerance_m)
+        is_met = np.isfinite(surface) & (surface > ray + view.tolerance_m)
         hidden[followed[is_met]] = True
         followed = followed[~is_met & (ray < highest)]
     return hidden
