@@ -57,7 +57,7 @@ def check_store(store: Store) -> Soundness:
         return Soundness(n_results=0, n_objects=0, damaged=())
     with shared_lock(store.lock_file):
         names = _named_by_digest(store.objects)
-        files = {name: store.damage(name, with_published=True, again=True) for name in names}
+        files = {name: store.damage(name) for name in names}
         keys = _named_by_digest(store.results)
         reasons = {key: store.remove_unusable(key) for key in keys}
     objects = [Damage(name=f"objects/{n}", what=file) for n, file in files.items() if file]

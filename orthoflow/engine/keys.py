@@ -19,14 +19,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Final, TypeAlias, cast
 
-from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
+from orthoflow.catalog.catalog import Catalog, MethodEntry
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.catalog.distributions import (
-    canonical_name,
-    direct_requirements,
-    package_path,
-    source_files,
-)
+from orthoflow.catalog.distributions import canonical_name, direct_requirements
 from orthoflow.catalog.guarding import UserInterrupt, guarded
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
 from orthoflow.errors import OrthoflowError, PluginError
@@ -44,7 +39,6 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 # Parts of the framework that can affect the result of a method; the engine and the command line
 # cannot.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
-_FRAMEWORK: Final = "orthoflow."
 _CORE: Final = frozenset({"numpy", "numba", "scipy", "opencv-python-headless"})
 # Requirements that do not affect results: command line, records, pages, drawings, metadata.
 _WITHOUT_EFFECT: Final = frozenset(
@@ -244,22 +238,6 @@ def _imported(sources: Iterable[Path]) -> set[str]:
         return set()
     known = metadata.packages_distributions()
     return {canonical_name(name) for module in modules for name in known.get(module, ())}
-
-
-def framework_tag() -> str:
-    """Return a digest of the framework's code."""
-    return files_digest(framework_files())
-
-
-def publisher_tag(entry: ProductEntry) -> str:
-    """Return a digest of the code that publishes files of a type; empty if there is none."""
-    module = entry.spec.publisher.partition(":")[0]
-    if not module:
-        return ""
-    if module.startswith(_FRAMEWORK):
-        return framework_tag()
-    files = source_files((entry.distribution.source_folder, package_path(module)))
-    return f"{framework_tag()} {files_digest(files)}"
 
 
 @cache

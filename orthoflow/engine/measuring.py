@@ -13,8 +13,6 @@ from typing import Any, Final, Self, cast
 
 import psutil
 
-from orthoflow.geometry.threads import start_beside
-
 MIB: Final = 1 << 20
 GIB: Final = 1 << 30
 
@@ -179,42 +177,3 @@ class LoadingMeter:
         )()
         events.register(_COMPILER_LOCK, listener)
         self._listener = listener
-
-
-class MemorySampler:
-    """Samples the memory of this process in a thread while a method runs.
-
-    Attributes:
-        processor_s: processor seconds used for sampling so far; to be subtracted, since they grow
-            with elapsed time, including time spent compiling.
-    """
-
-    def __init__(self) -> None:
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._peak_bytes = 0
-        self.processor_s = 0.0
-
-    def __enter__(self) -> Self:
-        self._note()
-        self._thread = start_beside(self._sample)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-        self._note()
-
-    @property
-    def peak_mib(self) -> float:
-        """Peak memory of this process."""
-        return round(self._peak_bytes / MIB, 1)
-
-    def _sample(self) -> None:
-        while not self._stop.wait(_SAMPLE_S):
-            self._note()
-            self.processor_s = time.thread_time()
-
-    def _note(self) -> None:
-        self._peak_bytes = max(self._peak_bytes, process_memory())

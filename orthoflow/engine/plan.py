@@ -18,7 +18,6 @@ from orthoflow.engine.keys import (
     cell_key,
     input_digest,
     method_facts,
-    publisher_tag,
     read_preimage,
 )
 from orthoflow.engine.results import CellResult, ProductRef, ProductTarget
@@ -360,7 +359,6 @@ def _product_targets(
             type_name=type_name,
             target=entry.spec.target,
             publisher=entry.spec.publisher,
-            publisher_tag=publisher_tag(entry),
         )
     return targets
 

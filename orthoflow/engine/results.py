@@ -56,13 +56,11 @@ class ProductTarget:
         type_name: name of the type.
         target: class of the product.
         publisher: function that writes its published files; empty if there is none.
-        publisher_tag: version of the publisher.
     """
 
     type_name: str
     target: str
     publisher: str = ""
-    publisher_tag: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ import stat
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Final, Literal, Protocol, TypeVar
 
@@ -142,14 +142,12 @@ class StoredProduct:
         format: name and version of the file format.
         object: name of the object that it describes.
         type: type of the product.
-        publisher: tag of the code that wrote the published files; empty if there are none.
         files: relative path -> size and SHA-256 of each file when it was stored.
     """
 
     format: Literal["orthoflow/object/1"] = "orthoflow/object/1"
     object: str
     type: str
-    publisher: str
     files: Mapping[str, tuple[int, str]]
 
 
@@ -195,15 +193,13 @@ class Store:
 
     # Products -----------------------------------------------------------------------------------
 
-    def put_product(
-        self, product: Product, publisher: Publisher | None = None, *, publisher_tag: str = ""
-    ) -> ProductRef:
+    def put_product(self, product: Product, publisher: Publisher | None = None) -> ProductRef:
         """Store a product and its published files.
 
         Args:
-            product: the product; if the store already contains the same product, that one is kept.
+            product: the product; if the store already contains it with the same published files,
+                that one is kept.
             publisher: function that writes the published files.
-            publisher_tag: version of the publisher; files of another version are written again.
 
         Raises:
             StoreError: the disk is full or fails.
@@ -217,14 +213,11 @@ class Store:
             with writing_to(self.folder):
                 digest = write_product_file(aside / PRODUCT, product.to_payload())
                 final = self._object(digest)
-                tag = publisher_tag if publisher else ""
-                is_there = partial(self._is_there, final, tag)
-                if not is_there():
-                    if publisher is not None:
-                        publish_into(aside / PUBLISHED, product, publisher, digest)
-                        sync_tree(aside / PUBLISHED)
-                    _describe(aside, final.name, type(product).type_name, tag)
-                    self._place(aside, final, is_there)
+                if publisher is not None:
+                    publish_into(aside / PUBLISHED, product, publisher, digest)
+                    sync_tree(aside / PUBLISHED)
+                files = _describe(aside, final.name, type(product).type_name)
+                self._place(aside, final, files)
         except RecordFormatError as error:
             raise ProductError(f"a {product.type_name} cannot be stored: {error}") from error
         finally:
@@ -286,7 +279,8 @@ class Store:
         if found is None:
             raise DamageError(f"the store {self.folder} has no intact product {digest}")
         files = sorted(found.files.items())
-        return {folder / name: sha256 for name, (_, sha256) in files if _is_published(name)}
+        inside = f"{PUBLISHED}/"
+        return {folder / name: sha256 for name, (_, sha256) in files if name.startswith(inside)}
 
     # Figures ------------------------------------------------------------------------------------
 
@@ -299,14 +293,11 @@ class Store:
         sha256 = hashlib.sha256(content).hexdigest()
         folder = self.objects / sha256
 
-        def is_there() -> bool:
-            return not self._damaged_file(folder, again=True)
-
-        if not is_there():
+        if self._damaged_file(folder):
             aside = self._new_folder()
             try:
                 write_whole(aside / BLOB, content)
-                self._place(aside, folder, is_there)
+                self._place(aside, folder, {BLOB: (-1, sha256)})
             finally:
                 remove_tree(aside)
         return sha256
@@ -330,25 +321,20 @@ class Store:
         """Whether a product or figure is undamaged; see `damage`."""
         return not self.damage(name)
 
-    def damage(self, name: str, *, with_published: bool = False, again: bool = False) -> str:
+    def damage(self, name: str) -> str:
         """Return the damaged file of an object, and remove the object; empty if it is intact.
 
         Args:
             name: name of the object: digest of a product, or SHA-256 of a figure.
-            with_published: also check the published files.
-            again: also check unchanged files that this process has already checked.
 
         Raises:
             StoreError: the object cannot be removed.
             OSError: the machine lacks memory or has too many open files.
         """
         folder = self._object(name)
-        damaged_file = partial(
-            self._damaged_file, folder, with_published=with_published, again=again
-        )
-        found = damaged_file()
+        found = self._damaged_file(folder)
         if found:
-            self._remove_damaged(folder, damaged_file)
+            self._remove_damaged(folder, lambda: self._damaged_file(folder))
         return found
 
     def trust(self, result: CellResult) -> None:
@@ -383,7 +369,7 @@ class Store:
         if result.key != key or result.status != "ok":
             return None, f"results/{path.name}"
         damaged = {
-            name: self._damaged_file(self.objects / name, with_published=True, by_size=True)
+            name: self._damaged_file(self.objects / name, by_size=True)
             for name in sorted(result.objects)
         }
         named = [f"objects/{name[:12]}/{file}" for name, file in damaged.items() if file]
@@ -453,11 +439,11 @@ class Store:
             folder.mkdir(parents=True)
         return folder
 
-    def _place(self, aside: Path, final: Path, is_there: Callable[[], bool]) -> None:
-        """Rename a finished object to its final name, replacing an unusable one."""
+    def _place(self, aside: Path, final: Path, files: Mapping[str, tuple[int, str]]) -> None:
+        """Rename a finished object to its final name, replacing a damaged or different one."""
         if os.path.lexists(final):
-            # Another run has stored the same object meanwhile, and may be reading it.
-            if is_there():
+            # Another run may be reading the same object.
+            if _files_of(final) == files and not self._damaged_file(final):
                 return
             with contextlib.suppress(FileNotFoundError):
                 self._remove(final)
@@ -470,31 +456,14 @@ class Store:
         path.rename(gone)
         remove_tree(gone)
 
-    def _is_there(self, folder: Path, publisher_tag: str) -> bool:
-        """Whether the same object is stored, intact, and has up-to-date published files."""
-        found = _read_description(folder)
-        is_current = found is not None and found.publisher == publisher_tag
-        return is_current and not self._damaged_file(folder, with_published=True, again=True)
-
-    def _damaged_file(
-        self,
-        folder: Path,
-        *,
-        with_published: bool = False,
-        again: bool = False,
-        by_size: bool = False,
-    ) -> str:
+    def _damaged_file(self, folder: Path, *, by_size: bool = False) -> str:
         files = _files_of(folder)
         if not files:
             return DESCRIPTION
         for name, (size_bytes, sha256) in files.items():
             path = folder / name
-            if _is_published(name) and not with_published:
-                continue
             try:
                 identity = _identity(path)
-                if again:
-                    self._sound.discard(identity)
                 is_sound = identity in self._sound or (
                     stat.S_ISREG(path.lstat().st_mode)
                     and size_bytes in (identity[2], -1)
@@ -535,25 +504,22 @@ def _identity(path: Path) -> tuple[Path, int, int, int, int]:
     return (path, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
 
-def _is_published(name: str) -> bool:
-    return name.startswith(f"{PUBLISHED}/")
-
-
 @cache
 def _codec() -> TypeAdapter[StoredProduct]:
     return TypeAdapter(StoredProduct)
 
 
-def _describe(folder: Path, name: str, type_name: str, publisher: str) -> None:
-    """Write `object.json` for the files in a folder."""
+def _describe(folder: Path, name: str, type_name: str) -> Mapping[str, tuple[int, str]]:
+    """Write `object.json` for the files in a folder, and return what it says of them."""
     published = sorted(path for path in (folder / PUBLISHED).rglob("*") if path.is_file())
     files = {
         path.relative_to(folder).as_posix(): (path.stat().st_size, file_sha256(path))
         for path in (folder / PRODUCT, *published)
     }
-    found = StoredProduct(object=name, type=type_name, publisher=publisher, files=files)
+    found = StoredProduct(object=name, type=type_name, files=files)
     text = _codec().dump_json(found).decode()
     write_whole(folder / DESCRIPTION, with_digest(text).encode())
+    return files
 
 
 def _read_description(folder: Path) -> StoredProduct | None:

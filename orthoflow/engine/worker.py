@@ -38,7 +38,7 @@ from orthoflow.engine.durability import is_broken, store_error, writing_to
 from orthoflow.engine.environment import now
 from orthoflow.engine.file_digests import FileRef, file_identity, file_sha256
 from orthoflow.engine.kernels import reload_numba_config
-from orthoflow.engine.measuring import MIB, LoadingMeter, MemorySampler, is_for_want_of_memory
+from orthoflow.engine.measuring import MIB, LoadingMeter, is_for_want_of_memory, process_memory
 from orthoflow.engine.results import (
     CellResult,
     Costs,
@@ -60,7 +60,6 @@ from orthoflow.errors import (
     ProductError,
     StepFailedError,
 )
-from orthoflow.geometry.compile_events import on_compiling
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
@@ -273,11 +272,10 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         is_cancelled: whether the task should stop.
     """
     started = now()
-    sampler, progress = MemorySampler(), _ProgressWithCompiling(listen)
     meter = LoadingMeter()
-    call = _Call(task, progress.listen, is_cancelled, meter, sampler)
+    call = _Call(task, listen, is_cancelled, meter)
     try:
-        with sampler, meter, on_compiling(progress.compiling):
+        with meter:
             result = call.run()
     except BaseException as error:
         # If Ctrl-C is ignored, only the method can have raised KeyboardInterrupt.
@@ -287,7 +285,7 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         result = failed_result(task, explain_failure(task, error))
         if not isinstance(error, OrthoflowError):
             # Write the traceback to the log, and so to the record, for the author of the method.
-            progress.listen(StepEvent(kind="log", text=_trace(error)))
+            listen(StepEvent(kind="log", text=_trace(error)))
             result = dataclasses.replace(result, is_bug=True)
     return dataclasses.replace(
         result,
@@ -352,24 +350,6 @@ def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
     return store_error(error, store) if is_broken(error, store) else None
 
 
-class _ProgressWithCompiling:
-    """Forwards messages of a step, and reports which kernel is being compiled."""
-
-    def __init__(self, listen: Listener) -> None:
-        self._listen = listen
-        self._last = StepEvent(kind="progress", text="", fraction=0.0)
-
-    def listen(self, event: StepEvent) -> None:
-        """Forward a message of the method."""
-        if event.kind == "progress":
-            self._last = event
-        self._listen(event)
-
-    def compiling(self, text: str) -> None:
-        """Report the kernel being compiled, or the previous message once it is compiled."""
-        self._listen(dataclasses.replace(self._last, text=text or self._last.text))
-
-
 @dataclass(kw_only=True)
 class _TimedContext(StepContext):
     """A context that measures the time spent on figures, which is not the method's own time.
@@ -401,11 +381,9 @@ class _Call:
         listen: Listener,
         is_cancelled: Callable[[], bool],
         meter: LoadingMeter,
-        sampler: MemorySampler,
     ) -> None:
         self.task = task
         self._meter = meter
-        self._sampler = sampler
         self._wall_s = self._processor_s = 0.0
         self._stored_mib: float | None = None
         self._store = Store(Path(task.store), workspace=Path(task.folder))
@@ -430,7 +408,8 @@ class _Call:
         return Costs(
             wall_s=self._wall_s,
             cpu_s=self._processor_s,
-            peak_rss_mib=self._sampler.peak_mib,
+            # The executor samples the memory of a step in a process of its own.
+            peak_rss_mib=round(process_memory() / MIB, 1),
             stored_mib=self._stored_mib,
             compile_s=round(self._meter.total_s, 4),
         )
@@ -465,10 +444,10 @@ class _Call:
         return result
 
     def _cpu_s(self) -> float:
-        """Processor seconds of this process and its children, without loading and sampling."""
-        others_s = self._meter.processor_s + self._sampler.processor_s
+        """Processor seconds of this process and its children, without loading."""
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return time.process_time() + children.ru_utime + children.ru_stime - others_s
+        own_s = time.process_time() - self._meter.processor_s
+        return own_s + children.ru_utime + children.ru_stime
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:
@@ -515,9 +494,7 @@ class _Call:
             expected = self.task.outputs[port]
             target = expected.publisher
             publisher = cast("Publisher", load_target(target)) if target else None
-            refs[port] = self._store.put_product(
-                product, publisher, publisher_tag=expected.publisher_tag
-            )
+            refs[port] = self._store.put_product(product, publisher)
         return refs
 
     def _keep_figures(self) -> tuple[FigureRef, ...]:

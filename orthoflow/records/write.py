@@ -312,7 +312,7 @@ def write_run(
             return read_run(finished)
     except StoreError as error:
         needed = [name for result in outcome.results.values() for name in result.objects]
-        damaged = [name for name in needed if store.damage(name, with_published=True, again=True)]
+        damaged = [name for name in needed if store.damage(name)]
         if not damaged and not isinstance(error, DamageError):
             raise
         raise DamageError(

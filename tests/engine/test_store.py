@@ -118,11 +118,11 @@ def test_an_equal_object_of_another_run_is_left_in_place(store: Store) -> None:
     first: list[int] = []
 
     def publish_twice(product: Product, folder: Path, digest: str, /) -> None:
-        ref = other.put_product(product, publish_note, publisher_tag="1")
+        ref = other.put_product(product, publish_note)
         first.append(object_folder(store, ref).stat().st_ino)
         publish_note(product, folder, digest)
 
-    ref = store.put_product(heights(), publish_twice, publisher_tag="1")
+    ref = store.put_product(heights(), publish_twice)
     assert [object_folder(store, ref).stat().st_ino] == first
     assert not list((store.scratch / "loose").iterdir())
 
