@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -35,48 +35,22 @@ CHUNK = (
     f"<cameras>{CAMERA}</cameras></chunk></document>"
 )
 THREE = CHUNK.replace(CAMERA, 3 * CAMERA)
+RING = [[0, 0], [4, 0], [4, 3], [0, 0]]
 MASK = {
     "type": "FeatureCollection",
-    "features": [
+    "features": 3
+    * [
         {
             "type": "Feature",
-            "properties": {"photo": f"{number}.jpg"},
-            "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 0]]]},
+            "properties": {"photo": "a.jpg"},
+            "geometry": {"type": "Polygon", "coordinates": [RING]},
         }
-        for number in range(3)
     ],
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limit:
-    """A limit of a reader, a file, and how much of what is limited the file has."""
-
-    module: object
-    constant: str
-    content: bytes
-    size: int
-    read: Callable[[Path], object]
-
-    def __str__(self) -> str:
-        module = getattr(self.module, "__name__", "").rpartition(".")[2]
-        return f"{module}-{self.constant}-{self.size}"
-
-
-def limit(
-    module: object, constant: str, text: str, size: int | None, read: Callable[[Path], object]
-) -> Limit:
-    content = text.encode()
-    size = len(content) if size is None else size
-    return Limit(module=module, constant=constant, content=content, size=size, read=read)
-
-
 def masks(path: Path) -> object:
     return polygons.read_polygons(path, name="photo", what="a mask")
-
-
-def decoded(path: Path) -> object:
-    return images.decode_image(path.read_bytes(), path.name)
 
 
 def cameras_of(suffix: str) -> Callable[[Path], object]:
@@ -94,43 +68,46 @@ def colmap_of_two(path: Path) -> object:
 
 REALITYCAPTURE = "#name,x,y,alt,heading,pitch,roll,f\n" + "a.jpg,1,2,3,0,0,0,24\n" * 2
 BLOCK = "project: Hall\ntitle: West wall\n"
-LIMITS = [
-    limit(calibration, "MOST_BYTES", LENS, None, calibration.read_calibration),
-    limit(sheet_contents, "MOST_BYTES", BLOCK, None, sheet_contents.read_title_block),
-    limit(sheet_contents, "MOST_LETTERS", BLOCK, len("West wall"), sheet_contents.read_title_block),
-    limit(survey_points, "MOST_BYTES", CSV, None, survey_points.read_survey_points),
-    limit(survey_points, "MOST_LINE", CSV, 24, survey_points.read_survey_points),
-    limit(survey_points, "MOST_POINTS", CSV, 3, survey_points.read_survey_points),
-    limit(polygons, "MOST_BYTES", json.dumps(MASK), None, masks),
-    limit(polygons, "MOST_POLYGONS", json.dumps(MASK), 3, masks),
-    limit(sidecars, "MOST_SIDECAR_BYTES", '{"gsd_m": 0.5}', None, sidecars.read_sidecar),
-    limit(camera_formats, "MOST_CAMERAS", REALITYCAPTURE, 2, cameras_of(".csv")),
-    limit(colmap, "MOST_CAMERAS", "", 2, colmap_of_two),
-    limit(camera_formats, "MOST_CAMERAS", THREE, 3, cameras_of(".xml")),
-    limit(metashape, "MOST_TAGS", CHUNK, CHUNK.count("<"), metashape.read_metashape_xml),
-    limit(metashape, "MOST_PIXELS", CHUNK, 640 * 480, metashape.read_metashape_xml),
-    Limit(
-        module=images,
-        constant="MOST_PIXELS",
-        content=encode_png(np.zeros((6, 7, 3), dtype=np.uint8)),
-        size=42,
-        read=decoded,
-    ),
+GREY = encode_png(np.zeros((6, 7, 3), dtype=np.uint8))
+# Module and constant, a file, how much of what is limited it has, and what reads it.
+LIMITS: list[tuple[ModuleType, str, str | bytes, int, Callable[[Path], object]]] = [
+    (calibration, "MOST_BYTES", LENS, len(LENS), calibration.read_calibration),
+    (sheet_contents, "MOST_BYTES", BLOCK, len(BLOCK), sheet_contents.read_title_block),
+    (sheet_contents, "MOST_LETTERS", BLOCK, len("West wall"), sheet_contents.read_title_block),
+    (survey_points, "MOST_BYTES", CSV, len(CSV), survey_points.read_survey_points),
+    (survey_points, "MOST_LINE", CSV, 24, survey_points.read_survey_points),
+    (survey_points, "MOST_POINTS", CSV, 3, survey_points.read_survey_points),
+    (polygons, "MOST_BYTES", json.dumps(MASK), len(json.dumps(MASK)), masks),
+    (polygons, "MOST_POLYGONS", json.dumps(MASK), 3, masks),
+    (sidecars, "MOST_SIDECAR_BYTES", '{"gsd_m": 0.5}', 14, sidecars.read_sidecar),
+    (camera_formats, "MOST_CAMERAS", REALITYCAPTURE, 2, cameras_of(".csv")),
+    (colmap, "MOST_CAMERAS", "", 2, colmap_of_two),
+    (camera_formats, "MOST_CAMERAS", THREE, 3, cameras_of(".xml")),
+    (metashape, "MOST_TAGS", CHUNK, CHUNK.count("<"), metashape.read_metashape_xml),
+    (metashape, "MOST_PIXELS", CHUNK, 640 * 480, metashape.read_metashape_xml),
+    (images, "MOST_PIXELS", GREY, 42, lambda path: images.decode_image(path.read_bytes(), "a")),
 ]
 
 
-@pytest.mark.parametrize("limit", LIMITS, ids=str)
+@pytest.mark.parametrize(("module", "constant", "content", "size", "reader"), LIMITS)
 def test_what_is_as_large_as_allowed_is_read_and_nothing_larger(
-    limit: Limit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    module: ModuleType,
+    constant: str,
+    content: str | bytes,
+    size: int,
+    reader: Callable[[Path], object],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def read() -> str:
-        (tmp_path / "file").write_bytes(limit.content)
-        return repr(limit.read(tmp_path / "file"))
+        data = content if isinstance(content, bytes) else content.encode()
+        (tmp_path / "file").write_bytes(data)
+        return repr(reader(tmp_path / "file"))
 
     usual = read()
-    monkeypatch.setattr(limit.module, limit.constant, limit.size)
+    monkeypatch.setattr(module, constant, size)
     assert read() == usual
-    monkeypatch.setattr(limit.module, limit.constant, limit.size - 1)
+    monkeypatch.setattr(module, constant, size - 1)
     with pytest.raises(InputError):
         read()
 

@@ -28,38 +28,27 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def features(path: Path) -> list[dict[str, object]]:
-    content = json.loads(path.read_text())
-    assert content["type"] == "FeatureCollection"
-    assert content["product_digest"] == "sha256:12"
-    found: list[dict[str, object]] = content["features"]
-    return found
-
-
-def test_walls_without_openings_have_no_file(folder: Path) -> None:
+def test_openings_are_rings_in_the_metres_of_their_walls_and_rows_of_a_schedule(
+    folder: Path,
+) -> None:
+    # A wall without openings has no file.
     assert sorted(path.name for path in folder.iterdir()) == [
         "openings.csv",
         "openings.geojson",
         f"wall_{WALL}_openings.geojson",
         f"wall_{WALL + 1}_openings.geojson",
     ]
-
-
-def test_outlines_are_closed_rings_in_the_coordinates_of_the_wall(folder: Path) -> None:
     (opening,) = box_openings().openings
-    (feature,) = features(folder / f"wall_{WALL}_openings.geojson")
-    geometry, about = feature["geometry"], feature["properties"]
-    assert isinstance(geometry, dict)
-    assert isinstance(about, dict)
-    ring = np.array(geometry["coordinates"][0])
+    content = json.loads((folder / f"wall_{WALL}_openings.geojson").read_text())
+    assert (content["type"], content["product_digest"]) == ("FeatureCollection", "sha256:12")
+    (feature,) = content["features"]
+    ring = np.array(feature["geometry"]["coordinates"][0])
     np.testing.assert_allclose(ring, np.vstack([opening.outline_m, opening.outline_m[:1]]))
+    about = feature["properties"]
     assert (about["kind"], about["opening"], about["number"]) == ("opening", "niche", 0)
     assert about["depth_m"] == 0.25
     assert about["side_source"] == ["depth", "image", "unseen", "depth"]
     assert about["side_sigma_mm"] == [3.0, 1.5, None, 3.0]
-
-
-def test_the_schedule_has_a_row_each(folder: Path) -> None:
     with (folder / "openings.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["wall"], row["number"], row["kind"]) for row in rows] == [

@@ -1,8 +1,7 @@
-"""Photos and cameras of other programs through the commands `check` and `run`."""
+"""Cameras of other programs through the commands `check` and `run`."""
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import pytest
 
 from orthoflow.files.images import encode_jpeg
 from tests import photo_files
-from tests.files.test_containers import pages, transparent
 from tests.files.test_metashape import UTM
 from tests.studios import asked
 
@@ -33,13 +31,8 @@ def metashape(*cameras: str, chunk: str = "") -> dict[str, str]:
 
 
 BUNDLE = "# Bundle file v0.3\n2 0\n" + "60 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n" * 2
-HEAD = "#cameras 2\n#name,x,y,alt,heading,pitch,roll,f\n# a comment\n"
 # Photos, files of their cameras, and for each photo its status: `ok`, or a part of the reason.
 CAMERAS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
-    "metashape disabled": (
-        metashape("a.jpg", 'b.jpg" enabled="false'),
-        {"a.jpg": "ok", "b.jpg": "disabled in Metashape"},
-    ),
     "metashape folders": (
         metashape("nadir/a.jpg", "oblique/a.jpg"),
         {"nadir/a.jpg": "ok", "oblique/a.jpg": "ok"},
@@ -51,10 +44,6 @@ CAMERAS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "bundler with spaces": (
         {"bundle.out": BUNDLE, "list.txt": "my photo 1.jpg\nmy photo 2.jpg 0 60\n"},
         {"my photo 1.jpg": "ok", "my photo 2.jpg": "ok"},
-    ),
-    "realitycapture": (
-        {"cameras.csv": f"{HEAD}a.jpg,1,2,3,0,0,0,36\n\nb.jpg,2,2,3,0,0,0,36\n"},
-        {"a.jpg": "ok", "b.jpg": "ok"},
     ),
     "colmap": (
         {
@@ -95,40 +84,3 @@ def test_cameras_of_other_programs_orient_their_photos(
             @ found["a.jpg"]["t_camera_from_world"]
         )
         np.testing.assert_allclose(centre[:2], [445000, 5430000], atol=20000)
-
-
-LARGE = photo_files.picture(128, 96)
-SMALL = np.ascontiguousarray(LARGE[::8, ::8])
-# Content of a photo, and either its megapixels or what it is refused with.
-PHOTOS: dict[str, tuple[str, bytes, float | str]] = {
-    "preview first": ("a.tif", pages(SMALL, LARGE, subfiles=(1, 0)), 0.012288),
-    "transparent": ("a.tif", transparent("TIFF"), 0.012288),
-    "nodata": ("a.tif", transparent("nodata"), 0.012288),
-    "misnamed HEIC": (
-        "a.jpg", b"\0\0\0\x1cftypheic\0\0\0\0mif1heic", "photo a.jpg is a HEIC file: install"
-    ),
-    "damaged": ("a.jpg", encode_jpeg(LARGE)[:1500] + b"\xff\xd9", "photo a.jpg is damaged"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", PHOTOS)
-def test_photos_as_they_are_met_are_read_or_named(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file, content, expected = PHOTOS[name]
-    monkeypatch.chdir(tmp_path)
-    photo_files.write(tmp_path / "photos", {file: content})
-    (tmp_path / "workflow.yaml").write_text(
-        "orthoflow: 1\ninputs: {photos: {}}\nsteps:\n"
-        "  shots: {use: read.photos, in: {files: inputs.photos}}\n"
-    )
-    given = ("workflow.yaml", "--input", "photos=photos", "--executor", "inline")
-    done = asked("run", *given, "-o", "run")
-    if isinstance(expected, str):
-        assert done.exit_code == 2
-        assert expected in " ".join(done.output.split())
-        return
-    assert done.exit_code == 0, done.output
-    with (tmp_path / "run/products/metrics.csv").open() as stream:
-        metrics = {row["metric"]: float(row["value"]) for row in csv.DictReader(stream)}
-    assert metrics["megapixels"] == pytest.approx(expected)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +35,7 @@ from orthoflow.files.colmap import write_colmap_model
 from orthoflow.files.drawings.sheet_contents import read_title_block
 from orthoflow.files.e57_images import count_e57_images
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
-from orthoflow.files.images import encode_jpeg, encode_png, encode_webp, shrunk_webp
+from orthoflow.files.images import encode_png, encode_webp, shrunk_webp
 from orthoflow.files.photo_files import damage, focal_length, icc_profile, read_exif
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.files.sidecars import frame_json, write_json
@@ -46,7 +45,6 @@ from orthoflow.products import (
     Cameras,
     CheckPoints,
     InputFiles,
-    Intrinsics,
     Photo,
     Photos,
     Product,
@@ -60,6 +58,12 @@ from orthoflow.workflow.source import shipped_workflows
 from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 from tests import photo_files, samples, scan_files
 from tests.files import test_metashape as agisoft
+from tests.files.test_e57_images import pinhole, spherical, written
+from tests.files.test_exif import INNER, MAIN
+from tests.files.test_given_cameras import HEAD as REALITYCAPTURE
+from tests.files.test_given_cameras import oriented
+from tests.files.test_other_programs import BUNDLE
+from tests.files.test_polygons import HOLE, SQUARE, feature, features
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import (
     mutate_bytes,
@@ -73,9 +77,10 @@ from tests.report_runs import environment
 from tests.scan_cases import CASES, Draw
 
 N_POINTS: Final = 40
+EXIF: Final = photo_files.exif_block(MAIN, INNER)
 
 
-def _read_with(method: type[Method], files: InputFiles, **more: Product) -> object:
+def _read_with(method: type[Method], files: InputFiles, **more: Product | InputFiles) -> object:
     trial = Trial(method=method, inputs={"files": files, **more})
     return run_trial(trial, files.paths[0].parent / "scratch", draws=False).digests
 
@@ -168,21 +173,8 @@ SCANS: Final = (E57, LAS, COPC, PLY, PCD, PTX, TEXT)
 # Photos, and other pictures -----------------------------------------------------------------------
 
 
-def _exif() -> bytes:
-    main = {photo_files.MAKE: "Maker", photo_files.MODEL: "Model", photo_files.ORIENTATION: 6}
-    inner = {
-        photo_files.FOCAL: (240, 10),
-        photo_files.FOCAL_35MM: 36,
-        photo_files.WIDTH: 64,
-        photo_files.HEIGHT: 48,
-        photo_files.RESOLUTION_X: (4000, 10),
-        photo_files.RESOLUTION_UNIT: 3,
-    }
-    return photo_files.exif_block({**main}, {**inner})
-
-
 def _photo_files(kind: str, folder: Path) -> None:
-    image, exif = photo_files.picture(), _exif()
+    image, exif = photo_files.picture(), EXIF
     made = {
         "jpg": photo_files.jpeg(image, exif),
         "png": photo_files.png(image, exif),
@@ -273,39 +265,21 @@ _METASHAPE: Final = agisoft.document(
     cameras=agisoft.posed("a.jpg", more=' component_id="0"')
     + f"<group>{agisoft.posed('b.jpg').replace(_OF_FIRST, _OF_SECOND)}</group>",
 ).replace('width="640" height="480"', 'width="64" height="48"')
-_BUNDLER: Final = (
-    "# Bundle file v0.3\n2 0\n60.5 -0.1 0.01\n1 0 0\n0 1 0\n0 0 1\n0.5 1.5 2.5\n" + 5 * "0 0 0\n"
-)
-_REALITYCAPTURE: Final = (
-    "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
-    "a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
-    "b.jpg,2.5,2.5,3.5,-90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
-)
-
-
-def _given() -> Cameras:
-    lens = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=60.5, fy=61.0, cx=31.5, cy=24.0)
-    first = Camera(
-        photo=_PHOTOS[0],
-        status="ok",
-        intrinsics=lens,
-        rotation_camera_from_world=np.eye(3),
-        translation_camera_from_world=np.array([1.0, 2.0, 3.0]),
-        sigma_wall_m=0.002,
-    )
-    return Cameras(cameras=(first, Camera(photo=_PHOTOS[1], status="no wall is recognised in it")))
 
 
 def _camera_files(folder: Path) -> None:
-    publish_cameras(_given(), folder, "sha256:0")
-    write_colmap_model(folder, _given())
+    lost = Camera(photo="b.jpg", status="no wall is recognised in it")
+    given = Cameras(cameras=(oriented("a.jpg", 5), lost))
+    publish_cameras(given, folder, "sha256:0")
+    write_colmap_model(folder, given)
     pycolmap.Reconstruction(str(folder)).write_binary(str(folder))
     for suffix in ("txt", "bin"):
         (folder / f"points3D.{suffix}").unlink()
     (folder / "metashape.xml").write_text(_METASHAPE)
-    (folder / "bundle.out").write_text(_BUNDLER)
+    (folder / "bundle.out").write_text(BUNDLE)
     (folder / "list.txt").write_text("walls/a.jpg 0 60.5\nwalls/b.jpg\n")
-    (folder / "list.csv").write_text(_REALITYCAPTURE)
+    row = "a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
+    (folder / "list.csv").write_text(REALITYCAPTURE + row)
 
 
 # What must lie beside a file for it to be read.
@@ -344,39 +318,10 @@ CAMERAS = Target(seeds=_camera_files, read=_read_cameras, mutate=_mutate_cameras
 
 # Photos in E57 files ------------------------------------------------------------------------------
 
-_NUMBERS: Final = {
-    "imageWidth": _WIDTH,
-    "imageHeight": _HEIGHT,
-    "focalLength": 0.03,
-    "pixelWidth": 5e-4,
-    "pixelHeight": 6e-4,
-    "principalPointX": 33.5,
-    "principalPointY": 22.25,
-}
-
 
 def _e57_photo_files(folder: Path) -> None:
-    picture = photo_files.picture(_WIDTH, _HEIGHT)
-    points = np.random.default_rng(1).uniform(0.0, 1.0, (5, 3))
-    fields = scan_files.cartesian(points)
-    pose = {"rotation": (0.8, 0.0, 0.0, 0.6), "translation": (1.0, 2.0, 3.0)}
-    sphere = {
-        "imageWidth": 64,
-        "imageHeight": 32,
-        "pixelWidth": 2.0 * np.pi / 64,
-        "pixelHeight": np.pi / 32,
-    }
-    jpeg, png, other = (
-        encode_jpeg(picture),
-        encode_png(photo_files.picture(64, 32)),
-        encode_png(picture),
-    )
-    images = [
-        {"kind": "pinhole", "name": "north", "content": jpeg, "numbers": _NUMBERS, **pose},
-        {"kind": "spherical", "content": png, "numbers": sphere, **pose},
-        {"kind": "visualReference", "content": other},
-    ]
-    scan_files.write_e57(folder / "room.e57", [{"fields": fields}], images)
+    reference = {"kind": "visualReference", "content": encode_png(photo_files.picture())}
+    written(folder, pinhole(name="north"), spherical(64, 32), reference)
 
 
 def _read_e57_photos(path: Path) -> object:
@@ -394,18 +339,8 @@ E57_PHOTOS = Target(seeds=_e57_photo_files, read=_read_e57_photos, mutate=mutate
 
 
 def _mask_files(folder: Path) -> None:
-    ring = [[4.5, 4], [30, 4], [30, 20.25], [4.5, 20.25], [4.5, 4]]
-    hole = [[10, 8], [12, 8], [12, 10], [10, 8]]
-    shapes = [
-        {"type": "Polygon", "coordinates": [ring, hole]},
-        {"type": "MultiPolygon", "coordinates": [[ring], [hole]]},
-    ]
-    features = [
-        {"type": "Feature", "properties": {"photo": name, "note": 1}, "geometry": shape}
-        for name, shape in zip(("a.jpg", "*.jp?"), shapes, strict=True)
-    ]
-    content = {"type": "FeatureCollection", "features": features}
-    (folder / "masks.geojson").write_text(json.dumps(content))
+    several = feature([[SQUARE], [HOLE]], kind="MultiPolygon", photo="*.jp?")
+    (folder / "masks.geojson").write_text(features(feature([SQUARE, HOLE], note=1), several))
     used = np.full((_HEIGHT, _WIDTH), 255, np.uint8)
     used[:10] = 0
     (folder / "a_mask.png").write_bytes(encode_png(used))
@@ -506,7 +441,7 @@ note: |
 
 def _read_calibration(path: Path) -> object:
     photo = path.with_name("b.jpg")
-    photo.write_bytes(photo_files.jpeg(photo_files.picture(), _exif()))
+    photo.write_bytes(photo_files.jpeg(photo_files.picture(), EXIF))
     return _read_with(ReadPhotos, _files(photo), calibration=_files(path))
 
 

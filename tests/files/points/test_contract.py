@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +101,7 @@ def by_pye57(path: Path, fields: Fields, *, is_posed: bool, has_grid: bool) -> F
     return {names[name]: values for name, values in whole.items()}
 
 
-def by_open3d(
-    path: Path, fields: Fields, *, is_ascii: bool, has_rgb: bool, is_packed: bool = False
-) -> Fields:
+def by_open3d(path: Path, fields: Fields, *, has_rgb: bool = False, **options: bool) -> Fields:
     from orthoflow_plugins.plane.comparators import load_open3d
 
     open3d = load_open3d("the test")
@@ -113,14 +110,17 @@ def by_open3d(
     if has_rgb:
         colours = np.column_stack([fields[name] for name in RGB]) / 255.0
         cloud.colors = open3d.utility.Vector3dVector(colours)
-    assert open3d.io.write_point_cloud(str(path), cloud, write_ascii=is_ascii, compressed=is_packed)
+    assert open3d.io.write_point_cloud(str(path), cloud, **options)
     return {name: fields[name] for name in (*XYZ, *(RGB if has_rgb else ()))}
 
 
-def by_numpy(path: Path, fields: Fields, *, separator: str, names: str, end: str) -> Fields:
+def by_numpy(
+    path: Path, fields: Fields, *, names: str, separator: str = " ", end: str = "\n"
+) -> Fields:
     table = np.column_stack(list(fields.values())).astype(np.float64)
+    header = names.replace(" ", separator)
     formats = ["%.4f"] * 3 + ["%d"] * 4
-    np.savetxt(path, table, formats, separator, newline=end, header=names, comments="")
+    np.savetxt(path, table, formats, separator, newline=end, header=header, comments="")
     return fields
 
 
@@ -131,47 +131,50 @@ def by_pandas(path: Path, fields: Fields, *, index: bool, **options: Any) -> Fie
     return fields
 
 
-WRITERS: Mapping[str, tuple[str, Callable[[Path, Fields], Fields]]] = {
-    "plyfile binary": ("a.ply", partial(by_plyfile, is_text=False, order="<", kind="f8")),
-    "plyfile big endian, faces first": (
-        "a.ply",
-        partial(by_plyfile, is_text=False, order=">", kind="f4"),
-    ),
-    "plyfile ascii": ("a.ply", partial(by_plyfile, is_text=True, order="=", kind="f8")),
+# Name -> name of the file, what writes it, and how.
+WRITERS: Mapping[str, tuple[str, Callable[..., Fields], dict[str, Any]]] = {
+    "plyfile binary": ("a.ply", by_plyfile, {"is_text": False, "order": "<", "kind": "f8"}),
+    "plyfile big endian": ("a.ply", by_plyfile, {"is_text": False, "order": ">", "kind": "f4"}),
+    "plyfile ascii": ("a.ply", by_plyfile, {"is_text": True, "order": "=", "kind": "f8"}),
     **{
         f"laspy {suffix} {version} format {point_format}": (
             f"a.{suffix}",
-            partial(by_laspy, point_format=point_format, version=version),
+            by_laspy,
+            {"point_format": point_format, "version": version},
         )
         for suffix in ("las", "laz")
         for version, formats in (("1.2", (0, 1, 2, 3)), ("1.4", (6, 7, 8)))
         for point_format in formats
     },
-    "pye57": ("a.e57", partial(by_pye57, is_posed=False, has_grid=False)),
-    "pye57 posed, on a grid": ("a.e57", partial(by_pye57, is_posed=True, has_grid=True)),
-    "open3d ply": ("a.ply", partial(by_open3d, is_ascii=False, has_rgb=True)),
-    "open3d ascii ply": ("a.ply", partial(by_open3d, is_ascii=True, has_rgb=False)),
-    "open3d pcd": ("a.pcd", partial(by_open3d, is_ascii=False, has_rgb=True)),
-    "open3d packed pcd": (
-        "a.pcd",
-        partial(by_open3d, is_ascii=False, has_rgb=True, is_packed=True),
+    "pye57": ("a.e57", by_pye57, {"is_posed": False, "has_grid": False}),
+    "pye57 posed, on a grid": ("a.e57", by_pye57, {"is_posed": True, "has_grid": True}),
+    "open3d ply": ("a.ply", by_open3d, {"has_rgb": True}),
+    "open3d ascii ply": ("a.ply", by_open3d, {"write_ascii": True}),
+    "open3d pcd": ("a.pcd", by_open3d, {"has_rgb": True}),
+    "open3d packed pcd": ("a.pcd", by_open3d, {"has_rgb": True, "compressed": True}),
+    "open3d ascii pcd": ("a.pcd", by_open3d, {"write_ascii": True}),
+    "open3d xyz": ("a.xyz", by_open3d, {}),
+    "open3d xyzrgb": ("a.xyzrgb", by_open3d, {"has_rgb": True}),
+    "open3d pts": ("a.pts", by_open3d, {}),
+    "numpy": ("a.xyz", by_numpy, {"names": "x y z i r g b"}),
+    "numpy tabs": ("a.txt", by_numpy, {"names": "X Y Z I R G B", "separator": "\t", "end": "\r\n"}),
+    "numpy without header": ("a.xyz", by_numpy, {"names": "400"}),
+    "numpy pts": ("a.pts", by_numpy, {"names": "400"}),
+    "pandas": ("a.csv", by_pandas, {"index": False}),
+    "pandas index": ("a.csv", by_pandas, {"index": True}),
+    "pandas commas": ("a.csv", by_pandas, {"index": True, "sep": ";", "decimal": ","}),
+    "pandas quotes": (
+        "a.csv",
+        by_pandas,
+        {"index": False, "quoting": 1, "encoding": "utf-8-sig"},
     ),
-    "open3d ascii pcd": ("a.pcd", partial(by_open3d, is_ascii=True, has_rgb=False)),
-    "open3d xyz": ("a.xyz", partial(by_open3d, is_ascii=True, has_rgb=False)),
-    "open3d xyzrgb": ("a.xyzrgb", partial(by_open3d, is_ascii=True, has_rgb=True)),
-    "open3d pts": ("a.pts", partial(by_open3d, is_ascii=True, has_rgb=False)),
-    "numpy": ("a.xyz", partial(by_numpy, separator=" ", names="x y z i r g b", end="\n")),
-    "numpy tabs": (
-        "a.txt",
-        partial(by_numpy, separator="\t", names="X\tY\tZ\tI\tR\tG\tB", end="\r\n"),
-    ),
-    "numpy without header": ("a.xyz", partial(by_numpy, separator=" ", names="400", end="\n")),
-    "numpy pts": ("a.pts", partial(by_numpy, separator=" ", names="400", end="\n")),
-    "pandas": ("a.csv", partial(by_pandas, index=False)),
-    "pandas index": ("a.csv", partial(by_pandas, index=True)),
-    "pandas commas": ("a.csv", partial(by_pandas, index=True, sep=";", decimal=",")),
-    "pandas quotes": ("a.csv", partial(by_pandas, index=False, quoting=1, encoding="utf-8-sig")),
 }
+
+
+def written(name: str, folder: Path, fields: Fields) -> tuple[Path, Fields]:
+    """Write a file, and return it with what it must contain."""
+    file_name, write, options = WRITERS[name]
+    return folder / file_name, write(folder / file_name, fields, **options)
 
 
 def check(found: Fields, right: Fields, *, atol: float) -> None:
@@ -193,10 +196,8 @@ def check(found: Fields, right: Fields, *, atol: float) -> None:
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("is_survey", [False, True], ids=["room", "survey"])
 def test_what_a_library_wrote_comes_out(name: str, is_survey: bool, tmp_path: Path) -> None:
-    file_name, write = WRITERS[name]
     shift = (301234.0, 4651234.0, 112.0) if is_survey else (0.0, 0.0, 0.0)
-    path = tmp_path / file_name
-    right = write(path, scene(shift=shift))
+    path, right = written(name, tmp_path, scene(shift=shift))
     check(read(path), right, atol=tolerance(name, is_survey=is_survey))
 
 
@@ -219,9 +220,7 @@ def test_blocks_join_without_a_seam(
     for module in (e57, las, records):
         monkeypatch.setattr(module, "BLOCK_POINTS", 150)
     monkeypatch.setattr(text, "_BLOCK_BYTES", 5000)
-    file_name, write = WRITERS[name]
-    path = tmp_path / file_name
-    right = write(path, scene())
+    path, right = written(name, tmp_path, scene())
     assert len(list(open_scan(path).read())) > 2
     check(read(path), right, atol=tolerance(name, is_survey=False))
 
@@ -231,19 +230,14 @@ def test_blocks_join_without_a_seam(
 def test_a_file_that_is_cut_off_is_refused_or_read_as_far_as_it_goes(
     name: str, share: float, tmp_path: Path
 ) -> None:
-    file_name, write = WRITERS[name]
-    path = tmp_path / file_name
-    right = write(path, scene())
+    path, right = written(name, tmp_path, scene())
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    refusal = ""
     try:
         points = read(path)["points"]
     except InputError as error:
         refusal = str(error)
-    if refusal:
-        assert file_name in refusal
-        assert "\n" not in refusal
+        assert [path.name in refusal, "\n" in refusal] == [True, False]
         return
     # Only text can end anywhere.
     assert path.suffix in (".xyz", ".txt", ".csv")

