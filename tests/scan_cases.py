@@ -6,7 +6,6 @@ which chooses numbers, orders, encodings, names and shares, to a `Case`.
 
 from __future__ import annotations
 
-import io
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +22,7 @@ T = TypeVar("T")
 STATION: Final = np.array([1.5, 0.3, 1.1])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Scene:
     """Points (n, 3) in metres with what is painted on them: reflectance 0..1 and colour."""
 
@@ -35,17 +34,23 @@ class Scene:
         return len(self.points)
 
     def part(self, chosen: NDArray[Any] | slice) -> Scene:
-        return Scene(
-            points=self.points[chosen], reflectance=self.reflectance[chosen], rgb=self.rgb[chosen]
-        )
+        return Scene(self.points[chosen], self.reflectance[chosen], self.rgb[chosen])
 
     def halves(self) -> tuple[Scene, Scene]:
         """What lies left and right of x = 1.5, as two scans show it."""
         is_left = self.points[:, 0] < 1.5
         return self.part(is_left), self.part(~is_left)
 
+    def with_points(self, places: NDArray[np.int64], point: NDArray[np.float64]) -> Scene:
+        """The scene with black points at one place, inserted before those of some indices."""
+        return Scene(
+            np.insert(self.points, places, point, axis=0),
+            np.insert(self.reflectance, places, 0.0),
+            np.insert(self.rgb, places, 0, axis=0),
+        )
 
-@dataclass(kw_only=True)
+
+@dataclass
 class Case:
     """Files and what is right of them.
 
@@ -69,7 +74,7 @@ class Case:
     scene: Scene
     paths: list[Path]
     params: dict[str, Any] = field(default_factory=dict)
-    shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    shift: NDArray[np.float64] | float = 0.0
     atol_m: float = 2e-3
     intensity: Literal["equal", "linear", "none"] = "none"
     has_intensity: NDArray[np.bool_] | None = None
@@ -95,6 +100,9 @@ class Draw:
     def one_of(self, *choices: T) -> T:
         return choices[0] if self.is_first else choices[int(self.rng.integers(len(choices)))]
 
+    def path(self, *suffixes: str) -> Path:
+        return self.folder / f"a.{self.one_of(*suffixes)}"
+
     def order(self, items: Sequence[T]) -> list[T]:
         places = range(len(items)) if self.is_first else self.rng.permutation(len(items))
         return [items[place] for place in places]
@@ -110,35 +118,73 @@ class Draw:
         mask[len(mask) // 2] = True
         return mask
 
+    def places(self, count: int) -> NDArray[np.int64]:
+        return np.sort(self.rng.integers(0, len(self.scene) + 1, count))
+
 
 def paint(rng: np.random.Generator, n_points: int) -> Scene:
     """Draw a wall 3 x 2 m at y = 2 with a bar and a square, a floor and a side wall."""
     a, b = rng.uniform(0.02, 0.98, (2, n_points))
     which = np.arange(n_points) % 4
-    wall = which < 2
-    points = np.where(
-        wall[:, None],
-        np.column_stack([3 * a, np.full(n_points, 2.0), 2 * b]),
-        np.where(
-            (which == 2)[:, None],
-            np.column_stack([3 * a, 2 * b, np.zeros(n_points)]),
-            np.column_stack([np.zeros(n_points), 2 * a, 2 * b]),
-        ),
-    )
-    points += rng.normal(0.0, 0.002, points.shape)
+    zero, wall = np.zeros(n_points), which < 2
+    surfaces = ([3 * a, zero + 2.0, 2 * b], [3 * a, 2 * b, zero], [zero, 2 * a, 2 * b])
+    x, y, z = (np.select([wall, which == 2], [s[k] for s in surfaces[:2]], surfaces[2][k])
+               for k in range(3))  # fmt: skip
+    points = np.column_stack([x, y, z]) + rng.normal(0.0, 0.002, (n_points, 3))
     # None without a return, whatever the noise.
     points = np.round(points, 4) + np.where(np.abs(points) < 1e-4, 1e-3, 0.0)
     x, z = points[:, 0], points[:, 2]
-    right = x > 1.5
     bar = (x > 0.4) & (x < 0.8) & (z > 0.3) & (z < 1.7) & wall
     square = (x > 2.2) & (x < 2.7) & (z > 1.3) & (z < 1.8) & wall
-    parts = [bar, square, right]
+    parts = [bar, square, x > 1.5]
     reflectance = np.select(parts, [0.15, 0.95, 0.35], 0.75)
     reflectance = np.clip(reflectance + rng.normal(0.0, 0.005, n_points), 0.0, 1.0)
     paints = [[180, 30, 30], [40, 60, 220], [90, 110, 70]]
     rgb = np.select([part[:, None] for part in parts], paints, [200, 180, 150])
     rgb = np.clip(rgb + rng.integers(-2, 3, rgb.shape), 0, 255).astype(np.uint8)
-    return Scene(points=points, reflectance=reflectance, rgb=rgb)
+    return Scene(points, reflectance, rgb)
+
+
+def joined(scenes: Sequence[Scene]) -> Scene:
+    """Points of several scans, one after the other."""
+    return Scene(*(np.concatenate(arrays) for arrays in zip(*map(_arrays, scenes), strict=True)))
+
+
+def _arrays(scene: Scene) -> tuple[NDArray[Any], ...]:
+    return scene.points, scene.reflectance, scene.rgb
+
+
+def _fields(scene: Scene, *, grey: Any = None, rgb: Any = None) -> dict[str, NDArray[Any]]:
+    """Columns x, y, z, then those of an intensity and of colours where they are given."""
+    fields = dict(zip("xyz", scene.points.T, strict=True))
+    if grey is not None:
+        fields["intensity"] = grey
+    return fields | (_named("red green blue", rgb) if rgb is not None else {})
+
+
+def _named(names: str, table: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    return dict(zip(names.split(), table.T, strict=True))
+
+
+def write_scene(
+    path: Path, scene: Scene, *, grey: Any = None, rgb: Any = None, **options: Any
+) -> Path:
+    """Write points with an intensity and colours, as they are, in the format of the suffix."""
+    fields = _fields(scene, grey=grey, rgb=rgb)
+    match path.suffix:
+        case ".e57":
+            scan = {"fields": _e57_fields(scene, grey=grey, rgb=rgb)} | options
+            return scan_files.write_e57(path, [scan])
+        case ".las" | ".laz":
+            return scan_files.write_las(path, scene.points, intensity=grey, rgb=rgb, **options)
+        case ".ply":
+            return scan_files.write_ply(path, fields, **options)
+        case ".pcd":
+            return scan_files.write_pcd(path, fields, **options)
+        case ".ptx":
+            table = np.column_stack(list(fields.values()))
+            return scan_files.write_ptx(path, [(table, 1, np.eye(4))])
+    return _write_table(path, fields, header=str(len(scene)) if path.suffix == ".pts" else "")
 
 
 # Text
@@ -165,14 +211,6 @@ def _write_table(
     return path
 
 
-def _xyz(scene: Scene, shift: NDArray[np.float64] | float = 0.0) -> dict[str, NDArray[Any]]:
-    return dict(zip("xyz", (scene.points + shift).T, strict=True))
-
-
-def _rgb(scene: Scene, names: str = "rgb") -> dict[str, NDArray[Any]]:
-    return dict(zip(names, scene.rgb.T, strict=True))
-
-
 def csv_named(draw: Draw) -> Case:
     """A CSV file with header, a column of texts among the numbers."""
     scene = draw.scene
@@ -187,27 +225,23 @@ def csv_named(draw: Draw) -> Case:
     quote = draw.one_of(False, True) and separator != "\t"
     text = draw.one_of("P{}", "Böschung {}", "wall-{}", "", "Wall, north; {}" if quote else "")
     columns: dict[str, Any] = {"name": [text.format(k) for k in range(len(scene))]} if text else {}
-    columns |= dict(zip(axes.split(), scene.points.T, strict=True))
-    columns |= dict(zip(colours.split(), scene.rgb.T, strict=True))
+    columns |= _named(axes, scene.points) | _named(colours, scene.rgb)
     has_intensity = draw.one_of(False, True)
     if has_intensity:
-        columns[draw.one_of("Intensity", "i", "Reflectance", "Scalar_field")] = (
-            scene.reflectance * draw.one_of(1.0, 255.0, 4095.0)
-        )
-    columns = {name: columns[name] for name in draw.order(list(columns))}
+        name = draw.one_of("Intensity", "i", "Reflectance", "Scalar_field")
+        columns[name] = scene.reflectance * draw.one_of(1.0, 255.0, 4095.0)
     # The first numbers may all be whole, where others have decimal commas.
     scene.points[0] = draw.one_of(scene.points[0], np.array([1.0, 2.0, 1.0]))
     path = _write_table(
-        draw.folder / draw.one_of("named.csv", "named.txt", "named.xyz"),
-        columns,
+        draw.path("csv", "txt", "xyz"),
+        {name: columns[name] for name in draw.order(list(columns))},
         separator=separator,
         decimal="," if (separator == ";" or quote) and draw.one_of(False, True) else ".",
         end=draw.one_of("\n", "\r\n"),
         encoding=draw.one_of("utf-8", "latin-1", "utf-8-sig"),
         quote=quote,
     )
-    intensity: Literal["linear", "none"] = "linear" if has_intensity else "none"
-    return Case(scene=scene, paths=[path], rgb=True, intensity=intensity)
+    return Case(scene, [path], rgb=True, intensity="linear" if has_intensity else "none")
 
 
 def text_header_unknown(draw: Draw) -> Case:
@@ -221,13 +255,10 @@ def text_header_unknown(draw: Draw) -> Case:
         "id,lat,lon,height",
     )
     separator = next((mark for mark in ";," if mark in header), " ")
-    n_columns = len(header.replace("#", "").replace(separator, " ").split())
-    table = {str(k): draw.rng.uniform(0.0, 9.0, 60) for k in range(n_columns)}
-    path = _write_table(
-        draw.folder / draw.one_of("a.txt", "a.csv"), table, separator=separator, header=header
-    )
-    words = header.replace("#", "").replace(separator, " ").replace('"', "").split()
-    return Case(scene=draw.scene, paths=[path], refusal=("cloud.columns", *words))
+    words = header.replace('"', "").split(separator)
+    table = {str(k): draw.rng.uniform(0.0, 9.0, 60) for k in range(len(words))}
+    path = _write_table(draw.path("txt", "csv"), table, separator=separator, header=header)
+    return Case(draw.scene, [path], refusal=("cloud.columns", *words))
 
 
 def text_names_twice(draw: Draw) -> Case:
@@ -237,29 +268,25 @@ def text_names_twice(draw: Draw) -> Case:
     names = draw.one_of(("N",), ("H",), ("i",), ("E", "N"), ("I", "J", "K"), ("Height",))
     columns: dict[str, Any] = dict(zip(names, other.T, strict=False))
     has_intensity = draw.one_of(True, False) or names == ("i",)
-    columns |= dict(zip(draw.one_of("XYZ", "xyz"), scene.points.T, strict=True))
+    columns |= _named(draw.one_of("X Y Z", "x y z"), scene.points)
     if has_intensity:
         columns["Intensity"] = scene.reflectance
     columns = {name: columns[name] for name in draw.order(list(columns))}
-    path = _write_table(draw.folder / "a.csv", columns, separator=draw.one_of(",", " ", ";"))
-    return Case(scene=scene, paths=[path], intensity="linear" if has_intensity else "none")
+    path = _write_table(draw.path("csv"), columns, separator=draw.one_of(",", " ", ";"))
+    return Case(scene, [path], intensity="linear" if has_intensity else "none")
 
 
 def text_index_first(draw: Draw) -> Case:
     """A first column 1, 2, 3 ... with and without a name."""
     scene = draw.scene
     numbers = np.arange(len(scene)) + draw.one_of(1, 0, 1001)
-    columns = {draw.one_of("OBJECTID", "id", "Point No", "//nr"): numbers, **_xyz(scene)}
     has_rgb = draw.one_of(False, True)
-    if has_rgb:
-        columns |= _rgb(scene)
+    columns = {draw.one_of("OBJECTID", "id", "Point No", "//nr"): numbers}
+    columns |= _fields(scene, rgb=scene.rgb if has_rgb else None)
     path = _write_table(
-        draw.folder / "points.csv",
-        columns,
-        separator=draw.one_of(",", ";"),
-        header=draw.one_of("", None),
+        draw.path("csv"), columns, separator=draw.one_of(",", ";"), header=draw.one_of("", None)
     )
-    return Case(scene=scene, paths=[path], rgb=has_rgb)
+    return Case(scene, [path], rgb=has_rgb)
 
 
 def text_not_a_number(draw: Draw) -> Case:
@@ -269,22 +296,19 @@ def text_not_a_number(draw: Draw) -> Case:
     spellings = ["-nan(ind)", "nan", "NaN", "-nan", "1.#QNAN", "-1.#IND00", "1.#INF", "inf"]
     spellings += ["-Infinity", "nan(snan)", "NAN", "#NUM!", "#N/A", "n/a", "NA", "null"]
     spelling = draw.one_of(*spellings)
-    columns: dict[str, Any] = {**_xyz(scene), **_rgb(scene)}
-    for name in draw.one_of(("x", "y", "z"), ("z",), ("x", "y")):
+    columns: dict[str, Any] = _fields(scene, rgb=scene.rgb)
+    for name in draw.one_of("xyz", "z", "xy"):
         columns[name] = [
             spelling if is_lost else f"{value:.4f}"
             for value, is_lost in zip(columns[name], lost, strict=True)
         ]
-    path = _write_table(
-        draw.folder / draw.one_of("a.xyz", "a.csv", "a.txt"),
-        columns,
-        separator=draw.one_of(" ", ",", ";"),
-        header=draw.one_of(None, ""),
-    )
+    separator = draw.one_of(" ", ",", ";")
+    path = draw.path("xyz", "csv", "txt")
+    _write_table(path, columns, separator=separator, header=draw.one_of(None, ""))
     n_lost = int(lost.sum())
     return Case(
-        scene=scene.part(~lost),
-        paths=[path],
+        scene.part(~lost),
+        [path],
         rgb=True,
         left_out={"not_finite": n_lost},
         warnings=(f"{n_lost} points",),
@@ -296,92 +320,81 @@ def text_normals(draw: Draw) -> Case:
     scene = draw.scene
     normals = draw.rng.normal(size=(len(scene), 3)) * 0.05 + [0.0, -1.0, 0.0]
     normals = np.round(normals / np.linalg.norm(normals, axis=1)[:, None], 3)
-    parts: list[dict[str, Any]] = [dict(zip(("nx", "ny", "nz"), normals.T, strict=True))]
+    parts = [_named("nx ny nz", normals)]
     has_rgb = draw.one_of(False, True)
     if has_rgb:
-        parts.append(_rgb(scene))
-    columns: dict[str, Any] = _xyz(scene)
+        parts.append(_named("r g b", scene.rgb))
+    columns = _fields(scene)
     for part in draw.order(parts):
         columns |= part
-    path = _write_table(
-        draw.folder / "normals.xyz",
-        columns,
-        separator=draw.one_of(" ", ",", "\t"),
-        header=draw.one_of(None, "", "//X Y Z Nx Ny Nz" if not has_rgb else None),
-    )
-    return Case(scene=scene, paths=[path], rgb=has_rgb)
+    header = draw.one_of(None, "", "//X Y Z Nx Ny Nz" if not has_rgb else None)
+    path = draw.path("xyz")
+    _write_table(path, columns, separator=draw.one_of(" ", ",", "\t"), header=header)
+    return Case(scene, [path], rgb=has_rgb)
+
+
+def in_unit(scene: Scene, unit: str) -> Scene:
+    return replace(scene, points=scene.points / UNITS_M[unit])
 
 
 def text_units(draw: Draw) -> Case:
-    """Units in comments and in the names of columns; the user's word wins."""
-    scene, unit = draw.scene, draw.one_of("ft", "us-ft", "mm", "cm")
-    spelled = {
-        "ft": ("ft", "feet", "international feet"),
-        "us-ft": ("us-ft", "US survey feet", "ftUS"),
-        "mm": ("mm", "millimetres", "millimeters"),
-        "cm": ("cm", "centimetres", "centimeters"),
-    }[unit]
-    word = draw.one_of(*spelled)
+    """Units in comments and in the names of columns."""
+    unit, words = draw.one_of(
+        ("ft", ("ft", "feet", "international feet")),
+        ("us-ft", ("us-ft", "US survey feet", "ftUS")),
+        ("mm", ("mm", "millimetres", "millimeters")),
+        ("cm", ("cm", "centimetres", "centimeters")),
+    )
+    word = draw.one_of(*words)
     header = draw.one_of(
         f"X [{word}],Y [{word}],Z [{word}]",
         f"# units: {word}\nx,y,z",
         f"x,y,z\n{word},{word},{word}",
     )
-    path = _write_table(
-        draw.folder / "a.csv",
-        _xyz(replace(scene, points=scene.points / UNITS_M[unit])),
-        separator=",",
-        header=header,
-    )
-    return Case(scene=scene, paths=[path], unit=unit)
+    columns = _fields(in_unit(draw.scene, unit))
+    path = _write_table(draw.path("csv"), columns, separator=",", header=header)
+    return Case(draw.scene, [path], unit=unit)
 
 
 def pts_two_scanners(draw: Draw) -> Case:
     """Two PTS files of scanners whose intensities have other ranges."""
     ranges = draw.order([(-2048.0, 2047.0), (0.0, 255.0)])
-    paths = []
     halves = draw.scene.halves()
-    for name, half, (low, high) in zip("ab", halves, ranges, strict=True):
-        intensity = np.rint(low + half.reflectance * (high - low))
-        columns = {**_xyz(half), "i": intensity, **_rgb(half)}
-        path = draw.folder / f"{name}.pts"
-        paths.append(_write_table(path, columns, header=str(len(half))))
-    scene = joined(halves)
-    return Case(scene=scene, paths=paths, intensity="equal", rgb=True, warnings=("range",))
-
-
-def joined(scenes: Sequence[Scene]) -> Scene:
-    """Points of several scans, one after the other."""
-    names = ("points", "reflectance", "rgb")
-    return Scene(**{name: np.concatenate([getattr(s, name) for s in scenes]) for name in names})
+    paths = [
+        write_scene(
+            draw.folder / name,
+            half,
+            grey=np.rint(low + half.reflectance * (high - low)),
+            rgb=half.rgb,
+        )
+        for name, half, (low, high) in zip(("a.pts", "b.pts"), halves, ranges, strict=True)
+    ]
+    return Case(joined(halves), paths, intensity="equal", rgb=True, warnings=("range",))
 
 
 # E57
 
 
-def _e57_fields(
-    scene: Scene,
-    shift: NDArray[np.float64] | float = 0.0,
-    *,
-    intensity: float | None = 1.0,
-    low: float = 0.0,
-    rgb: float | None = 1.0,
-) -> dict[str, Any]:
-    fields = scan_files.cartesian(scene.points + shift)
-    if intensity is not None:
-        fields["intensity"] = low + scene.reflectance * (intensity - low)
-    if rgb is not None:
-        names = ("colorRed", "colorGreen", "colorBlue")
-        values = np.rint(scene.rgb.astype(np.float64).T * rgb)
-        fields |= dict(zip(names, values, strict=True))
-    return fields
+def _e57_fields(scene: Scene, *, grey: Any = None, rgb: Any = None) -> dict[str, Any]:
+    fields = scan_files.cartesian(scene.points)
+    if grey is not None:
+        fields["intensity"] = grey
+    return fields | (_named("colorRed colorGreen colorBlue", rgb) if rgb is not None else {})
+
+
+# What most files state of a scan.
+_LIMITS: Final = {"intensity_limits": (0.0, 1.0), "rgb_limit": 255}
+
+
+def _whole(scene: Scene) -> dict[str, Any]:
+    return _e57_fields(scene, grey=scene.reflectance, rgb=scene.rgb)
 
 
 def e57_colour_invalid(draw: Draw) -> Case:
     """Points whose colour is flagged invalid, and written as black."""
     scene = draw.scene
     lost = draw.chosen(draw.one_of(0.3, 0.05, 0.9))
-    fields = _e57_fields(scene)
+    fields = _whole(scene)
     for name in ("colorRed", "colorGreen", "colorBlue"):
         fields[name] = np.where(lost, draw.one_of(0, 255), fields[name])
     fields["isColorInvalid"] = lost
@@ -392,13 +405,9 @@ def e57_colour_invalid(draw: Draw) -> Case:
         fields["intensity"] = np.where(has_intensity, fields["intensity"], 0.0)
     if draw.one_of(False, True):
         fields["cartesianInvalidState"] = np.zeros(len(scene))
-    path = scan_files.write_e57(
-        draw.folder / "a.e57",
-        [{"fields": fields, "intensity_limits": (0.0, 1.0), "rgb_limit": 255}],
-    )
     return Case(
-        scene=scene,
-        paths=[path],
+        scene,
+        [scan_files.write_e57(draw.path("e57"), [{"fields": fields, **_LIMITS}])],
         rgb=True,
         has_rgb=~lost,
         intensity="equal",
@@ -409,38 +418,26 @@ def e57_colour_invalid(draw: Draw) -> Case:
 
 def e57_colour_limit_wrong(draw: Draw) -> Case:
     """A colour limit that the data do not fit is named and not used."""
-    limit, scale = draw.one_of((1, 1.0), (65535, 1.0), (255, 257.0), (4095, 1.0))
-    path = scan_files.write_e57(
-        draw.folder / "a.e57", [{"fields": _e57_fields(draw.scene, rgb=scale), "rgb_limit": limit}]
-    )
-    return Case(
-        scene=draw.scene,
-        paths=[path],
-        rgb=True,
-        intensity="linear",
-        warnings=(str(limit), "colours reach at most"),
-    )
+    limit, scale = draw.one_of((1, 1), (65535, 1), (255, 257), (4095, 1))
+    scene = draw.scene
+    rgb = scene.rgb.astype(np.float64) * scale
+    path = write_scene(draw.path("e57"), scene, grey=scene.reflectance, rgb=rgb, rgb_limit=limit)
+    warnings = (str(limit), "colours reach at most")
+    return Case(scene, [path], rgb=True, intensity="linear", warnings=warnings)
 
 
 def e57_scan_without(draw: Draw) -> Case:
     """One of several scans has no colour, or no intensity."""
-    left, right = draw.scene.halves()
-    scenes = [left, right] if draw.one_of(True, False) else [right, left]
+    scenes = list(draw.scene.halves())[:: draw.one_of(1, -1)]
     lacks = draw.one_of("colour", "intensity")
     place = draw.one_of(1, 0)
-    scans = []
-    for k, scene in enumerate(scenes):
-        fields = _e57_fields(
-            scene,
-            intensity=None if lacks == "intensity" and k == place else 1.0,
-            rgb=None if lacks == "colour" and k == place else 1.0,
-        )
-        scans.append({"fields": fields, "intensity_limits": (0.0, 1.0), "rgb_limit": 255})
-    path = scan_files.write_e57(draw.folder / "a.e57", scans)
+    scans = [{"fields": _whole(scene), **_LIMITS} for scene in scenes]
+    kept = {"colour": {"grey": scenes[place].reflectance}, "intensity": {"rgb": scenes[place].rgb}}
+    scans[place]["fields"] = _e57_fields(scenes[place], **kept[lacks])
     has = np.concatenate([np.full(len(scene), k != place) for k, scene in enumerate(scenes)])
     return Case(
-        scene=joined(scenes),
-        paths=[path],
+        joined(scenes),
+        [scan_files.write_e57(draw.path("e57"), scans)],
         rgb=True,
         has_rgb=has if lacks == "colour" else None,
         intensity="equal",
@@ -452,41 +449,42 @@ def e57_scan_without(draw: Draw) -> Case:
 def e57_two_depths(draw: Draw) -> Case:
     """Scans of one file with colours of different depth."""
     scenes = draw.scene.halves()
-    depths = draw.order(draw.one_of([(255, 1.0), (65535, 257.0)], [(255, 1.0), (65535, 256.0)]))
     scans = []
-    for scene, (limit, scale) in zip(scenes, depths, strict=True):
-        scans.append({"fields": _e57_fields(scene, rgb=scale)})
+    for scene, (limit, scale) in zip(
+        scenes, draw.order([(255, 1), (65535, draw.one_of(257, 256))]), strict=True
+    ):
+        rgb = scene.rgb.astype(np.float64) * scale
+        scans.append({"fields": _e57_fields(scene, grey=scene.reflectance, rgb=rgb)})
         if draw.one_of(True, False):
             scans[-1]["rgb_limit"] = limit
-    path = scan_files.write_e57(draw.folder / "a.e57", scans)
-    return Case(scene=joined(scenes), paths=[path], rgb=True, intensity="linear")
+    path = scan_files.write_e57(draw.path("e57"), scans)
+    return Case(joined(scenes), [path], rgb=True, intensity="linear")
 
 
 def e57_two_intensity_limits(draw: Draw) -> Case:
     """Scans of one file with intensity limits of their own."""
     scenes = draw.scene.halves()
     limits = [(0.0, 1.0), (0.0, 65535.0), (-2048.0, 2047.0), (0.0, 255.0), (0.0, 100.0)]
-    chosen = draw.order(limits)[:2]
-    scans = [
-        {"fields": _e57_fields(scene, intensity=high, low=low), "intensity_limits": (low, high)}
-        for scene, (low, high) in zip(scenes, chosen, strict=True)
-    ]
-    path = scan_files.write_e57(draw.folder / "a.e57", scans)
-    return Case(scene=joined(scenes), paths=[path], rgb=True, intensity="equal")
+    scans = []
+    for scene, (low, high) in zip(scenes, draw.order(limits)[:2], strict=True):
+        grey = low + scene.reflectance * (high - low)
+        fields = _e57_fields(scene, grey=grey, rgb=scene.rgb)
+        scans.append({"fields": fields, "intensity_limits": (low, high)})
+    path = scan_files.write_e57(draw.path("e57"), scans)
+    return Case(joined(scenes), [path], rgb=True, intensity="equal")
 
 
 def e57_not_finite(draw: Draw) -> Case:
     """Coordinates that are not finite, with or without a pose of the scan."""
     scene = draw.scene
     lost = draw.chosen(draw.one_of(0.1, 0.5))
-    fields = _e57_fields(scene, -STATION)
+    fields = _whole(replace(scene, points=scene.points - STATION))
     for name in draw.one_of(("cartesianY",), ("cartesianX", "cartesianY", "cartesianZ")):
         fields[name] = np.where(lost, draw.one_of(np.nan, np.inf, -np.inf), fields[name])
-    scan = {"fields": fields, "intensity_limits": (0.0, 1.0), "rgb_limit": 255}
-    scan |= {"rotation": (1.0, 0.0, 0.0, 0.0), "translation": STATION}
+    scan = {"fields": fields, "rotation": (1.0, 0.0, 0.0, 0.0), "translation": STATION} | _LIMITS
     return Case(
-        scene=scene.part(~lost),
-        paths=[scan_files.write_e57(draw.folder / "a.e57", [scan])],
+        scene.part(~lost),
+        [scan_files.write_e57(draw.path("e57"), [scan])],
         rgb=True,
         intensity="equal",
         left_out={"not_finite": int(lost.sum())},
@@ -502,37 +500,21 @@ def points_at_zero(draw: Draw) -> Case:
     scene, shift = draw.scene, draw.shift()
     share = draw.one_of(0.5, 0.1, 0.0, 0.8)
     n_lost = max(1, int(share / (1.0 - share) * len(scene)))
-    places = np.sort(draw.rng.integers(0, len(scene) + 1, n_lost))
-
-    def with_zeros(values: NDArray[Any], fill: float = 0.0) -> NDArray[Any]:
-        return np.insert(values.astype(np.float64), places, fill, axis=0)
-
-    points, greys = with_zeros(scene.points + shift), with_zeros(scene.reflectance)
-    rgb = with_zeros(scene.rgb)
-    all_of = Scene(points=points, reflectance=greys, rgb=rgb.astype(np.uint8))
-    kind = draw.one_of("e57", "ply", "pcd", "las", "laz", "xyz", "pts", "ptx")
-    path = draw.folder / f"zeros.{kind}"
-    if kind == "e57":
-        scan_files.write_e57(path, [{"fields": _e57_fields(all_of), "intensity_limits": (0, 1)}])
-    elif kind == "ply":
-        fields = {**_xyz(all_of), **_rgb_named(all_of), "intensity": greys}
-        scan_files.write_ply(path, fields, encoding=draw.one_of(*_PLY_ENCODINGS))
-    elif kind == "pcd":
-        fields = {**_xyz(all_of), **_rgb(all_of), "intensity": greys}
-        scan_files.write_pcd(path, fields, data=draw.one_of("binary", "ascii", "binary_compressed"))
-    elif kind in ("las", "laz"):
+    moved = replace(scene, points=scene.points + shift)
+    all_of = moved.with_points(draw.places(n_lost), np.zeros(3))
+    path = draw.path("e57", "ply", "pcd", "las", "laz", "xyz", "pts", "ptx")
+    grey, options = all_of.reflectance, {}
+    if path.suffix == ".ply":
+        options = {"encoding": draw.one_of(*_PLY_ENCODINGS)}
+    elif path.suffix == ".pcd":
+        options = {"data": draw.one_of("binary", "ascii", "binary_compressed")}
+    elif path.suffix in (".las", ".laz"):
         # Coordinates of LAS count from an offset, here that of the file's world.
-        _write_las(path, all_of, offset=np.zeros(3), scale=0.005)
-    elif kind == "ptx":
-        table = np.column_stack([points, greys, rgb])
-        scan_files.write_ptx(path, [(table, 1, np.eye(4))])
-    else:
-        columns: dict[str, Any] = {**_xyz(all_of), "intensity": greys, **_rgb(all_of)}
-        header = str(len(points)) if kind == "pts" else None
-        _write_table(path, columns, header=header if kind == "pts" else "")
+        grey, options = grey * 65535.0, {"offset": np.zeros(3), "scale": 0.005}
+    write_scene(path, all_of, grey=grey, rgb=all_of.rgb, **options)
     return Case(
-        scene=scene,
-        paths=[path],
+        scene,
+        [path],
         shift=shift,
         atol_m=0.004,
         rgb=True,
@@ -545,23 +527,14 @@ def points_at_one_place(draw: Draw) -> Case:
     """Points without a return that were moved with the scan, to its scanner or a file's offset."""
     scene, shift = draw.scene, draw.shift()
     n_lost = round(draw.one_of(1.0, 0.2, 4.0) * len(scene))
-    places = np.sort(draw.rng.integers(0, len(scene) + 1, n_lost))
-    all_of = Scene(
-        points=np.insert(scene.points + shift, places, STATION + shift, axis=0),
-        reflectance=np.insert(scene.reflectance, places, 0.0),
-        rgb=np.insert(scene.rgb, places, 0, axis=0),
-    )
-    kind = draw.one_of("las", "xyz", "ply", "laz")
-    path = draw.folder / f"a.{kind}"
-    if kind == "ply":
-        scan_files.write_ply(path, {**_xyz(all_of), **_rgb_named(all_of)})
-    elif kind == "xyz":
-        _write_table(path, {**_xyz(all_of), **_rgb(all_of)})
-    else:
-        _write_las(path, all_of, offset=STATION + shift, intensity=np.zeros(len(all_of)))
+    moved = replace(scene, points=scene.points + shift)
+    all_of = moved.with_points(draw.places(n_lost), STATION + shift)
+    path = draw.path("las", "xyz", "ply", "laz")
+    options = {"offset": STATION + shift} if path.suffix.startswith(".la") else {}
+    write_scene(path, all_of, rgb=all_of.rgb, **options)
     return Case(
-        scene=scene,
-        paths=[path],
+        scene,
+        [path],
         shift=shift,
         rgb=True,
         left_out={"one_place": n_lost},
@@ -572,70 +545,33 @@ def points_at_one_place(draw: Draw) -> Case:
 # LAS
 
 
-def _write_las(
-    path: Path,
-    scene: Scene,
-    *,
-    offset: NDArray[np.float64],
-    scale: float = 0.0001,
-    intensity: NDArray[Any] | None = None,
-    rgb: bool = True,
-    extra: Mapping[str, NDArray[Any]] | None = None,
-    vlrs: Sequence[Any] = (),
-    version: str = "1.4",
-    factor: int = 256,
-) -> Path:
-    import laspy
-
-    point_format = (7 if rgb else 6) if version == "1.4" else (2 if rgb else 0)
-    header = laspy.LasHeader(point_format=point_format, version=version)
-    header.offsets, header.scales = offset, np.full(3, scale)
-    for name, values in (extra or {}).items():
-        header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=values.dtype))
-    header.vlrs.extend(vlrs)
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = scene.points.T
-    grey = scene.reflectance * 65535.0 if intensity is None else intensity
-    las.intensity = np.rint(grey).astype(np.uint16)
-    if rgb:
-        las.red, las.green, las.blue = scene.rgb.astype(np.uint16).T * factor
-    for name, values in (extra or {}).items():
-        las[name] = values
-    las.write(path)
-    return path
+def _las(path: Path, scene: Scene, **options: Any) -> Path:
+    """A LAS file whose intensities and colours reach 65,535."""
+    given = {"grey": scene.reflectance * 65535.0, "rgb": scene.rgb.astype(np.int64) * 256}
+    return write_scene(path, scene, **(given | {"offset": np.zeros(3)} | options))
 
 
 def las_bounds_stale(draw: Draw) -> Case:
-    """Bounds of another place, or fewer points stated than there are."""
+    """Bounds of another place."""
     scene, shift = draw.scene, draw.shift()
     moved = replace(scene, points=scene.points + shift)
-    kind = draw.one_of("las", "laz")
-    path = _write_las(draw.folder / f"a.{kind}", moved, offset=np.floor(shift), version="1.2")
+    path = _las(draw.path("las", "laz"), moved, offset=np.floor(shift), version="1.2")
     content = bytearray(path.read_bytes())
-    away = draw.one_of(-1000.0, 250.0, 1e5)
-    bounds = np.array(struct.unpack_from("<6d", content, 179)) + away
+    bounds = np.array(struct.unpack_from("<6d", content, 179)) + draw.one_of(-1000.0, 250.0, 1e5)
     struct.pack_into("<6d", content, 179, *bounds)
     path.write_bytes(bytes(content))
-    return Case(
-        scene=scene,
-        paths=[path],
-        shift=shift,
-        rgb=True,
-        intensity="linear",
-        warnings=("outside the bounding box",),
-    )
+    warnings = ("outside the bounding box",)
+    return Case(scene, [path], shift=shift, rgb=True, intensity="linear", warnings=warnings)
 
 
 def las_count_stale(draw: Draw) -> Case:
     """Points were appended, and the header still states the number before."""
     scene = draw.scene
-    path = _write_las(draw.folder / "a.las", scene, offset=np.zeros(3), version="1.2")
+    path = _las(draw.path("las"), scene, version="1.2")
     content = bytearray(path.read_bytes())
     struct.pack_into("<I", content, 107, draw.one_of(len(scene) // 2, 1, len(scene) - 1))
     path.write_bytes(bytes(content))
-    return Case(
-        scene=scene, paths=[path], rgb=True, intensity="linear", warnings=(str(len(scene)),)
-    )
+    return Case(scene, [path], rgb=True, intensity="linear", warnings=(str(len(scene)),))
 
 
 def colours_of_few_bits(draw: Draw) -> Case:
@@ -644,22 +580,12 @@ def colours_of_few_bits(draw: Draw) -> Case:
     most = draw.one_of(1023, 4095)
     scene.rgb[:10] = 255
     deep = np.rint(scene.rgb / 255.0 * most).astype(np.uint16)
-    path = draw.folder / draw.one_of("a.las", "a.ply", "a.xyz")
-    if path.suffix == ".las":
-        deep_scene = replace(scene, rgb=deep)
-        _write_las(path, deep_scene, offset=np.zeros(3), factor=1, intensity=np.zeros(len(scene)))
-    else:
-        colours = dict(zip(("red", "green", "blue"), deep.T, strict=True))
-        write = scan_files.write_ply if path.suffix == ".ply" else _write_table
-        write(path, {**_xyz(scene), **colours})
-    return Case(scene=scene, paths=[path], rgb=True, warnings=(f"colours, which reach {most}",))
+    path = write_scene(draw.path("las", "ply", "xyz"), scene, rgb=deep)
+    return Case(scene, [path], rgb=True, warnings=(f"colours, which reach {most}",))
 
 
 def las_feet(draw: Draw) -> Case:
     """Feet by GeoTIFF keys or WKT, also with heights in another unit."""
-    import laspy
-    import pyproj
-
     level, height, epsg = draw.one_of(
         ("us-ft", "us-ft", 2260),
         ("ft", "ft", 2222),
@@ -667,67 +593,60 @@ def las_feet(draw: Draw) -> Case:
         ("us-ft", "m", 2260),
         ("m", "us-ft", 32618),
     )
-    vertical = {"us-ft": 6360, "m": 5703, "ft": 8228}[height]
     how = draw.one_of("keys", "wkt", "wkt behind the points", "citation")
-    if how == "citation" and level != height:
-        how = "keys"
-    if how == "citation":
+    has_height = height != level or draw.one_of(False, True)
+    if how == "citation" and level == height:
         foot = {"us-ft": "US survey foot", "ft": "foot", "m": "metre"}[level]
-        text = f"PCS Name = site|Linear unit = {foot}|"
-        record = laspy.VLR("LASF_Projection", 34737, "", text.encode() + b"\0")
-    elif how == "keys":
-        codes = {"m": 9001, "ft": 9002, "us-ft": 9003}
-        keys = [(1024, 1), (3072, epsg), (3076, codes[level])]
-        if height != level or draw.one_of(False, True):
-            keys.append((4099, codes[height]))
-        words = [1, 1, 0, len(keys)]
-        for key, value in keys:
-            words += [key, 0, 1, value]
-        record = laspy.VLR("LASF_Projection", 34735, "", struct.pack(f"<{len(words)}H", *words))
+        number, data = 34737, f"PCS Name = site|Linear unit = {foot}|\0".encode()
+    elif how.startswith("wkt"):
+        vertical = {"us-ft": 6360, "m": 5703, "ft": 8228}[height]
+        data = _wkt(f"EPSG:{epsg}+{vertical}" if has_height else f"EPSG:{epsg}", draw)
+        number = 2112
     else:
-        crs = pyproj.CRS.from_epsg(epsg)
-        if height != level or draw.one_of(False, True):
-            crs = pyproj.CRS.from_user_input(f"EPSG:{epsg}+{vertical}")
-        text = crs.to_wkt(draw.one_of("WKT1_GDAL", "WKT2_2019"))
-        record = laspy.VLR("LASF_Projection", 2112, "", text.encode() + b"\0")
+        codes = {"m": 9001, "ft": 9002, "us-ft": 9003}
+        keys = {1024: 1, 3072: epsg, 3076: codes[level]}
+        keys |= {4099: codes[height]} if has_height else {}
+        words = [
+            1,
+            1,
+            0,
+            len(keys),
+            *(w for key, value in keys.items() for w in (key, 0, 1, value)),
+        ]
+        number, data = 34735, struct.pack(f"<{len(words)}H", *words)
     scene = draw.scene
     metres = np.array([UNITS_M[level], UNITS_M[level], UNITS_M[height]])
     in_feet = replace(scene, points=scene.points / metres)
-    path = _write_las(
-        draw.folder / draw.one_of("a.las", "a.laz"),
-        in_feet,
-        offset=np.zeros(3),
-        vlrs=[] if how == "wkt behind the points" else [record],
-    )
-    if how == "wkt behind the points":
-        _append_record(path, record)
-    params: dict[str, Any] = {}
+    is_behind = how == "wkt behind the points"
+    vlrs = [] if is_behind else [("LASF_Projection", number, data)]
+    path = _las(draw.path("las", "laz"), in_feet, vlrs=vlrs)
+    if is_behind:
+        # A record behind the points, which LAS 1.4 allows.
+        content = bytearray(path.read_bytes())
+        struct.pack_into("<QI", content, 235, len(content), 1)
+        struct.pack_into("<H", content, 6, 0x11)
+        head = struct.pack("<H16sHQ32s", 0, b"LASF_Projection", number, len(data), b"")
+        path.write_bytes(bytes(content) + head + data)
     unit = level if level == height else f"{level}/{height}"
     if draw.one_of(False, True):
         # What the user says wins over what the file states.
-        params, unit = {"unit": "m"}, "m"
-        scene = in_feet
-    return Case(scene=scene, paths=[path], rgb=True, intensity="linear", params=params, unit=unit)
+        params = {"unit": "m"}
+        return Case(in_feet, [path], rgb=True, intensity="linear", params=params)
+    return Case(scene, [path], rgb=True, intensity="linear", unit=unit)
 
 
-def _append_record(path: Path, record: Any) -> None:
-    """Add a record behind the points, which LAS 1.4 allows."""
-    content, data = bytearray(path.read_bytes()), record.record_data
-    struct.pack_into("<QI", content, 235, len(content), 1)
-    struct.pack_into("<H", content, 6, 0x11)
-    head = struct.pack("<H16sHQ32s", 0, b"LASF_Projection", record.record_id, len(data), b"")
-    path.write_bytes(bytes(content) + head + data)
+def _wkt(system: str, draw: Draw) -> bytes:
+    import pyproj
+
+    form = draw.one_of("WKT1_GDAL", "WKT2_2019")
+    return str(pyproj.CRS.from_user_input(system).to_wkt(form)).encode() + b"\0"
 
 
 def las_degrees(draw: Draw) -> Case:
     """Geographic coordinates are refused, with the way out."""
-    import laspy
-    import pyproj
-
-    text = pyproj.CRS.from_epsg(draw.one_of(4326, 4979, 4258)).to_wkt("WKT2_2019")
-    record = laspy.VLR("LASF_Projection", 2112, "", text.encode())
-    path = _write_las(draw.folder / "a.las", draw.scene, offset=np.zeros(3), vlrs=[record])
-    return Case(scene=draw.scene, paths=[path], refusal=("degrees", "cloud.unit"))
+    data = _wkt(f"EPSG:{draw.one_of(4326, 4979, 4258)}", draw)
+    path = _las(draw.path("las"), draw.scene, vlrs=[("LASF_Projection", 2112, data)])
+    return Case(draw.scene, [path], refusal=("degrees", "cloud.unit"))
 
 
 def las_extra_intensity(draw: Draw) -> Case:
@@ -738,43 +657,30 @@ def las_extra_intensity(draw: Draw) -> Case:
     extra = {names[0]: (scene.reflectance * 20.0 - 15.0).astype(np.float32)}
     extra |= {name: draw.rng.uniform(0.0, 9.0, len(scene)).astype(np.float32) for name in names[1:]}
     wants = draw.one_of(False, True)
-    path = _write_las(
-        draw.folder / draw.one_of("a.las", "a.laz"),
+    has_rgb = draw.one_of(False, True)
+    path = _las(
+        draw.path("las", "laz"),
         scene,
-        offset=np.zeros(3),
-        intensity=draw.rng.uniform(0.0, 9.0, len(scene)) if wants else np.zeros(len(scene)),
+        grey=draw.rng.uniform(0.0, 9.0, len(scene)) if wants else np.zeros(len(scene)),
         extra={name: extra[name] for name in draw.order(list(extra))},
-        rgb=draw.one_of(False, True),
+        **({} if has_rgb else {"rgb": None}),
     )
     params = {"intensity_field": draw.one_of(names[0], names[0].upper())} if wants else {}
-    import laspy
-
-    has_rgb = laspy.read(path).header.point_format.id == 7
-    return Case(scene=scene, paths=[path], rgb=has_rgb, intensity="linear", params=params)
+    return Case(scene, [path], rgb=has_rgb, intensity="linear", params=params)
 
 
 def one_reflector(draw: Draw) -> Case:
     """A few points of a reflector set no scale."""
     scene = draw.scene
     low, high = draw.one_of((300.0, 1800.0), (20.0, 90.0), (1000.0, 9000.0))
-    grey = np.rint(low + scene.reflectance * (high - low))
+    grey = np.rint(low + scene.reflectance * (high - low)).astype(np.float32)
     places = draw.rng.choice(len(scene), draw.one_of(5, 1, 3), replace=False)
     grey[places] = 65535
-    is_usual = np.ones(len(scene), dtype=np.bool_)
-    is_usual[places] = False
-    kind = draw.one_of("las", "ply", "pcd", "xyz", "e57")
-    path = draw.folder / f"a.{kind}"
-    if kind == "las":
-        _write_las(path, scene, offset=np.zeros(3), intensity=grey, rgb=False)
-    elif kind == "e57":
-        fields = {**_e57_fields(scene, rgb=None), "intensity": grey}
-        scan_files.write_e57(path, [{"fields": fields, "intensity_limits": (0.0, 65535.0)}])
-    elif kind == "xyz":
-        _write_table(path, {**_xyz(scene), "intensity": grey})
-    else:
-        fields = {**_xyz(scene), "intensity": grey.astype(np.float32)}
-        (scan_files.write_ply if kind == "ply" else scan_files.write_pcd)(path, fields)
-    return Case(scene=scene, paths=[path], intensity="linear", has_linear=is_usual)
+    path = draw.path("las", "ply", "pcd", "xyz", "e57")
+    options = {"intensity_limits": (0.0, 65535.0)} if path.suffix == ".e57" else {}
+    write_scene(path, scene, grey=grey, **options)
+    is_usual = ~np.isin(np.arange(len(scene)), places)
+    return Case(scene, [path], intensity="linear", has_linear=is_usual)
 
 
 # PLY and PCD
@@ -782,92 +688,68 @@ def one_reflector(draw: Draw) -> Case:
 _PLY_ENCODINGS: Final = ("binary_little_endian", "binary_big_endian", "ascii")
 
 
-def _rgb_named(scene: Scene, names: str = "red green blue") -> dict[str, NDArray[Any]]:
-    return dict(zip(names.split(), scene.rgb.T, strict=True))
-
-
 def ply_lists(draw: Draw) -> Case:
     """A list property somewhere among the others, and names of colours that programs use."""
+    from plyfile import PlyElement
+
     scene = draw.scene
-    encoding = draw.one_of(*_PLY_ENCODINGS)
-    order = {"ascii": "", "binary_big_endian": ">"}.get(encoding, "<")
     names = draw.one_of("red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b")
-    axis_kind, axis_name = draw.one_of(("f4", "float"), ("f8", "double"), ("f4", "float32"))
-    members = [(name, axis_kind, f"property {axis_name} {name}") for name in "xyz"]
-    members += [
-        (name, "u1", f"property {draw.one_of('uchar', 'uint8')} {name}") for name in names.split()
-    ]
-    item = draw.one_of(("u4", "uint"), ("i4", "int"), ("f4", "float"))
-    listed = ("list", item[0], f"property list uchar {item[1]} view_indices")
-    place = draw.one_of(len(members), 0, 3)
-    members.insert(place, listed)
-    values = {**_xyz(scene), **dict(zip(names.split(), scene.rgb.T, strict=True))}
-    body = io.BytesIO()
-    for k in range(len(scene)):
-        count = int(draw.rng.integers(0, 4))
-        words = []
-        for name, kind, _ in members:
-            numbers = [count, *range(count)] if name == "list" else [values[name][k]]
-            kinds = ["u1", *[kind] * count] if name == "list" else [kind]
-            if order:
-                for number, one in zip(numbers, kinds, strict=True):
-                    body.write(np.array(number, dtype=order + one).tobytes())
-            else:
-                words += [f"{number:.9g}" for number in numbers]
-        body.write((" ".join(words) + "\n").encode() if not order else b"")
-    header = [
-        "ply",
-        f"format {encoding} 1.0",
-        *draw.one_of(["comment x"], ["obj_info y"], []),
-        f"element vertex {len(scene)}",
-        *(line for _, _, line in members),
-        "end_header",
-    ]
-    path = draw.folder / "a.ply"
-    path.write_bytes(("\n".join(header) + "\n").encode() + body.getvalue())
-    return Case(scene=scene, paths=[path], rgb=True)
+    kind = draw.one_of("f4", "f8")
+    fields = _fields(replace(scene, points=scene.points.astype(kind))) | _named(names, scene.rgb)
+    encoding = draw.one_of(*_PLY_ENCODINGS)
+    # plyfile writes a table with lists as it lies in memory.
+    order = ">" if "big" in encoding else "<"
+    columns = [(name, order + array.dtype.str[1:]) for name, array in fields.items()]
+    columns.insert(draw.one_of(len(columns), 0, 3), ("view_indices", "O"))
+    table = np.zeros(len(scene), dtype=columns)
+    item = draw.one_of("u4", "i4", "f4")
+    for name, array in fields.items():
+        table[name] = array
+    for k, count in enumerate(draw.rng.integers(0, 4, len(scene))):
+        table["view_indices"][k] = np.arange(count, dtype=order + item)
+    element = PlyElement.describe(
+        table, "vertex", len_types={"view_indices": "u1"}, val_types={"view_indices": item}
+    )
+    comments = draw.one_of(["x"], [])
+    path = draw.path("ply")
+    scan_files.write_elements(path, [element], encoding, comments)
+    # Other names of the same types.
+    old, new = draw.one_of((b"", b""), (b" uchar ", b" uint8 "), (b" float ", b" float32 "))
+    path.write_bytes(path.read_bytes().replace(old, new, 20))
+    return Case(scene, [path], rgb=True)
 
 
 def comment_units(draw: Draw) -> Case:
-    """PLY and PCD files whose comments state a unit or a coordinate system."""
-    unit = draw.one_of("us-ft", "ft", "mm")
-    comment = {
-        "us-ft": ("units: US survey feet", "EPSG:2260", "unit us-ft"),
-        "ft": ("units: feet", "coordinates in ft", "EPSG:2222"),
-        "mm": ("unit: mm", "units = millimeters", "length unit mm"),
-    }[unit]
-    word = draw.one_of(*comment)
-    scene = draw.scene
-    inside = replace(scene, points=scene.points / UNITS_M[unit])
-    kind = draw.one_of("ply", "pcd", "e57")
-    path = draw.folder / f"a.{kind}"
-    if kind == "ply":
-        scan_files.write_ply(path, {**_xyz(inside), **_rgb_named(inside)})
-        path.write_bytes(path.read_bytes().replace(b"made by hand", word.encode(), 1))
-    elif kind == "pcd":
-        scan_files.write_pcd(path, {**_xyz(inside), **_rgb(inside)})
-        path.write_bytes(f"# {word}\n".encode() + path.read_bytes())
-    else:
-        scan = {"fields": _e57_fields(inside, intensity=None)}
+    """PLY, PCD and E57 files whose comments state a unit or a coordinate system."""
+    unit, words = draw.one_of(
+        ("us-ft", ("units: US survey feet", "EPSG:2260", "unit us-ft")),
+        ("ft", ("units: feet", "coordinates in ft", "EPSG:2222")),
+        ("mm", ("unit: mm", "units = millimeters", "length unit mm")),
+    )
+    word = draw.one_of(*words)
+    inside = in_unit(draw.scene, unit)
+    path = draw.path("ply", "pcd", "e57")
+    if path.suffix == ".e57":
+        scan = {"fields": _e57_fields(inside, rgb=inside.rgb)}
         scan_files.write_e57(path, [scan], coordinate_metadata=word)
-    return Case(scene=scene, paths=[path], rgb=True, unit=unit)
+    else:
+        write_scene(path, inside, rgb=inside.rgb)
+        content = path.read_bytes().replace(b"made by hand", word.encode(), 1)
+        path.write_bytes(content if path.suffix == ".ply" else f"# {word}\n".encode() + content)
+    return Case(draw.scene, [path], rgb=True, unit=unit)
 
 
 def pcd_names(draw: Draw) -> Case:
     """PCD files of any first line and capitalisation, with colours in fields of their own."""
     scene = draw.scene
-    fields: dict[str, Any] = dict(
-        zip(draw.one_of("xyz", "XYZ"), scene.points.astype(np.float32).T, strict=True)
-    )
+    fields: dict[str, Any] = _named(draw.one_of("x y z", "X Y Z"), scene.points.astype(np.float32))
     colours = draw.one_of("red green blue", "Red Green Blue", "r g b", "R G B", "packed", "")
     if colours == "packed":
-        parts = scene.rgb.astype(np.uint32)
-        bits = (parts[:, 0] << 16) | (parts[:, 1] << 8) | parts[:, 2]
-        name = draw.one_of("rgb", "RGB", "rgba")
-        fields[name] = bits if draw.one_of(True, False) else bits.view(np.float32)
+        bits = scene.rgb.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+        bits = bits if draw.one_of(True, False) else bits.view(np.float32)
+        fields[draw.one_of("rgb", "RGB", "rgba")] = bits
     elif colours:
-        kind = draw.one_of(np.uint8, np.uint16)
-        fields |= dict(zip(colours.split(), scene.rgb.astype(kind).T, strict=True))
+        fields |= _named(colours, scene.rgb.astype(draw.one_of(np.uint8, np.uint16)))
     has_intensity = draw.one_of(True, False) or not colours
     if has_intensity:
         name = draw.one_of("intensity", "Intensity", "INTENSITY", "i", "Reflectance")
@@ -875,9 +757,8 @@ def pcd_names(draw: Draw) -> Case:
     data = draw.one_of("binary", "ascii", "binary_compressed")
     if data == "ascii" and colours == "packed":
         data = "binary"
-    path = scan_files.write_pcd(draw.folder / "a.pcd", fields, data=data)
-    content = path.read_bytes()
-    first, rest = content.split(b"\n", 1)
+    path = scan_files.write_pcd(draw.path("pcd"), fields, data=data)
+    first, rest = path.read_bytes().split(b"\n", 1)
     first = draw.one_of(
         b"#.PCD v.7 - Point Cloud Data file format", b"# made by hand", b"", b"# PCD", first
     )
@@ -885,34 +766,13 @@ def pcd_names(draw: Draw) -> Case:
     if draw.one_of(False, True):
         head = head.replace(b"HEIGHT 1\n", b"")
     if draw.one_of(False, True):
-        head = b"\n".join(
-            line.replace(line.split()[0], line.split()[0].lower(), 1) if line.split() else line
-            for line in head.split(b"\n")
-        )
+        words = [line.partition(b" ") for line in head.split(b"\n")]
+        head = b"\n".join(word.lower() + space + more for word, space, more in words)
     path.write_bytes((first + b"\n" if first else b"") + head + b"DATA" + body)
-    return Case(
-        scene=scene,
-        paths=[path],
-        rgb=bool(colours),
-        intensity="linear" if has_intensity else "none",
-    )
+    return Case(scene, [path], rgb=bool(colours), intensity="linear" if has_intensity else "none")
 
 
 # PTX
-
-
-def _ptx_lines(
-    table: NDArray[np.float64], pose: NDArray[np.float64], shape: tuple[int, int]
-) -> list[str]:
-    lines = [str(shape[0]), str(shape[1])]
-    lines += [" ".join(f"{value:.9f}" for value in pose[:3, 3])]
-    lines += [" ".join(f"{value:.9f}" for value in pose[:3, axis]) for axis in range(3)]
-    lines += [" ".join(f"{value:.9f}" for value in row) for row in pose.T]
-    numbers = table.tolist()
-    return lines + [
-        " ".join([*(f"{value:.6f}" for value in row[:4]), *(f"{value:.0f}" for value in row[4:])])
-        for row in numbers
-    ]
 
 
 def ptx_scans(draw: Draw) -> Case:
@@ -921,36 +781,32 @@ def ptx_scans(draw: Draw) -> Case:
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     pose[:3, 3] = STATION
-    lines: list[str] = []
-    scenes = draw.scene.halves()
     lacks = draw.one_of("lines", "colour", "blank", "nothing")
     place = draw.one_of(1, 0)
-    has_rgb = []
-    kept = []
-    for k, half in enumerate(scenes):
-        n_points = len(half) // 2 * 2
-        scene = half.part(slice(n_points))
-        rows, columns = 2, n_points // 2
+    path, content = draw.path("ptx"), ""
+    has_rgb, kept = [], []
+    for k, half in enumerate(draw.scene.halves()):
+        scene = half.part(slice(len(half) // 2 * 2))
+        stated = f"{len(scene) // 2}\n2\n"
         if lacks == "lines" and k == place:
-            left = draw.rng.uniform(size=n_points) > draw.one_of(0.1, 0.6)
+            left = draw.rng.uniform(size=len(scene)) > draw.one_of(0.1, 0.6)
             scene = scene.part(left)
         local = (scene.points - pose[:3, 3]) @ pose[:3, :3]
-        table = np.column_stack([local, scene.reflectance, scene.rgb])
         is_grey = lacks == "colour" and k == place
-        lines += _ptx_lines(table[:, :4] if is_grey else table, pose, (columns, rows))
-        lines += [""] * (draw.one_of(1, 2) if lacks == "blank" else 0)
+        table = np.column_stack([local, scene.reflectance, *([] if is_grey else scene.rgb.T)])
+        scan_files.write_ptx(path, [(table, 1, pose)])
+        content += stated + path.read_text().split("\n", 2)[2]
+        content += "\n" * (draw.one_of(1, 2) if lacks == "blank" else 0)
         has_rgb.append(np.full(len(scene), not is_grey))
         kept.append(scene)
-    path = draw.folder / "a.ptx"
-    path.write_bytes(draw.one_of("\n", "\r\n").join([*lines, ""]).encode())
-    warnings = {"lines": ("lines of points",), "colour": ("no colour",)}.get(lacks, ())
+    path.write_bytes(content.replace("\n", draw.one_of("\n", "\r\n")).encode())
     return Case(
-        scene=joined(kept),
-        paths=[path],
+        joined(kept),
+        [path],
         rgb=True,
         has_rgb=np.concatenate(has_rgb),
         intensity="equal",
-        warnings=warnings,
+        warnings={"lines": ("lines of points",), "colour": ("no colour",)}.get(lacks, ()),
     )
 
 

@@ -25,31 +25,36 @@ def read_points(path: Path, columns: Columns | None = None) -> NDArray[np.float6
     return np.concatenate([block.points for block in read_all(path, columns)])
 
 
+# Any: arrays of every kind.
 def write_las(
     path: Path,
     points: NDArray[np.float64],
     *,
-    intensity: NDArray[np.int64] | None = None,
-    rgb: NDArray[np.int64] | None = None,
-    withheld: NDArray[np.bool_] | None = None,
-    classes: NDArray[np.int64] | None = None,
+    rgb: NDArray[Any] | None = None,
     scale: float = 0.0001,
+    offset: NDArray[np.float64] | None = None,
+    version: str = "1.4",
+    vlrs: Sequence[tuple[str, int, bytes]] = (),
+    extra: Mapping[str, NDArray[Any]] | None = None,
+    **fields: Any,
 ) -> Path:
+    """Write points with fields of the format, extra ones, and records (user, number, content)."""
     import laspy
 
-    header = laspy.LasHeader(point_format=7 if rgb is not None else 6, version="1.4")
-    header.offsets = np.floor(points.min(axis=0)) if len(points) else np.zeros(3)
+    point_format = (7 if rgb is not None else 6) if version == "1.4" else 2
+    header = laspy.LasHeader(point_format=point_format, version=version)
+    header.offsets = np.floor(points.min(axis=0)) if offset is None else offset
     header.scales = np.full(3, scale)
+    for name, values in (extra or {}).items():
+        header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=values.dtype))
+    header.vlrs.extend(laspy.VLR(user, number, "", content) for user, number, content in vlrs)
     las = laspy.LasData(header)
     las.x, las.y, las.z = points.T
-    if intensity is not None:
-        las.intensity = intensity.astype(np.uint16)
     if rgb is not None:
         las.red, las.green, las.blue = rgb.astype(np.uint16).T
-    if withheld is not None:
-        las.withheld = withheld
-    if classes is not None:
-        las.classification = classes.astype(np.uint8)
+    for name, values in {**fields, **(extra or {})}.items():
+        if values is not None:
+            las[name] = np.rint(values).astype(np.uint16) if name == "intensity" else values
     las.write(path)
     return path
 
@@ -261,20 +266,28 @@ def write_ply(
     before_data: bytes = b"",
 ) -> Path:
     """Write vertices and a face; `before` are header lines of elements that come before them."""
-    from plyfile import PlyData, PlyElement
+    from plyfile import PlyElement
 
     kinds = [(name, array.dtype.str[1:]) for name, array in fields.items()]
     table = np.array(list(zip(*fields.values(), strict=True)), dtype=kinds)
     faces = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))])
     elements = [PlyElement.describe(table, "vertex"), PlyElement.describe(faces, "face")]
-    order = "<" if "little" in encoding else ">"
-    file = PlyData(elements, encoding == "ascii", order, comments=["made by hand"])
-    file.write(str(path))
+    write_elements(path, elements, encoding, ["made by hand"])
     if before:
         head, end, data = path.read_bytes().partition(b"end_header\n")
         head = head.replace(b"element vertex", before.encode() + b"\nelement vertex")
         path.write_bytes(head + end + before_data + data)
     return path
+
+
+def write_elements(
+    path: Path, elements: Sequence[Any], encoding: str, comments: Sequence[str]
+) -> None:
+    """Write elements of plyfile."""
+    from plyfile import PlyData
+
+    order = "<" if "little" in encoding else ">"
+    PlyData(elements, encoding == "ascii", order, comments=comments).write(str(path))
 
 
 def write_pcd(

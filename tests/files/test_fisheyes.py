@@ -71,9 +71,9 @@ def test_tangential_terms_and_skew_are_those_of_metashape() -> None:
     lens = replace(LENS, tangential=(2e-3, -1e-3), skew=3.0)
     rays = random_directions(200, 80.0)
     # Its manual: x = x0 atan(r0) / r0 with x0 = X / Z, then as in a frame camera; P1 is p2.
-    x0, y0 = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
-    r0 = np.hypot(x0, y0)
-    x, y = x0 * np.arctan(r0) / r0, y0 * np.arctan(r0) / r0
+    xy = rays[:, :2] / rays[:, 2:]
+    r0 = np.linalg.norm(xy, axis=1)
+    x, y = (xy * (np.arctan(r0) / r0)[:, None]).T
     r2 = x * x + y * y
     radial = 1.0 + sum(k * r2 ** (n + 1) for n, k in enumerate(lens.radial))
     p2, p1 = lens.tangential
@@ -81,6 +81,11 @@ def test_tangential_terms_and_skew_are_those_of_metashape() -> None:
     bent_y = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
     expected = [lens.cx + bent_x * lens.fx + bent_y * lens.skew, lens.cy + bent_y * lens.fy]
     np.testing.assert_allclose(lens.project(rays), np.column_stack(expected), atol=1e-9)
+    # A panorama: u = w / 2 + f atan2(x, z), v = h / 2 + f atan2(y, hypot(x, z)), f = w / 2 pi.
+    x, y, z = rays.T
+    angles = np.column_stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))])
+    found = PanoramaLens(width=720, height=360).project(rays)
+    np.testing.assert_allclose(found, [360, 180] + 720 / (2 * np.pi) * angles, atol=1e-9)
 
 
 def test_each_direction_is_shown_once_and_where_it_is() -> None:

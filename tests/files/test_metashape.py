@@ -40,25 +40,19 @@ def read(folder: Path, text: str | bytes) -> tuple[GivenCamera, ...]:
     return read_metashape_xml(path)
 
 
-def lens_of(folder: Path, sensor: str) -> Intrinsics:
-    (given,) = read(folder, document(sensors=sensor))
-    assert isinstance(given.lens, Intrinsics)
-    return given.lens
-
-
-@pytest.mark.parametrize(
-    ("calibrations", "focal_px"),
-    [
-        ([("initial", 400)], 400.0),
-        ([("adjusted", 500), ("initial", 400)], 500.0),
-        ([("initial", 400), ("adjusted", 500), ("adjusted", 501)], 501.0),
-    ],
-)
-def test_the_last_calibration_holds_an_adjusted_one_before_others(
-    tmp_path: Path, calibrations: list[tuple[str, int]], focal_px: float
-) -> None:
-    texts = [f'<calibration class="{kind}"><f>{f}</f></calibration>' for kind, f in calibrations]
-    assert lens_of(tmp_path, SENSOR.replace(ADJUSTED, "".join(texts))).fx == focal_px
+def test_the_last_calibration_holds_an_adjusted_one_before_others(tmp_path: Path) -> None:
+    for said, focal_px in (
+        ("initial 400", 400.0),
+        ("adjusted 500, initial 400", 500.0),
+        ("initial 400, adjusted 500, adjusted 501", 501.0),
+    ):
+        texts = [
+            f'<calibration class="{kind}"><f>{f}</f></calibration>'
+            for kind, f in (one.split() for one in said.split(", "))
+        ]
+        (given,) = read(tmp_path, document(sensors=SENSOR.replace(ADJUSTED, "".join(texts))))
+        assert isinstance(given.lens, Intrinsics)
+        assert given.lens.fx == focal_px
 
 
 @pytest.mark.parametrize(
@@ -170,16 +164,11 @@ def test_cameras_project_as_the_manual_says(tmp_path: Path, where: str) -> None:
     np.testing.assert_allclose(project(given, POINTS), formula(POINTS, TERMS), atol=1e-8)
 
 
-def test_a_panorama_projects_as_the_manual_says(tmp_path: Path) -> None:
+def test_a_panorama_looks_where_its_camera_does(tmp_path: Path) -> None:
     size = '<resolution width="720" height="360"/>'
     sensor = f'<sensor id="0" label="360" type="spherical">{size}</sensor>'
     (given,) = read(tmp_path, document(sensors=sensor, cameras=posed("r.jpg")))
-    assert isinstance(given.lens, PanoramaLens)
-    # u = w / 2 + f atan2(x, z), v = h / 2 + f atan2(y, hypot(x, z)), f = w / 2 pi.
-    points = np.random.default_rng(8).normal(size=(300, 3))
-    u = 360 + 720 / (2 * np.pi) * np.arctan2(points[:, 0], points[:, 2])
-    v = 180 + 720 / (2 * np.pi) * np.arctan2(points[:, 1], np.hypot(points[:, 0], points[:, 2]))
-    np.testing.assert_allclose(given.lens.project(points), np.column_stack([u, v]), atol=1e-9)
+    assert given.lens == PanoramaLens(width=720, height=360)
     assert given.rotation is not None
     np.testing.assert_allclose(given.rotation, MATRIX[:3, :3].T, atol=1e-12)
 
@@ -189,7 +178,6 @@ def test_a_panorama_projects_as_the_manual_says(tmp_path: Path) -> None:
     [
         {"k1": -0.05, "k2": 0.02, "k3": -0.01, "k4": 0.03},
         {"k1": -0.05, "k2": 0.02, "p1": 1e-3, "p2": -5e-4, "p3": 0.1, "p4": -0.05},
-        {"k1": -0.1, "k2": 0.05, "k3": -0.02, "k4": 0.2, "p1": 1e-3, "p2": -5e-4, "p3": 0.02},
     ],
 )
 def test_terms_that_opencv_lacks_are_taken_over_by_the_others(
@@ -206,14 +194,13 @@ def test_terms_of_a_fisheye_that_opencv_lacks_are_taken_over(tmp_path: Path) -> 
     terms = {"f": 500.0, "k1": 0.03, "p1": 1e-3, "p2": -5e-4, "p3": 0.1, "p4": -0.05}
     sensor = sensor_of(terms).replace('"frame"', '"fisheye"')
     (given,) = read(tmp_path, document(sensors=sensor))
-    assert isinstance(given.lens, Intrinsics | FisheyeLens)
+    assert isinstance(given.lens, FisheyeLens)
     # As in a frame camera, with the angle off the axis for its tangent.
     xy = np.random.default_rng(1).uniform([-0.6, -0.45], [0.6, 0.45], (50, 2))
     theta = np.hypot(*xy.T)[:, None]
     rays = np.column_stack([xy * np.sin(theta) / theta, np.cos(theta)])
     expected = formula(np.column_stack([xy, np.ones(50)]), terms)
-    viewing = given.lens if isinstance(given.lens, FisheyeLens) else given.lens.posed()
-    assert np.abs(viewing.project(rays)[:, :2] - expected).max() < MAX_LEFT_OUT_PX
+    assert np.abs(given.lens.project(rays) - expected).max() < MAX_LEFT_OUT_PX
 
 
 def test_what_cannot_be_taken_over_is_stated_in_pixels(tmp_path: Path) -> None:

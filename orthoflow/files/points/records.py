@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -262,7 +263,9 @@ def _used(rows: NDArray[Any], columns: Columns) -> Iterator[Values]:
 
 def _by_plyfile(path: Path, position: int, columns: Columns) -> Iterator[Values]:
     plyfile = load_library("plyfile", path)
-    with reading(path, "PLY"):
+    with reading(path, "PLY"), warnings.catch_warnings():
+        # numpy warns of each empty list of an ASCII file.
+        warnings.simplefilter("ignore", UserWarning)
         rows = plyfile.PlyData.read(str(path)).elements[position].data
     yield from _used(rows, columns)
 

@@ -23,7 +23,9 @@ def test_only_the_classes_asked_for_are_given_and_the_rest_is_counted(
     rng = np.random.default_rng(1)
     points, withheld = rng.uniform(0, 5, (60_000, 3)), np.arange(60_000) % 7 == 0
     classes = rng.choice([2, 6, 40], 60_000)
-    path = scan_files.write_las(tmp_path / f"a{suffix}", points, withheld=withheld, classes=classes)
+    path = scan_files.write_las(
+        tmp_path / f"a{suffix}", points, withheld=withheld, classification=classes.astype(np.uint8)
+    )
     monkeypatch.setattr(las, "BLOCK_POINTS", 50_000)
     blocks = list(open_scan(path, classes=(6, 40)).read())
     wanted = np.isin(classes, [6, 40])

@@ -137,7 +137,7 @@ def test_a_box_without_an_inside_is_refused() -> None:
 
 def test_classes_choose_points_of_las_files(tmp_path: Path, read: ScanReader) -> None:
     classes = np.arange(400) % 3
-    path = scan_files.write_las(tmp_path / "a.laz", POINTS, classes=classes)
+    path = scan_files.write_las(tmp_path / "a.laz", POINTS, classification=classes.astype(np.uint8))
     cloud = read(path, classes=[0, 2])
     np.testing.assert_allclose(cloud.points_world(), POINTS[classes != 1], atol=6e-5)
     assert scan_of(cloud)["left_out"] == {"other_class": 133}
