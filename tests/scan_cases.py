@@ -696,22 +696,21 @@ def ply_lists(draw: Draw) -> Case:
     names = draw.one_of("red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b")
     kind = draw.one_of("f4", "f8")
     fields = _fields(replace(scene, points=scene.points.astype(kind))) | _named(names, scene.rgb)
-    encoding = draw.one_of(*_PLY_ENCODINGS)
-    # plyfile writes a table with lists as it lies in memory.
-    order = ">" if "big" in encoding else "<"
-    columns = [(name, order + array.dtype.str[1:]) for name, array in fields.items()]
+    columns = [(name, array.dtype.str[1:]) for name, array in fields.items()]
     columns.insert(draw.one_of(len(columns), 0, 3), ("view_indices", "O"))
     table = np.zeros(len(scene), dtype=columns)
     item = draw.one_of("u4", "i4", "f4")
     for name, array in fields.items():
         table[name] = array
     for k, count in enumerate(draw.rng.integers(0, 4, len(scene))):
-        table["view_indices"][k] = np.arange(count, dtype=order + item)
+        table["view_indices"][k] = np.arange(count, dtype=item)
     element = PlyElement.describe(
         table, "vertex", len_types={"view_indices": "u1"}, val_types={"view_indices": item}
     )
     comments = draw.one_of(["x"], [])
     path = draw.path("ply")
+    # In the other order of bytes plyfile writes no lists.
+    encoding = draw.one_of("binary_little_endian", "ascii")
     scan_files.write_elements(path, [element], encoding, comments)
     # Other names of the same types.
     old, new = draw.one_of((b"", b""), (b" uchar ", b" uint8 "), (b" float ", b" float32 "))
