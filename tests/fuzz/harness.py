@@ -17,6 +17,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -68,46 +69,17 @@ class Target:
     max_mib: float = MAX_MEMORY_MIB
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """A case that neither returned something nor was refused as it should.
-
-    Attributes:
-        case: its number.
-        kind: `traceback`, `crash`, `hang`, `memory` or `write`.
-        text: what happened.
-        file: the damaged file, kept.
-    """
-
-    case: int
-    kind: str
-    text: str
-    file: Path
-
-
 @dataclass(kw_only=True)
 class Outcome:
-    """What came of fuzzing a group: cases that ran, those refused, and what is to be mended."""
+    """What came of fuzzing a group: cases that ran, those refused, and what is to be mended.
 
-    name: str
-    seed: int
+    `findings` has one text for each kind (`traceback`, `crash`, `hang`, `memory`, `write`) and
+    place, with the damaged file, which is kept, and how the case can be repeated.
+    """
+
     n_cases: int = 0
     n_refused: int = 0
-    findings: list[Finding] = field(default_factory=list)
-
-    def report(self) -> str:
-        """Return what was found, and how each case can be repeated."""
-        lines = [f"{self.name}: {len(self.findings)} findings in {self.n_cases} cases"]
-        for finding in self.findings:
-            lines += [
-                f"--- {finding.kind}: {finding.text}",
-                f"file: {finding.file}",
-                (
-                    f"again: ORTHOFLOW_FUZZ_SEED={self.seed} ORTHOFLOW_FUZZ_CASE={finding.case} "
-                    f"python -m pytest tests/fuzz -k {self.name.rpartition(':')[2].lower()}"
-                ),
-            ]
-        return "\n".join(lines)
+    findings: dict[str, str] = field(default_factory=dict)
 
 
 def targets_of(group: str) -> Sequence[Target]:
@@ -157,62 +129,69 @@ def fuzz(
     for number, target in enumerate(targets):
         (folder / "seeds" / str(number)).mkdir()
         target.seeds(folder / "seeds" / str(number))
-    outcome = Outcome(name=group, seed=seed)
+    outcome = Outcome()
     first, most = (int(CASE), 1) if CASE else (0, most_cases * len(targets) or sys.maxsize)
     left_s = budget_s * len(targets)
     while left_s > 0.0 and outcome.n_cases < most and len(outcome.findings) < _MAX_FINDINGS:
         count = min(_MAX_PER_PROCESS, most - outcome.n_cases)
-        left_s -= _fuzz_in_process(outcome, folder, first + outcome.n_cases, count, left_s)
+        start = first + outcome.n_cases
+        left_s -= _fuzz_in_process(outcome, group, seed, folder, start, count, left_s)
     return outcome
 
 
 def _fuzz_in_process(
-    outcome: Outcome, folder: Path, first: int, count: int, budget_s: float
+    outcome: Outcome, group: str, seed: int, folder: Path, first: int, count: int, budget_s: float
 ) -> float:
     """Run cases until the process ends, however it does; return the seconds that they took."""
     from tests.fuzz.reading import read_cases
 
+    case, began = first, 0.0
+
+    def add(kind: str, text: str) -> None:
+        # What differs from case to case is behind the colon.
+        place = f"{kind}: {text.partition(': ')[0]}"
+        if place in outcome.findings:
+            return
+        kept = folder / "findings" / str(case)
+        kept.mkdir(exist_ok=True)
+        file = write_case(group, seed, case, folder / "seeds", kept)
+        outcome.findings[place] = (
+            f"{kind}: {text}\nfile: {file}\n"
+            f"again: ORTHOFLOW_FUZZ_SEED={seed} ORTHOFLOW_FUZZ_CASE={case} "
+            f"python -m pytest tests/fuzz -k {group.rpartition(':')[2].lower()}"
+        )
+
     # A process of its own kind: pytest's has threads, and modules that a reader may change.
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    arguments = (outcome.name, outcome.seed, first, count, folder, budget_s, sender)
+    arguments = (group, seed, first, count, folder, budget_s, sender)
     process = context.Process(target=read_cases, args=arguments, daemon=True)
     process.start()
     sender.close()
-    case, began = first, 0.0
-    while True:
-        try:
+    with suppress(EOFError):
+        while True:
             kind, text = receiver.recv()
-        except EOFError:
-            break
-        if kind == "case":
-            case, began = int(text), began or time.monotonic()
-            outcome.n_cases += 1
-        elif kind == "refused":
-            outcome.n_refused += 1
-        else:
-            _add(outcome, folder, case, kind, text)
+            if kind == "case":
+                case, began = int(text), began or time.monotonic()
+                outcome.n_cases += 1
+            elif kind == "refused":
+                outcome.n_refused += 1
+            else:
+                add(kind, text)
     process.join()
     output = (folder / "output").read_text(errors="replace") if process.exitcode else ""
     # A broken harness must not look like a reader that is never asked.
     assert began, f"no case was read: {output}"
     if process.exitcode:
         kind, text = _death(-process.exitcode)
-        _add(outcome, folder, case, kind, f"{text}{_place(output)}: {output[:3000]}")
+        # Where it happened, as the faulthandler printed it: innermost first.
+        frames = re.findall(r'File "([^"]*)", line (\d+)', output)[:3]
+        place = "".join(f" < {Path(path).name}:{line}" for path, line in frames)
+        add(kind, f"{text}{place}: {output[:3000]}")
     strays = {item.name for item in folder.iterdir()} - _OWN
     if strays:
-        _add(outcome, folder, case, "write", f"left outside its folder: {strays}")
+        add("write", f"left outside its folder: {strays}")
     return time.monotonic() - began
-
-
-def _add(outcome: Outcome, folder: Path, case: int, kind: str, text: str) -> None:
-    """Keep the first finding of each kind and place: what differs is behind the colon."""
-    known = {(finding.kind, finding.text.partition(": ")[0]) for finding in outcome.findings}
-    if (kind, text.partition(": ")[0]) not in known:
-        kept = folder / "findings" / f"{outcome.seed}-{case}"
-        kept.mkdir(exist_ok=True)
-        file = write_case(outcome.name, outcome.seed, case, folder / "seeds", kept)
-        outcome.findings.append(Finding(case=case, kind=kind, text=text, file=file))
 
 
 def _death(number: int) -> tuple[str, str]:
@@ -220,13 +199,5 @@ def _death(number: int) -> tuple[str, str]:
         return "hang", "too much processor time"
     if number == signal.SIGALRM:
         return "hang", f"more than {MAX_WALL_S:g} s"
-    return (
-        "crash",
-        f"ended by {signal.Signals(number).name}" if number > 0 else "the harness failed",
-    )
-
-
-def _place(output: str) -> str:
-    """Return where it happened, as the faulthandler printed it: innermost first."""
-    frames = re.findall(r'File "([^"]*)", line (\d+)', output)[:3]
-    return "".join(f" < {Path(path).name}:{line}" for path, line in frames)
+    text = f"ended by {signal.Signals(number).name}" if number > 0 else "the harness failed"
+    return "crash", text

@@ -251,7 +251,7 @@ GEOTIFF = Target(seeds=lambda folder: _write_image(folder / "wall.tif"), read=_r
 _WIDTH, _HEIGHT = 64, 48
 _PHOTOS: Final = ("a.jpg", "b.jpg")
 PHOTOS: Final = Photos(
-    photos=tuple(Photo(name=name, width=_WIDTH, height=_HEIGHT, encoded=b"") for name in _PHOTOS)
+    photos=tuple(Photo(name=name, width=640, height=480, encoded=b"") for name in _PHOTOS)
 )
 
 # Cameras ------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ _METASHAPE: Final = agisoft.document(
     "<translation>4e5 5e6 100</translation><scale>1.5</scale></transform></component></components>",
     cameras=agisoft.posed("a.jpg", more=' component_id="0"')
     + f"<group>{agisoft.posed('b.jpg').replace(_OF_FIRST, _OF_SECOND)}</group>",
-).replace('width="640" height="480"', 'width="64" height="48"')
+)
 
 
 def _camera_files(folder: Path) -> None:
