@@ -26,6 +26,7 @@ from orthoflow.files.drawings.printed_pictures import (
     write_relief,
 )
 from orthoflow.files.drawings.sheet_contents import SheetText, TitleBlock
+from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.files.sidecars import placed_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.records.open import open_run
@@ -62,21 +63,16 @@ def test_shading_is_the_cosine_between_surface_and_light(slope: float) -> None:
 
 def test_light_from_above_meets_what_looks_up() -> None:
     depths = np.tile(-0.005 * np.arange(20.0)[:, None], (1, 10))  # recedes downwards: looks down
-    above, below = (shaded(depths, 0.01, Light(azimuth_deg=a)) for a in (0.0, 180.0))
-    assert below.min() > above.max()
     depths[5, 5] = np.nan
-    assert shaded(depths, 0.01, Light())[5, 5] == NOTHING
+    above, below = (shaded(depths, 0.01, Light(azimuth_deg=a)) for a in (0.0, 180.0))
+    assert above[5, 5] == below[5, 5] == NOTHING
+    assert below[8:].min() > above[8:].max()
 
 
-def test_noise_of_a_flat_wall_is_not_shaded_and_an_edge_is(run: Path, tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    depths = rng.normal(0.0, 0.002, (400, 600))
+def test_noise_of_a_flat_wall_is_not_shaded_and_an_edge_is(tmp_path: Path) -> None:
+    depths = np.random.default_rng(5).normal(0.0, 0.002, (400, 600)).astype(np.float32)
     depths[:, 300:] += 0.03
-    with rasterio.open(next((run / "products").rglob(f"wall_{WALL}_depth.tif"))) as given:
-        profile = {**given.profile, "width": 600, "height": 400}
-    profile["transform"] = rasterio.Affine(0.005, 0, 0, 0, -0.005, 0)
-    with rasterio.open(tmp_path / "depth.tif", "w", **profile) as target:
-        target.write(depths.astype("f4"), 1)
+    write_raster(tmp_path / "depth.tif", depths, place=GridPlace(gsd_m=0.005), tags={})
     write_relief(tmp_path / "depth.tif", tmp_path / "relief.tif", Light(azimuth_deg=90.0))
     with rasterio.open(tmp_path / "relief.tif") as made:
         grey = made.read(1).astype(float)
@@ -90,14 +86,12 @@ def test_equal_depths_before_and_behind_the_plane_have_equally_strong_colours(
     run: Path, tmp_path: Path
 ) -> None:
     depth = next((run / "products").rglob(f"wall_{WALL}_depth.tif"))
-    with rasterio.open(depth) as given:
-        profile = given.profile
+    frame = placed_raster(depth)[0]
     # Three bands: 40 mm behind the plane, on it, and 10 mm before it.
-    depths_m = np.repeat([-0.04, 0.0, 0.01], -(-profile["height"] // 3))[: profile["height"]]
-    shaped = tmp_path / "depth.tif"
-    with rasterio.open(shaped, "w", **profile) as target:
-        target.write(np.repeat(depths_m[:, None], profile["width"], axis=1).astype("f4"), 1)
-    write_depth_figure(shaped, placed_raster(depth)[0], tmp_path / "figure.png", Light())
+    rows = np.repeat([-0.04, 0.0, 0.01], -(-frame.height // 3))[: frame.height, None]
+    depths_m = np.broadcast_to(rows, frame.shape).astype(np.float32)
+    write_raster(tmp_path / "depth.tif", depths_m, place=GridPlace.of(frame), tags={})
+    write_depth_figure(tmp_path / "depth.tif", frame, tmp_path / "figure.png", Light())
     with Image.open(tmp_path / "figure.png") as figure:
         rgb = np.asarray(figure.convert("RGB")).astype(int)
     colours, counts = np.unique(rgb.reshape(-1, 3), axis=0, return_counts=True)
