@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,10 +31,11 @@ from orthoflow.products import (
     Orthoimages,
     OrthoMask,
     Planes,
+    PointLabels,
     Wall,
 )
 from orthoflow.products.inspections import Finding
-from orthoflow.products.product import Product
+from orthoflow.products.product import Payload, Product
 from tests import samples
 from tests.provenance_records import ProductShelf
 from tests.report_runs import cell, metrics, record
@@ -154,44 +156,66 @@ def publish_box(folder: Path, image: Orthoimage | None = None) -> tuple[Publishe
     )
 
 
+# Which step takes what of which others, where there are any.
+_TAKEN = {
+    "plane": {"cloud": "scan"},
+    "wall": {"planes": "plane"},
+    "orient": {"photos": "photos"},
+    "ortho": {"cameras": "orient", "photos": "photos"},
+    "mosaic": {"walls": "wall", "layers": "ortho"},
+    "openings": {"walls": "wall"},
+    "check": {"orthoimages": "mosaic", "checkpoints": "points"},
+}
+
+
 def write_drawing_run(
-    folder: Path, *, gains: str = "none", differ: bool = False, image: Orthoimage | None = None
+    folder: Path,
+    *,
+    gains: str = "none",
+    differ: bool = False,
+    image: Orthoimage | None = None,
+    before: Mapping[str, Product] | None = None,
+    labels: PointLabels | None = None,
+    change: Callable[[Payload], Payload] = lambda payload: payload,
+    **facts: object,
 ) -> Path:
-    """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection."""
+    """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection.
+
+    `before` are products of other steps, `change` damages any before it is digested, and `facts`
+    are what all cells have.
+    """
     folder.mkdir(parents=True)
     shelf = ProductShelf(folder)
-    given = {}
-    for step, product in box_products(image).items():
-        payload = product.to_payload()
-        given[step] = RecordedProduct(
-            type_name=payload.type_name,
-            encoding_version=payload.encoding_version,
-            digest=shelf.put(payload),  # type: ignore[arg-type] # a payload like any
-            embedded=True,
-        )
-    taken = {
-        "wall": {"planes": "plane"},
-        "mosaic": {"walls": "wall"},
-        "openings": {"walls": "wall"},
-        "check": {"orthoimages": "mosaic", "checkpoints": "points"},
-    }
+    products = {**(before or {}), **box_products(image)}
+    given = {step: _recorded(shelf, change(item.to_payload())) for step, item in products.items()}
+    more = {"plane": [_recorded(shelf, change(labels.to_payload()))]} if labels else {}
     cells = [
         cell(
             step,
             params={"gains": gains} if step == "mosaic" else {},
             metrics=metrics(gain_max=1.2) if step == "mosaic" and differ else (),
-            environment="",
             inputs={
                 port: replace(given[source], source=f"{source}.{port}", embedded=False)
-                for port, source in taken.get(step, {}).items()
+                for port, source in _TAKEN.get(step, {}).items()
+                if source in given
             },
-            outputs={given[step].type_name: given[step]},
+            outputs={one.type_name: one for one in (given[step], *more.get(step, ()))},
+            **{"environment": "", **facts},
         )
-        for step in ("points", "plane", "wall", "openings", "mosaic", "check")
+        for step in (*(before or {}), "points", "plane", "wall", "openings", "mosaic", "check")
     ]
     made = record(cells, name="box", published=publish_box(folder, image), environments=())
     write_record(folder / "run.h5", made, shelf.find)
     return folder
+
+
+def _recorded(shelf: ProductShelf, payload: Payload) -> RecordedProduct:
+    return RecordedProduct(
+        type_name=payload.type_name,
+        encoding_version=payload.encoding_version,
+        digest=shelf.put(payload),  # type: ignore[arg-type] # a payload like any
+        embedded=True,
+    )
 
 
 def _wall(frame: WallFrame) -> Wall:

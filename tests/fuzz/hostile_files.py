@@ -42,45 +42,36 @@ def damage_structure(path: Path, random: Random) -> None:
         for _ in range(random.choice((1, 1, 1, 2, 4))):
             with suppress(*REFUSALS):
                 random.choice(CHANGES)(file, random)
-        if sum(item.nbytes for item in datasets(file)) > 1 << 30:
+        if sum(item.nbytes for item in objects(file, h5py.Dataset)) > 1 << 30:
             # Digesting what is not there would take longer than all else; nobody opens it.
             return
         hostile.seal(file)
 
 
-def objects(file: h5py.File) -> list[Any]:
+def objects(file: h5py.File, kind: type = object) -> list[Any]:
     found: list[Any] = [file]
     file.visititems(lambda _, item: found.append(item))
-    return found
-
-
-def groups(file: h5py.File) -> list[Any]:
-    return [item for item in objects(file) if isinstance(item, h5py.Group)]
-
-
-def datasets(file: h5py.File) -> list[Any]:
-    return [item for item in objects(file) if isinstance(item, h5py.Dataset)]
+    return [item for item in found if isinstance(item, kind)]
 
 
 def change_attribute(file: h5py.File, random: Random) -> None:
     item = random.choice([item for item in objects(file) if len(item.attrs)])
     name = random.choice(sorted(item.attrs))
     del item.attrs[name]
-    kind = random.randrange(5)
-    if kind == 0:
-        return
-    if kind == 1:
-        item.attrs[name] = np.bytes_(random.choice(TEXTS).encode())
-    elif kind == 2:
-        item.attrs[name] = np.asarray(random.choice(NUMBERS))
-    elif kind == 3:
-        item.attrs[name] = np.zeros(random.choice(((0,), (3,), (2, 2))))
-    else:
-        item.attrs[name] = np.bytes_(bytes(random.randrange(256) for _ in range(8)))
+    values = (
+        np.bytes_(random.choice(TEXTS).encode()),
+        np.asarray(random.choice(NUMBERS)),
+        np.zeros(random.choice(((0,), (3,), (2, 2)))),
+        np.bytes_(random.randbytes(8)),
+        None,
+    )
+    value = random.choice(values)
+    if value is not None:
+        item.attrs[name] = value
 
 
 def change_dataset(file: h5py.File, random: Random) -> None:
-    item = random.choice(datasets(file))
+    item = random.choice(objects(file, h5py.Dataset))
     parent, name, attributes = item.parent, item.name.rpartition("/")[2], dict(item.attrs)
     content = item[()]
     del parent[name]
@@ -94,10 +85,8 @@ def change_dataset(file: h5py.File, random: Random) -> None:
         chunks = tuple(min(4096, length) or 1 for length in shape)
         parent.create_dataset(name, shape, np.uint8, chunks=chunks, compression="gzip")
     elif kind == 3:
-        values = np.zeros(
-            random.choice((0, 1, 3, 100_000)), random.choice(("<f4", "S7", "?", "<i8"))
-        )
-        parent.create_dataset(name, data=values)
+        count, type_code = random.choice((0, 3, 100_000)), random.choice(("<f4", "S7", "?", "<i8"))
+        parent.create_dataset(name, data=np.zeros(count, type_code))
     elif kind == 4 and isinstance(content, bytes):
         write_array(parent, name, fixed_text(changed_json(content, random)))
     elif kind == 5 and isinstance(content, np.ndarray) and content.dtype.names and content.size:
@@ -129,7 +118,7 @@ def changed_json(content: bytes, random: Random) -> str:
 
 
 def rename(file: h5py.File, random: Random) -> None:
-    group = random.choice([item for item in groups(file) if len(item)])
+    group = random.choice([item for item in objects(file, h5py.Group) if len(item)])
     name = random.choice(sorted(group)).encode()
     group.id.links.move(name, group.id, random.choice(NAMES))
 

@@ -70,17 +70,19 @@ def mutate_text(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
 
 def mutate_json(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
     """Change the values and keys of a JSON document, and sometimes its text."""
-    if rng.random() < 0.7:
-        content = _changed_tree(_json_tree(content), rng)
-    return mutate_text(content, rng, others) if rng.random() < 0.4 else content
+    return _mutate_tree(content, rng, others, 0.7)
 
 
 def mutate_yaml(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
     """Change a YAML document as a tree, which is JSON then, or as text."""
-    if rng.random() < 0.4:
-        content = _changed_tree(_yaml_tree(content), rng)
-        return mutate_text(content, rng, others) if rng.random() < 0.3 else content
-    return mutate_text(content, rng, others)
+    return _mutate_tree(content, rng, others, 0.4)
+
+
+def _mutate_tree(content: bytes, rng: Random, others: Sequence[bytes], share: float) -> bytes:
+    is_tree = rng.random() < share
+    if is_tree:
+        content = _changed_tree(_tree_of(content), rng)
+    return content if is_tree and rng.random() < 0.7 else mutate_text(content, rng, others)
 
 
 def mutate_e57(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
@@ -181,14 +183,12 @@ _TEXT_STEPS: Final[tuple[Mutate, ...]] = (_number, _number, _fragment, _line)
 
 
 @lru_cache(maxsize=64)
-def _json_tree(content: bytes) -> str:
-    return json.dumps(json.loads(content))
-
-
-@lru_cache(maxsize=64)
-def _yaml_tree(content: bytes) -> str:
+def _tree_of(content: bytes) -> str:
+    """A document of JSON or YAML, as JSON."""
     from ruamel.yaml import YAML
 
+    if content.startswith(b"{"):
+        return json.dumps(json.loads(content))
     return json.dumps(YAML(typ="safe", pure=True).load(content), default=str)
 
 

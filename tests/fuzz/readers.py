@@ -50,6 +50,7 @@ from orthoflow.products import (
     Product,
 )
 from orthoflow.sdk import Method
+from orthoflow.testing.examples import example
 from orthoflow.testing.trials import Trial, run_trial
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.draft import draft_workflow, recognised
@@ -220,38 +221,30 @@ def _write_image(path: Path) -> None:
     )
 
 
-@cache
-def _image() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "wall.tif"
-        _write_image(path)
-        return path.read_bytes()
+def _write_sidecar(path: Path) -> None:
+    write_json(path, {"wall": 3, **frame_json(_frame())})
 
 
-def _read_sidecar(path: Path) -> object:
-    image = path.with_suffix(".tif")
-    image.write_bytes(_image())
-    return _read_with(ReadOrthoimage, _files(image, path))
-
-
-def _read_geotiff(path: Path) -> object:
-    sidecar = path.with_suffix(".json")
-    write_json(sidecar, {"wall": 3, **frame_json(_frame())})
-    return _read_with(ReadOrthoimage, _files(path, sidecar))
+def _read_ortho(path: Path) -> object:
+    """Read a raster with its sidecar, one of them damaged."""
+    image, sidecar = path.with_suffix(".tif"), path.with_suffix(".json")
+    if path == image:
+        _write_sidecar(sidecar)
+    else:
+        _write_image(image)
+    return _read_with(ReadOrthoimage, _files(image, sidecar))
 
 
 SIDECAR = Target(
-    seeds=lambda folder: write_json(folder / "wall.json", {"wall": 3, **frame_json(_frame())}),
-    read=_read_sidecar,
-    mutate=mutate_json,
+    seeds=lambda folder: _write_sidecar(folder / "wall.json"), read=_read_ortho, mutate=mutate_json
 )
-GEOTIFF = Target(seeds=lambda folder: _write_image(folder / "wall.tif"), read=_read_geotiff)
+GEOTIFF = Target(seeds=lambda folder: _write_image(folder / "wall.tif"), read=_read_ortho)
 
 
-_WIDTH, _HEIGHT = 64, 48
-_PHOTOS: Final = ("a.jpg", "b.jpg")
 PHOTOS: Final = Photos(
-    photos=tuple(Photo(name=name, width=640, height=480, encoded=b"") for name in _PHOTOS)
+    photos=tuple(
+        Photo(name=name, width=640, height=480, encoded=b"") for name in ("a.jpg", "b.jpg")
+    )
 )
 
 # Cameras ------------------------------------------------------------------------------------------
@@ -341,18 +334,16 @@ E57_PHOTOS = Target(seeds=_e57_photo_files, read=_read_e57_photos, mutate=mutate
 def _mask_files(folder: Path) -> None:
     several = feature([[SQUARE], [HOLE]], kind="MultiPolygon", photo="*.jp?")
     (folder / "masks.geojson").write_text(features(feature([SQUARE, HOLE], note=1), several))
-    used = np.full((_HEIGHT, _WIDTH), 255, np.uint8)
+    used = np.full((48, 64), 255, np.uint8)
     used[:10] = 0
     (folder / "a_mask.png").write_bytes(encode_png(used))
 
 
 def _read_mask(path: Path) -> object:
     """Read photos with it; `drawn_seams` of `mosaic` read polygons in the same way."""
-    folder = path.parent / "photos"
-    folder.mkdir()
-    photo = photo_files.jpeg(photo_files.picture(_WIDTH, _HEIGHT))
-    photo_files.write(folder, dict.fromkeys(_PHOTOS, photo))
-    return _read_with(ReadPhotos, _files(*(folder / name for name in _PHOTOS)), masks=_files(path))
+    photo = photo_files.jpeg(photo_files.picture())
+    photos = photo_files.write(path.parent / "photos", {"a.jpg": photo, "b.jpg": photo})
+    return _read_with(ReadPhotos, _files(*photos), masks=_files(path))
 
 
 def _mutate_mask(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
@@ -369,13 +360,10 @@ def _folder_files(folder: Path) -> None:
     _camera_files(folder)
     for name in ("images.txt", "images.bin", "bundle.out", "list.txt"):
         (folder / name).unlink()
-    (folder / "ties.csv").write_text(_TIES)
-    (folder / "points.csv").write_text("name,x,y,z\np1,1.0,2.0,3.0\n")
-    (folder / "calibration.yaml").write_text(
-        'cameras: {"*": {width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}}\n'
-    )
+    _point_files(folder)
+    (folder / "calibration.yaml").write_text(_CALIBRATION)
     (folder / "scan.xyz").write_text("1.5 2.5 3.5 0.5\n4.5 5.5 6.5 0.25\n")
-    photo_files.write(folder, {"a.jpg": photo_files.jpeg(photo_files.picture())})
+    _photo_files("jpg", folder)
 
 
 def _draft(path: Path) -> object:
@@ -524,6 +512,7 @@ _DIGEST: Final = "sha256:" + "cd" * 32
 
 
 def _result() -> CellResult:
+    digest = f"sha256:{'cd' * 32}"
     return CellResult(
         status="ok",
         method="make.range",
@@ -533,9 +522,7 @@ def _result() -> CellResult:
         metrics=(Metric(name="n", value=4.0, unit="1"),),
         warnings=("a warning",),
         environment=environment(),
-        outputs={
-            "numbers": ProductRef(type_name="checkpoints", encoding_version=1, digest=_DIGEST)
-        },
+        outputs={"numbers": ProductRef(type_name="cloud", encoding_version=1, digest=digest)},
         figures=(FigureRef(name="f", caption="c", media_type="image/png", sha256="ef" * 32),),
     )
 
@@ -551,30 +538,20 @@ def _read_stored(path: Path) -> object:
     store, content = Store(path.parent / "store"), path.read_bytes()
     with store.in_use():
         if path.name == "object.json":
-            ref = store.put_product(_product())
+            ref = store.put_product(example("checkpoints"))
             folder = store.objects / ref.digest.removeprefix("sha256:")
             (folder / path.name).write_bytes(content)
-            return store.product_file(ref.digest), store.put_product(_product())
+            return store.product_file(ref.digest), store.put_product(example("checkpoints"))
         (store.results / f"{_KEY}.json").write_bytes(content)
         (store.folder / "digests.json").write_bytes(content)
         store.file_digests().digest(path)
         return store.result(_KEY), list_results(store), store.earlier_results("make.range")
 
 
-def _product() -> CheckPoints:
-    return CheckPoints(
-        names=("a", "b"),
-        points_world=np.arange(6.0).reshape(2, 3),
-        classes=("", "nail"),
-        wall=np.array([-1, 2], dtype=np.int32),
-        pixels_wall=np.array([[np.nan, np.nan], [1.5, 2.5]]),
-    )
-
-
 def _product_files(folder: Path) -> None:
     store = Store(folder / "store")
     with store.in_use():
-        ref = store.put_product(_product())
+        ref = store.put_product(example("checkpoints"))
     path = store.product_file(ref.digest)
     assert path is not None
     path.rename(folder / "product.h5")

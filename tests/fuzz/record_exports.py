@@ -17,8 +17,7 @@ from random import Random
 from typing import Any, Final
 
 import numpy as np
-from orthoflow_provenance.document import RecordedProduct, sha256_text
-from orthoflow_provenance.record import write_record
+from orthoflow_provenance.document import sha256_text
 
 from orthoflow.products import PointCloud, PointLabels, Product
 from orthoflow.products.product import Payload
@@ -38,8 +37,6 @@ from tests.fuzz.records import (
     surroundings,
     with_damage,
 )
-from tests.provenance_records import ProductShelf
-from tests.report_runs import cell, record
 from tests.studios import Studio
 
 Change = Callable[[Payload], Payload]
@@ -89,70 +86,28 @@ def _cloud() -> PointCloud:
 
 
 @cache
-def _payloads() -> dict[tuple[str, str], Payload]:
-    """What each step gives, by its port, with what the drawing run has."""
-    plane = np.repeat([drawing_runs.WALL, 0, -1], [200, 80, 20])
-    given = {
-        ("scan", "cloud"): _cloud(),
-        ("plane", "labels"): PointLabels(plane_index=plane.astype(np.int16)),
-        ("photos", "photos"): example("photos"),
-        ("orient", "cameras"): example("cameras"),
-        ("ortho", "layers"): example("layers"),
-    }
-    given |= {(step, item.type_name): item for step, item in drawing_runs.box_products().items()}
-    return {place: item.to_payload() for place, item in given.items() if isinstance(item, Product)}
-
-
-# Which step takes what of which other one.
-_TAKEN: Final[dict[str, Sequence[tuple[str, str]]]] = {
-    "scan": (),
-    "photos": (),
-    "points": (),
-    "plane": (("scan", "cloud"),),
-    "wall": (("plane", "planes"),),
-    "orient": (("photos", "photos"),),
-    "ortho": (("orient", "cameras"), ("photos", "photos")),
-    "openings": (("wall", "walls"),),
-    "mosaic": (("wall", "walls"), ("ortho", "layers")),
-    "check": (("mosaic", "orthoimages"), ("points", "checkpoints")),
-}
+def _before() -> dict[str, Product]:
+    """What steps before those of the drawing run give."""
+    photos = {"photos": example("photos"), "orient": example("cameras"), "ortho": example("layers")}
+    return {"scan": _cloud(), **photos}
 
 
 def write_run(folder: Path, change: Change = lambda payload: payload) -> None:
     """Write a run whose record verifies, with products that were changed before it was made."""
-    (folder / "products").mkdir(parents=True)
-    published = drawing_runs.publish_box(folder)
-    shelf = ProductShelf(folder)
-    given = {
-        place: RecordedProduct(
-            type_name=payload.type_name,
-            encoding_version=payload.encoding_version,
-            digest=shelf.put(change(payload)),  # type: ignore[arg-type] # a payload like any
-            embedded=True,
-        )
-        for place, payload in _payloads().items()
-    }
-    cells = [
-        cell(
-            step,
-            key=sha256_text("{}"),
-            key_preimage="{}",
-            started="2026-01-02T03:04:05Z",
-            ended="2026-01-02T03:04:06Z",
-            determinism="exact",
-            distribution="orthoflow-tls",
-            distribution_version="0.1.0",
-            inputs={
-                port: replace(given[source, port], source=f"{source}.{port}", embedded=False)
-                for source, port in taken
-            },
-            outputs={port: item for (source, port), item in given.items() if source == step},
-        )
-        for step, taken in _TAKEN.items()
-    ]
-    write_record(folder / "run.h5", record(cells, name="box", published=published), shelf.find)
-    for path in shelf.files.values():
-        path.unlink()
+    plane = np.repeat([drawing_runs.WALL, 0, -1], [200, 80, 20])
+    drawing_runs.write_drawing_run(
+        folder,
+        before=_before(),
+        labels=PointLabels(plane_index=plane.astype(np.int16)),
+        change=change,
+        key=sha256_text("{}"),
+        key_preimage="{}",
+        started="2026-01-02T03:04:05Z",
+        ended="2026-01-02T03:04:06Z",
+        determinism="exact",
+        distribution="orthoflow-tls",
+        distribution_version="0.1.0",
+    )
 
 
 # Damage -------------------------------------------------------------------------------------------
@@ -223,7 +178,8 @@ def _read(path: Path) -> None:
     run, random = folder / "out" / "run", Random(number)
     command = random.choice(COMMANDS) if mark else COMMANDS[0]
     if mark and random.random() < 0.5:
-        wanted = random.choice(sorted({item.type_name for item in _payloads().values()}))
+        made = (*_before().values(), *drawing_runs.box_products().values())
+        wanted = random.choice(["labels", *sorted(item.type_name for item in made)])
         try:
             write_run(run, partial(_change_payload, random, wanted))
         except _REFUSED:
