@@ -16,18 +16,7 @@ from orthoflow.files import images
 from orthoflow.files.images import before_masks, encode_png
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.products import Photo
-
-
-def blocks(rows: int, columns: int, side: int = 8) -> NDArray[np.uint8]:
-    """Squares of random colours."""
-    rng = np.random.default_rng(3)
-    small = rng.integers(0, 256, (rows // side, columns // side, 3), dtype=np.uint8)
-    return small.repeat(side, axis=0).repeat(side, axis=1)
-
-
-def opened(encoded: bytes) -> NDArray[np.uint8]:
-    """What another program sees."""
-    return np.asarray(Image.open(io.BytesIO(encoded)))
+from tests.photo_files import picture
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -35,13 +24,13 @@ def test_colours_keep_their_order_in_a_png(channels: int) -> None:
     image = np.random.default_rng(1).integers(0, 256, (5, 7, channels), dtype=np.uint8)
     image = image[..., 0] if channels == 1 else image
     encoded = images.encode_png(image)
-    np.testing.assert_array_equal(opened(encoded), image)
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(encoded))), image)
     rgb = np.dstack([image] * 3) if channels == 1 else image[..., :3]
     np.testing.assert_array_equal(images.decode_image(encoded), rgb)
 
 
 def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None:
-    plain = images.encode_png(blocks(8, 8))
+    plain = images.encode_png(picture(8, 8))
 
     def stating(width: int, height: int) -> bytes:
         return plain[:16] + struct.pack(">II", width, height) + plain[24:]
@@ -58,7 +47,7 @@ def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None
 def test_no_room_is_made_for_what_a_png_only_says_that_it_has(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    whole = images.encode_png(blocks(16, 16))
+    whole = images.encode_png(picture(16, 16))
     at = whole.index(b"IDAT") - 4
     monkeypatch.setattr("cv2.imdecode", lambda *_: pytest.fail("it was handed to the decoder"))
     for stated in (2**31 - 1, 3_332_046_943):
@@ -83,7 +72,7 @@ def test_a_very_large_one_is_averaged_band_by_band(
     monkeypatch.setattr(images, "_BAND_PX", band_px)
     # Squares of 4 pixels, the left half of each of them shown, what is not is black.
     shown = np.broadcast_to(np.arange(48) % 4 < 2, (64, 48))
-    image = np.where(shown[..., None], blocks(64, 48, side=4), 0).astype(np.uint8)
+    image = np.where(shown[..., None], picture(96, 128)[::2, ::2], 0).astype(np.uint8)
     asked = []
 
     def cells(part: images.Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -102,11 +91,10 @@ def test_a_very_large_one_is_averaged_band_by_band(
 
 def test_levels_are_as_deep_as_the_file_and_in_the_order_of_colours() -> None:
     deep = np.random.default_rng(5).integers(0, 1 << 16, (6, 9, 3), dtype=np.uint16)
-    np.testing.assert_array_equal(images.decode_levels(images.encode_png(deep)), deep)
-    plain = (deep >> 8).astype(np.uint8)
-    found = images.decode_levels(images.encode_png(plain))
-    np.testing.assert_array_equal(found, plain)
-    assert found.dtype == np.uint8
+    for image in (deep, (deep >> 8).astype(np.uint8)):
+        found = images.decode_levels(images.encode_png(image))
+        np.testing.assert_array_equal(found, image)
+        assert found.dtype == image.dtype
 
 
 # What is masked of a photo hides what lies behind it
