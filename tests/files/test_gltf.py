@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 from PIL import Image
+from syrupy.assertion import SnapshotAssertion
 
+from orthoflow.files import gltf
 from orthoflow.files.geotiff import GridPlace, write_raster
-from orthoflow.files.gltf import write_page, write_room
+from orthoflow.files.gltf import WallMesh, relief_mesh, write_page, write_room
+from tests import samples
 from tests.browser import Page
 from tests.ortho_file_scenes import CORNER, FLOOR_SHAPE, GSD_M, UP, WALL_SHAPE, colours, room
 
@@ -109,31 +113,78 @@ def test_textures_show_the_orthoimage_at_its_place(written: Path) -> None:
     assert np.abs(jpeg - colours(FLOOR_SHAPE)).mean() < 3.0
 
 
-def test_walls_are_painted_with_colours_that_have_their_light_already(written: Path) -> None:
+def test_walls_are_painted_with_colours_that_have_their_light_already(
+    written: Path, snapshot: SnapshotAssertion
+) -> None:
     told, _ = parts(written)
-    painted = {
-        "metallicFactor": 0.0,
-        "roughnessFactor": 1.0,
-    }
-    wall, floor = told["materials"]
-    for index, material in enumerate((wall, floor)):
-        texture = {"baseColorTexture": {"index": index}}
-        assert material["pbrMetallicRoughness"] == texture | painted
-        assert material["extensions"] == {"KHR_materials_unlit": {}}
-    # A cell is shown or not: half way between is the border.
-    assert (wall["alphaMode"], wall["alphaCutoff"]) == ("MASK", 0.5)
-    assert floor.keys().isdisjoint({"alphaMode", "alphaCutoff"})
-    assert told["extensionsUsed"] == ["KHR_materials_unlit"]
-    assert told["textures"] == [{"sampler": 0, "source": 0}, {"sampler": 0, "source": 1}]
+    named = ("extensionsUsed", "materials", "textures", "samplers", "scene", "scenes")
+    assert {name: told[name] for name in named} == snapshot
     assert [image["mimeType"] for image in told["images"]] == ["image/png", "image/jpeg"]
-    # Linear, between levels too, and no side's colour on the other side.
-    assert told["samplers"] == [
-        {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
-    ]
-    assert (told["scene"], told["scenes"]) == (0, [{"nodes": [0]}])
     assert told["nodes"][0]["children"] == [1, 2]
     assert [node["mesh"] for node in told["nodes"][1:]] == [0, 1]
     assert {node["extras"]["surface"] for node in told["nodes"][1:]} == {"plane"}
+
+
+# Walls as triangles
+
+RELIEF_GSD_M = 0.01
+RELIEF_SHAPE = (40, 60)
+
+
+def slope() -> NDArray[np.float32]:
+    """Depths that grow by 0.1 m to the right and 0.04 m downwards, by the middles of cells."""
+    rows, columns = np.indices(RELIEF_SHAPE)
+    return (0.1 * (columns + 0.5) / RELIEF_SHAPE[1] + 0.04 * (rows + 0.5) / RELIEF_SHAPE[0]).astype(
+        np.float32
+    )
+
+
+def relief(folder: Path, depths_m: NDArray[np.float32]) -> WallMesh:
+    write_raster(folder / "depth.tif", depths_m, place=GridPlace(gsd_m=RELIEF_GSD_M), tags={})
+    rows, columns = RELIEF_SHAPE
+    frame = samples.facing_east(RELIEF_GSD_M, columns, rows, (1.0, 2.0, 30.0))
+    return relief_mesh(frame, folder / "depth.tif")
+
+
+def area_m2(mesh: WallMesh) -> float:
+    """Area as the viewer sees it; triangles that turn their back count less than nothing."""
+    first, second, third = (mesh.vertices[mesh.triangles[:, k], :2].astype(float) for k in range(3))
+    one, other = second - first, third - first
+    return float(0.5 * (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum())
+
+
+def test_a_slope_is_where_the_depths_are(tmp_path: Path) -> None:
+    mesh = relief(tmp_path, slope())
+    assert len(mesh.vertices) == RELIEF_SHAPE[0] * RELIEF_SHAPE[1]
+    assert area_m2(mesh) == pytest.approx(0.4 * 0.6)
+    np.testing.assert_allclose(mesh.vertices[:, :2], mesh.places * [0.6, -0.4], atol=1e-6)
+    # Outer nodes stand for cells half a cell further in.
+    expected = 0.1 * mesh.places[:, 0] + 0.04 * mesh.places[:, 1]
+    inner = ((mesh.places > 0.0) & (mesh.places < 1.0)).all(axis=1)
+    np.testing.assert_allclose(mesh.vertices[inner, 2], expected[inner], atol=1e-6)
+    np.testing.assert_allclose(mesh.vertices[:, 2], expected, atol=2e-3)
+
+
+def test_where_no_depth_is_known_there_is_a_hole(tmp_path: Path) -> None:
+    depths_m = slope()
+    depths_m[10:20, 30:45] = np.nan
+    mesh = relief(tmp_path, depths_m)
+    # From the middles of the last known cells on either side, two corners of it halved.
+    assert area_m2(mesh) == pytest.approx(0.4 * 0.6 - 0.11 * 0.16 + 0.01**2)
+    assert np.isfinite(mesh.vertices).all()
+    assert np.unique(mesh.triangles).tolist() == list(range(len(mesh.vertices)))
+    assert len(mesh.vertices) == RELIEF_SHAPE[0] * RELIEF_SHAPE[1] - 150
+
+
+def test_nodes_of_a_large_wall_are_means_of_cells(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gltf, "LONGEST_NODES", 15)
+    mesh = relief(tmp_path, slope())
+    assert len(mesh.vertices) == 10 * 15
+    first = mesh.vertices[:, 2].reshape(10, 15)[0, 0]
+    assert first == pytest.approx(slope()[:4, :4].mean(), abs=1e-6)
+    assert area_m2(mesh) == pytest.approx(0.4 * 0.6)
 
 
 @pytest.mark.long

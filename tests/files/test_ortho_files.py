@@ -14,6 +14,7 @@ from orthoflow.files.geotiff import GridPlace, write_orthoimage, write_raster
 from orthoflow.files.sidecars import OrthoFile, ortho_files
 from orthoflow.files.wall_descriptions import described
 from orthoflow.geometry import WallFrame
+from tests import samples
 
 ROWS, COLUMNS = 6, 9
 RGB = np.random.default_rng(1).integers(0, 256, (ROWS, COLUMNS, 3), dtype=np.uint8)
@@ -22,15 +23,7 @@ SHOWN[4:, 2] = False
 
 
 def frame(rows: int = ROWS, columns: int = COLUMNS) -> WallFrame:
-    return WallFrame(
-        origin_world=np.zeros(3),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.5,
-        width=columns,
-        height=rows,
-    )
+    return samples.facing_south(0.5, columns, rows)
 
 
 def ortho(folder: Path, rgb: NDArray[np.uint8 | np.uint16] = RGB) -> OrthoFile:

@@ -19,7 +19,6 @@ from orthoflow.products import (
     Camera,
     Cameras,
     Intrinsics,
-    Orthoimage,
     Orthoimages,
     Planes,
     TieRole,
@@ -38,10 +37,6 @@ WORLD_FILE = "0.5\n0.0\n0.0\n-0.5\n0.25\n29.75\n"
 
 def json_of(path: Path) -> Any:
     return json.loads(path.read_text())
-
-
-def picture(path: Path) -> Any:
-    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
 
 
 def names_in(folder: Path) -> set[str]:
@@ -91,14 +86,8 @@ RGB = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
 def test_orthoimages_are_told_completely(
     tmp_path: Path, profile: bytes | None, colours: str, snapshot: SnapshotAssertion
 ) -> None:
-    image = Orthoimage(
-        frame=FRAME,
-        wall=7,
-        name="north",
-        rgb=RGB,
-        mask=MASK,
-        source=np.zeros((2, 3), np.int16),
-        sources=("a.jpg", "b.jpg"),
+    image = samples.orthoimage(
+        FRAME, wall=7, name="north", rgb=RGB, mask=MASK, sources=("a.jpg", "b.jpg")
     )
     publishing.publish_orthoimages(
         Orthoimages(images=(image,), icc_profile=profile), tmp_path, DIGEST
@@ -127,7 +116,7 @@ def test_orthoimages_are_told_completely(
     }
     for suffix in (".tfw", ".pgw"):
         assert (tmp_path / f"wall_7_ortho{suffix}").read_text() == WORLD_FILE
-    preview = picture(tmp_path / "wall_7_ortho.png")
+    preview: Any = cv2.imread(str(tmp_path / "wall_7_ortho.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(preview[:, :, 2::-1], RGB)
     np.testing.assert_array_equal(preview[:, :, 3], 255 * shown)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, StoreError
 from orthoflow.files import geotiff, images, publishing
@@ -18,11 +17,8 @@ from orthoflow.products import (
     Camera,
     Cameras,
     Intrinsics,
-    Layer,
     Layers,
-    Orthoimage,
     Orthoimages,
-    Walls,
 )
 from tests import samples
 
@@ -34,36 +30,18 @@ def frame() -> WallFrame:
     return samples.facing_east(0.01, 700, 40, (634512.347, 486215.781, 114.5))
 
 
-def orthoimage(frame: WallFrame, wall: int = 3) -> Orthoimage:
+def orthoimage(frame: WallFrame, **known: object) -> Orthoimages:
     rng = np.random.default_rng(5)
     rgb = rng.integers(0, 256, (*frame.shape, 3), dtype=np.uint8)
     mask = rng.integers(0, 5, frame.shape, dtype=np.uint8)
-    return Orthoimage(
-        frame=frame,
-        wall=wall,
-        name="wall 3",
-        rgb=rgb,
-        mask=mask,
-        source=np.zeros(frame.shape, np.int16),
-        sources=("cloud",),
-    )
-
-
-def walls(frame: WallFrame, intensity: NDArray[np.float32] | None) -> Walls:
-    wall = samples.wall(frame, plane_index=2, name="wall 2", intensity=intensity)
-    return Walls(
-        walls=(wall,),
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity_source="none" if intensity is None else "laser",
-        buffer_front_m=0.3,
-        buffer_behind_m=0.2,
-    )
+    plain = {"wall": 3, "name": "wall 3", "rgb": rgb, "mask": mask, "sources": ("cloud",)}
+    return Orthoimages(images=(samples.orthoimage(frame, **(plain | known)),))
 
 
 def test_no_traceback_is_printed_for_text_in_a_file_that_is_not_utf_8(
     tmp_path: Path, frame: WallFrame, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
+    publishing.publish_orthoimages(orthoimage(frame), tmp_path, DIGEST)
     path = tmp_path / "wall_3_ortho.tif"
     content = path.read_bytes()
     assert b"<GDALMetadata>" in content
@@ -85,8 +63,8 @@ def test_previews_open_where_their_rasters_lie(
     half[:, 3000:] = 200
     half[400:, :, 0] = 250
     shown = np.ones(wide.shape, dtype=np.uint8)
-    image = replace(orthoimage(wide), rgb=half, mask=shown)
-    publishing.publish_orthoimages(Orthoimages(images=(image,)), tmp_path, DIGEST)
+    image = orthoimage(wide, rgb=half, mask=shown)
+    publishing.publish_orthoimages(image, tmp_path, DIGEST)
     with (
         rasterio.open(tmp_path / "wall_3_ortho.tif") as raster,
         rasterio.open(tmp_path / "wall_3_ortho.png") as preview,
@@ -103,12 +81,13 @@ def test_previews_open_where_their_rasters_lie(
 
 def test_publishing_twice_gives_the_same_bytes(tmp_path: Path, frame: WallFrame) -> None:
     intensity = np.linspace(0, 1, 28000, dtype=np.float32).reshape(frame.shape)
+    wall = samples.wall(frame, plane_index=2, name="wall 2", intensity=intensity)
     contents = []
     for name in ("first", "second"):
         folder = tmp_path / name
         folder.mkdir()
-        publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), folder, DIGEST)
-        publishing.publish_walls(walls(frame, intensity), folder, DIGEST)
+        publishing.publish_orthoimages(orthoimage(frame), folder, DIGEST)
+        publishing.publish_walls(samples.walls(wall, intensity_source="laser"), folder, DIGEST)
         contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert contents[0] == contents[1]
     assert set(contents[0]) == {
@@ -123,49 +102,31 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(
     tmp_path: Path, frame: WallFrame
 ) -> None:
     with pytest.raises(StoreError, match=r"wall_3_ortho\.tif cannot be written: .*No such file"):
-        publishing.publish_orthoimages(
-            Orthoimages(images=(orthoimage(frame),)), tmp_path / "missing", DIGEST
-        )
+        publishing.publish_orthoimages(orthoimage(frame), tmp_path / "missing", DIGEST)
     (tmp_path / "text.tif").write_text("no picture")
     with pytest.raises(InputError, match=r"text\.tif cannot be read as a GeoTIFF"):
         geotiff.read_raster(tmp_path / "text.tif")
 
 
 def test_estimated_lenses_are_published_as_a_calibration_file(tmp_path: Path) -> None:
-    lens = Intrinsics(
-        width=30,
-        height=20,
-        fx=25.25,
-        fy=25.5,
-        cx=15.125,
-        cy=10.0,
-        distortion=(-0.1, 0.02, 1e-3, -1e-3, 0.0),
-        source="estimated",
-    )
+    lens = Intrinsics(width=30, height=20, fx=25.25, fy=25.5, cx=15.125, cy=10.0)
+    lens = replace(lens, distortion=(-0.1, 0.02, 1e-3, -1e-3, 0.0), source="estimated")
+    known = replace(lens, source="calibration")
     pose = {
         "rotation_camera_from_world": np.eye(3),
         "translation_camera_from_world": np.array([0.0, 0.0, 5.0]),
     }
     cameras = (
         Camera(photo="a[1].jpg", status="ok", intrinsics=lens, **pose),
-        Camera(photo="b.jpg", status="ok", intrinsics=replace(lens, source="calibration"), **pose),
+        Camera(photo="b.jpg", status="ok", intrinsics=known, **pose),
     )
     publishing.publish_cameras(Cameras(cameras=cameras), tmp_path, DIGEST)
     found = read_calibration(tmp_path / "calibration.yaml")
-    assert found.patterns == ("a[1].jpg",)
-    assert found.lenses == (replace(lens, source="calibration"),)
+    assert (found.patterns, found.lenses) == (("a[1].jpg",), (known,))
 
 
-def test_a_layer_of_a_photo_with_any_name_has_a_file(tmp_path: Path, frame: WallFrame) -> None:
-    small = replace(frame, width=4, height=3)
-    layer = Layer(
-        frame=small,
-        wall=0,
-        source=f"../../\x1b{300 * 'x'}.jpg",
-        rgb=np.zeros((3, 4, 3), np.uint8),
-        mask=np.ones((3, 4), np.uint8),
-        quality=np.ones((3, 4), np.float32),
-    )
+def test_a_layer_of_a_photo_with_any_name_has_a_file(tmp_path: Path) -> None:
+    layer = samples.layer((3, 4), source=f"../../\x1b{300 * 'x'}.jpg")
     publishing.publish_layers(Layers(layers=(layer,)), tmp_path, "sha256:0")
     stem = f"wall_0_layer_0_-{99 * 'x'}"
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{stem}.json", f"{stem}.tif"]

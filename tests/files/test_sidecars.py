@@ -50,14 +50,17 @@ def test_a_map_lies_where_its_coordinates_are() -> None:
     ("changes", "message"),
     [
         ({"u_world": None}, "u_world must be three numbers below 1e\\+09, got None"),
-        ({"u_world": [0.0, 1.0]}, "u_world must be three numbers"),
-        ({"u_world": [0.0, True, 0.0]}, "u_world must be three numbers"),
-        ({"u_world": [0.0, "1.0", "x"]}, "u_world must be three numbers"),
-        ({"u_world": [[0.0], [1.0, 2.0], [0.0]]}, "u_world must be three numbers"),
-        ({"u_world": [0.0, 10**400, 0.0]}, "u_world must be three numbers"),
-        ({"origin_world": [1e9, 0.0, 0.0]}, "origin_world must be three numbers"),
-        ({"origin_world": [-1e9, 0.0, 0.0]}, "origin_world must be three numbers"),
-        ({"origin_world": [math.nan, 0.0, 0.0]}, "origin_world must be three numbers"),
+        *(
+            ({"u_world": value}, "u_world must be three numbers")
+            for value in (
+                *([0.0, 1.0], [0.0, True, 0.0], [0.0, "1.0", "x"], [0.0, 10**400, 0.0]),
+                [[0.0], [1.0, 2.0], [0.0]],
+            )
+        ),
+        *(
+            ({"origin_world": [value, 0.0, 0.0]}, "origin_world must be three numbers")
+            for value in (1e9, -1e9, math.nan)
+        ),
         ({"v_world": [0.0, 0.0, 1.0]}, "a.json: a wall frame needs u x v = -n"),
     ],
 )
