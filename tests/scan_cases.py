@@ -581,7 +581,7 @@ def colours_of_few_bits(draw: Draw) -> Case:
     scene.rgb[:10] = 255
     deep = np.rint(scene.rgb / 255.0 * most).astype(np.uint16)
     path = write_scene(draw.path("las", "ply", "xyz"), scene, rgb=deep)
-    return Case(scene, [path], rgb=True, warnings=(f"colours, which reach {most}",))
+    return Case(scene, [path], rgb=True, warnings=(f"colours reach {most} and",))
 
 
 def las_feet(draw: Draw) -> Case:
