@@ -16,14 +16,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_part
-from orthoflow.geometry.scenes import Scene, SurfaceRole
+from orthoflow.geometry.scenes import Scene
 
 # The small functions have explicit types, since numba would otherwise compile a separate version
 # for each constant argument, which takes seconds in the first run.
@@ -442,18 +441,12 @@ class SceneRays:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
         self._table = _cast_table(scene)
         self._paint = PaintTable(
             frames=np.ascontiguousarray(np.hstack([scene.centre, scene.axis_a, scene.axis_b])),
             kinds=np.array(scene.texture),
             params=np.array(scene.texture_params),
         )
-
-    @cached_property
-    def objects(self) -> SceneRays:
-        """Return only the free-standing objects, with their own numbering of rectangles."""
-        return SceneRays(self._scene.only(self._scene.role == SurfaceRole.OBJECT))
 
     def cast(
         self,

@@ -37,8 +37,6 @@ class TrueOrthoimage:
         rectangle: (rows, cols) int32 row of the scene at the centre; -1 if there is no surface.
         seen: (rows, cols) bool, whether a viewer sees this surface point; undefined unless
             requested.
-        behind_object: (rows, cols) bool, whether a free-standing object hides this point from a
-            viewer or from the front; undefined unless requested.
     """
 
     frame: WallFrame
@@ -46,7 +44,6 @@ class TrueOrthoimage:
     depth_m: NDArray[np.float32]
     rectangle: NDArray[np.int32]
     seen: NDArray[np.bool_]
-    behind_object: NDArray[np.bool_]
 
 
 def render(  # noqa: PLR0913
@@ -71,8 +68,7 @@ def render(  # noqa: PLR0913
         viewers: positions from which the surface is seen; if None, no cell is seen.
         supersample: colours are the mean of supersample^2 rays per cell.
         coloured: (rows, cols) bool, cells whose colour is requested; None for all cells.
-        judged: (rows, cols) bool, cells whose `seen` and `behind_object` are requested; None for
-            all cells.
+        judged: (rows, cols) bool, cells whose `seen` is requested; None for all cells.
         cores: number of threads; does not change the result.
     """
     truth = TrueOrthoimage(
@@ -81,15 +77,16 @@ def render(  # noqa: PLR0913
         depth_m=np.full(frame.shape, np.nan, dtype=np.float32),
         rectangle=np.empty(frame.shape, dtype=np.int32),
         seen=np.zeros(frame.shape, dtype=np.bool_),
-        behind_object=np.zeros(frame.shape, dtype=np.bool_),
     )
     renderer = _Renderer(scene, truth, front_m=front_m, behind_m=behind_m, viewers=viewers)
+    positions = () if viewers is None else viewers.positions_world - scene.origin
 
     def render_cells(first: int, last: int) -> None:
         cells = np.arange(first, last)
         points = renderer.look(cells)
         chosen = renderer.shows_something(cells, judged)
-        renderer.look_back(cells[chosen], points[:, chosen])
+        for position in positions:
+            renderer.look_from(position, cells[chosen], points[:, chosen])
         renderer.colour(cells[renderer.shows_something(cells, coloured)], supersample)
 
     n_cells = frame.width * frame.height
@@ -228,7 +225,6 @@ class _Renderer:
         self._depth_m = truth.depth_m.reshape(-1)
         self._rectangle = truth.rectangle.reshape(-1)
         self._seen = truth.seen.reshape(-1)
-        self._behind_object = truth.behind_object.reshape(-1)
         self._width = frame.width
         self._origin = scene.origin
         self._normal = frame.normal_world[:, None]
@@ -253,34 +249,23 @@ class _Renderer:
         shows: NDArray[np.bool_] = self._rectangle[cells] >= 0
         return shows if wanted is None else shows & wanted.reshape(-1)[cells]
 
-    def look_back(self, cells: NDArray[np.int64], points: NDArray[np.float64]) -> None:
-        """Set which cells (n,) with surface points (3, n) a viewer sees and an object hides."""
-        ways = np.broadcast_to(self._normal, points.shape)
-        before = self._rays.objects.cast(points, ways).rectangle >= 0
-        self._behind_object[cells[before]] = True
-        if self._viewers is not None:
-            for position in self._viewers.positions_world - self._origin:
-                self._look_from(position[:, None], self._viewers, cells, points)
-
-    def _look_from(
-        self,
-        position: NDArray[np.float64],
-        viewers: Viewers,
-        cells: NDArray[np.int64],
-        points: NDArray[np.float64],
+    def look_from(
+        self, position: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
     ) -> None:
+        """Set which cells (n,) with surface points (3, n) a viewer at a position sees."""
+        viewers = self._viewers
+        if viewers is None:
+            return
         # With a small tolerance, since the sine of straight up may be rounded to more than 1.
         lowest = math.sin(math.radians(viewers.lowest_elevation_deg)) - 1e-12
         highest = math.sin(math.radians(viewers.highest_elevation_deg)) + 1e-12
-        ways = points - position
+        ways = points - position[:, None]
         lengths = np.sqrt(np.einsum("in,in->n", ways, ways))
         sines = (viewers.up @ ways) / lengths
         inside = (sines >= lowest) & (sines <= highest)
         cells, ways, within = cells[inside], ways[:, inside], 1.0 - _SEEN_WITHIN_M / lengths[inside]
-        blocked = self._rays.cast(position, ways, within=within).rectangle >= 0
-        self._seen[cells[~blocked]] = True
-        by_object = self._rays.objects.cast(position, ways[:, blocked], within=within[blocked])
-        self._behind_object[cells[blocked][by_object.rectangle >= 0]] = True
+        hits = self._rays.cast(position[:, None], ways, within=within)
+        self._seen[cells[hits.rectangle < 0]] = True
 
     def colour(self, cells: NDArray[np.int64], n_sub: int) -> None:
         """Set the mean colours of cells whose centre shows a surface, from n_sub^2 rays each."""

@@ -120,18 +120,6 @@ class Scene:
         b = self.extent[:, [2, 2, 3, 3], None] * self.axis_b[:, None, :]
         return self.centre[:, None, :] + a + b
 
-    def only(self, chosen: NDArray[np.bool_]) -> Scene:
-        """Return a scene with only the chosen rectangles (r,) and their holes."""
-        place = np.cumsum(chosen) - 1
-        holes = chosen[self.hole_rectangle]
-        kept = {name: getattr(self, name)[chosen] for name in _PER_RECTANGLE.split()}
-        return replace(
-            self,
-            **kept,
-            hole_rectangle=place[self.hole_rectangle[holes]].astype(np.int32),
-            hole_extent=self.hole_extent[holes],
-        )
-
     def turned(self, rotation: NDArray[np.float64]) -> Scene:
         """Return the scene rotated about its origin by a matrix (3, 3)."""
         return replace(

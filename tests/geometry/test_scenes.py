@@ -174,9 +174,6 @@ def test_a_screen_hides_from_a_viewer_just_its_shadow() -> None:
     shadow = (x > 0.4) & (x < 1.2)
     wall_row = image.rectangle[5] == 0
     np.testing.assert_array_equal(image.seen[5][wall_row], ~shadow[wall_row])
-    # Straight from the front the screen itself stands before 0.2..0.6.
-    hidden = shadow | ((x > 0.2) & (x < 0.6))
-    np.testing.assert_array_equal(image.behind_object[5][wall_row], hidden[wall_row])
 
 
 def test_viewers_see_only_their_elevations() -> None:
@@ -201,8 +198,7 @@ def test_a_part_of_a_true_orthoimage_is_that_part_of_the_whole() -> None:
     np.testing.assert_array_equal(part.depth_m, whole.depth_m)
     np.testing.assert_array_equal(part.rgb, np.where(coloured[:, :, None], whole.rgb, np.nan))
     np.testing.assert_array_equal(part.seen, whole.seen & judged)
-    np.testing.assert_array_equal(part.behind_object, whole.behind_object & judged)
-    assert 0 < np.count_nonzero(part.behind_object) < np.count_nonzero(whole.behind_object)
+    assert 0 < np.count_nonzero(part.seen) < np.count_nonzero(whole.seen)
 
 
 def test_a_scene_with_arrays_that_disagree_is_refused() -> None:
@@ -215,16 +211,6 @@ def test_a_scene_with_arrays_that_disagree_is_refused() -> None:
             hole_rectangle=np.array([1, 0], dtype=np.int32),
             hole_extent=np.zeros((2, 4)),
         )
-
-
-def test_a_part_of_a_scene_keeps_its_holes() -> None:
-    scene = random_scene(3)
-    chosen = np.arange(len(scene)) % 3 == 0
-    part = scene.only(chosen)
-    assert len(part) == chosen.sum()
-    # Rectangles 3 (two holes) and 9 (one) become 1 and 3.
-    np.testing.assert_array_equal(part.hole_rectangle, [1, 1, 3])
-    np.testing.assert_array_equal(part.hole_extent, scene.hole_extent)
 
 
 @pytest.mark.parametrize("supersample", [1, 3])

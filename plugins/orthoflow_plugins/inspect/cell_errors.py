@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 # Neighbouring cells whose true depths differ by more are a depth step, reported separately.
 _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
-# A colour is grossly wrong if it is this far outside the range of the true colours within one cell.
-_GROSS_GREY: Final = 40.0
 # A multiple of the patch size (32 cells), large enough that little is lost at the borders.
 BLOCK_CELLS: Final = 96
 # Limits for all walls together: cells with a colour comparison, and with a visibility test.
@@ -53,7 +51,6 @@ _NAMES_BESIDE_TRACED: Final = {
     "rmse_v_mm": "patch_rmse_v_mm",
     "mean_u_mm": "patch_mean_u_mm",
     "mean_v_mm": "patch_mean_v_mm",
-    "ghost_share": "ghost_colour_share",
 }
 
 
@@ -141,9 +138,6 @@ class WallSamples:
         n_seen_painted: painted cells among `n_seen`.
         n_seen_shown: painted or filled cells among `n_seen`.
         n_unseen_painted: painted cells whose true surface no station sees, away from steps.
-        n_coloured: painted cells whose colour is compared with the true colours around them.
-        n_gross: cells among `n_coloured` with a grossly wrong colour, away from steps.
-        n_ghost: cells among `n_gross` that have an object in front of the wall.
     """
 
     depth_m: NDArray[np.float64]
@@ -159,9 +153,6 @@ class WallSamples:
     n_seen_painted: int
     n_seen_shown: int
     n_unseen_painted: int
-    n_coloured: int
-    n_gross: int
-    n_ghost: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,12 +203,9 @@ def wall_errors(
         (wall.mask == SurfaceMask.MEASURED) & known, wall.depth_m.astype(np.float64), np.nan
     ) - true.depth_m.astype(np.float64)
     patches = _shifts(image, true, chosen.coloured & known & ~steps).within(inner)
-    compared = painted & _inner(chosen.coloured, known)
-    gross = (_gross_colours(image, true) & compared & ~steps)[inner]
     asked, seen = (painted & chosen.lattice)[inner], (true.seen & chosen.lattice)[inner]
-    behind = true.behind_object[inner]
     sigma_m = wall.sigma_m[inner]
-    depth, square, compared = depth[inner], square[inner], compared[inner]
+    depth, square = depth[inner], square[inner]
     painted, filled, steps = painted[inner], filled[inner], steps[inner]
     measured = np.isfinite(depth)
     compares = np.isfinite(square)
@@ -235,9 +223,6 @@ def wall_errors(
         n_seen_painted=count_true(seen & painted),
         n_seen_shown=count_true(seen & (painted | filled)),
         n_unseen_painted=count_true(asked & ~seen & ~steps),
-        n_coloured=count_true(compared),
-        n_gross=count_true(gross),
-        n_ghost=count_true(gross & behind),
     )
     return WallErrors(
         samples=samples, patches=patches, steps=steps, depth_m=depth, grey=np.sqrt(square)
@@ -265,8 +250,7 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool) -> list[Finding]:
     """Return metrics of the cells of one wall, or of all walls (wall -1); empty without samples.
 
-    Displacements and ghosts get a prefix if they are also computed from the cameras, which is more
-    accurate.
+    Displacements get a prefix if they are also computed from the cameras, which is more accurate.
     """
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
     numbers = (
@@ -294,7 +278,7 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -
     """Return displacements of patches, measured with known cells away from steps."""
     painted = is_painted(image.mask)
     filled = image.mask == OrthoMask.FILLED
-    # Two centimetres is far beyond any plausible error; larger ones are reported as gross colour.
+    # Two centimetres is far beyond any plausible error.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
     grey, true_grey = np.zeros(known.shape), np.zeros(known.shape)
     grey[known] = eight_bits(image.rgb[known]) @ REC_601
@@ -304,28 +288,6 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -
         GreyImage(grey=true_grey, valid=known, region=known),
         reach_cells=reach,
     )
-
-
-def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]:
-    """Return cells whose colour is outside the range of the true colours within one cell."""
-    import cv2
-
-    # An unknown colour is NaN.
-    missing = np.isnan(true.rgb)
-    window = np.ones((3, 3), dtype=np.uint8)
-    low = cv2.erode(np.where(missing, np.float32(np.inf), true.rgb), window)
-    high = cv2.dilate(np.where(missing, np.float32(-np.inf), true.rgb), window)
-    shown, reach = eight_bits(image.rgb), np.float32(_GROSS_GREY)
-    outside: NDArray[np.bool_] = np.any((shown < low - reach) | (shown > high + reach), axis=2)
-    return outside
-
-
-def _inner(coloured: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return compared cells whose direct neighbours are compared as well."""
-    import cv2
-
-    whole = cv2.erode((coloured | ~known).view(np.uint8), np.ones((3, 3), dtype=np.uint8))
-    return coloured & np.asarray(whole, dtype=np.bool_)
 
 
 def _depth_numbers(samples: WallSamples) -> list[Number]:
@@ -394,9 +356,4 @@ def _share_numbers(samples: WallSamples) -> list[Number]:
     if samples.n_painted:
         share = samples.n_unseen_painted / samples.n_painted
         numbers.append(("unseen_painted_share", share, "1"))
-    if samples.n_coloured:
-        numbers += [
-            ("gross_colour_share", samples.n_gross / samples.n_coloured, "1"),
-            ("ghost_share", samples.n_ghost / samples.n_coloured, "1"),
-        ]
     return numbers

@@ -56,7 +56,12 @@ from orthoflow_plugins.inspect.image_quality import (
 )
 from orthoflow_plugins.inspect.patches import IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
-from orthoflow_plugins.inspect.point_doubts import doubts, is_own, missed_points, with_reasons
+from orthoflow_plugins.inspect.point_doubts import (
+    is_own,
+    missed_points,
+    report_doubts,
+    with_reasons,
+)
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
 # Maximum number of points whose residuals are logged.
@@ -171,8 +176,7 @@ class InspectCheckpoints(Method):
                 "or check that scan and points use the same unit and coordinate system "
                 "(inspect.checkpoints)"
             )
-        for doubt, name, values in doubts(points, inputs.checkpoints, pictures):
-            ctx.report(doubt, subject=name, **values)
+        report_doubts(points, inputs.checkpoints, pictures, ctx)
         # In a simulated room, some points are hidden on purpose.
         if missed and not is_simulated:
             ways = ["measure them in an orthoimage"]

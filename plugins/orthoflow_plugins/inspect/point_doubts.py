@@ -1,34 +1,20 @@
-"""Check points that no image shows, or that refer to another raster, unit or system."""
+"""Check points that no image shows, or that are in another unit or system."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.products import CheckPoints, Walls
-from orthoflow.sdk import DiagnosticSpec
-from orthoflow_plugins.inspect.findings import rms
+from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
-# A diagnostic: its spec, its subject, and its values.
-Doubt: TypeAlias = tuple[DiagnosticSpec, str, dict[str, Any]]
-# An orthoimage is off by a few cells, not by tens of cells.
-_OFF_CELLS: Final = 20.0
-# A larger deviation from scale 1 cannot be explained by poses or by the scale of the scan.
-_SCALE_OFF: Final = 0.02
-# The shift that all points have in common is reported if it is this share of the RMS.
-_ALIKE_SHARE: Final = 0.9
-_ALIKE_LEAST: Final = 3
 # Number of unused points listed in a message, and the distance from which it uses metres.
 _NAMED: Final = 4
 _NEAR_M: Final = 1.0
-_ANY_CELLS: Final = (
-    "measure them in this orthoimage, or enter coordinates that do not depend on the pixel size: "
-    "shown_x, shown_y, shown_z as saved by the report, or map_x, map_y"
-)
 OWN_POINTS: Final = DiagnosticSpec(
     code="check-points-of-the-image",
     severity="warning",
@@ -45,21 +31,6 @@ FAR_POINTS: Final = DiagnosticSpec(
     remedy="check `unit` of read.checkpoints, and the coordinate systems of points and scan",
     rank_by="n",
 )
-OTHER_CELLS: Final = DiagnosticSpec(
-    code="check-points-of-other-cells",
-    severity="warning",
-    text="{subject}: its {n_points} check points seem to have been measured in an image with a "
-    "pixel size of {measured_m:.3g} m; this one has {gsd_m:.3g} m",
-    remedy="{any_cells}",
-)
-SHIFTED_POINTS: Final = DiagnosticSpec(
-    code="check-points-shifted",
-    severity="warning",
-    text="{subject}: all of its {n_points} check points appear {right_m:+.4g} m to the right of "
-    "and {down_m:+.4g} m below their surveyed positions; perhaps they were measured in a "
-    "raster with another origin",
-    remedy="{any_cells}",
-)
 
 
 def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
@@ -69,31 +40,28 @@ def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
     return np.asarray((surveyed.shown_world == surveyed.points_world).all(axis=1), dtype=np.bool_)
 
 
-def doubts(
-    points: Sequence[ShownPoint], surveyed: CheckPoints, pictures: Sequence[Picture]
-) -> Iterator[Doubt]:
-    """Return diagnostics of implausible check points.
+def report_doubts(
+    points: Sequence[ShownPoint],
+    surveyed: CheckPoints,
+    pictures: Sequence[Picture],
+    ctx: StepContext,
+) -> None:
+    """Report implausible check points.
 
     Args:
         points: expected and shown position of each point.
         surveyed: the check points.
         pictures: the images that show them.
+        ctx: receives diagnostics.
     """
     if n_own := int(np.count_nonzero(is_own(surveyed))):
-        yield OWN_POINTS, "", {"n": n_own, "n_points": len(points)}
+        ctx.report(OWN_POINTS, n=n_own, n_points=len(points))
     by_wall = {picture.wall: picture for picture in pictures}
     beyond_m = np.array([_beyond_m(point, by_wall.get(point.wall)) for point in points])
     if n_far := np.count_nonzero(beyond_m > 0.0):
         farthest_m = float(beyond_m.max())
         how_far = f", up to {farthest_m:.4g} m" if np.isfinite(farthest_m) else ""
-        yield FAR_POINTS, "", {"n": n_far, "n_points": len(points), "how_far": how_far}
-    for picture in pictures:
-        mine = [
-            point
-            for point, far_m in zip(points, beyond_m, strict=True)
-            if point.wall == picture.wall and point.how == "measured" and far_m <= 0.0
-        ]
-        yield from _doubts_of_places(mine, picture)
+        ctx.report(FAR_POINTS, n=n_far, n_points=len(points), how_far=how_far)
 
 
 def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
@@ -104,29 +72,6 @@ def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
     size = np.array([frame.width, frame.height])
     off_m = frame.gsd_m * float(np.max([-point.expected, point.expected - size]))
     return off_m if off_m > frame.gsd_m * size.max() else 0.0
-
-
-def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterator[Doubt]:
-    """Yield a diagnostic if measured positions differ by a scale or by a common shift."""
-    if len(points) < 2:
-        return
-    expected = np.array([point.expected for point in points])
-    shift = np.array([point.place for point in points]) - expected
-    if rms(np.linalg.norm(shift, axis=1)) <= _OFF_CELLS:
-        return
-    aside = expected - expected.mean(axis=0)
-    scale = 1.0 + float((aside * shift).sum() / max(float((aside**2).sum()), 1e-12))
-    gsd_m, name = picture.frame.gsd_m, picture.image.name
-    if scale > 0.0 and abs(scale - 1.0) > _SCALE_OFF:
-        cells = {"measured_m": gsd_m / scale, "gsd_m": gsd_m, "any_cells": _ANY_CELLS}
-        yield OTHER_CELLS, name, {"n_points": len(points), **cells}
-        return
-    alike = shift.mean(axis=0)
-    of_all = float(np.linalg.norm(alike)) / rms(np.linalg.norm(shift, axis=1))
-    if len(points) >= _ALIKE_LEAST and of_all > _ALIKE_SHARE:
-        right_m, down_m = gsd_m * alike
-        where = {"right_m": right_m, "down_m": down_m, "any_cells": _ANY_CELLS}
-        yield SHIFTED_POINTS, name, {"n_points": len(points), **where}
 
 
 class Missed(NamedTuple):

@@ -121,8 +121,6 @@ _OF_WALLS: Final = (
     lower("colour_rmse_grey", label="colour error, RMS"),
     lower("filled_colour_rmse_grey", label="colour error of filled cells, RMS"),
     lower("step_colour_rmse_grey", label="colour error near depth steps, RMS"),
-    MetricSpec("gross_colour_share", label="cells with a gross colour error"),
-    MetricSpec("ghost_colour_share", label="cells with the colour of an occluder"),
     lower("ghost_share", label="share of the cells that show an occluder"),
     higher(
         "completeness",
@@ -203,6 +201,7 @@ class InspectTruth(Method):
 
     id: ClassVar[str] = "inspect.truth"
     determinism: ClassVar[Determinism] = "loose"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *_needing(("orthoimages", "walls"), *of_walls(_OF_WALLS), *IMAGE_QUALITY),
         *of_walls(_OF_PLANES),
