@@ -23,7 +23,6 @@ from orthoflow_plugins.plane.kernels import (
     assign_points,
     count_points,
     each_part,
-    name_labels,
     piece_of,
 )
 
@@ -108,23 +107,11 @@ class PreparedCloud:
         steps = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
         return (self.grid.low_m + steps * self.grid.extent_m) @ self.grid.basis
 
-    def assign(
-        self,
-        slabs: NDArray[np.float64],
-        bounds_m: NDArray[np.float64],
-        names: NDArray[np.int8] | None = None,
-    ) -> None:
-        """Assign each point to the nearest of the slabs (k, 12) whose bounds (k, 5) contain it.
-
-        Claims are the indices of the slabs, or their (k + 1,) names; the last name is for points
-        outside all slabs.
-        """
+    def assign(self, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]) -> None:
+        """Assign each point to the nearest of the slabs (k, 12) whose bounds (k, 5) contain it."""
 
         def claim(_part: int, piece: slice) -> None:
-            claims = self.claims[piece]
-            assign_points(piece_of(self.points, piece), claims, slabs, bounds_m)
-            if names is not None:
-                claims[:] = names[claims]
+            assign_points(piece_of(self.points, piece), self.claims[piece], slabs, bounds_m)
 
         each_part(len(self.claims), self.parts, claim)
 
@@ -132,7 +119,8 @@ class PreparedCloud:
         """Write labels (n,) of points from (k + 1,) names; the last is for points on no plane."""
 
         def write(_part: int, piece: slice) -> None:
-            name_labels(self.claims[piece], names, labels[piece])
+            # A claim of -1 wraps to the last name.
+            np.take(names, self.claims[piece], out=labels[piece], mode="wrap")
 
         each_part(len(labels), self.parts, write)
 

@@ -28,11 +28,6 @@ if TYPE_CHECKING:
 
 # Minimum number of points of a candidate as a share of the minimum of a plane.
 PART_SHARE: Final = 0.2
-# Defaults of open3d: scatter of the normals in a patch, its flatness (90 is flat), and its share of
-# points off the plane.
-_NORMAL_VARIANCE_DEG: Final = 60.0
-_COPLANARITY_DEG: Final = 75.0
-_OUTLIER_SHARE: Final = 0.75
 # Number of neighbours for normals and region growing.
 _NEIGHBOURS: Final = 30
 
@@ -146,7 +141,6 @@ class SegmentProposer:
         return Candidate(
             plane=Plane(normal=normal / length, offset_m=-float(model[3]) / length),
             constraint=self._params.constraint,
-            votes=float(len(inliers)),
         )
 
     def reject(self, candidate: Candidate) -> None:
@@ -199,9 +193,6 @@ class PatchProposer:
         try:
             cloud.estimate_normals(neighbours)
             boxes = cloud.detect_planar_patches(
-                normal_variance_threshold_deg=_NORMAL_VARIANCE_DEG,
-                coplanarity_deg=_COPLANARITY_DEG,
-                outlier_ratio=_OUTLIER_SHARE,
                 min_num_points=max(10, int(PART_SHARE * search.least_points)),
                 search_param=neighbours,
             )
@@ -210,24 +201,20 @@ class PatchProposer:
                 f"open3d's detect_planar_patches failed on the {len(points_m)} points "
                 f"({str(error).splitlines()[0]}): try another thinning"
             ) from error
-        self._candidates = []
-        for box in boxes:
-            normal = np.asarray(box.R, dtype=np.float64)[:, 2]
-            offset_m = float(normal @ np.asarray(box.center, dtype=np.float64))
-            inside = len(box.get_point_indices_within_bounding_box(cloud.points))
-            self._candidates.append(
-                Candidate(
-                    plane=Plane(normal=normal, offset_m=offset_m),
-                    constraint=params.constraint,
-                    votes=float(inside),
-                )
-            )
-        self._candidates.sort(key=lambda candidate: -candidate.votes)
+        self._constraint = params.constraint
+        self._boxes = sorted(
+            boxes, key=lambda box: -len(box.get_point_indices_within_bounding_box(cloud.points))
+        )
 
     def propose(self, search: Search) -> Candidate | None:
         """Return the next patch."""
         del search
-        return self._candidates.pop(0) if self._candidates else None
+        if not self._boxes:
+            return None
+        box = self._boxes.pop(0)
+        normal = np.asarray(box.R, dtype=np.float64)[:, 2]
+        offset_m = float(normal @ np.asarray(box.center, dtype=np.float64))
+        return Candidate(plane=Plane(normal=normal, offset_m=offset_m), constraint=self._constraint)
 
     def reject(self, candidate: Candidate) -> None:
         """Do nothing, because each patch is proposed only once."""

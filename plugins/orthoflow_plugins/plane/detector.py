@@ -155,13 +155,6 @@ class DetectorParams(MethodParams):
         description="Stop when the share of points not yet on a plane is smaller than this. "
         "markiewicz2015 uses 0.1, which misses walls far from the scanner. 0 disables this.",
     )
-    stop_rest_share: float = Field(
-        0.0,
-        ge=0.0,
-        lt=1.0,
-        description="Stop at a plane that contains a smaller share of the points not yet "
-        "assigned: the other interpretation of the 10 % in markiewicz2015. 0 disables this.",
-    )
     thinning: int = Field(
         1,
         ge=1,
@@ -241,14 +234,12 @@ class Candidate:
     Attributes:
         plane: the plane in the cloud's offsets, accurate to a few centimetres or a degree.
         constraint: permitted orientation of the fitted plane.
-        votes: score of the detector.
         own_tolerance_m: tolerance estimated by the detector, or None.
         start: initial plane of the common fit; None for `plane`.
     """
 
     plane: Plane
     constraint: Constraint
-    votes: float
     own_tolerance_m: float | None = None
     start: Plane | None = None
 

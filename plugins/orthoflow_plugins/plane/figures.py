@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,11 +19,12 @@ from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import Planes, PointCloud, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.detector import Materials
-from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS, PlanGrid
+from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS
 from orthoflow_plugins.plane.planes import Deviations, Normality
 from orthoflow_plugins.plane.thickness import RowPoints
 
 if TYPE_CHECKING:
+    from orthoflow_plugins.plane.hough2d import PlanProposer
     from orthoflow_plugins.plane.voxels import SurfaceVoxels
 
 
@@ -249,19 +250,10 @@ _MAP_MOST_DEG: Final = 15.0
 _MAP_PIXELS_MOST: Final = 700
 
 
-class PlanVotes(Protocol):
-    """A plan before any plane was removed from it; see `hough2d.PlanProposer`."""
-
-    grid: PlanGrid
-    plan: NDArray[np.int64]
-    centre_m: NDArray[np.float64]
-    reach_m: float
-    first: NDArray[np.int32] | None
-    voters: str
-
-
 @in_column_style()
-def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: PointCloud) -> None:
+def draw_accumulator(
+    ctx: StepContext, votes: PlanProposer, planes: Planes, cloud: PointCloud
+) -> None:
     """Draw the plan with the detected walls, and the parameter space with their maxima.
 
     Args:
@@ -320,8 +312,8 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     ctx.figure(
         "accumulator",
         figure,
-        "Above: points per plan cell with the walls found. Below: the parameter space, in which "
-        f"{votes.voters}; circles mark the walls, the cross and the dotted line the "
+        "Above: points per plan cell with the walls found. Below: votes in the parameter space; "
+        "circles mark the walls, the cross and the dotted line the "
         "bin with the most votes. A wall is a sharp bright spot; a bright spot without a circle is "
         "a missed wall, and a circle on grey background may be accidental.",
     )

@@ -42,12 +42,6 @@ _NOT_AGAIN_ANGLES: Final = 2
 # Thresholds of the edge detector for the 8-bit density image.
 _EDGE_LOW: Final = 60
 _EDGE_HIGH: Final = 160
-_VOTERS: Final = {
-    "counts": "each cell votes with its number of points",
-    "unit": "each cell with points has one vote",
-    "canny": "each cell on an edge of the density has one vote",
-    "raw": "each point of the sample votes with its coordinates",
-}
 
 
 class Hough2d(Method):
@@ -141,7 +135,6 @@ class PlanProposer:
         reach_m: maximum distance of lines from the centre, on each side.
         first: (angles, bins) votes of the whole cloud, VOTE_SHARES each; None if only level planes
             are searched for.
-        voters: description of the voting items.
     """
 
     def __init__(self, search: Search, params: Hough2d.Params) -> None:
@@ -150,7 +143,6 @@ class PlanProposer:
         self._cloud, self._params = cloud, params
         self._is_raw = params.coordinates == "raw"
         self._is_plain = params.scoring == "votes"
-        self.voters = _VOTERS["raw" if self._is_raw else params.accumulator]
         self.grid, self.plan = cloud.grid, cloud.plan
         rows, columns, storeys = self.grid.shape
         self._cell_m = self.grid.cell_m
@@ -195,7 +187,7 @@ class PlanProposer:
             self._last = (-1, storey)
             height_m = float(self.grid.low_m[2] + (storey + 0.5) * self._cell_m)
             plane = Plane(normal=self.grid.basis[2], offset_m=height_m)
-            return Candidate(plane=plane, constraint="horizontal", votes=height_score)
+            return Candidate(plane=plane, constraint="horizontal")
         self._last = (angle, place)
         angle_rad, distance_m = self._angles_rad[angle], (place + 0.5) * self._cell_m - self.reach_m
         if not self._is_plain:
@@ -204,7 +196,7 @@ class PlanProposer:
         offset_m = distance_m + float(direction @ self.centre_m)
         normal = direction @ self.grid.basis[:2]
         plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m)
-        return Candidate(plane=plane, constraint="vertical", votes=line_score)
+        return Candidate(plane=plane, constraint="vertical")
 
     def reject(self, candidate: Candidate) -> None:
         """Exclude the surroundings of the last maximum."""

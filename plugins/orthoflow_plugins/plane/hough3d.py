@@ -183,7 +183,7 @@ class SpaceProposer:
         world = world / np.linalg.norm(world)
         on_plane = (point + self._middle_m) @ self._basis
         plane = Plane(normal=world, offset_m=float(world @ on_plane))
-        return Candidate(plane=plane, constraint=self._params.constraint, votes=score)
+        return Candidate(plane=plane, constraint=self._params.constraint)
 
     def reject(self, candidate: Candidate) -> None:
         """Exclude the surroundings of the last maximum."""

@@ -461,15 +461,6 @@ def sum_assigned(
 
 
 @compiled
-def name_labels(
-    claims: NDArray[np.int8], names: NDArray[np.int16], labels: NDArray[np.int16]
-) -> None:
-    """Set labels (n,) to the names (k + 1,) of claims (n,); the last name is for a claim of -1."""
-    for i in range(claims.size):
-        labels[i] = names[claims[i]]
-
-
-@compiled
 def measure_deviations(
     points: BlockedPoints,
     claims: NDArray[np.int8],

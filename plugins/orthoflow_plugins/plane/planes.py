@@ -181,7 +181,6 @@ def assemble(
             {
                 "normal": own.normal.tolist(),
                 "offset_m": own.offset_m,
-                "support": float(candidate.votes),
                 "own_tolerance_m": candidate.own_tolerance_m,
             }
         )
@@ -190,7 +189,7 @@ def assemble(
         for row in ordered.histogram
     ]
     # Normal and offset change sign together, which leaves their covariance unchanged.
-    covariances, n_independent = zip(*(found[k].adjusted.stated() for k in order), strict=True)
+    covariances = [found[k].adjusted.stated()[0] for k in order]
     is_guessed = [item.is_guessed for item in faced]
     viewpoint: Viewpoint = "guess" if all(is_guessed) else known_viewpoint(cloud)
     known: SideSource = "given" if viewpoint == "view_from" else "stations"
@@ -205,11 +204,9 @@ def assemble(
         details={
             "fit_n_points": ordered.n_fit.tolist(),
             "fit_rms_m": ordered.rms_fit_m.tolist(),
-            "n_independent": list(n_independent),
             "normality": [None if item is None else item.to_json() for item in normalities],
             "fit_tolerance_m": ordered.fit_tolerance_m,
             "raw": raw,
-            "guessed_sides": list[JsonValue](np.flatnonzero(is_guessed).tolist()),
         },
     )
     return planes, ordered, normalities, order

@@ -294,7 +294,6 @@ class ConsensusProposer:
             return Candidate(
                 plane=self._in_offsets(hypothesis.plane(0)),
                 constraint="vertical" if params.model == "2d" else params.constraint,
-                votes=float(self._scores.value[place]),
                 own_tolerance_m=own_m,
                 start=self._in_offsets(layer),
             )

@@ -43,6 +43,10 @@ _PAPER_PRESET: Final[dict[str, object]] = {
     "labels": "region",
     "stop_unclassified_share": 0.1,
 }
+# Number of points of a neighbourhood for `knn`.
+_N_NEAREST: Final = 30
+# Maximum distance of a cell's centroid from the region's plane, unless noise is larger.
+_DISTANCE_M: Final = 0.015
 # Share of the required points that a region needs, because the parts of a wall are separate
 # regions, which may have enough points only together.
 _PART_SHARE: Final = 0.2
@@ -120,9 +124,6 @@ class Region(Method):
             "times the tolerance of the fit if that is more, because noise must not dominate "
             "the normals.",
         )
-        n_neighbours: int = Field(
-            30, ge=3, le=100_000, description="Number of points in a neighbourhood, for knn."
-        )
         cell_m: float | None = Field(
             None,
             gt=0.0,
@@ -140,11 +141,6 @@ class Region(Method):
             gt=0.0,
             le=45.0,
             description="Maximum angle between the normal of a cell and that of the region.",
-        )
-        distance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
-            "auto",
-            description="Maximum distance of a cell's centroid from the region's plane, metres. "
-            "auto: 0.015, or half the tolerance of the fit if that is more.",
         )
         labels: Literal["plane", "region"] = Field(
             "plane",
@@ -170,7 +166,7 @@ class Region(Method):
             return Neighbourhood(
                 shape=self.neighbourhood,
                 size_m=size_m,
-                n_points=self.n_neighbours,
+                n_points=_N_NEAREST,
                 voxel_m=share * size_m if self.cell_m is None else self.cell_m,
             )
 
@@ -268,7 +264,6 @@ class RegionProposer:
             return Candidate(
                 plane=plane,
                 constraint=constraint,
-                votes=float(self.n_points[region]),
                 start=self.starts[region],
             )
         return None
@@ -322,8 +317,8 @@ def region_proposer(
     if params.criterion == "normal":
         regions = _grouped(voxels, params.angle_deg, least_points, viewer_m)
     else:
-        auto_m = max(0.015, 0.5 * fit_tolerance_m)
-        distance_m = auto_m if params.distance_m == "auto" else params.distance_m
+        # Noise must not keep cells from the plane that they are on.
+        distance_m = max(_DISTANCE_M, 0.5 * fit_tolerance_m)
         once = partial(_grown_once, angle_deg=params.angle_deg, distance_m=distance_m)
         regions = _grown(voxels, once, least_points)
     return RegionProposer(search, params, voxels, *regions)

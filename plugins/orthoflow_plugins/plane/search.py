@@ -49,7 +49,6 @@ from orthoflow_plugins.plane.fit import (
 from orthoflow_plugins.plane.kernels import BlockedPoints
 from orthoflow_plugins.plane.planes import assemble, report_first, report_planes
 from orthoflow_plugins.plane.support import (
-    CELL_LEAST_M,
     CellSums,
     Support,
     SurfaceRaster,
@@ -108,7 +107,7 @@ _SET_ASIDE: Final[frozenset[Criterion]] = frozenset({"small", "strip", "bent"})
 
 _NO_PLANE: Final = (
     "no plane was found in {count} points ({size}) with tolerance_m {tolerance:.3g} and min_share "
-    "{share:.2%}: {why}; {advice}{small} ({method})"
+    "{share:.2%}: {why}; {advice} ({method})"
 )
 _CRITERIA: Final[Mapping[Criterion, str]] = {
     "few": "the largest candidate has {share:.2%} of the points",
@@ -129,14 +128,6 @@ _ADVICE: Final = (
 _ADVICE_WIDER: Final = "with tolerance_m {wider:.3g} one is found"
 # Larger tolerances tried for the message, as multiples of the one that found nothing.
 _WIDER: Final = (1.5, 2.0, 3.0, 4.0, 6.0)
-# If two sides of a cloud are shorter than this, its unit may be wrong, and planes are hard to find.
-_SMALL_M: Final = 1.0
-_SMALL: Final = (
-    ". The cloud is small: check unit of read.scan. A plane must be at least {least} m wide and "
-    "high, and one that is not much larger is distorted by points near its edges: lower "
-    "fit_tolerance_m to 0.005, with max_tilt_deg 45 if it is tilted, or specify the plane "
-    "(plane.given)"
-)
 _NO_INTENSITY: Final = (
     "materials are distinguished by the intensity of points, which this cloud does not have: omit "
     "materials, or read a scan with intensity ({method})"
@@ -392,8 +383,6 @@ def greedy_search(
             proposer.reject(candidate)
             n_rejected += 1
             continue
-        if plane.support.n_points < params.stop_rest_share * search.n_points:
-            break
         found.append(plane)
         n_rejected = 0
         search.claim(Claim.of(plane.raster, plane.support, search.tolerance_m))
@@ -632,9 +621,10 @@ def label(found: list[FoundPlane], cloud: PreparedCloud, tolerance_m: float) -> 
     bounds = _bounds(found, tolerance_m)
     plane_of_slab = np.repeat(np.arange(len(found)), [len(own) for own in bounds])
     slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)[plane_of_slab]
-    # The last entry is for a claim of -1.
-    names = np.append(plane_of_slab, -1).astype(np.int8) if len(slabs) > len(found) else None
-    cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]), names)
+    cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]))
+    if len(slabs) > len(found):
+        # The last entry is for a claim of -1.
+        cloud.claims[:] = np.append(plane_of_slab, -1).astype(np.int8)[cloud.claims]
 
 
 def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
@@ -662,7 +652,7 @@ def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], met
         if greedy_search(wider, proposer_of(wider)):
             advice = _ADVICE_WIDER.format(wider=wider.tolerance_m)
             break
-    sides_m = [float(np.ptp(axis)) for axis in (cloud.x, cloud.y, cloud.z)]
+    sides_m = (float(np.ptp(axis)) for axis in (cloud.x, cloud.y, cloud.z))
     return _NO_PLANE.format(
         count=len(cloud),
         size=" x ".join(f"{side_m:.3g}" for side_m in sides_m) + " m",
@@ -670,7 +660,6 @@ def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], met
         share=search.params.min_share,
         why=why,
         advice=advice,
-        small=_SMALL.format(least=2 * CELL_LEAST_M) if sorted(sides_m)[1] < _SMALL_M else "",
         method=method,
     )
 

@@ -183,12 +183,9 @@ class GivenByName:
             given: the cameras.
             photos: all photos; photos with the same file name need separate cameras.
         """
-        self._exact: dict[str, list[GivenCamera]] = {}
-        self._lower: dict[str, list[GivenCamera]] = {}
+        self._by_name: dict[str, list[GivenCamera]] = {}
         for camera in given:
-            name = _file_name(camera.name)
-            self._exact.setdefault(name, []).append(camera)
-            self._lower.setdefault(name.lower(), []).append(camera)
+            self._by_name.setdefault(_file_name(camera.name).lower(), []).append(camera)
         self._n_named = Counter(_file_name(photo.name).lower() for photo in photos)
 
     def of_photo(self, name: str, folder: str = "") -> GivenCamera | None:
@@ -209,21 +206,22 @@ class GivenByName:
         return _nearest(found, folder, is_only=is_only)
 
     def _named(self, name: str) -> list[GivenCamera]:
+        """Return the cameras of a file name or its stem; in the same case if there are any."""
         for wanted in (name, PurePath(name).stem):
-            found = self._exact.get(wanted) or self._lower.get(wanted.lower(), [])
+            found = self._by_name.get(wanted.lower(), [])
             if found:
-                return found
+                return [one for one in found if _file_name(one.name) == wanted] or found
         return []
 
     def _of_stem(self, stem: str) -> list[GivenCamera]:
         """Return the cameras of a photo with this name except for its suffix."""
-        named = {
-            name: cameras
-            for name, cameras in self._exact.items()
-            if PurePath(name).stem.lower() == stem.lower()
-        }
-        exact = [camera for name in named if PurePath(name).stem == stem for camera in named[name]]
-        return exact or [camera for cameras in named.values() for camera in cameras]
+        found = [
+            camera
+            for name, cameras in self._by_name.items()
+            if PurePath(name).stem == stem.lower()
+            for camera in cameras
+        ]
+        return [one for one in found if PurePath(_file_name(one.name)).stem == stem] or found
 
 
 def _file_name(path: str) -> str:

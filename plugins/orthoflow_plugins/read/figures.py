@@ -155,53 +155,47 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
 
 
 class ContactSheet:
-    """Thumbnails of photos with their names, in rows, as stored, without rotation."""
+    """Thumbnails of the first hundred photos with their names, as stored, without rotation."""
 
     def __init__(self, n_photos: int) -> None:
-        self.n_photos = n_photos
-        self.n_shown = min(n_photos, _MOST)
-        self._columns = math.ceil(math.sqrt(self.n_shown))
+        self._n_photos = n_photos
+        self._columns = math.ceil(math.sqrt(min(n_photos, _MOST)))
         self._cell_px = min(_CELL_PX, _SHEET_SIDE_PX // self._columns)
-        shape = (
-            -(-self.n_shown // self._columns) * self._cell_px,
-            self._columns * self._cell_px,
-            3,
-        )
-        self._sheet = np.full(shape, _PAPER, dtype=np.uint8)
-        self._count = 0
+        self._cells: list[NDArray[np.uint8]] = []
 
     @property
     def caption(self) -> str:
         """Caption of the sheet, one sentence."""
-        if self.n_shown < self.n_photos:
-            which = f"The first {self.n_shown} of {self.n_photos} photos, as they are stored"
-        else:
-            which = "The photos, as they are stored"
+        which = "The photos" if self._n_photos <= _MOST else f"The first of {self._n_photos} photos"
         return (
-            f"{which}: orthoimages are good where several photos show a wall frontally; blur, "
-            "and parts that no photo shows, cannot be corrected later."
+            f"{which}, as they are stored: orthoimages are good where several photos show a wall "
+            "frontally; blur, and parts that no photo shows, cannot be corrected later."
         )
 
     def add(self, name: str, image: NDArray[np.uint8]) -> None:
         """Add a photo (rows, cols, 3) RGB to the sheet, if there is space."""
         import cv2
 
-        if self._count == self.n_shown:
+        if len(self._cells) == _MOST:
             return
-        row, column = divmod(self._count, self._columns)
-        self._count += 1
-        top, left = (place * self._cell_px + _GAP_PX for place in (row, column))
+        cell = np.full((self._cell_px, self._cell_px, 3), _PAPER, dtype=np.uint8)
         room_px = self._cell_px - 2 * _GAP_PX
         scale = min(room_px / image.shape[1], (room_px - _LABEL_PX) / image.shape[0])
         width, height = (max(1, int(side * scale)) for side in (image.shape[1], image.shape[0]))
-        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        self._sheet[top : top + height, left : left + width] = small
-        label, place = _shortened(name, room_px // _LETTER_PX), (left, top + height + _LABEL_PX - 8)
-        cv2.putText(self._sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 1, cv2.LINE_AA)
+        bottom = _GAP_PX + height
+        cell[_GAP_PX:bottom, _GAP_PX : _GAP_PX + width] = cv2.resize(
+            image, (width, height), interpolation=cv2.INTER_AREA
+        )
+        label, place = _shortened(name, room_px // _LETTER_PX), (_GAP_PX, bottom + _LABEL_PX - 8)
+        cv2.putText(cell, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 1, cv2.LINE_AA)
+        self._cells.append(cell)
 
     def encoded(self) -> bytes:
         """Encode the sheet as WebP; its sides are at most 1004 pixels long."""
-        return encode_webp(self._sheet)
+        blank = np.full_like(self._cells[0], _PAPER)
+        cells = self._cells + [blank] * (-len(self._cells) % self._columns)
+        starts = range(0, len(cells), self._columns)
+        return encode_webp(np.vstack([np.hstack(cells[k : k + self._columns]) for k in starts]))
 
 
 def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:

@@ -194,8 +194,6 @@ class ReadPhotos(Method):
                 read.append(_masked(_read_photo(source, calibration, sheet), source, masks))
             except InputError as error:
                 problems.append(str(error))
-            else:
-                ctx.log(_described(read[-1]))
         if problems:
             more = len(problems) - _MOST_PROBLEMS
             counted = [f"... and {more} more problems"] if more > 0 else []
@@ -513,27 +511,6 @@ def _camera(exif: Exif) -> str:
     if not exif.camera:
         return ""
     return exif.camera if exif.focal_mm is None else f"{exif.camera}, {exif.focal_mm:g} mm"
-
-
-def _described(read: _ReadPhoto) -> str:
-    photo, exif, focal = read.photo, read.exif, read.focal
-    parts = [f"{photo.name}: {photo.width} x {photo.height}"]
-    bits = stated_bits(photo.encoded)
-    if bits is not None and bits != _PLAIN_BITS:
-        parts.append(f"{bits} bits per channel")
-    if exif.camera:
-        parts.append(exif.camera)
-    if exif.orientation != 1:
-        parts.append(f"EXIF orientation {exif.orientation} (not applied)")
-    if photo.intrinsics is not None:
-        parts.append(f"calibrated, focal length {photo.intrinsics.fx:.1f} px")
-    elif focal.value_px is not None:
-        parts.append(f"focal length {focal.value_px:.1f} px from the {focal.reason}")
-    else:
-        parts.append(focal.reason)
-    if photo.mask is not None:
-        parts.append("masked")
-    return ", ".join(parts)
 
 
 def _warn(

@@ -121,27 +121,10 @@ SIZE: Final = DiagnosticSpec(
     text="the extent of the scan is {size} m ({unit}), which is unusual",
     remedy="set {step}.unit={other} if the file is in {other}, or to cm, ft, us-ft or in",
 )
-TOO_FAR: Final = DiagnosticSpec(
-    code="points-too-far",
-    text="{subject}: {n_points} points are farther than {farthest_m:g} m from the origin, the "
-    "first at {place}, and were left out",
+LEFT_OUT: Final = DiagnosticSpec(
+    code="points-left-out",
+    text="{subject}: {n_points} points {why}, and were left out",
     remedy="check the file and {step}.unit",
-    rank_by="n_points",
-)
-ONE_PLACE: Final = DiagnosticSpec(
-    code="points-at-one-place",
-    text="{subject}: {n_points} points are at exactly {place}: they are not returns of the scanner "
-    "and were left out",
-    rank_by="n_points",
-)
-NO_RETURN: Final = DiagnosticSpec(
-    code="points-without-return",
-    text="{n_points} points at 0 0 0 are not returns of the scanner and were left out",
-    rank_by="n_points",
-)
-NOT_FINITE: Final = DiagnosticSpec(
-    code="points-not-finite",
-    text="{n_points} points with coordinates that are not finite were left out",
     rank_by="n_points",
 )
 OTHER_UP: Final = DiagnosticSpec(
@@ -316,31 +299,22 @@ def report_summary(
     left_out: Counter[str] = Counter()
     for count in counts:
         left_out.update({cause: n for cause, n in count.left_out.items() if n})
-        if count.left_out["too_far"]:
-            ctx.report(
-                TOO_FAR,
-                subject=count.title,
-                n_points=count.left_out["too_far"],
-                farthest_m=FARTHEST_M,
-                place=" ".join(f"{value:g}" for value in count.first_far_m),
-            )
-        if count.repeated_m is not None:
-            ctx.report(
-                ONE_PLACE,
-                subject=count.title,
-                n_points=count.left_out["one_place"],
-                place=" ".join(f"{value:.3f}" for value in count.repeated_m),
-            )
-    for spec, cause in ((NO_RETURN, "no_return"), (NOT_FINITE, "not_finite")):
-        if left_out[cause]:
-            ctx.report(spec, n_points=left_out[cause])
+        far = " ".join(f"{value:g}" for value in count.first_far_m)
+        place = "" if count.repeated_m is None else " ".join(map("{:.3f}".format, count.repeated_m))
+        reasons = {
+            "too_far": f"are farther than {FARTHEST_M:g} m from the origin, the first at {far}",
+            "one_place": f"are at exactly {place}, where the scanner had no return",
+            "no_return": "are at 0 0 0, where the scanner had no return",
+            "not_finite": "have coordinates that are not finite",
+        }
+        for cause, why in reasons.items():
+            if count.left_out[cause]:
+                n_points = count.left_out[cause]
+                ctx.report(LEFT_OUT, subject=count.title, n_points=n_points, why=why)
     ctx.metric("n_points", len(cloud), "1")
     ctx.metric("n_points_left_out", left_out.total(), "1")
     for cause, n_points in sorted(left_out.items()):
         ctx.metric(f"n_left_out_{cause}", n_points, "1")
-    ctx.metric("n_invalid", left_out["invalid"] + left_out["no_return"], "1")
-    ctx.metric("n_withheld", left_out["withheld"], "1")
-    ctx.metric("n_not_finite", left_out["not_finite"] + left_out["too_far"], "1")
     ctx.metric("n_scans", len(counts), "1")
     ctx.metric("n_stations", 0 if cloud.stations is None else len(cloud.stations), "1")
     sides_m = np.array([values.max() - values.min() for values in assembly.offsets])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from orthoflow.files.images import decode_image, encode_webp
-from orthoflow.geometry import Plane, frame_over, wall_axes
+from orthoflow.geometry import frame_over, wall_axes
 from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.scene_views import SceneCameras, render
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
@@ -258,19 +258,17 @@ def _true_planes(
 
 
 def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDArray[np.float64]:
-    """Return the RMS distances of points from their planes, summed block by block in order."""
+    """Return the RMS distances of points from their planes, summed in order."""
     offsets = planes.offset - planes.normal @ cloud.origin
     sums = np.zeros(len(planes))
     for start in range(0, len(cloud), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        label = labels[part]
-        points = np.column_stack([cloud.x[part], cloud.y[part], cloud.z[part]])
-        for index in range(len(planes)):
-            distances = Plane(
-                normal=planes.normal[index], offset_m=float(offsets[index])
-            ).distances_m(points[label == index].astype(np.float64))
-            # Not a dot product: in BLAS the order of summation depends on the number of threads.
-            sums[index] += float(np.square(distances).sum())
+        part = np.flatnonzero(labels[start : start + _CHUNK] >= 0) + start
+        own = labels[part]
+        # Not a dot product: in BLAS the order of summation depends on the number of threads.
+        distances = -offsets[own]
+        for axis, values in enumerate((cloud.x, cloud.y, cloud.z)):
+            distances += planes.normal[own, axis] * values[part]
+        sums += np.bincount(own, distances**2, minlength=len(planes))
     return np.sqrt(sums / np.maximum(planes.n_points, 1))
 
 

@@ -354,12 +354,12 @@ def _grown(small: Extent, large: Extent, area_m2: float) -> Extent:
         middle = np.repeat([0.5 * (one[0] + one[1]), 0.5 * (one[2] + one[3])], 2)
         grown = middle + math.sqrt(area_m2 / full) * (one - middle)
     else:
-        low, high = 0.0, 1.0
-        for _ in range(50):
-            share = 0.5 * (low + high)
-            is_less = _area_m2((one + share * (other - one)).tolist()) < area_m2
-            low, high = (share, high) if is_less else (low, share)
-        grown = one + high * (other - one)
+        # Both sides grow by the same share, which solves a quadratic equation.
+        (width, height), (wider, higher) = (np.diff(e.reshape(2, 2))[:, 0] for e in (one, other))
+        linear = width * (higher - height) + height * (wider - width)
+        square = (wider - width) * (higher - height)
+        root = math.sqrt(linear**2 + 4.0 * square * (area_m2 - full))
+        grown = one + min(1.0, (root - linear) / (2.0 * square)) * (other - one)
     a0, a1, b0, b1 = grown.tolist()
     return a0, a1, b0, b1
 
