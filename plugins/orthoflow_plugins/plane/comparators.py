@@ -69,6 +69,7 @@ def load_open3d(purpose: str) -> Any:
 class _Open3dMethod(Method):
     """Base class of the methods of open3d."""
 
+    result_version = 2
     determinism = "loose"
     metrics = DETECTOR_METRICS
     In = DetectorIn

@@ -68,6 +68,7 @@ class Hough2d(Method):
     """
 
     id = "plane.hough2d"
+    result_version = 2
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (PAPER,)

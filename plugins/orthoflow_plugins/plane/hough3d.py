@@ -64,6 +64,7 @@ class Hough3d(Method):
     """
 
     id = "plane.hough3d"
+    result_version = 2
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (

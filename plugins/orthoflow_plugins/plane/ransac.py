@@ -96,6 +96,7 @@ class Ransac(Method):
     """
 
     id = "plane.ransac"
+    result_version = 2
     determinism = "seeded"
     metrics = (
         *DETECTOR_METRICS,

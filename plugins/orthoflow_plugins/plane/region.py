@@ -89,6 +89,7 @@ class Region(Method):
     """
 
     id = "plane.region"
+    result_version = 2
     determinism = "exact"
     metrics = (
         *DETECTOR_METRICS,
