@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,12 +19,11 @@ from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import Planes, PointCloud, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.detector import Materials
-from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS
+from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS, PlanGrid
 from orthoflow_plugins.plane.planes import Deviations, Normality
 from orthoflow_plugins.plane.thickness import RowPoints
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.hough2d import PlanProposer
     from orthoflow_plugins.plane.voxels import SurfaceVoxels
 
 
@@ -250,10 +249,18 @@ _MAP_MOST_DEG: Final = 15.0
 _MAP_PIXELS_MOST: Final = 700
 
 
+class PlanVotes(Protocol):
+    """A plan before any plane was removed from it; see `hough2d.PlanProposer`."""
+
+    grid: PlanGrid
+    plan: NDArray[np.int64]
+    centre_m: NDArray[np.float64]
+    reach_m: float
+    first: NDArray[np.int32] | None
+
+
 @in_column_style()
-def draw_accumulator(
-    ctx: StepContext, votes: PlanProposer, planes: Planes, cloud: PointCloud
-) -> None:
+def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: PointCloud) -> None:
     """Draw the plan with the detected walls, and the parameter space with their maxima.
 
     Args:
