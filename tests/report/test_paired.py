@@ -123,7 +123,6 @@ def test_values_without_a_finite_difference_are_not_paired() -> None:
     [
         ("lower", 0.84536087, 0.84536104),
         ("higher", 0.84536104, 0.84536087),
-        ("lower", 3.2e6 + 0.5, 3.2e6 + 2.5),
         # Angles of next to nothing, in degrees; errors of both signs; factors to 1.
         ("lower", 1e-13, 4.5e-13),
         ("lower", -0.84536087, 0.84536104),
@@ -273,11 +272,8 @@ def test_mean_ranks_are_those_of_a_worked_example() -> None:
     assert found.critical_difference == pytest.approx(1.25, abs=0.01)
     assert 0.01 < found.p < 0.05
     assert found.leading == ("+m+cf", "+m", "+cf", "C4.5")
-
-
-def test_equal_methods_lead_together() -> None:
-    found = mean_ranks(("a", "b", "c"), np.ones((6, 3)))
-    assert (found.p, found.leading) == (1.0, ("a", "b", "c"))
+    level = mean_ranks(("a", "b", "c"), np.ones((6, 3)))
+    assert (level.p, level.leading) == (1.0, ("a", "b", "c"))
 
 
 def test_the_interval_of_a_median_covers_it_as_often_as_stated() -> None:

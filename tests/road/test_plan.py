@@ -113,6 +113,10 @@ def test_the_map_lies_where_the_site_does(plan: Path) -> None:
         for line in (plan / "products" / "mosaic" / "wall_0_ortho.tfw").read_text().split()[-2:]
     )
     assert (left, top) == pytest.approx((bounds[0] + 0.5 * GSD, bounds[3] - 0.5 * GSD), abs=1e-6)
+    about = json.loads((plan / "products" / "wall" / "wall_0_depth.json").read_text())
+    assert about["map_crs"] == "EPSG:2100"
+    assert (about["u_world"], about["v_world"]) == ([1.0, 0.0, 0.0], [0.0, -1.0, 0.0])
+    assert about["raster"]["geotiff"].startswith("X = x_of_left_m + gsd_m * column (east)")
 
 
 def test_what_is_painted_reaches_the_corners_and_the_tile_lies_in_its_place(plan: Path) -> None:
@@ -157,11 +161,3 @@ def test_points_measured_in_east_and_north_give_their_residuals(plan: Path) -> N
     if ("register", "scale") in metrics:
         assert metrics["register", "scale"] == pytest.approx(SCALE, rel=1e-5)
         assert metrics["register", "rms_mm"] < 0.1
-
-
-def test_the_sidecar_places_the_map(plan: Path) -> None:
-    content = json.loads((plan / "products" / "wall" / "wall_0_depth.json").read_text())
-    assert content["map_crs"] == "EPSG:2100"
-    assert content["u_world"] == [1.0, 0.0, 0.0]
-    assert content["v_world"] == [0.0, -1.0, 0.0]
-    assert content["raster"]["geotiff"].startswith("X = x_of_left_m + gsd_m * column (east)")
