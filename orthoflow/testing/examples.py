@@ -30,8 +30,8 @@ def example_inputs(
 ) -> dict[str, Product | InputFiles]:
     """Return the required inputs of a method, all from one scene: photographed wall or room.
 
-    True values are included wherever a method has a port for them. A product type of a plugin is
-    created by an installed method that outputs it.
+    The true room is included if a method has a port for it. Types that neither scene has are
+    created by an installed method that outputs them.
 
     Args:
         method: class of the method.
@@ -48,10 +48,12 @@ def _example_inputs(
 ) -> dict[str, Product | InputFiles]:
     ports = port_specs(method.In)
     required = {port.type_name for port in ports.values() if port.required}
-    scene = PHOTOGRAPHED if required & {"photos", "cameras", "ties"} else {}
+    is_photographed = bool(required & {*PHOTOGRAPHED, "orthoimages", "openings"} - {*SURVEYED})
+    scene = PHOTOGRAPHED if is_photographed else SURVEYED
     found: dict[str, Product | InputFiles] = {}
     for name, port in ports.items():
-        if name not in besides and (port.required or port.type_name == "truth"):
+        is_known = port.type_name == "truth" and not is_photographed
+        if name not in besides and (port.required or is_known):
             make = scene.get(port.type_name)
             found[name] = make() if make else _example(port.type_name, within)
     return found
@@ -90,7 +92,7 @@ def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
 
 
 def _givers(catalog: Catalog, type_name: str) -> Iterator[tuple[type[Method], str]]:
-    """Yield installed methods that output a type of a plugin, each with its output port."""
+    """Yield installed methods that output a type, each with its output port."""
     if type_name not in catalog.products:
         return
     for entry in catalog.methods.values():

@@ -26,6 +26,9 @@ from orthoflow.products import (
     Cameras,
     CheckPoints,
     Intrinsics,
+    Layer,
+    LayerMask,
+    Layers,
     Photo,
     Photos,
     PointCloud,
@@ -175,6 +178,27 @@ def cloud_of(scene: TexturedWall, *, spacing_m: float = 0.005) -> PointCloud:
     )
 
 
+def two_halves(scene: TexturedWall) -> Layers:
+    """Return layers of the left and the right 60 % of the wall, in its true colours."""
+    frame = scene.frame
+    grey = np.rint(255.0 * scene.grey(*places_of_cells(frame))).astype(np.uint8)
+    across = np.broadcast_to(np.arange(frame.width) / frame.width, frame.shape)
+    layers = []
+    for source, shown in (("left", across < 0.6), ("right", across > 0.4)):
+        mask = np.where(shown, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8)
+        layers.append(
+            Layer(
+                frame=frame,
+                wall=0,
+                source=source,
+                rgb=np.where(shown, grey, 0)[..., np.newaxis].repeat(3, axis=2),
+                mask=mask,
+                quality=shown.astype(np.float32),
+            )
+        )
+    return Layers(layers=tuple(layers), names=("wall 0",))
+
+
 def camera_before(
     scene: TexturedWall,
     *,
@@ -225,8 +249,8 @@ def _picture(pickled: bytes) -> bytes:
     scene: TexturedWall
     camera: ViewingCamera
     scene, camera = pickle.loads(pickled)
-    rays = _rays_camera(pickle.dumps(_without_pose(camera))) @ camera.rotation
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = camera.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
     gsd_m = scene.frame.gsd_m
     start = scene.frame.wall_from_world(camera.centre_world[None])[0] * [gsd_m, gsd_m, 1.0]
     axes = np.vstack([scene.frame.u_world, scene.frame.v_world, scene.frame.normal_world])
@@ -243,19 +267,6 @@ def _picture(pickled: bytes) -> bytes:
         0.0,
     )
     return encode_png(np.rint(255 * grey).astype(np.uint8).reshape(camera.height, camera.width))
-
-
-def _without_pose(camera: ViewingCamera) -> ViewingCamera:
-    return replace(camera, rotation=np.eye(3), translation=np.zeros(3))
-
-
-# All photos of a scene have the same lens, and removing distortion takes a third of the time.
-@lru_cache(maxsize=2)
-def _rays_camera(pickled: bytes) -> NDArray[np.float64]:
-    """Return the directions of all pixels in camera axes; the pose of the camera is ignored."""
-    camera: ViewingCamera = pickle.loads(pickled)
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    return camera.rays_camera(np.column_stack([columns.ravel(), rows.ravel()]))
 
 
 def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
@@ -436,6 +447,7 @@ PHOTOGRAPHED: Final[Mapping[str, Callable[[], Product]]] = {
     "calibration": _calibration,
     "ties": example_ties,
     "walls": cache(lambda: walls_of(photographed_scene())),
+    "layers": cache(lambda: two_halves(photographed_scene())),
     "cloud": cache(lambda: cloud_of(photographed_scene(), spacing_m=0.01)),
     "checkpoints": _checkpoints,
 }

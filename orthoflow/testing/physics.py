@@ -31,6 +31,7 @@ from orthoflow.testing.photographed import (
     photographed_scene,
     photographing_cameras,
     places_of_cells,
+    two_halves,
     wall_error_m,
     walls_of,
 )
@@ -178,7 +179,7 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
     """Two overlapping layers become an orthoimage whose cells have the colour of their position."""
     for gsd_m in _CELL_SIZES_M:
         scene = photographed_scene(gsd_m)
-        kinds: _Kinds = {"layers": partial(_two_halves, scene), "walls": partial(walls_of, scene)}
+        kinds: _Kinds = {"layers": partial(two_halves, scene), "walls": partial(walls_of, scene)}
         run = subject.run_on(f"mosaic{gsd_m}", **_inputs(subject, kinds))
         images = output_of(run, "orthoimages", Orthoimages).images
         require(images, "no orthoimage was made")
@@ -196,27 +197,6 @@ def _inputs(subject: Subject, kinds: _Kinds) -> dict[str, Product]:
     """Return inputs of a method by port, for its ports of these types."""
     ports = port_specs(subject.method.In).items()
     return {name: kinds[port.type_name]() for name, port in ports if port.type_name in kinds}
-
-
-def _two_halves(scene: TexturedWall) -> Layers:
-    """Return layers of the left and the right 60 % of the wall, in its true colours."""
-    frame = scene.frame
-    grey = np.rint(255.0 * scene.grey(*places_of_cells(frame))).astype(np.uint8)
-    across = np.broadcast_to(np.arange(frame.width) / frame.width, frame.shape)
-    layers = []
-    for source, shown in (("left", across < 0.6), ("right", across > 0.4)):
-        mask = np.where(shown, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8)
-        layers.append(
-            Layer(
-                frame=frame,
-                wall=0,
-                source=source,
-                rgb=np.where(shown, grey, 0)[..., np.newaxis].repeat(3, axis=2),
-                mask=mask,
-                quality=shown.astype(np.float32),
-            )
-        )
-    return Layers(layers=tuple(layers), names=("wall 0",))
 
 
 def _check_cells(

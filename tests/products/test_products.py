@@ -32,6 +32,7 @@ from orthoflow.products import (
     TieWall,
     Walls,
 )
+from orthoflow.testing.photographed import PHOTOGRAPHED
 from orthoflow.testing.surveyed import SURVEYED
 from tests import samples
 from tests.drawing_runs import box_planes, box_products
@@ -83,8 +84,8 @@ def walls() -> Walls:
 
 @cache
 def products() -> tuple[Product, ...]:
-    names = ("cloud", "labels", "walls", "layers", "orthoimages")
-    examples = [SURVEYED[name]() for name in names]
+    examples = [SURVEYED[name]() for name in ("cloud", "labels")]
+    examples += [PHOTOGRAPHED[name]() for name in ("walls", "layers")]
     return planes(), cameras(), photos(), walls(), *examples, *box_products().values()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthoflow.products import Photos, PointCloud, Truth, Walls
+from orthoflow.products import Photos, Planes, PointCloud, Truth, Walls
 from orthoflow.sdk import Method, Ports
 from orthoflow.testing import examples
 from orthoflow.testing.examples import (
@@ -71,7 +71,7 @@ class Photographing(_Idle):
 
 class Surveying(_Idle):
     class In(Ports):
-        walls: Walls
+        planes: Planes
         cloud: PointCloud | None = None
         truth: Truth | None = None
 
@@ -80,7 +80,7 @@ def test_what_a_method_gets_is_of_one_scene_and_a_truth_wherever_it_takes_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # To render photos takes seconds.
-    for scene, ports in (("PHOTOGRAPHED", "photos walls ties"), ("SURVEYED", "walls truth")):
+    for scene, ports in (("PHOTOGRAPHED", "photos walls ties"), ("SURVEYED", "planes truth")):
         makers = {port: lambda made=f"{port} of {scene}": made for port in ports.split()}
         monkeypatch.setattr(examples, scene, makers)
     assert example_inputs(Photographing) == {
@@ -88,8 +88,9 @@ def test_what_a_method_gets_is_of_one_scene_and_a_truth_wherever_it_takes_one(
         "walls": "walls of PHOTOGRAPHED",
     }
     assert list(example_inputs(Photographing, besides=("photos",))) == ["walls"]
-    assert example_inputs(Surveying) == {"walls": "walls of SURVEYED", "truth": "truth of SURVEYED"}
-    assert example_inputs(Surveying, besides=("walls", "truth")) == {}
+    names = ("planes", "truth")
+    assert example_inputs(Surveying) == {name: f"{name} of SURVEYED" for name in names}
+    assert example_inputs(Surveying, besides=names) == {}
     assert example("ties") == "ties of PHOTOGRAPHED"
     with pytest.raises(ExampleError, match="there is no example of a dent product, and no "):
         example("dent")
