@@ -103,7 +103,9 @@ class RecordCommand(Command):
 
             for path in self._runs(ctx):
                 if findings := verify_run(path, also_published=False).findings:
-                    raise RecordError(f"{path} is not as it was written: {findings[0]}") from error
+                    raise RecordError(
+                        f"{path} was changed after it was written: {findings[0]}"
+                    ) from error
             raise
 
     def _runs(self, ctx: click.Context) -> Iterator[str | Path]:

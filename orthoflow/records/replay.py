@@ -87,7 +87,7 @@ def plan_replay(
     findings = verify_run(run.path, also_published=False).findings
     if problems := findings or (*_inconsistencies(run), *_loose_ends(run)):
         raise RefusedRunError(
-            f"{run.path} is not as it was written: {problem}" for problem in problems
+            f"{run.path} was changed after it was written: {problem}" for problem in problems
         )
     try:
         workflow = workflow_from_resolved(run.record.workflow_resolved, run.record.workflow_source)

@@ -563,7 +563,8 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
             if sentence := name_problem(figure.name) or path_problem(path):
                 problem = problem or f"the figure {figure.name!r} of {address} {sentence}"
     if twice := colliding(path for path, _ in named):
-        problem = problem or f"two figures have names that some systems treat as one, {twice!r}"
+        same = "two figures have the same name on file systems that ignore case"
+        problem = problem or f"{same}, {twice!r}"
     if problem:
         raise RecordError(f"{run.path}: {problem}, so its file cannot be written")
     return dict(named)

@@ -323,7 +323,7 @@ def verify_run(
     record_path = find_record(path)
     if found := verify_record(record_path):
         is_unchecked = found[0].code in ("foreign", "locked")
-        wrong = "cannot be checked" if is_unchecked else "is not as it was written"
+        wrong = "cannot be checked" if is_unchecked else "was changed after it was written"
         findings = tuple(f"{finding.place}: {finding.problem}" for finding in found)
         return Verification(path=record_path, findings=findings, wrong=f"{record_path} {wrong}")
     with record_errors(record_path), open_record(record_path) as opened:
@@ -448,7 +448,9 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
     places = [finding.place for finding in findings if finding.code not in _OWN_FAULTS]
     if not places:
         return ""
-    return f"{run.path} is not as it was written: its seal does not hold for {first_few(places)}"
+    return (
+        f"{run.path} was changed after it was written: its seal does not match {first_few(places)}"
+    )
 
 
 def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str], list[Note]]:

@@ -49,7 +49,7 @@ _CHUNK_BYTES: Final = 1 << 20
 # Compression or memory mapping is of no use for smaller arrays.
 _SMALL_BYTES: Final = 4096
 _EXACT: Final = 0.0
-_ALONE: Final = "only one of the products has it"
+_ALONE: Final = "it exists in only one of the products"
 # Tolerance for floats in the metadata, which describe a product but are not the product itself: the
 # last digits depend on the version of numerical libraries.
 _STATED_SHARE: Final = 1e-6
@@ -189,8 +189,8 @@ def check_storable(dtype: np.dtype[np.generic]) -> None:
     is_float = dtype.kind == "f" and dtype.itemsize in (2, 4, 8)
     if not (dtype.kind in "biu" or is_float):
         raise RecordFormatError(
-            f"an array of type {dtype} cannot be stored, only bool, integers and floats of 2, 4 or "
-            "8 bytes can"
+            f"an array of type {dtype} cannot be stored; only bool, integers and floats of 2, 4 "
+            "or 8 bytes are supported"
         )
 
 
@@ -307,7 +307,7 @@ def measure_payloads(
 def _metadata(group: h5py.Group) -> dict[str, JsonValue]:
     value = parse_json(read_text(group, "metadata"), f"{group.name}/metadata")
     if not isinstance(value, dict):
-        raise RecordFormatError(f"{group.name}/metadata must hold a JSON object")
+        raise RecordFormatError(f"{group.name}/metadata must contain a JSON object")
     return value
 
 
@@ -323,8 +323,8 @@ def _check_payload(payload: PayloadLike) -> None:
         for depth in range(1, len(parents)):
             if "/".join(parents[:depth]) in payload.arrays:
                 raise RecordFormatError(
-                    f"the array {name} cannot lie below {'/'.join(parents[:depth])}, which is an "
-                    "array itself"
+                    f"the array {name} cannot be inside {'/'.join(parents[:depth])}, which is "
+                    "itself an array"
                 )
 
 
@@ -411,7 +411,7 @@ def _read_array(dataset: h5py.Dataset) -> NDArray[np.generic]:
     if is_mappable:
         path = Path(dataset.file.filename)
         if offset + dataset.nbytes > path.stat().st_size:
-            raise RecordFormatError(f"{dataset.name} reaches beyond the end of {path.name}")
+            raise RecordFormatError(f"{dataset.name} extends beyond the end of {path.name}")
         mapped = np.memmap(path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape)
         return mapped.view(np.ndarray)
     array: NDArray[np.generic] = np.empty(dataset.shape, dtype=dataset.dtype)
@@ -432,7 +432,7 @@ def _array_differences(
     tolerance: tuple[float, str],
 ) -> Iterator[ArrayDifference]:
     if left.shape != right.shape or left.dtype != right.dtype:
-        problem = f"{left.dtype} of shape {left.shape} against {right.dtype} of {right.shape}"
+        problem = f"{left.dtype} of shape {left.shape} versus {right.dtype} of shape {right.shape}"
         yield _unlike(name, tolerance, problem)
         return
     limit, unit = tolerance
@@ -447,7 +447,7 @@ def _array_differences(
             f"{n_values} of {left.size} values differ by more than {_amount(limit, unit)}, the "
             f"largest by {largest:g}; the mean of all is {total / left.size:.3g}"
             if n_values
-            else f"differs by {_amount(largest, unit)} at most, {limit:g} are allowed"
+            else f"differs by up to {_amount(largest, unit)}; the limit is {limit:g}"
         )
         yield ArrayDifference(
             name=name,
@@ -500,10 +500,10 @@ def _json_differences(
                 limit=limit,
                 unit=unit,
                 n_values=int(abs(one - other) > limit),
-                problem=f"{one:g} against {other:g}, {_amount(limit, unit)} are allowed",
+                problem=f"{one:g} versus {other:g}; the limit is {_amount(limit, unit)}",
             )
     elif left != right or type(left) is not type(right):
-        yield _unlike(name, tolerance, f"{left!r:.60} against {right!r:.60}")
+        yield _unlike(name, tolerance, f"{left!r:.60} versus {right!r:.60}")
 
 
 def _is_number(value: JsonValue) -> bool:

@@ -515,7 +515,7 @@ def from_json(text: str, contents: Callable[[str], bytes]) -> RunRecord:
         raise RecordFormatError(f"the document at /{place}: {first['msg']}") from error
     if (written := codec.dump_python(record, mode="json")) != document:
         odd = min({*_paths(document)} ^ {*_paths(written)}, default="/")
-        raise RecordFormatError(f"the document lacks {odd}, or has it where no such field is known")
+        raise RecordFormatError(f"the document lacks {odd}, or contains it where it is not allowed")
     return _with_figures(record, lambda one: replace(one, data=contents(one.data.decode())))
 
 
@@ -558,7 +558,7 @@ def parse_json(text: str, place: str) -> JsonValue:
     try:
         value: JsonValue = json.loads(text, parse_constant=refuse)
     except (ValueError, RecursionError) as error:
-        raise RecordFormatError(f"{place} must hold JSON: {error}") from error
+        raise RecordFormatError(f"{place} must contain JSON: {error}") from error
     return value
 
 
@@ -610,7 +610,9 @@ def plain_json(value: object, place: str = "") -> JsonValue:
         return int(value)
     if isinstance(value, float):
         if not math.isfinite(value):
-            raise RecordFormatError(f"JSON needs finite numbers, got {value} at {place or 'root'}")
+            raise RecordFormatError(
+                f"numbers in JSON must be finite, got {value} at {place or 'root'}"
+            )
         return float(value)
     if isinstance(value, str):
         return str(value)
@@ -624,6 +626,6 @@ def plain_json(value: object, place: str = "") -> JsonValue:
                 )
         return {str(key): plain_json(item, f"{place}/{key}") for key, item in value.items()}
     raise RecordFormatError(
-        f"JSON knows no {type(value).__name__}, got one at {place or 'root'}: store numbers, text, "
-        "lists or mappings"
+        f"JSON does not support {type(value).__name__}, found at {place or 'root'}: store "
+        "numbers, text, lists or mappings"
     )

@@ -131,7 +131,7 @@ def int_attribute(item: h5py.Group | h5py.Dataset, name: str) -> int:
     value = _attribute(item, name)
     if not isinstance(value, np.integer | int):
         raise RecordFormatError(
-            f"{item.name}@{name} must be a whole number, got {type(value).__name__}"
+            f"{item.name}@{name} must be an integer, got {type(value).__name__}"
         )
     return int(value)
 
@@ -190,8 +190,8 @@ def read_whole(dataset: h5py.Dataset) -> object:
     with reading(dataset.name):
         if dataset.nbytes > max(_PACKED_BYTES_MOST, dataset.id.get_storage_size()):
             raise RecordFormatError(
-                f"{dataset.name} unpacks to {dataset.nbytes} bytes: texts, tables and figures of "
-                f"more than {_PACKED_BYTES_MOST} bytes must not be packed"
+                f"{dataset.name} has {dataset.nbytes} bytes when decompressed: texts, tables and "
+                f"figures of more than {_PACKED_BYTES_MOST} bytes must not be compressed"
             )
         value: object = dataset[()]
     return value
@@ -343,9 +343,10 @@ def _check_superblock(path: Path) -> None:
         raise UnknownFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
     if len(start) == _SUPERBLOCK_BYTES and start[8] == 3 and start[11] & _WRITER_MARKS:
         raise LockedFileError(
-            f"{path.name} is open for writing in another program, or was left so by one that "
-            f"crashed: close that program; if there is none, `h5clear -s {path.name}` (of the HDF5 "
-            "tools) takes the mark away, and `orthoflow verify` reports whether the file is whole"
+            f"{path.name} is open for writing in another program, or was left so by a program "
+            f"that crashed: close that program; if there is none, `h5clear -s {path.name}` (part "
+            "of the HDF5 tools) removes the mark, and `orthoflow verify` checks whether the file "
+            "is complete"
         )
 
 
@@ -362,14 +363,15 @@ def _require_format(file: h5py.File, file_name: str, name: str) -> None:
         found, version = (_short_text(file, one) for one in ("format", "format_version"))
     if found is None or version is None:
         raise UnknownFormatError(
-            f"{file_name} is not a record of orthoflow: it does not name that format; give a run.h5"
+            f"{file_name} is not a record of orthoflow: it does not declare this format; give a "
+            "run.h5"
         )
     if found != name:
-        raise UnknownFormatError(f"{file_name} must be of format {name}, got {found!r}")
+        raise UnknownFormatError(f"{file_name} must have the format {name}, got {found!r}")
     if version != FORMAT_VERSION:
         raise UnknownFormatError(
-            f"{file_name} has format version {version!r}, this program reads version "
-            f"{FORMAT_VERSION}: use the orthoflow that wrote it, or a newer one"
+            f"{file_name} has format version {version!r}, but this program reads version "
+            f"{FORMAT_VERSION}: use the version of orthoflow that wrote it, or a newer one"
         )
 
 
@@ -404,7 +406,7 @@ class _Inspection:
         self._visit_once(self._file.id, "/")
         while pending:
             group, path, depth = pending.pop()
-            too_deep = f"is nested more than {_DEEPEST} groups deep"
+            too_deep = f"is nested in more than {_DEEPEST} groups"
             self._refuse(path, depth > _DEEPEST, too_deep)
             with reading(f"{self._name}:{path}"):
                 self._check_attributes(group, path)
@@ -426,11 +428,11 @@ class _Inspection:
             # Other programs would interpret `..` in a path as the parent group.
             check_name(name.decode("utf-8"), "the object")
         except RecordFormatError as error:
-            raise self._refusal(place, f"is not a place in a record: {error}") from error
+            raise self._refusal(place, f"is not a path in a record: {error}") from error
         link = group.links.get_info(name).type
         self._refuse(place, link == h5py.h5l.TYPE_EXTERNAL, "is a link into another file")
         is_soft = link != h5py.h5l.TYPE_HARD
-        self._refuse(place, is_soft, "is a soft link, only hard links are allowed")
+        self._refuse(place, is_soft, "is a soft link; only hard links are allowed")
         child = h5py.h5o.open(group, name)
         is_known = isinstance(child, h5py.h5g.GroupID | h5py.h5d.DatasetID)
         self._refuse(place, not is_known, "is neither a group nor a dataset")
@@ -442,13 +444,13 @@ class _Inspection:
         info = h5py.h5o.get_info(item)
         identity = (int(info.fileno), int(info.addr))
         is_known = identity in self._seen
-        self._refuse(place, is_known, "leads to an object that has another place as well")
+        self._refuse(place, is_known, "refers to an object that also has another path")
         self._seen.add(identity)
         self._count(1, place)
 
     def _count(self, n_objects: int, place: str) -> None:
         self._n_objects += n_objects
-        reason = f"and what lies before it are more than {MAX_OBJECTS} groups and attributes"
+        reason = f"is preceded by more than {MAX_OBJECTS} groups and attributes"
         self._refuse(place, self._n_objects > MAX_OBJECTS, reason)
 
     def _check_dataset(self, dataset: h5py.h5d.DatasetID, place: str) -> None:
@@ -460,7 +462,7 @@ class _Inspection:
         chunk = math.prod(properties.get_chunk()) * itemsize if is_chunked else 0
         in_file = is_chunked or layout in {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS}
         filters = f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
-        self._refuse(place, properties.get_external_count(), "keeps its data in another file")
+        self._refuse(place, properties.get_external_count(), "stores its data in another file")
         self._refuse(place, not in_file, "is a virtual dataset")
         self._refuse(place, is_filtered, filters)
         self._refuse(place, not _is_allowed(kind), "has a type outside the format")
@@ -468,11 +470,13 @@ class _Inspection:
         declared = math.prod(dataset.shape or ()) * itemsize
         stored = dataset.get_storage_size()
         unfounded = declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored)
-        sizes = f"declares {declared} bytes, but the file holds {stored} for it"
+        sizes = f"declares {declared} bytes, but the file contains {stored}"
         self._refuse(place, unfounded, sizes)
         # Many datasets, each below the limit that is always allowed, could be excessive together.
         self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
-        together = "and those before it declare more than 64 MiB that the file cannot hold"
+        together = (
+            "and the datasets before it declare more than 64 MiB that the file does not contain"
+        )
         self._refuse(place, self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES, together)
 
     def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:

@@ -48,8 +48,8 @@ def check_name(name: str, what: str) -> str:
     """
     if name in {"", ".", ".."} or "/" in name or holds_control(name):
         raise RecordFormatError(
-            f"{what} {name!r} cannot be a name in a record: names are not empty, not `.` or `..`, "
-            "and hold neither `/` nor control characters"
+            f"{what} {name!r} cannot be a name in a record: names must not be empty, `.` or "
+            "`..`, or contain `/` or control characters"
         )
     return name
 
@@ -57,15 +57,15 @@ def check_name(name: str, what: str) -> str:
 _PROBLEMS: Final[tuple[tuple[str, Callable[[str], object]], ...]] = (
     ("is empty", lambda name: not name),
     ("is . or ..", lambda name: name in {".", ".."}),
-    ("holds / or a backslash", lambda name: "/" in name or "\\" in name),
-    ("holds a control character", holds_control),
+    ("contains / or a backslash", lambda name: "/" in name or "\\" in name),
+    ("contains a control character", holds_control),
     (
         f"is longer than {LONGEST_NAME_BYTES} bytes",
         lambda name: len(name.encode("utf-8")) > LONGEST_NAME_BYTES,
     ),
     ("ends with a dot or a space", lambda name: name[-1] in ". "),
-    ("is reserved for a device", _DEVICES.fullmatch),
-    ("begins with the letter of a drive", _DRIVE.match),
+    ("is a reserved device name", _DEVICES.fullmatch),
+    ("begins with a drive letter", _DRIVE.match),
 )
 
 
@@ -106,7 +106,7 @@ def path_below(folder: Path, path: str) -> Path:
             absolute, with `..`, empty, with control characters or reserved names, or too long.
     """
     if problem := path_problem(path):
-        raise UnsafeFileError(f"{path!r} {problem}, so it cannot be the name of a file here")
+        raise UnsafeFileError(f"{path!r} {problem}, so it cannot be a file name here")
     return folder.joinpath(*path.split("/"))
 
 
@@ -200,7 +200,7 @@ def _check_regular(found: os.stat_result, path: str) -> None:
     if not stat.S_ISREG(found.st_mode):
         other = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
         kind = "a link" if stat.S_ISLNK(found.st_mode) else other
-        raise UnsafeFileError(f"{path!r} must be a file, but {kind} stands there")
+        raise UnsafeFileError(f"{path!r} must be a file, but is {kind}")
 
 
 def without_folders(text: str, folders: Sequence[Path] = ()) -> str:

@@ -115,16 +115,17 @@ class OpenRecord:
             raise RecordFormatError(f"the record has no output {port} of the cell {address}")
         if not output.embedded:
             raise RecordFormatError(
-                f"the record names the output {port} of {address} ({output.type_name}) by its "
-                f"digest only, {output.digest}: it is in the store, or run again with --embed"
+                f"the record contains only the digest of the output {port} of {address} "
+                f"({output.type_name}), {output.digest}: read it from the store, or run again "
+                "with --embed"
             )
         group = open_group(self.file, product_path(output.digest))
         payload = read_payload(group)
         # Check it here, because the caller may not have checked the seal of the file.
         if (found := payload_digest(payload)) != output.digest:
             raise RecordFormatError(
-                f"{group.name} has the digest {found}, the record states {output.digest}: it was "
-                "changed, or the file is damaged"
+                f"{group.name} has the digest {found}, but the record states {output.digest}: it "
+                "was changed, or the file is damaged"
             )
         return payload
 
@@ -460,7 +461,7 @@ def _embed_product(
     path = product_file(digest)
     if path is None:
         raise RecordFormatError(
-            f"the product {digest} is not in the store any more: run the workflow again"
+            f"the product {digest} is no longer in the store: run the workflow again"
         )
     with safe_open(path, PRODUCT_FORMAT) as source:
         _copy_product(products, digest, open_group(source, PRODUCT_GROUP))
@@ -478,12 +479,12 @@ def _copy_product(products: h5py.Group, digest: str, source: h5py.Group) -> None
 def _embed_file(files: h5py.Group, input_name: str, file: RecordedFile, path: Path | None) -> None:
     if path is None:
         raise InputFileError(
-            f"the file {file.name} of the input {input_name} is to be embedded, but there is none "
-            f"with its SHA-256 {file.sha256[:12]}..."
+            f"the file {file.name} of the input {input_name} cannot be embedded, because no file "
+            f"has its SHA-256 {file.sha256[:12]}..."
         )
     another = InputFileError(
         f"the input file {path.name} must have {file.size_bytes} bytes with the SHA-256 "
-        f"{file.sha256[:12]}..., but it was changed since it was digested"
+        f"{file.sha256[:12]}..., but was changed since it was read"
     )
     if not path.is_file():
         # Do not open it: reading from a pipe would block.
@@ -538,8 +539,8 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
             sha256 = dataset_sha256(dataset, stream.write)
         if sha256 != file.sha256:
             raise RecordFormatError(
-                f"{dataset.name} has the SHA-256 {sha256}, the record states {file.sha256} of "
-                f"{file.name!r}"
+                f"{dataset.name} has the SHA-256 {sha256}, but the record states {file.sha256} "
+                f"for {file.name!r}"
             )
         yield path_below(folder, inside)
 

@@ -131,8 +131,9 @@ def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
     """Check the seal against the bytes of the file."""
     n_bytes = bytes_behind_end(path)
     if n_bytes:
-        how = f"{n_bytes} bytes stand behind" if n_bytes > 0 else f"{-n_bytes} bytes are missing at"
-        yield Finding("appended", "/", f"{how} the end that the file states")
+        after = f"there are {n_bytes} bytes after"
+        how = after if n_bytes > 0 else f"{-n_bytes} bytes are missing at"
+        yield Finding("appended", "/", f"{how} the end declared in the file")
     try:
         seal = read_text(file, SEAL)
         offset = dataset_of(file, SEAL).id.get_offset()
@@ -141,7 +142,7 @@ def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
         return
     found = "" if offset is None or len(seal) != 64 else file_sha256(path, offset)
     if found != seal:
-        problem = f"the seal is {seal:.80}, the bytes of the file have the SHA-256 {found}"
+        problem = f"the seal is {seal:.80}, but the SHA-256 of the content is {found}"
         yield Finding("seal", f"/{SEAL}", f"{problem}: the file was changed")
 
 
@@ -161,7 +162,7 @@ def _object_findings(
             attributes = frozenset() if below[1:] else _PRODUCT_ATTRIBUTES
         elif top == FILES and below:
             is_known = below[0] in contents
-        problem = "is in the file, but not in the document"
+        problem = "is in the file, but not listed in the document"
         if is_known:
             try:
                 problem = _object_problem(item, nodes.get(path), attributes)
@@ -170,7 +171,7 @@ def _object_findings(
         if problem:
             yield Finding("object", path, problem)
     for path in sorted(missing):
-        yield Finding("object", path, "is missing in the file")
+        yield Finding("object", path, "is missing from the file")
 
 
 def _object_problem(
@@ -179,7 +180,7 @@ def _object_problem(
     """Return how an object differs from a node, or from an object with any content."""
     with reading(item.name):
         if isinstance(item, h5py.Group) and item.id.get_create_plist().get_link_creation_order():
-            return "keeps its links in an order of their own, which no record does"
+            return "tracks the creation order of its links, which records do not"
         odd = set(item.attrs) ^ set(node.attributes if node else attributes)
         odd |= {
             name
@@ -187,7 +188,7 @@ def _object_problem(
             if name not in odd and not _is_same(np.asarray(item.attrs[name]), value)
         }
     if odd:
-        return f"its attribute {min(odd)!r} is not what the document states"
+        return f"its attribute {min(odd)!r} differs from the document"
     if node is None or (node.data is None and isinstance(item, h5py.Group)):
         return ""
     is_alike = (
@@ -196,7 +197,7 @@ def _object_problem(
         and (item.shape, item.nbytes) == (node.data.shape, node.data.nbytes)
         and _is_same(np.asarray(read_whole(item)), node.data)
     )
-    return "" if is_alike else "is not what the document states"
+    return "" if is_alike else "differs from the document"
 
 
 def _is_same(found: NDArray[Any], expected: NDArray[Any]) -> bool:
@@ -249,9 +250,9 @@ def _content_findings(
             dataset = dataset_of(open_group(file, FILES), sha256)
             is_bytes = dataset.dtype == np.uint8 and dataset.ndim == 1
             if not is_bytes or size_bytes not in (None, dataset.size):
-                problem = f"does not hold the {size_bytes} bytes of {name}"
+                problem = f"does not contain the {size_bytes} bytes of {name}"
             elif (with_arrays or size_bytes is None) and dataset_sha256(dataset) != sha256:
-                problem = f"does not hold the bytes of {name}"
+                problem = f"does not contain the bytes of {name}"
         except RecordFormatError as error:
             problem = str(error)
         if problem:
@@ -265,7 +266,7 @@ def _product_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
             payload = read_payload(open_group(file, place))
             found = payload_digest(payload)
             if found != digest or payload.digest != digest:
-                problem = f"has the digest {found}, the record states {digest}"
+                problem = f"has the digest {found}, but the record states {digest}"
                 yield Finding("product", place, problem)
         except RecordFormatError as error:
             yield Finding("product", place, str(error))
@@ -277,7 +278,7 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
         if not getattr(record, name):
             yield Finding("field", "/", f"{name} must not be empty")
     if any(cell.status == "failed" for cell in record.cells) != (record.status == "failed"):
-        problem = f"the run is {record.status}, which does not fit the status of its cells"
+        problem = f"the status of the run is {record.status}, which contradicts that of its cells"
         yield Finding("field", "/@status", problem)
     try:
         parse_json(record.workflow_resolved, "workflow_resolved")
@@ -291,11 +292,13 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
     files += [("/published", one.path, path_problem(one.path), one) for one in record.published]
     for place, name, problem, file in files:
         if problem:
-            yield Finding("name", place, f"{name!r} {problem}, so no file can be named so")
+            yield Finding("name", place, f"{name!r} {problem}, so it cannot be a file name")
         if not (is_sha256(file.sha256) and file.size_bytes >= 0):
             yield Finding("field", place, f"the file {name!r} needs a size and a SHA-256")
     if twice := colliding(file.path for file in record.published):
-        yield Finding("name", "/published", f"{twice!r} is named twice, as some systems see it")
+        yield Finding(
+            "name", "/published", f"{twice!r} occurs twice on file systems that ignore case"
+        )
     yield from _name_findings(record)
 
 
@@ -318,12 +321,12 @@ def _name_findings(record: RunRecord) -> Iterator[Finding]:
                 problem = f"the name of the figure {figure.name!r} {problem}"
                 yield Finding("name", f"{place}/figures", problem)
         if twice := colliding(figure.name for figure in cell.figures):
-            problem = f"two figures are named {twice!r}, as some systems see it"
+            problem = f"two figures are named {twice!r} on file systems that ignore case"
             yield Finding("field", f"{place}/figures", problem)
     for place, name in named:
         # Empty names are reported by other checks.
         if name and (problem := name_problem(name)):
-            yield Finding("name", place, f"{name!r} {problem}, so no file can be named so")
+            yield Finding("name", place, f"{name!r} {problem}, so it cannot be a file name")
 
 
 def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
@@ -358,5 +361,7 @@ def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Itera
                 yield Finding("reference", place, f"{digest!r} is not a SHA-256 digest")
             given = outputs.get(product.source, digest) if product.source else digest
             if given != digest:
-                problem = f"has the digest {digest}, but its source {product.source} gave {given}"
+                problem = (
+                    f"has the digest {digest}, but its source {product.source} returned {given}"
+                )
                 yield Finding("reference", place, problem)

@@ -87,10 +87,12 @@ def test_of_a_record_with_changed_arrays_neither_it_nor_its_seal_is_handed_on(
     for words in ways:
         refused = studio("export", "first", *words, "-o", "whole")
         assert refused.exit_code == 3, refused.output
-        assert "its seal does not hold for /products/" in refused.stderr
+        assert "its seal does not match /products/" in refused.stderr
         assert "; changed records are not exported: use an unchanged copy" in refused.stderr
         assert not (studio.folder / "whole").exists()
-    with pytest.raises(RecordError, match=r"has the digest .*, the record states .* another copy"):
+    with pytest.raises(
+        RecordError, match=r"has the digest .*, but the record states .* another copy"
+    ):
         open_run("first").product("survey", "planes")
 
 

@@ -31,7 +31,7 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
         "signed_with": "",
     }
     path.write_bytes(path.read_bytes()[:-1])
-    assert "is not as it was written (see above)\n" in said("verify", path, code=3)
+    assert "was changed after it was written (see above)\n" in said("verify", path, code=3)
     told = json.loads(said("verify", path, "--json", code=3))
     assert (told["ok"], len(told["findings"])) == (False, 1)
 
@@ -44,7 +44,7 @@ def test_who_shows_a_record_that_was_changed_says_so(tmp_path: Path) -> None:
     assert warning not in page.read_text()
     with h5py.File(path, "r+") as file:
         file.attrs["seed"] = type(file.attrs["seed"])(b"8")
-    doubt = f"{path} is not as it was written: its seal does not hold for /; "
+    doubt = f"{path} was changed after it was written: its seal does not match /; "
     assert doubt in said("show", path, code=3)
     assert doubt in said("report", path, "-o", page, code=3)
     assert warning in page.read_text()

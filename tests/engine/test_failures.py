@@ -87,8 +87,8 @@ RAISED = {
         "ProductError: metric nan must be finite, got nan: if it is unknown, do not report it"
     ),
     "values = np.array([object()])": (
-        "ProductError: a numbers cannot be stored: an array of type object cannot be stored, only "
-        "bool, integers and floats of 2, 4 or 8 bytes can"
+        "ProductError: a numbers cannot be stored: an array of type object cannot be stored; only "
+        "bool, integers and floats of 2, 4 or 8 bytes are supported"
     ),
 }
 N_BUGS = 7

@@ -95,7 +95,7 @@ def publish_control(product: Product, folder: Path, digest: str, /) -> None:
 def test_what_cannot_be_published_everywhere_is_refused(store: Store) -> None:
     for publisher, sentence in (
         (publish_link, "a heights publishes 'link.txt', which is a link or a device"),
-        (publish_control, r"publishes 'a\\x1b\[2J.txt', which holds a control character"),
+        (publish_control, r"publishes 'a\\x1b\[2J.txt', which contains a control character"),
     ):
         with pytest.raises(ProductError, match=sentence):
             store.put_product(heights(), publisher)

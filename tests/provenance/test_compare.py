@@ -61,8 +61,11 @@ def test_unsigned_integers_do_not_wrap_around() -> None:
 @pytest.mark.parametrize(
     ("right", "problem"),
     [
-        (np.zeros((5, 4)), "float64 of shape (4, 5) against float64 of (5, 4)"),
-        (np.zeros((4, 5), dtype=np.float32), "float64 of shape (4, 5) against float32 of (4, 5)"),
+        (np.zeros((5, 4)), "float64 of shape (4, 5) versus float64 of shape (5, 4)"),
+        (
+            np.zeros((4, 5), dtype=np.float32),
+            "float64 of shape (4, 5) versus float32 of shape (4, 5)",
+        ),
     ],
 )
 def test_other_shapes_and_types_cannot_be_compared(
@@ -79,21 +82,21 @@ def test_other_shapes_and_types_cannot_be_compared(
         (
             {"walls": [{"gsd_m": 0.01}]},
             {"walls": [{"gsd_m": 0.02}]},
-            [("walls/0/gsd_m", "0.01 against 0.02, 1e-06 m are allowed")],
+            [("walls/0/gsd_m", "0.01 versus 0.02; the limit is 1e-06 m")],
         ),
         ({"a": 1}, {"a": 1.0}, []),
-        ({"a": 1}, {"a": 2}, [("a", "1 against 2, 0 are allowed")]),
+        ({"a": 1}, {"a": 2}, [("a", "1 versus 2; the limit is 0")]),
         ({"a": 1000.0}, {"a": 1000.0009}, []),
         ({"a": 1e-8}, {"a": 9e-7}, []),
         (
             {"a_px": 1000.0},
             {"a_px": 1000.002},
-            [("a_px", "1000 against 1000, 0.001 px are allowed")],
+            [("a_px", "1000 versus 1000; the limit is 0.001 px")],
         ),
-        ({"a": 1}, {"a": True}, [("a", "1 against True")]),
-        ({"a": "x"}, {"a": "y"}, [("a", "'x' against 'y'")]),
-        ({"a": [1]}, {"a": [1, 2]}, [("a", "[1] against [1, 2]")]),
-        ({"a": None}, {}, [("a", "only one of the products has it")]),
+        ({"a": 1}, {"a": True}, [("a", "1 versus True")]),
+        ({"a": "x"}, {"a": "y"}, [("a", "'x' versus 'y'")]),
+        ({"a": [1]}, {"a": [1, 2]}, [("a", "[1] versus [1, 2]")]),
+        ({"a": None}, {}, [("a", "it exists in only one of the products")]),
     ],
 )
 def test_metadata_are_compared_value_by_value(

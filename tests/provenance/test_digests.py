@@ -38,10 +38,10 @@ def test_canonical_json_reads_back_to_the_same_value(value: object) -> None:
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (float("nan"), "JSON needs finite numbers, got nan at root"),
+        (float("nan"), "numbers in JSON must be finite, got nan at root"),
         ({"a": [0, float("inf")]}, "got inf at /a/1"),
         ({1: 2}, "keys of a JSON object must be text, got 1 at root"),
-        ({"a": np.zeros(2)}, "JSON knows no ndarray, got one at /a"),
+        ({"a": np.zeros(2)}, "JSON does not support ndarray, found at /a"),
         ("\ud800", "half a surrogate pair"),
     ],
 )

@@ -96,20 +96,20 @@ def flood_of_small_datasets(file: h5py.File) -> None:
 
 FORBIDDEN: list[tuple[Callable[[h5py.File], None], str]] = [
     (external_link, ":/b/c/a is a link into another file: the file is not opened"),
-    (soft_link, ":/a is a soft link, only hard links are allowed"),
-    (hard_link_cycle, ":/a/b leads to an object that has another place as well"),
+    (soft_link, ":/a is a soft link; only hard links are allowed"),
+    (hard_link_cycle, ":/a/b refers to an object that also has another path"),
     (named_type, ":/a is neither a group nor a dataset"),
-    (external_storage, ":/a keeps its data in another file"),
+    (external_storage, ":/a stores its data in another file"),
     (virtual_dataset, ":/a is a virtual dataset"),
-    (dataset_without_data, "declares 8000000000000 bytes, but the file holds 0 for it"),
+    (dataset_without_data, "declares 8000000000000 bytes, but the file contains 0"),
     (gzip_twice, "must use each of shuffle, gzip, fletcher32 at most once and no other"),
     (other_filter, "must use each of shuffle, gzip, fletcher32 at most once and no other"),
     (text_of_variable_length, ":/a has a type outside the format"),
     (reference, ":/a has a type outside the format"),
     (nested_compound, ":/a has a type outside the format"),
     (text_of_variable_length_in_an_attribute, ":/b@a has a type outside the format"),
-    (way_up, ":/.. is not a place in a record: the object '..' cannot be a name"),
-    (flood_of_small_datasets, ":/c and those before it declare more than 64 MiB"),
+    (way_up, ":/.. is not a path in a record: the object '..' cannot be a name"),
+    (flood_of_small_datasets, ":/c and the datasets before it declare more than 64 MiB"),
 ]
 
 
@@ -170,7 +170,9 @@ def test_tables_and_texts_that_unpack_to_much_are_not_read(tmp_path: Path) -> No
         file.create_dataset("plain", data=rows[:1000], chunks=(1000,), compression=9)
         set_attributes(file, **NAMED)
     with safe_open(path, RUN_FORMAT) as file:
-        with pytest.raises(RecordFormatError, match=r"/packed unpacks to 5242880 bytes: texts, ta"):
+        with pytest.raises(
+            RecordFormatError, match=r"/packed has 5242880 bytes when decompressed: texts, ta"
+        ):
             read_whole(file["packed"])
         assert np.shape(read_whole(file["plain"])) == (1000,)
 

@@ -57,7 +57,9 @@ def test_embedded_products_come_back_and_others_are_named_by_their_digest(tmp_pa
     path, record, _ = write_sample(tmp_path)
     with open_record(path) as opened:
         stored = opened.payload(WALL, "walls")
-        with pytest.raises(RecordFormatError, match=r"by its digest only, sha256:.*--embed"):
+        with pytest.raises(
+            RecordFormatError, match=r"contains only the digest of .*, sha256:.*--embed"
+        ):
             opened.payload("cloud", "cloud")
         with pytest.raises(RecordFormatError, match="no output walls of the cell nowhere"):
             opened.payload("nowhere", "walls")
@@ -86,7 +88,7 @@ def test_what_cannot_be_written_leaves_the_older_record(tmp_path: Path) -> None:
     other = shelf.put(cloud_payload(5))
     lost, another = (lambda _: None), (lambda _: shelf.find(other))
     for find, change, message in (
-        (lost, {}, "is not in the store any more: run the workflow"),
+        (lost, {}, "is no longer in the store: run the workflow"),
         (another, {}, r"product-2\.h5 must hold the product sha256:"),
         (shelf.find, {"cells": (cell, cell)}, "the cell 'cloud' is given twice"),
         (shelf.find, {"cells": (replace(cell, address="a/b"),)}, "'a/b' cannot be a name"),
@@ -150,7 +152,9 @@ def test_a_truncated_record_and_what_is_none_are_findings(tmp_path: Path) -> Non
             read_record(path)
     path.unlink()
     assert "No such file" in verify_record(path)[0].problem
-    with pytest.raises(RecordFormatError, match="of format orthoflow-run, got 'orthoflow-product'"):
+    with pytest.raises(
+        RecordFormatError, match="have the format orthoflow-run, got 'orthoflow-product'"
+    ):
         read_record(next(iter(shelf.files.values())))
 
 
@@ -362,7 +366,7 @@ def test_a_changed_byte_is_named_and_not_taken_out(tmp_path: Path) -> None:
         hostile.seal(file)
     [finding] = verify_record(path)
     assert finding.code == "file"
-    with pytest.raises(RecordFormatError, match=r"has the SHA-256 .* the record states"):
+    with pytest.raises(RecordFormatError, match=r"has the SHA-256 .* but the record states"):
         extract_files(path, read_record(path).inputs, tmp_path / "out")
 
 
@@ -376,10 +380,10 @@ def test_a_file_that_changed_or_is_gone_is_not_embedded(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for find, sentence in (
-        (lambda _: pipe, "but it was changed since it was digested"),
-        (lambda _: tmp_path / "gone", "but it was changed since it was digested"),
-        (lambda _: changed, "but it was changed since it was digested"),
-        (lambda _: None, "is to be embedded, but there is none with its SHA-256"),
+        (lambda _: pipe, "but was changed since it was read"),
+        (lambda _: tmp_path / "gone", "but was changed since it was read"),
+        (lambda _: changed, "but was changed since it was read"),
+        (lambda _: None, "cannot be embedded, because no file has its SHA-256"),
     ):
         with pytest.raises(InputFileError, match=sentence):
             write_record(tmp_path / "run.h5", record, lambda _: None, input_file=find)

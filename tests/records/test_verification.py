@@ -140,15 +140,15 @@ def test_only_what_the_record_vouches_for_is_used(
 @pytest.mark.parametrize(
     ("stated", "said"),
     [
-        ({"format": "colmap-db"}, "x.h5 is not a record of orthoflow: it does not name"),
+        ({"format": "colmap-db"}, "x.h5 is not a record of orthoflow: it does not declare"),
         (
             {"format": b"colmap-db", "format_version": b"1"},
-            "x.h5 must be of format orthoflow-run, got 'colmap-db'",
+            "x.h5 must have the format orthoflow-run, got 'colmap-db'",
         ),
         # What a later version writes may be outside this one's format.
         (
             {"format": b"orthoflow-run", "format_version": b"2.0"},
-            "x.h5 has format version '2.0', this program reads version ",
+            "x.h5 has format version '2.0', but this program reads version ",
         ),
     ],
 )
