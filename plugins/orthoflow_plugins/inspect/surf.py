@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Final, Literal
 
 import numpy as np
@@ -47,7 +48,7 @@ from orthoflow_plugins.inspect.image_quality import (
     quality_findings,
 )
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
-from orthoflow_plugins.inspect.patches import GreyCells, GreyImage, IntensityGrey
+from orthoflow_plugins.inspect.patches import GreyImage, IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
 # The intensity is compared with a copy of itself shifted by this much, in a tile of limited size,
@@ -144,7 +145,7 @@ class InspectSurf(Method):
         for place, image in enumerate(images if reason is None else ()):
             ctx.progress(place / len(images), image.name)
             wall = wall_of(image, inputs.walls, in_files(ctx, f"{place}.laid"))
-            verdicts.append(_Comparison(inputs.cameras, ctx.cores).of(image, wall))
+            verdicts.append(_compared(image, wall, inputs.cameras, ctx.cores))
         fit = [item for item in verdicts if len(item.pairs) >= _FEWEST_PAIRS]
         if reason is None and not fit:
             most = max(len(item.pairs) for item in verdicts)
@@ -215,56 +216,46 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
     return "the walls have neither intensity nor colour to compare with"
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """Compares walls one by one."""
+def _compared(image: Orthoimage, wall: Wall, cameras: Cameras | None, threads: int) -> _Verdict:
+    """Return the pairs of a wall; the rest is computed only if there are enough of them."""
+    if wall.intensity is None:
+        raise MethodError(f"{wall.name} has no intensity to compare with")
+    if not n_shown(image):
+        return _Verdict(image=image)
+    intensity = IntensityGrey(intensity=wall.intensity, of_roots=True)
+    find = partial(find_key_pairs, radius_cells=_RADIUS_CELLS, threads=threads)
+    pairs = find(OrthoimageGrey(image), intensity)
+    if len(pairs) < _FEWEST_PAIRS:
+        return _Verdict(image=image, pairs=pairs)
+    part = intensity.fullest_part(_FLOOR_CELLS)
+    floor = find(_set_aside(part), part)
+    return _Verdict(
+        image=image,
+        pairs=pairs,
+        floor=replace(
+            floor, shift=floor.shift - _FLOOR_SHIFT_CELLS, found=floor.found - _FLOOR_SHIFT_CELLS
+        ),
+        quality=(completeness(image, wall), *quality_findings(image, wall, cameras)),
+    )
 
-    cameras: Cameras | None
-    threads: int
 
-    def of(self, image: Orthoimage, wall: Wall) -> _Verdict:
-        """Return the pairs of a wall; the rest is computed only if there are enough of them."""
-        if wall.intensity is None:
-            raise MethodError(f"{wall.name} has no intensity to compare with")
-        if not n_shown(image):
-            return _Verdict(image=image)
-        intensity = IntensityGrey(intensity=wall.intensity, of_roots=True)
-        pairs = self._pairs(OrthoimageGrey(image), intensity)
-        if len(pairs) < _FEWEST_PAIRS:
-            return _Verdict(image=image, pairs=pairs)
-        return _Verdict(
-            image=image,
-            pairs=pairs,
-            floor=self._floor(intensity.fullest_part(_FLOOR_CELLS)),
-            quality=(completeness(image, wall), *quality_findings(image, wall, self.cameras)),
-        )
+def _set_aside(intensity: GreyImage) -> GreyImage:
+    """Return a shifted copy, whose displacements from the original are errors of the comparison."""
+    import cv2
 
-    def _pairs(self, shown: GreyCells, reference: GreyCells) -> KeyPairs:
-        return find_key_pairs(shown, reference, radius_cells=_RADIUS_CELLS, threads=self.threads)
-
-    def _floor(self, intensity: GreyImage) -> KeyPairs:
-        """Compare the intensity with a shifted copy of itself; errors are the displacements."""
-        import cv2
-
-        right, down = _FLOOR_SHIFT_CELLS
-        rows, columns = intensity.grey.shape
-        move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
-        # Linear interpolation would smooth one of the two images; cubic interpolation keeps most
-        # of the detail.
-        grey = cv2.warpAffine(
-            intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
-        )
-        whole = cv2.warpAffine(
-            intensity.valid.astype(np.float32), move, (columns, rows), flags=cv2.INTER_LINEAR
-        )
-        valid = np.asarray(whole) > 0.999
-        aside = GreyImage(grey=np.asarray(grey, dtype=np.float64), valid=valid, region=valid)
-        pairs = self._pairs(aside, intensity)
-        return replace(
-            pairs,
-            shift=pairs.shift - _FLOOR_SHIFT_CELLS,
-            found=pairs.found - _FLOOR_SHIFT_CELLS,
-        )
+    right, down = _FLOOR_SHIFT_CELLS
+    rows, columns = intensity.grey.shape
+    move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
+    # Linear interpolation would smooth one of the two images; cubic interpolation keeps most of the
+    # detail.
+    grey = cv2.warpAffine(
+        intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
+    )
+    whole = cv2.warpAffine(
+        intensity.valid.astype(np.float32), move, (columns, rows), flags=cv2.INTER_LINEAR
+    )
+    valid = np.asarray(whole) > 0.999
+    return GreyImage(grey=np.asarray(grey, dtype=np.float64), valid=valid, region=valid)
 
 
 def _numbers(items: list[_Verdict], wall: int, gsd_m: float) -> list[Finding]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.raster.extents import SampledPoints, points_in
+
+Cause = Literal["behind", "before", "hidden", "sparse", "unseen"]
 
 # Causes are determined on tiles of about this side, each with some points of the sample.
 _TILE_M: Final = 0.05
@@ -39,29 +42,24 @@ class Emptiness:
     """Shares of the cells of a wall that are empty, by cause.
 
     Attributes:
-        behind_share: cells whose points are behind the buffer.
-        behind_m: median depth of these points behind the plane; NaN if there are none.
-        before_share: cells with objects directly in front of the wall, beyond the buffer.
-        before_m: depth in front of the plane that includes 95 % of these objects; NaN if there are
+        shares: share of the cells by cause. `behind`: their points are behind the buffer; `before`:
+            objects are directly in front of the wall, beyond the buffer; `hidden`: objects are
+            between them and every scanner; `sparse`: close to points of the wall (gaps, shadows of
+            relief, borders); `unseen`: nothing was scanned there.
+        behind_m: median depth behind the plane of the points behind the buffer; NaN if there are
             none.
-        hidden_share: cells with objects between them and every scanner.
-        sparse_share: cells close to points of the wall: gaps, shadows of relief, borders.
-        unseen_share: cells where nothing was scanned.
+        before_m: depth in front of the plane that includes 95 % of the objects directly in front;
+            NaN if there are none.
     """
 
-    behind_share: float
+    shares: Mapping[Cause, float]
     behind_m: float
-    before_share: float
     before_m: float
-    hidden_share: float
-    sparse_share: float
-    unseen_share: float
 
     @property
     def share(self) -> float:
         """Return the share of all empty cells."""
-        around = self.behind_share + self.before_share
-        return around + self.hidden_share + self.sparse_share + self.unseen_share
+        return sum(self.shares.values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,35 +99,28 @@ def emptiness_of(
     reach = Slab(frame=tiles.frame, front_m=before_m, behind_m=_BEHIND_MOST_M)
     around = points_in(points, reach, threads=threads)
     is_behind, is_before = around.depth_m < -slab.behind_m, around.depth_m > slab.front_m
-    n_behind = np.bincount(around.cells[is_behind], minlength=n_void.size).reshape(n_void.shape)
-    n_before = np.bincount(around.cells[is_before], minlength=n_void.size).reshape(n_void.shape)
-    is_sparse = tiles.n_measured > 0
-    is_before_tile = ~is_sparse & (n_before >= _POINTS_LEAST)
-    is_hidden = np.zeros(is_sparse.shape, dtype=np.bool_)
-    open_tiles = np.flatnonzero((n_void > 0) & ~is_sparse & ~is_before_tile)
-    if sight.stations is not None and len(sight.stations) and len(open_tiles):
-        blocked = _blocked(tiles.frame, open_tiles, sight, sight.stations)
-        is_hidden.ravel()[open_tiles] |= blocked
-    is_behind_tile = ~is_sparse & ~is_before_tile & ~is_hidden & (n_behind >= _POINTS_LEAST)
-    stands = is_before_tile.ravel()[around.cells] & is_before
-    # Only tiles with void cells.
-    stands &= (n_void > 0).ravel()[around.cells]
-    far_m = np.percentile(around.depth_m[stands], _BEFORE_PERCENT) if stands.any() else math.nan
-    of_tile = is_behind_tile.ravel()[around.cells] & is_behind
-    behind_m = -float(np.median(around.depth_m[of_tile])) if of_tile.any() else math.nan
-    is_unseen = ~is_sparse & ~is_before_tile & ~is_hidden & ~is_behind_tile
-    behind, before, hidden, sparse, unseen = (
-        float(n_void[of].sum()) / wall.mask.size
-        for of in (is_behind_tile, is_before_tile, is_hidden, is_sparse, is_unseen)
+    n_behind, n_before = (
+        np.bincount(around.cells[chosen], minlength=n_void.size)
+        for chosen in (is_behind, is_before)
     )
+    is_sparse, is_void = tiles.n_measured.ravel() > 0, n_void.ravel() > 0
+    is_hidden = np.zeros(n_void.size, dtype=np.bool_)
+    open_tiles = np.flatnonzero(is_void & ~is_sparse & (n_before < _POINTS_LEAST))
+    if sight.stations is not None and len(sight.stations) and len(open_tiles):
+        is_hidden[open_tiles] = _blocked(tiles.frame, open_tiles, sight, sight.stations)
+    causes: tuple[Cause, ...] = ("sparse", "before", "hidden", "behind", "unseen")
+    cause = np.select(
+        [is_sparse, n_before >= _POINTS_LEAST, is_hidden, n_behind >= _POINTS_LEAST],
+        causes[:4],
+        causes[4],
+    )
+    of_point = cause[around.cells]
+    standing = around.depth_m[is_before & (of_point == "before") & is_void[around.cells]]
+    beyond = around.depth_m[is_behind & (of_point == "behind")]
     return Emptiness(
-        behind_share=behind,
-        behind_m=behind_m,
-        before_share=before,
-        before_m=float(far_m),
-        hidden_share=hidden,
-        sparse_share=sparse,
-        unseen_share=unseen,
+        shares={one: float(n_void.ravel()[cause == one].sum()) / wall.mask.size for one in causes},
+        behind_m=-float(np.median(beyond)) if beyond.size else math.nan,
+        before_m=float(np.percentile(standing, _BEFORE_PERCENT)) if standing.size else math.nan,
     )
 
 

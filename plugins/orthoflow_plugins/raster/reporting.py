@@ -16,7 +16,7 @@ from orthoflow.geometry.levels import plain_tone
 from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
-from orthoflow_plugins.raster.emptiness import Emptiness
+from orthoflow_plugins.raster.emptiness import Cause, Emptiness
 
 # For walls with more cells, medians are estimated from some of the rows.
 _CELLS_ASKED: Final = 1 << 26
@@ -119,7 +119,7 @@ CLOSE_CELLS: Final = DiagnosticSpec(
     remedy="{remedy}",
     rank_by="interpolated",
 )
-_CAUSES: Final = {
+_CAUSES: Final[dict[Cause, DiagnosticSpec]] = {
     "behind": BEHIND_BUFFER,
     "before": FRONT_LEFT_OUT,
     "hidden": HIDDEN,
@@ -254,12 +254,12 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
     """Report the causes of empty cells as metrics, and as diagnostics if many are affected."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
     for cause in _CAUSES:
-        shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
+        shares = [of_wall.shares[cause] for of_wall in empty]
         ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
         if not wall.count.any() or of_wall.share < _SHARE_LEAST:
             continue
-        shares_of = {cause: getattr(of_wall, f"{cause}_share") for cause in _CAUSES}
+        shares_of = {cause: of_wall.shares[cause] for cause in _CAUSES}
         ctx.log(
             f"{wall.name}: {of_wall.share:.1%} of its cells are empty: "
             + ", ".join(f"{share:.1%} {cause}" for cause, share in shares_of.items())

@@ -118,13 +118,12 @@ def told(
     )
     assert found.share == pytest.approx(VOID_SHARE)
     depths_m = places_m[:, 2]
-    if found.before_share:
+    if found.shares["before"]:
         before_m = depths_m[(depths_m > 0.15) & (depths_m < free_m)]
         assert found.before_m == pytest.approx(np.percentile(before_m, 95.0))
-    if found.behind_share:
+    if found.shares["behind"]:
         assert found.behind_m == pytest.approx(-np.median(depths_m[depths_m < -0.25]))
-    shares = {cause: getattr(found, f"{cause}_share") / VOID_SHARE for cause in CAUSES}
-    return {cause: share for cause, share in shares.items() if share}
+    return {cause: share / VOID_SHARE for cause, share in found.shares.items() if share}
 
 
 def in_each_tile(depth_m: float, count: int = 2) -> NDArray[np.float64]:

@@ -99,11 +99,10 @@ def test_cells_that_are_advised_are_no_longer_too_fine(ctx: StepContext) -> None
 
 
 def emptiness(**shares: float) -> Emptiness:
-    known = {"behind": 0.0, "before": 0.0, "hidden": 0.0, "sparse": 0.0, "unseen": 0.0, **shares}
     return Emptiness(
-        behind_m=0.4321 if known["behind"] else math.nan,
-        before_m=2.7654 if known["before"] else math.nan,
-        **{f"{cause}_share": share for cause, share in known.items()},
+        behind_m=0.4321 if "behind" in shares else math.nan,
+        before_m=2.7654 if "before" in shares else math.nan,
+        shares={cause: shares.get(cause, 0.0) for cause in reporting._CAUSES},
     )
 
 
