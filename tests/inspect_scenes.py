@@ -31,7 +31,6 @@ from orthoflow.products import (
     Product,
     SurfaceMask,
     Truth,
-    Wall,
     Walls,
 )
 from orthoflow.sdk import Method, StepContext
@@ -89,13 +88,7 @@ def walls(*, source: IntensitySource = "laser", where: WallFrame | None = None) 
         mask=np.where(known, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
         intensity=None if source == "none" else intensity,
     )
-    return Walls(
-        walls=(wall,),
-        up=UP,
-        intensity_source=source,
-        buffer_front_m=BUFFER_M,
-        buffer_behind_m=BUFFER_M,
-    )
+    return samples.walls(wall, up=UP, intensity_source=source, buffer_m=BUFFER_M)
 
 
 def image_of(grey: NDArray[np.float64], where: WallFrame | None = None) -> Orthoimage:
@@ -229,9 +222,8 @@ def truth_inputs() -> Mapping[str, Product]:
     depth[60:70, 60:80] = np.nan
     known = np.isfinite(depth)
     image = replace(image_of(np.zeros(TRUE_FRAME.shape), TRUE_FRAME), rgb=rgb, mask=mask)
-    wall = Wall(
-        frame=TRUE_FRAME,
-        plane_index=0,
+    wall = samples.wall(
+        TRUE_FRAME,
         name="main wall",
         depth_m=depth,
         sigma_m=np.where(known, 2.0**-9, np.nan).astype(np.float32),

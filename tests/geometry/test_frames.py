@@ -163,22 +163,22 @@ def test_floors_read_like_a_map_whichever_way_they_lean(rise_deg: float) -> None
 def test_a_grid_covers_its_rectangle_to_a_millionth_of_a_cell(
     size_m: tuple[float, float], cells: tuple[int, int]
 ) -> None:
-    right, down = np.array([size_m[0], 0, 0]), np.array([0, 0, -size_m[1]])
-    corner = np.array([1.0, 2.0, 3.0])
-    corners = np.array([corner, corner + down, corner + down + right, corner + right])
-    frame = frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.1)
+    frame = over_rectangle(*size_m)
     assert (frame.width, frame.height) == cells
-    np.testing.assert_array_equal(frame.origin_world, corner)
+    np.testing.assert_array_equal(frame.origin_world, FRAME.origin_world)
     np.testing.assert_allclose(frame.u_world, [1.0, 0.0, 0.0])
     np.testing.assert_allclose(frame.v_world, [0.0, 0.0, -1.0])
 
 
-@pytest.mark.parametrize("flat", [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
-def test_a_rectangle_without_an_area_is_refused(flat: list[float]) -> None:
-    right, down = np.array([flat[0], 0, 0]), np.array([0, 0, -flat[1]])
-    corners = np.array([0 * right, down, down + right, right])
+def over_rectangle(width_m: float, height_m: float) -> WallFrame:
+    steps_m = np.array([[0, 0, 0], [0, 0, -height_m], [width_m, 0, -height_m], [width_m, 0, 0]])
+    return frame_over(FRAME.origin_world + steps_m, FRAME.normal_world, gsd_m=FRAME.gsd_m)
+
+
+@pytest.mark.parametrize("flat", [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0)])
+def test_a_rectangle_without_an_area_is_refused(flat: tuple[float, float]) -> None:
     with pytest.raises(GeometryError, match="the area of a rectangle must not be 0"):
-        frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.1)
+        over_rectangle(*flat)
 
 
 # Two metres along (0.6, 0, 0.8).

@@ -24,7 +24,6 @@ from orthoflow_plugins.inspect.point_places import ShownPoint
 from orthoflow_plugins.plane.given import GivenPlane
 from orthoflow_plugins.read.scan import ReadScan
 
-from orthoflow.diagnostics import Diagnostic
 from orthoflow.errors import MethodError
 from orthoflow.products import (
     CheckPoints,
@@ -52,15 +51,22 @@ def inspect(
     return inspect_scenes.inspected(InspectCheckpoints, folder, **inputs)
 
 
+PLACES = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0], [120.0, 150.0]])
+
+
+def surveyed(places: NDArray[np.float64] = PLACES) -> NDArray[np.float64]:
+    return inspect_scenes.frame().world_from_wall(places, 0.01)
+
+
+def shown(folder: Path, points: CheckPoints) -> tuple[dict[str, float], Inspection, StepContext]:
+    return inspect(folder, points, inspect_scenes.walls(), inspect_scenes.displaced(0, 0))
+
+
 def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
-    walls = inspect_scenes.walls()
-    places = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0], [120.0, 150.0]])
-    surveyed = walls.walls[0].frame.world_from_wall(places, 0.01)
     off = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, -2.0], [0.0, -2.0]])
-    points = points_at(
-        surveyed, classes=("flat", "flat", "vertical edge", "vertical edge"), pixels=places + off
-    )
-    metrics, found, ctx = inspect(tmp_path, points, walls, inspect_scenes.displaced(0, 0))
+    classes = ("flat", "flat", "vertical edge", "vertical edge")
+    points = points_at(surveyed(), classes=classes, pixels=PLACES + off)
+    metrics, found, ctx = shown(tmp_path, points)
     np.testing.assert_allclose(found.displacement_m, GSD_M * off, atol=1e-9)
     assert metrics["flat_rmse_x_mm"] == pytest.approx(1e3 * GSD_M)
     assert metrics["flat_rmse_y_mm"] == pytest.approx(0.0, abs=1e-6)
@@ -75,18 +81,16 @@ def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
 
 
 def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -> None:
-    walls = inspect_scenes.walls()
-    frame = walls.walls[0].frame
+    frame, image = inspect_scenes.frame(), inspect_scenes.displaced(0, 0)
     places = np.array([[50, 40], [60, frame.height + 0.5], [-300, 9], [60, 60], [60, 60]])
-    surveyed = frame.world_from_wall(places, [0.0, 0.0, 0.0, BUFFER_M + 0.25, 0.0])
     pixels = np.full((5, 2), np.nan)
     pixels[0] = places[0]
-    points = points_at(surveyed, pixels=pixels)
-    image = inspect_scenes.displaced(0, 0)
+    depths_m = [0.0, 0.0, 0.0, BUFFER_M + 0.25, 0.0]
+    points = points_at(frame.world_from_wall(places, depths_m), pixels=pixels)
 
     def missed(*wall: int) -> dict[str, Any]:
         numbered = replace(points, wall=np.array(wall, dtype=np.int32))
-        metrics, _, ctx = inspect(tmp_path, numbered, walls, image)
+        metrics, _, ctx = shown(tmp_path, numbered)
         assert (metrics["n_points"], metrics["n_found"]) == (5, 1)
         (said,) = ctx.diagnostics
         assert said.code == "check-points-missed"
@@ -105,13 +109,10 @@ def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -
 
 
 def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
-    walls = inspect_scenes.walls()
     places = np.column_stack([np.linspace(40.0, 300.0, 20), np.linspace(40.0, 200.0, 20)])
-    surveyed = walls.walls[0].frame.world_from_wall(places, 0.01)
     off = np.zeros((20, 2))
     off[:, 0] = np.append(np.full(12, 0.1), np.linspace(1.0, 2.0, 8))
-    image = inspect_scenes.displaced(0, 0)
-    metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)
+    metrics, _, ctx = shown(tmp_path, points_at(surveyed(places), pixels=places + off))
     assert metrics["n_outliers_iterated_capped"] == 5
     (said,) = ctx.diagnostics
     assert (said.code, said.values["numbers"]) == (
@@ -119,7 +120,7 @@ def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
         "n_outliers_iterated_capped 5",
     )
     off[12:] = off[:8]
-    metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)
+    metrics, _, ctx = shown(tmp_path, points_at(surveyed(places), pixels=places + off))
     assert metrics["n_outliers_iterated"] == 0
     assert ctx.warnings == []
 
@@ -220,69 +221,38 @@ def test_points_are_measured_without_memory_per_cell(
     assert metrics["mean_x_mm"] == pytest.approx(0.25e3 * GSD_M)
 
 
-def shown_at(wall: int, place: list[float], point_world: list[float]) -> ShownPoint:
-    return ShownPoint(
-        how="target",
-        wall=wall,
-        expected=np.array([10.0, 20.0]),
-        place=np.array(place),
-        point_world=np.array(point_world),
-    )
-
-
 def test_points_that_are_carried_back_into_space_are_off_by_their_distance() -> None:
-    nowhere = [np.nan] * 3
-    points = [
-        shown_at(0, [0.0, 0.0], [1.0, 2.0, 3.0]),
-        shown_at(0, [0.0, 0.0], nowhere),
-        shown_at(0, [0.0, 0.0], [5.003, 6.0, 7.004]),
-    ]
-    surveyed = points_at(np.array([[9.0, 9, 9], [1, 2, 3], [1, 1, 1], [5, 6, 7]]))
-    found = checkpoints._findings_in_space(points, surveyed, [1, 2, 3])
+    places = ([1.0, 2.0, 3.0], [np.nan] * 3, [5.003, 6.0, 7.004])
+    points = [ShownPoint(how="target", point_world=np.array(place)) for place in places]
+    checks = points_at(np.array([[9.0, 9, 9], [1, 2, 3], [1, 1, 1], [5, 6, 7]]))
+    found = checkpoints._findings_in_space(points, checks, [1, 2, 3])
     assert {item.name: (item.value, item.unit) for item in found} == {
         "n_3d": (2.0, "1"),
         "rms_3d_mm": (pytest.approx(np.sqrt(12.5)), "mm"),
         "max_3d_mm": (pytest.approx(5.0), "mm"),
     }
-    assert checkpoints._findings_in_space(points[1:2], surveyed, [2]) == []
+    assert checkpoints._findings_in_space(points[1:2], checks, [2]) == []
 
 
 def test_points_without_a_class_are_check_points(tmp_path: Path) -> None:
-    walls = inspect_scenes.walls()
-    places = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0]])
-    points = points_at(
-        walls.walls[0].frame.world_from_wall(places), classes=("", "flat", ""), pixels=places
-    )
-    _, found, _ = inspect(tmp_path, points, walls)
+    points = points_at(surveyed(PLACES[:3]), classes=("", "flat", ""), pixels=PLACES[:3])
+    _, found, _ = inspect(tmp_path, points, inspect_scenes.walls())
     assert found.kinds == ("check point", "flat")
     assert found.kind.tolist() == [0, 1, 0]
 
 
-PLACES = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0], [120.0, 150.0]])
-
-
-def surveyed() -> NDArray[np.float64]:
-    return inspect_scenes.frame().world_from_wall(PLACES, 0.01)
-
-
-def said(folder: Path, points: CheckPoints) -> tuple[list[Diagnostic], dict[str, float]]:
-    image = inspect_scenes.displaced(0, 0)
-    metrics, _, ctx = inspect(folder, points, inspect_scenes.walls(), image)
-    return ctx.diagnostics, metrics
-
-
 def test_points_in_another_unit_are_told(tmp_path: Path) -> None:
-    far = inspect_scenes.frame().world_from_wall(100.0 * PLACES, 0.0)
-    ((one,), _) = said(tmp_path, points_at(far, pixels=PLACES))
+    _, _, ctx = shown(tmp_path, points_at(surveyed(100.0 * PLACES), pixels=PLACES))
+    (one,) = ctx.diagnostics
     assert (one.code, one.values["n"], one.values["n_points"]) == ("check-points-far", 4, 4)
 
 
 def test_what_was_shown_holds_for_cells_of_any_size(tmp_path: Path) -> None:
     off = np.array([[1.5, 0.0], [1.5, 0.0], [0.0, -2.0], [0.0, -2.0]])
-    shown = inspect_scenes.frame().world_from_wall(PLACES + off, 0.02)
+    clicked = inspect_scenes.frame().world_from_wall(PLACES + off, 0.02)
     points = points_at(surveyed(), pixels=np.full((4, 2), np.nan))
-    found, metrics = said(tmp_path, replace(points, shown_world=shown))
-    assert found == []
+    metrics, _, ctx = shown(tmp_path, replace(points, shown_world=clicked))
+    assert ctx.diagnostics == []
     assert metrics["n_found"] == 4
     assert metrics["mean_x_mm"] == pytest.approx(0.75e3 * GSD_M)
     assert metrics["mean_y_mm"] == pytest.approx(-1e3 * GSD_M)
@@ -292,9 +262,10 @@ def test_clicked_points_that_nobody_surveyed_are_no_check(tmp_path: Path) -> Non
     points = points_at(surveyed(), pixels=np.full((4, 2), np.nan))
     own = surveyed()
     with pytest.raises(MethodError, match="enter the surveyed coordinates"):
-        said(tmp_path, replace(points, shown_world=own))
+        shown(tmp_path, replace(points, shown_world=own))
     own[3, 0] += 0.001
-    (one,), metrics = said(tmp_path, replace(points, shown_world=own))
+    metrics, _, ctx = shown(tmp_path, replace(points, shown_world=own))
+    (one,) = ctx.diagnostics
     assert (one.code, one.values["n"]) == ("check-points-of-the-image", 3)
     assert metrics["n_found"] == 4
 
