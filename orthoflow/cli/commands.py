@@ -367,7 +367,7 @@ def explain(error: Exception, session: Session) -> int:
         )
         return EXIT_PLUGIN_MISSING
     echo_error(
-        f"error: orthoflow itself failed ({type(error).__name__}: {_first_line(str(error))}); "
+        f"error: orthoflow itself failed ({type(error).__name__}: {one_line(error)}); "
         "repeat the command with --debug and report its output"
     )
     return EXIT_CELL_FAILED
@@ -376,14 +376,9 @@ def explain(error: Exception, session: Session) -> int:
 def _sentences(error: OrthoflowError) -> list[str]:
     n_problems = len(getattr(error, "problems", ()))
     if not n_problems:
-        return [f"error: {error_text(error)}"]
+        return [f"error: {str(error) or type(error).__name__}"]
     # Lines that begin with file:line:column, which editors and other tools parse.
     return [*str(error).split("\n"), f"error: {counted(n_problems, 'problem')}"]
-
-
-def error_text(error: Exception) -> str:
-    """Return the message of an error; `str` of an OSError without arguments would be empty."""
-    return str(error) or type(error).__name__
 
 
 def echo_error(*lines: str) -> None:
@@ -415,7 +410,3 @@ def silence_stdout() -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
-
-
-def _first_line(text: str) -> str:
-    return (text.splitlines() or [""])[0]

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from orthoflow.cli.commands import DEFAULT_STORE, Changes
-from orthoflow.cli.run import prepared
 from orthoflow.cli.run import run as command
+from orthoflow.cli.run import run_workflow
 from orthoflow.errors import ArgumentError, did_you_mean
 
 if TYPE_CHECKING:
@@ -84,9 +84,7 @@ def run(
     if isinstance(datasets, Mapping):
         chosen["datasets"] = json.loads(_json("datasets", datasets))
     changes = Changes(**{item.name: chosen.pop(item.name) for item in fields(Changes)})
-    del chosen["json_log"]
-    with prepared(changes=changes, **chosen) as call:
-        _, made = call.make()
+    _, made = run_workflow(changes=changes, **chosen)
     from orthoflow.report.notebooks import open_run
 
     return open_run(made.path)

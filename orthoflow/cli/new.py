@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
-from orthoflow.cli.tables import echo, echo_folded, echo_json
+from orthoflow.cli.tables import echo, echo_json
 from orthoflow.errors import ArgumentError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def _print(draft: Draft, output: Path) -> None:
     for name, text in draft.inputs.items():
         echo(f"{name}: {text}")
     for text in draft.left_out:
-        echo_folded(f"not used: {text}")
+        echo(f"not used: {text}")
     name = shlex.quote(str(output))
     echo(
         f"wrote {output}, based on the recipe {draft.recipe}",

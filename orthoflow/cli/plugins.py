@@ -57,26 +57,21 @@ def plugins_list(*, as_json: bool) -> int:
         echo_json(found)
         return EXIT_GOOD
     for section, columns in (
-        ("methods", {"method": "id", "state": "state"}),
-        ("kinds", {"kind": "name", "takes": "in", "gives": "out"}),
-        ("products", {"product": "name"}),
+        ("methods", ("id", "state")),
+        ("kinds", ("name", "takes", "gives")),
+        ("products", ("name",)),
     ):
-        if section != "methods":
-            echo()
-        echo_table(
-            (*columns, "distribution", "summary"),
-            [
-                (
-                    *(_cell(one, key) for key in columns.values()),
-                    f"{one['distribution']} {one['version']}",
-                    one["summary"],
-                )
-                for one in found[section]
-            ],
-        )
+        names = (*columns, "distribution", "summary")
+        header = (section.removesuffix("s"), *names[1:])
+        rows = [
+            {**one, "takes": ", ".join(one.get("in", ())), "gives": ", ".join(one.get("out", ()))}
+            for one in found[section]
+        ]
+        echo_table(header, [[one[name] for name in names] for one in rows])
+        echo()
     problems = [one["problem"] for rows in found.values() for one in rows if one["problem"]]
     if problems:
-        echo("", "problems:", *(f"- {problem}" for problem in problems))
+        echo("problems:", *(f"- {problem}" for problem in problems))
     if current_session().debug:
         echo(*(line for one in found["broken"] for line in ["", *one["traceback"].split("\n")]))
     return EXIT_GOOD
@@ -121,12 +116,6 @@ def _announced(entry: MethodEntry | KindEntry | ProductEntry) -> dict[str, objec
         "version": entry.distribution.version,
         "summary": entry.spec.summary,
     }
-
-
-def _cell(entry: Mapping[str, Any], key: str) -> str:
-    if key in ("in", "out"):
-        return "its methods' own" if entry["is_source"] else ", ".join(entry[key])
-    return str(entry[key])
 
 
 @click.command("show", cls=Command)

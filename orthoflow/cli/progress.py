@@ -275,11 +275,12 @@ class Progress:
         for title in ("step", "state", "time", "left", ""):
             table.add_column(title, no_wrap=True, overflow="ellipsis")
         cells = self.cells()
-        urgency = {"running": 0, "failed": 1, "waiting": 2}
-        most = max(1, (self.console.height if self.console else len(cells)) - 4)
-        chosen = sorted(cells, key=lambda address: urgency.get(cells[address].state, 3))[:most]
+        most = (self.console.height if self.console else len(cells) + 4) - 4
+        ended = len(cells) - most if len(cells) > most else 0
         for address, cell in cells.items():
-            if address not in chosen:
+            # Where not all fit, those that ended first are left out.
+            if ended > 0 and cell.state not in ("running", "failed", "waiting"):
+                ended -= 1
                 continue
             running = cell.state == "running"
             state = f"{100 * cell.fraction:3.0f} %" if running else cell.state

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import shutil
 from collections.abc import Iterator, Sequence
@@ -164,22 +163,16 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
         yield given
         return
     fresh = folder.with_name(f"{folder.name}.store")
-    made = [place for place in fresh.parents if not place.exists()]
     fresh.mkdir(parents=True, exist_ok=True)
-    is_interrupted = False
     try:
         yield fresh
     except (CancelledStepError, ClusterError, KeyboardInterrupt):
         # Finished results are kept for another call of the same command.
-        is_interrupted = True
         raise
-    finally:
-        if not is_interrupted:
-            shutil.rmtree(fresh, ignore_errors=True)
-            with contextlib.suppress(OSError):
-                # Folders such as `runs`, if nothing was run.
-                for place in made:
-                    place.rmdir()
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
+    shutil.rmtree(fresh, ignore_errors=True)
 
 
 def _print_metrics(metrics: Sequence[ReplayedMetric]) -> None:

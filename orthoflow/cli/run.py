@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,22 +87,36 @@ def run(
     same -o. The run folder contains run.h5 (the record), report.html, and products/ with files for
     other programs.
     """
-    with prepared(workflow, changes, output, store, embed=embed, **choices) as call:
-        return replace(call, json_log=json_log).go()
+    from orthoflow.engine.journal import LOGS, cell_file_name
+
+    began_s = time.monotonic()
+    outcome, made = run_workflow(
+        workflow, changes, output, store, embed=embed, json_log=json_log, **choices
+    )
+    for address, failed in outcome.failed.items():
+        if failed.is_bug:
+            log = made.folder / LOGS / f"{cell_file_name(address)}.log"
+            echo_error(f"{address}: traceback: {log}")
+    try:
+        _print_summary(made, outcome.resumed, time.monotonic() - began_s)
+    except BrokenPipeError:
+        # The reader has closed the pipe; the exit code still gives the outcome of the run.
+        silence_stdout()
+    return outcome.exit_code
 
 
-@contextmanager
-def prepared(
+def run_workflow(
     workflow: str,
     changes: Changes,
     output: Path | None,
     store: Path,
     *,
     embed: bool,
+    json_log: Path | None,
     # Any: the fields of RunOptions.
     **choices: Any,
-) -> Iterator[Call]:
-    """Read and plan a workflow, and hold its store until the run is over.
+) -> tuple[RunOutcome, Run]:
+    """Plan and execute a workflow, and write record and report.
 
     Raises:
         ArgumentError: an option is invalid.
@@ -112,11 +125,13 @@ def prepared(
 
     with working_on("reading the workflow, its inputs and the store"):
         # Import slow modules here.
-        import orthoflow.report  # noqa: F401
         from orthoflow.catalog.discovery import discover_catalog
-        from orthoflow.engine.journal import require_run_folder
+        from orthoflow.engine.journal import new_run_folder, new_run_id, require_run_folder
         from orthoflow.engine.plan import RunOptions, plan_run
         from orthoflow.engine.store import Store
+        from orthoflow.records.runs import REPORT_FILE
+        from orthoflow.records.write import begin_run
+        from orthoflow.report import write_page
         from orthoflow.workflow.expand import expand_cells
 
         options = RunOptions(**choices)
@@ -127,79 +142,37 @@ def prepared(
             require_run_folder(output.absolute(), loaded.name)
         opened = Store(store)
         cells = expand_cells(loaded, catalog)
-        planned = plan_run(cells, loaded, catalog, opened, options)
+        plan = plan_run(cells, loaded, catalog, opened, options)
+    run_id = new_run_id()
+    folder = output or new_run_folder(loaded.name, run_id)
     # Held until the record is written, so that `cache gc` does not remove its results.
-    with opened.in_use():
-        yield Call(workflow=loaded, plan=planned, store=opened, folder=output, embed=embed)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Call:
-    """One call of the command, ready to run."""
-
-    workflow: Workflow
-    plan: RunPlan
-    store: Store
-    folder: Path | None
-    embed: bool
-    json_log: Path | None = None
-
-    def go(self) -> int:
-        """Execute the run, write record and report, and print the summary."""
-        from orthoflow.engine.journal import LOGS, cell_file_name
-        from orthoflow.records.runs import REPORT_FILE
-
-        began_s = time.monotonic()
-        outcome, run = self.make()
-        folder = run.folder
-        report = folder / REPORT_FILE
-        for address, failed in outcome.failed.items():
-            if failed.is_bug:
-                log = folder / LOGS / f"{cell_file_name(address)}.log"
-                echo_error(f"{address}: traceback: {log}")
-        try:
-            _print_summary(run, report, outcome.resumed, time.monotonic() - began_s)
-        except BrokenPipeError:
-            # The reader has closed the pipe; the exit code still gives the outcome of the run.
-            silence_stdout()
-        return outcome.exit_code
-
-    def make(self) -> tuple[RunOutcome, Run]:
-        """Execute the run, and write record and report."""
-        from orthoflow.engine.journal import new_run_folder, new_run_id
-        from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.records.write import begin_run
-        from orthoflow.report import write_page
-
-        run_id = new_run_id()
-        folder = self.folder or new_run_folder(self.workflow.name, run_id)
+    with opened.in_use(), _json_log(json_log, plan) as log:
         # Shown before the run, which may take minutes.
-        echo_lint(self.workflow)
-        with _json_log(self.json_log, self.plan) as log:
-            has_begun = False
+        echo_lint(loaded)
+        has_begun = False
 
-            def listen(event: RunEvent) -> None:
-                nonlocal has_begun
-                if not has_begun:
-                    has_begun = True
-                    begin_run(self.plan, self.workflow, folder, self.store, run_id)
-                log(event)
+        def listen(event: RunEvent) -> None:
+            nonlocal has_begun
+            if not has_begun:
+                has_begun = True
+                begin_run(plan, loaded, folder, opened, run_id)
+            log(event)
 
-            try:
-                return executed(
-                    self.plan,
-                    self.workflow,
-                    self.store,
-                    folder,
-                    run_id,
-                    embed=self.embed,
-                    report=lambda run: write_page(run, folder / REPORT_FILE),
-                    listen=listen,
-                )
-            except (CancelledStepError, ClusterError, StoreError):
-                if has_begun:
-                    _report_unfinished(folder)
-                raise
+        try:
+            return executed(
+                plan,
+                loaded,
+                opened,
+                folder,
+                run_id,
+                embed=embed,
+                report=lambda made: write_page(made, folder / REPORT_FILE),
+                listen=listen,
+            )
+        except (CancelledStepError, ClusterError, StoreError):
+            if has_begun:
+                _report_unfinished(folder)
+            raise
 
 
 def _report_unfinished(folder: Path) -> None:
@@ -283,12 +256,11 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
         yield listen
 
 
-def _print_summary(run: Run, report: Path, kept: Collection[str], took_s: float) -> None:
+def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
     """Print the table of cells, the warnings, and the paths of report, record and images.
 
     Args:
         run: the finished run.
-        report: path of its report.
         kept: addresses of the cells computed before an interruption.
         took_s: duration of the whole run.
     """
@@ -312,13 +284,14 @@ def _print_summary(run: Run, report: Path, kept: Collection[str], took_s: float)
     echo_diagnostics(cells, run.folder)
     echo("", _cached_text(cells, kept))
     echo(f"total time: {duration(took_s)}, including starting, loading and compiling")
+    from orthoflow.records.runs import REPORT_FILE
     from orthoflow.report.combinations import baseline_of
     from orthoflow.workflow.expand import variants_text
 
     if baseline := variants_text(baseline_of(run)):
         echo(f"baseline: {baseline}, with which all others are compared")
     echo(f"products: {run.products_folder}")
-    echo(f"report: {report}")
+    echo(f"report: {run.folder / REPORT_FILE}")
     echo(f"record: {run.path}")
     for image in run.orthoimages:
         echo(f"orthoimage: {image}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
-from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, number
+from orthoflow.cli.tables import counted, echo, echo_json, echo_table, number
 from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
@@ -102,12 +102,10 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
         raise ArgumentError(f"{table.parent} does not exist: create the folder or choose another")
     places: dict[Path, None] = {}
     for folder in folders or (Path(),):
-        if folder.is_dir() and not (folder / RECORD_FILE).is_file():
-            places |= dict.fromkeys(
-                place for place in run_folders([folder]) if (place / RECORD_FILE).is_file()
-            )
-        else:
-            places[folder] = None
+        below = run_folders([folder]) if folder.is_dir() else [folder]
+        places |= dict.fromkeys(
+            place for place in below if place.is_file() or (place / RECORD_FILE).is_file()
+        )
     joined = join_runs([open_run(place) for place in places])
     with writing_to(table):
         write_whole(table, joined_csv(joined).encode("utf-8", "backslashreplace"))
@@ -159,7 +157,7 @@ def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
     )
     for run in kept:
         if run.reason:
-            echo_folded(f"{run.folder} {run.status}: {run.reason}")
+            echo(f"{run.folder} {run.status}: {run.reason}")
     n_left_out = len(found) - len(kept)
     others = f", {counted(n_left_out, 'other')} omitted" if n_left_out else ""
     echo(f"{counted(len(kept), 'run')}{others}")
@@ -223,11 +221,10 @@ def _facts_text(facts: Mapping[str, object]) -> str:
     """Describe the differences of a run, as far as they fit on a line."""
     parts = []
     for name, value in facts.items():
-        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-        if name.startswith("input ") and isinstance(value, list):
-            text = ", ".join(map(str, value)) or "not given"
-        cut = text if len(text) <= _LONGEST_FACT else f"{text[:_LONGEST_FACT]}..."
-        parts.append(f"{name}={cut}")
+        text = json.dumps(value, ensure_ascii=False)
+        if isinstance(value, str | list):
+            text = value if isinstance(value, str) else ", ".join(map(str, value))
+        parts.append(f"{name}={text[:_LONGEST_FACT]}")
     return first_few(parts, most=_FACTS_MOST)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -77,7 +78,10 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
 
 def _print_head(run: Run) -> None:
     record = run.record
-    echo(f"{record.name}, run {record.run_id}: {_status_text(run)}")
+    counts = Counter(cell.status for cell in record.cells)
+    states = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
+    n_steps = counted(len(record.cells), "step")
+    echo(f"{record.name}, run {record.run_id}: {n_steps}, {states}")
     echo(f"{record.started} to {record.ended}, {record.created_by}, seed {record.seed}")
     if record.overrides:
         echo(f"overrides: {' '.join(record.overrides)}")
@@ -89,15 +93,6 @@ def _print_head(run: Run) -> None:
                 f"input {entry.name}: {file.name}, {size(file.size_bytes)}, "
                 f"sha256 {file.sha256[:12]}{', in the record' if entry.embedded else ''}"
             )
-
-
-def _status_text(run: Run) -> str:
-    counts = [
-        f"{count} {status}"
-        for status in ("ok", "failed", "skipped")
-        if (count := sum(cell.status == status for cell in run.record.cells))
-    ]
-    return f"{counted(len(run.record.cells), 'step')}, {', '.join(counts)}"
 
 
 def _print_cells(run: Run, *, is_whole: bool) -> None:
@@ -200,10 +195,7 @@ def _print_files(run: Run) -> None:
 
     published = run.record.published
     n_files = sum((run.folder / file.path).exists() for file in published)
-    of_all = "" if n_files == len(published) else f" of {len(published)} published"
-    where = f"{run.products_folder}, {counted(n_files, 'file')}{of_all}"
-    if published and not n_files:
-        where = f"none of the {len(published)} published files is next to the record"
+    where = f"{run.products_folder}, {n_files} of {counted(len(published), 'published file')}"
     echo("", f"products: {where}")
     about = {wall.orthoimage: wall.sentence for wall in delivered_walls(run.products_folder)}
     for image in run.orthoimages:

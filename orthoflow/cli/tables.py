@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
-import sys
-import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -37,23 +34,6 @@ def echo(*lines: str, err: bool = False) -> None:
         click.echo(shown(line), err=err)  # noqa: TID251 - the only place
 
 
-def echo_folded(line: str) -> None:
-    """Print a sentence; on a terminal, break its lines between words."""
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
-    echo(*(folded(shown(line), width) if width else (line,)))
-
-
-def folded(line: str, width: int) -> list[str]:
-    """Break a line between words, leaving long words whole; further lines are indented.
-
-    >>> folded("warning, wall: no point lies within its buffer", 24)
-    ['warning, wall: no point', '  lies within its buffer']
-    """
-    return textwrap.wrap(
-        line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
-    )
-
-
 def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool = False) -> None:
     """Print what limits the results of cells, the most severe first, one line per code.
 
@@ -68,7 +48,7 @@ def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool
         group for group in grouped(standing(cells)) if is_whole or group.worst.severity != "note"
     ]
     for group in groups if is_whole else groups[:FIRST_SHOWN]:
-        echo_folded(f"{group.worst.severity}, {group.where}: {group.sentence}")
+        echo(f"{group.worst.severity}, {group.where}: {group.sentence}")
     n_more = 0 if is_whole else len(groups) - FIRST_SHOWN
     if n_more > 0:
         echo(f"and {counted(n_more, 'more warning')}: orthoflow show {shlex.quote(str(run))} --all")

@@ -155,7 +155,7 @@ def test_the_live_table_shows_every_state_and_keeps_warnings(
     assert "plane: warning: the side is a [guess]" in capsys.readouterr().err
 
 
-def test_rows_that_do_not_fit_are_the_least_urgent() -> None:
+def test_of_rows_that_do_not_fit_those_that_ended_are_left_out() -> None:
     progress = Progress(planned(*"abcdef"))
     for event in (
         CellFinished(address="a", result=OK, cached=False),
@@ -163,7 +163,7 @@ def test_rows_that_do_not_fit_are_the_least_urgent() -> None:
         CellFinished(address="d", result=FAILED, cached=False),
     ):
         progress.take(event)
-    for rows, addresses in ((6, "abcdef"), (3, "bcd"), (0, "c")):
+    for rows, addresses in ((6, "abcdef"), (5, "bcdef"), (3, "bcdef")):
         progress.console = Console(height=rows + 4, file=io.StringIO())
         assert [str(cell) for cell in progress.table().columns[0].cells] == [*addresses]
 

@@ -23,8 +23,3 @@ def test_what_a_terminal_would_obey_is_written_out(capsys: pytest.CaptureFixture
     }
     assert "\N{LATIN SMALL LETTER A WITH DIAERESIS}" in printed
     assert "\x9b" not in printed
-
-
-def test_lines_fold_at_words_and_long_words_stay_whole() -> None:
-    assert tables.folded("one two-three four", 10) == ["one", "  two-three", "  four"]
-    assert tables.folded("a " + "b" * 20, 10) == ["a", "  " + "b" * 20]

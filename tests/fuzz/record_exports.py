@@ -51,7 +51,7 @@ _CLOUDS: Final[Sequence[Command]] = (
         ("export", "--to", target, "-o", f"out/{target}")
         for target in ("laz", "copc", "ply", "e57")
     ),
-    ("export", "--to", "ply", "--colour", "deviation", "--clean", "-o", "out/cleaned"),
+    ("export", "--to", "ply", "--colour", "deviation", "-o", "out/deviation"),
     ("export", "--to", "laz", "--wall", "2", "-o", "out/wall"),
 )
 COMMANDS: Final[Sequence[Command]] = (

@@ -64,18 +64,17 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
     n_figures = len(figure_files(run, addresses))
     make_empty(folder)
     n_written = write_figures(run, folder, addresses, as_pdf=suffix == "pdf")
-    left_out = ""
-    if n_written < n_figures:
-        left_out = f"; {n_figures - n_written} omitted (damaged or unsafe)"
     curves = curve_files(run, suffix) if chosen.cell is None else {}
     charts = {f"curves/{name}": data for name, data in curves.items()}
     plan = photo_plan(run, list(wall_pictures(run))) if chosen.cell is None else None
     if plan is not None:
         charts[f"photos_and_walls.{suffix}"] = plan.file(suffix)
     write_files(folder, {name: partial(bytes, data) for name, data in charts.items()})
-    drawn = f", {counted(len(curves), 'curve')}" if curves else ""
-    drawn += ", the plan of photos" if plan is not None else ""
-    return f"{counted(n_written, 'figure')}{drawn} and the graph{left_out}"
+    damaged = f"; {n_figures - n_written} omitted (damaged or unsafe)"
+    return (
+        f"{counted(n_written, 'figure')}, {counted(len(charts), 'chart')} and the graph"
+        f"{damaged if n_written < n_figures else ''}"
+    )
 
 
 def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
@@ -102,13 +101,8 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     record = embedded(run, folder, chosen) if chosen.embed else None
     author = (chosen.author or "").strip()
     files = write_crate(run, folder, license_text=license_text, author=author, record=record)
-    lacking = [
-        flag
-        for flag, said in (("--license", chosen.license_text), ("--author", author))
-        if not said
-    ]
-    advice = f"; {' and '.join(lacking)} would add missing information" if lacking else ""
-    return f"{counted(len(files), 'file')}, described in {files[0].name}{advice}"
+    lacking = "" if chosen.license_text and author else "; license or author unknown"
+    return f"{counted(len(files), 'file')}, described in {files[0].name}{lacking}"
 
 
 def export_layers(run: Run, folder: Path, chosen: Choices) -> str:

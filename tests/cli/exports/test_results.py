@@ -29,7 +29,7 @@ def test_figures_are_written_in_the_format_that_is_asked_for(tmp_path: Path) -> 
     for suffix in ("svg", "pdf", "png"):
         folder = tmp_path / suffix
         told = module.export_figures(run, folder, Choices(figure_format=suffix))
-        assert told == f"{n_figures} figures, the plan of photos and the graph"
+        assert told == f"{n_figures} figures, 1 chart and the graph"
         assert (folder / f"photos_and_walls.{suffix}").stat().st_size > 1000
     pages = list((tmp_path / "pdf").glob("*/*.pdf"))
     assert pages
@@ -41,8 +41,7 @@ def test_figures_are_written_in_the_format_that_is_asked_for(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("choices", "lacking"),
     [
-        ({}, "; --license and --author would add missing information"),
-        ({"license_text": "CC0-1.0", "author": "  "}, "; --author would add missing information"),
+        ({"license_text": "CC0-1.0", "author": "  "}, "; license or author unknown"),
         ({"license_text": "CC0-1.0", "author": " A. Nobody ", "embed": True}, ""),
     ],
 )
