@@ -137,7 +137,7 @@ def test_surf_key_points() -> None:
         return np.asarray(sigma**4 * (xx * yy - xy**2))
 
     strongest = np.max([curvature(sigma) for sigma in (1.2, 1.8, 2.6, 3.8, 5.6)], axis=0)
-    column, row = np.floor(pairs.places - pairs.found / 2.0).astype(int).T
+    column, row = np.floor(pairs.centre - pairs.found / 2.0).astype(int).T
     assert np.median(strongest[row, column]) > 3.0 * np.median(strongest)
 
 

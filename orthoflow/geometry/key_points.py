@@ -290,14 +290,10 @@ def mutual_matches(
     """
     if not (len(first) and len(second)):
         return _no_matches()
-    found = two_nearest(first, second)
-    ratios = _ratio(found.best, found.next_best)
     # Few pairs pass the ratio test, so only these are tested in the other direction.
-    distinct = np.flatnonzero(ratios <= ratio)
-    asked, place = np.unique(found.index[distinct], return_inverse=True)
-    back = nearest(second[asked], first)[place]
-    kept = distinct[back == distinct]
-    return Matches(first=kept, second=found.index[kept], ratio=ratios[kept])
+    distinct = best_matches(first, second, ratio=ratio)
+    asked, place = np.unique(distinct.second, return_inverse=True)
+    return distinct.take(nearest(second[asked], first)[place] == distinct.first)
 
 
 def best_matches(

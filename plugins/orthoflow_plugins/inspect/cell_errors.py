@@ -133,11 +133,9 @@ class WallSamples:
         step_colour: (s,) the same for painted cells at steps.
         shift_m: (p, 2) displacement of patches along u and v, measured minus true position.
         shift_cells: (p, 2) the same in cells.
-        n_painted: painted cells among those with a visibility test.
         n_seen: cells with a visibility test whose true surface is seen from a station.
         n_seen_painted: painted cells among `n_seen`.
         n_seen_shown: painted or filled cells among `n_seen`.
-        n_unseen_painted: painted cells whose true surface no station sees, away from steps.
     """
 
     depth_m: NDArray[np.float64]
@@ -148,11 +146,9 @@ class WallSamples:
     step_colour: NDArray[np.float64]
     shift_m: NDArray[np.float64]
     shift_cells: NDArray[np.float64]
-    n_painted: int
     n_seen: int
     n_seen_painted: int
     n_seen_shown: int
-    n_unseen_painted: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,7 +199,7 @@ def wall_errors(
         (wall.mask == SurfaceMask.MEASURED) & known, wall.depth_m.astype(np.float64), np.nan
     ) - true.depth_m.astype(np.float64)
     patches = _shifts(image, true, chosen.coloured & known & ~steps).within(inner)
-    asked, seen = (painted & chosen.lattice)[inner], (true.seen & chosen.lattice)[inner]
+    seen = (true.seen & chosen.lattice)[inner]
     sigma_m = wall.sigma_m[inner]
     depth, square = depth[inner], square[inner]
     painted, filled, steps = painted[inner], filled[inner], steps[inner]
@@ -218,11 +214,9 @@ def wall_errors(
         step_colour=square[compares & painted & steps],
         shift_m=patches.shift * true.frame.gsd_m,
         shift_cells=patches.shift,
-        n_painted=count_true(asked),
         n_seen=count_true(seen),
         n_seen_painted=count_true(seen & painted),
         n_seen_shown=count_true(seen & (painted | filled)),
-        n_unseen_painted=count_true(asked & ~seen & ~steps),
     )
     return WallErrors(
         samples=samples, patches=patches, steps=steps, depth_m=depth, grey=np.sqrt(square)
@@ -353,7 +347,4 @@ def _share_numbers(samples: WallSamples) -> list[Number]:
             ("completeness", samples.n_seen_painted / samples.n_seen, "1"),
             ("completeness_filled", samples.n_seen_shown / samples.n_seen, "1"),
         ]
-    if samples.n_painted:
-        share = samples.n_unseen_painted / samples.n_painted
-        numbers.append(("unseen_painted_share", share, "1"))
     return numbers

@@ -101,6 +101,7 @@ class InspectCheckpoints(Method):
 
     id: ClassVar[str] = "inspect.checkpoints"
     determinism: ClassVar[Determinism] = "loose"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_points", label="check points"),
         MetricSpec("n_3d", label="check points compared in space"),

@@ -48,10 +48,6 @@ DISPLACEMENTS: Final = (
     MetricSpec(
         "beyond_2rmse_[xy]_share", label="share of displacements beyond twice the RMS along {0}"
     ),
-    MetricSpec(
-        "beyond_2rmse_any_share", label="share of displacements beyond twice the RMS along u or v"
-    ),
-    MetricSpec("p95_mm", label="displacement, 95th percentile"),
 )
 LENGTHS: Final = (
     MetricSpec("n_lengths", label="distances compared"),
@@ -126,12 +122,6 @@ def displacement_findings(
             (f"max_{name}_mm", np.abs(values).max(), "mm"),
             (f"beyond_2rmse_{name}_share", float(np.mean(np.abs(values) > 2.0 * rmse)), "1"),
         ]
-    both = np.any(np.abs(shift_mm) > 2.0 * np.sqrt(np.mean(shift_mm**2, axis=0)), axis=1)
-    length = np.linalg.norm(shift_mm, axis=1)
-    numbers += [
-        ("beyond_2rmse_any_share", both.mean(), "1"),
-        ("p95_mm", float(np.percentile(length, 95)), "mm"),
-    ]
     return findings_of(numbers, wall, prefix=prefix)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,34 +49,6 @@ _RIM_CELLS: Final = 512
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeyPairs:
-    """Corresponding positions in two images.
-
-    Attributes:
-        places: (n, 2) float64 column and row in the shown image.
-        shift: (n, 2) float64 refined displacement along u and v in cells, shown minus reference.
-        found: (n, 2) float64 displacement before the refinement, as SURF found it.
-        n_points: numbers of key points of the two images.
-        n_matched: number of matched descriptors, including wrong matches.
-    """
-
-    places: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    found: NDArray[np.float64]
-    n_points: tuple[int, int]
-    n_matched: int
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-
-def no_pairs() -> KeyPairs:
-    """Return an empty result."""
-    nothing = np.zeros((0, 2))
-    return KeyPairs(places=nothing, shift=nothing, found=nothing, n_points=(0, 0), n_matched=0)
-
-
-@dataclass(frozen=True, kw_only=True)
 class _KeyPoints:
     """SURF key points: positions (n, 2), scale (n,), sign of the Laplacian (n,), descriptors."""
 
@@ -88,7 +60,7 @@ class _KeyPoints:
 
 def find_key_pairs(
     shown: GreyCells, reference: GreyCells, *, radius_cells: float, threads: int = 1
-) -> KeyPairs:
+) -> PatchShifts:
     """Find pairs of key points within a radius.
 
     The local contrast of both images is normalised first, because laser and camera record different
@@ -102,30 +74,19 @@ def find_key_pairs(
         reference: the image to compare it with.
         radius_cells: maximum displacement.
         threads: number of threads; it does not change the pairs.
+
+    Returns:
+        The pairs as patches of the shown image, with their displacements from the reference.
     """
     shape = shown.shape
     is_whole = math.prod(shape) <= _WHOLE_CELLS
-    found = [
-        _pairs_of_tile(shown, reference, tile, radius_cells, threads=threads, is_whole=is_whole)
-        for tile in tiles(shape, max(shape) if is_whole else _TILE_CELLS)
-    ]
-    refined = PatchShifts.joined([tile.refined for tile in found])
-    kept = _agreed(refined.centre, refined.shift)
-    return KeyPairs(
-        places=refined.centre[kept],
-        shift=refined.shift[kept],
-        found=refined.found[kept],
-        n_points=(sum(tile.n_points[0] for tile in found), sum(tile.n_points[1] for tile in found)),
-        n_matched=sum(tile.n_matched for tile in found),
+    found = PatchShifts.joined(
+        [
+            _pairs_of_tile(shown, reference, tile, radius_cells, threads=threads, is_whole=is_whole)
+            for tile in tiles(shape, max(shape) if is_whole else _TILE_CELLS)
+        ]
     )
-
-
-class _TilePairs(NamedTuple):
-    """Refined pairs whose first point is in a tile; numbers of its key points and matches."""
-
-    refined: PatchShifts
-    n_points: tuple[int, int]
-    n_matched: int
+    return found.take(_agreed(found.centre, found.shift))
 
 
 def _pairs_of_tile(
@@ -136,20 +97,13 @@ def _pairs_of_tile(
     *,
     threads: int,
     is_whole: bool,
-) -> _TilePairs:
-    """Find the pairs of a tile in the tile with its margin."""
+) -> PatchShifts:
+    """Find the pairs whose first point is in a tile, using the tile with its margin."""
     rows, columns = (
         slice(max(0, part.start - _RIM_CELLS), min(size, part.stop + _RIM_CELLS))
         for part, size in zip(tile, shown.shape, strict=True)
     )
     corner = np.array([columns.start, rows.start])
-    low = (tile[1].start, tile[0].start) - corner
-    end = (tile[1].stop, tile[0].stop) - corner
-
-    def lies_in_tile(places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        inside: NDArray[np.bool_] = np.all((places >= low) & (places < end), axis=1)
-        return inside
-
     images = [cells.cut((rows, columns)) for cells in (shown, reference)]
     first, second = in_order(_levelled, images, threads=threads)
     share = images[0].grey.size / math.prod(shown.shape)
@@ -157,8 +111,10 @@ def _pairs_of_tile(
     key_points = partial(_key_points, n_most=round(share * _n_most(shown.shape)))
     one, other = in_order(key_points, (first, second), threads=threads if is_whole else 1)
     matches = _matches(one, other, radius_cells)
-    matches = matches[lies_in_tile(one.places[matches[:, 0]])]
     places = one.places[matches[:, 0]]
+    low, end = ([getattr(part, name) for part in tile[::-1]] for name in ("start", "stop"))
+    own = np.all((places + corner >= low) & (places + corner < end), axis=1)
+    places, matches = places[own], matches[own]
     refined = refine_shifts(
         first,
         second,
@@ -167,14 +123,7 @@ def _pairs_of_tile(
         threads=threads,
     )
     refined = refined.take(refined.correlation >= _LEAST_CORRELATION)
-    return _TilePairs(
-        refined=replace(refined, centre=refined.centre + corner),
-        n_points=(
-            int(np.count_nonzero(lies_in_tile(one.places))),
-            int(np.count_nonzero(lies_in_tile(other.places))),
-        ),
-        n_matched=len(matches),
-    )
+    return replace(refined, centre=refined.centre + corner)
 
 
 def _n_most(shape: tuple[int, int]) -> int:

@@ -168,10 +168,7 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
     if own.any():
         numbers.append(("match_wrong_share_own_wall", is_wrong[own].mean()))
     if kept.any():
-        numbers += [
-            ("tie_wrong_share", is_wrong[kept].mean()),
-            ("tie_error_median_cells", np.median(errors[kept])),
-        ]
+        numbers.append(("tie_wrong_share", is_wrong[kept].mean()))
     return findings_of((*number, "1") for number in numbers)
 
 

@@ -82,7 +82,6 @@ def inspect_planes(
         worst = _PlaneDistance(
             angle_deg=max(distance.angle_deg for distance in seen),
             offset_m=max(abs(distance.offset_m) for distance in seen),
-            corner_m=max(distance.corner_m for distance in seen),
         )
         findings += findings_of(worst.numbers(), prefix="worst_")
     for plane, distance in zip(truth.planes.names, nearest, strict=True):
@@ -124,7 +123,7 @@ def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
 def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
     """Return the largest errors over the planes of all walls."""
     worst = []
-    for name in ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"):
+    for name in ("plane_angle_deg", "plane_offset_mm"):
         values = [finding for finding in findings if finding.name == name]
         if values:
             largest = max(abs(finding.value) for finding in values)
@@ -200,12 +199,10 @@ class _PlaneDistance:
     Attributes:
         angle_deg: angle between the normals.
         offset_m: distance at the centroid of the true rectangle, positive towards the viewer.
-        corner_m: largest distance at the corners of the true rectangle.
     """
 
     angle_deg: float
     offset_m: float
-    corner_m: float
 
     def is_within(self, angle_deg: float, offset_m: float) -> bool:
         """Return whether angle and offset are within limits."""
@@ -216,7 +213,6 @@ class _PlaneDistance:
         return [
             (f"plane_angle_deg{suffix}", self.angle_deg, "deg"),
             (f"plane_offset_mm{suffix}", 1e3 * self.offset_m, "mm"),
-            (f"plane_corner_max_mm{suffix}", 1e3 * self.corner_m, "mm"),
         ]
 
     @property
@@ -227,12 +223,10 @@ class _PlaneDistance:
 
 def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
     """Compare a plane with a true plane."""
-    corners = true.corners[index]
-    centroid = corners.mean(axis=0)
+    centroid = true.corners[index].mean(axis=0)
     return _PlaneDistance(
         angle_deg=angle_between_deg(found.normal, true.normal[index]),
         offset_m=-float(found.distances_m(centroid[None])[0]),
-        corner_m=float(np.abs(found.distances_m(corners)).max()),
     )
 
 

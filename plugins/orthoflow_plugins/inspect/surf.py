@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Final, Literal
 
@@ -33,7 +33,6 @@ from orthoflow_plugins.inspect.figures import draw_arrows
 from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
     IMAGE_QUALITY,
-    Number,
     displacement_findings,
     findings_of,
     lower,
@@ -47,8 +46,8 @@ from orthoflow_plugins.inspect.image_quality import (
     n_shown,
     quality_findings,
 )
-from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
-from orthoflow_plugins.inspect.patches import GreyImage, IntensityGrey
+from orthoflow_plugins.inspect.key_pairs import find_key_pairs
+from orthoflow_plugins.inspect.patches import GreyImage, IntensityGrey, PatchShifts, unrefined
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
 # The intensity is compared with a copy of itself shifted by this much, in a tile of limited size,
@@ -56,6 +55,7 @@ from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
+_NO_PAIRS: Final = unrefined(*np.zeros((2, 0, 2)))
 # Radius within which a pair is searched, large enough for gross errors.
 _RADIUS_CELLS: Final = 40.0
 UNFIT: Final = DiagnosticSpec(
@@ -84,15 +84,12 @@ class InspectSurf(Method):
 
     id: ClassVar[str] = "inspect.surf"
     determinism: ClassVar[Determinism] = "loose"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls_inspected", label="walls inspected"),
         *of_walls(
             (
                 MetricSpec("n_pairs", label="key point pairs"),
-                MetricSpec("n_key_points", label="key points of the orthoimage"),
-                MetricSpec("n_key_points_intensity", label="key points of the intensity"),
-                MetricSpec("matched_kept_share", label="share of matches kept"),
-                MetricSpec("floor_n_pairs", label="key point pairs, intensity with itself"),
                 lower("surf_rmse_[xy]_mm", label="displacement along {0} by SURF, RMS"),
                 MetricSpec(
                     "surf_beyond_2rmse_[xy]_share",
@@ -175,22 +172,16 @@ class _Verdict:
     """Pairs of one wall, and pairs of its intensity with itself."""
 
     image: Orthoimage
-    pairs: KeyPairs = field(default_factory=no_pairs)
-    floor: KeyPairs = field(default_factory=no_pairs)
+    pairs: PatchShifts = _NO_PAIRS
+    floor: PatchShifts = _NO_PAIRS
     quality: tuple[Finding, ...] = ()
 
     def findings(self) -> list[Finding]:
         """Return the wall's metrics."""
         wall = self.image.wall
         gsd_m = self.image.frame.gsd_m
-        counts: list[Number] = [
-            ("n_pairs", len(self.pairs), "1"),
-            ("n_key_points", self.pairs.n_points[0], "1"),
-            ("n_key_points_intensity", self.pairs.n_points[1], "1"),
-            ("matched_kept_share", len(self.pairs) / max(1, self.pairs.n_matched), "1"),
-            ("floor_n_pairs", len(self.floor), "1"),
-        ]
-        return [*findings_of(counts, wall), *_numbers([self], wall, gsd_m), *self.quality]
+        n_pairs = findings_of([("n_pairs", len(self.pairs), "1")], wall)
+        return [*n_pairs, *_numbers([self], wall, gsd_m), *self.quality]
 
     def draw(self, ctx: StepContext) -> None:
         """Draw the displacements (markiewicz2015, Figure 25)."""
@@ -198,7 +189,7 @@ class _Verdict:
             ctx,
             f"wall_{self.image.number}_displacements",
             self.image,
-            self.pairs.places,
+            self.pairs.centre,
             self.pairs.shift,
             title="displacements between orthoimage and intensity",
         )
@@ -285,7 +276,7 @@ def _together(items: list[_Verdict]) -> list[Finding]:
 
 
 def _inspection(items: list[_Verdict], findings: list[Finding], reason: str | None) -> Inspection:
-    points = [item.image.frame.world_from_wall(item.pairs.places) for item in items]
+    points = [item.image.frame.world_from_wall(item.pairs.centre) for item in items]
     shifts = [item.image.frame.gsd_m * item.pairs.shift for item in items]
     walls = [np.full(len(item.pairs), item.image.wall, dtype=np.int32) for item in items]
     n_points = sum(len(item.pairs) for item in items)

@@ -133,9 +133,6 @@ _OF_WALLS: Final = (
         label="covered share of the surface visible from a station and a photo",
         headline=True,
     ),
-    MetricSpec(
-        "unseen_painted_share", label="covered cells whose surface is visible from no station"
-    ),
     MetricSpec("n_traced", label="cells traced back to their source photo"),
     lower("far_source_share", label="share of cells coloured from a wrong position"),
     MetricSpec("n_ghost_cells", label="cells that show an occluder"),
@@ -151,7 +148,6 @@ _OF_WALLS: Final = (
 _OF_PLANES: Final = (
     lower("plane_angle_deg", label="direction error of the main plane", headline=True),
     lower("plane_offset_mm", label="position error of the main plane", headline=True),
-    MetricSpec("plane_corner_max_mm", label="error of the main plane at its corners, largest"),
 )
 NOT_COMPARED: Final = DiagnosticSpec(
     code="truth-not-compared",
@@ -240,7 +236,6 @@ class InspectTruth(Method):
             ),
             MetricSpec("n_ties_kept", label="ties kept by the orientation"),
             lower("tie_wrong_share", label="share of wrong ties among those kept"),
-            lower("tie_error_median_cells", label="error of the kept ties, median"),
         ),
         *_needing(
             ("planes",),
@@ -250,9 +245,6 @@ class InspectTruth(Method):
         ),
         MetricSpec("worst_plane_angle_deg", label="direction error of the worst plane"),
         MetricSpec("worst_plane_offset_mm", label="position error of the worst plane"),
-        MetricSpec(
-            "worst_plane_corner_max_mm", label="error of the worst plane at its corners, largest"
-        ),
         *_needing(
             ("labels",),
             *(

@@ -82,17 +82,12 @@ def test_cells_are_compared_away_from_steps_and_by_what_they_are() -> None:
     np.testing.assert_allclose(errors.grey[5, :8], 10.0)
     assert np.isnan(errors.grey[10:]).all()
     painted = (image_.mask == OrthoMask.PAINTED) & (true.rectangle >= 0)
-    assert samples.n_painted == np.count_nonzero(painted & lattice)
     assert samples.n_seen == np.count_nonzero(true.seen & lattice)
     assert samples.n_seen_painted == np.count_nonzero(true.seen & lattice & painted)
     assert samples.n_seen_shown - samples.n_seen_painted == np.count_nonzero(lattice[7])
-    assert samples.n_unseen_painted == 0
     some = wall_errors(image_, wall, true, Sampling(coloured=~every, lattice=every)).samples
     assert len(some.colour) == 0
     assert len(some.depth_m) == n_away
-    true.seen[2, :8] = False
-    assert wall_errors(image_, wall, true, Sampling(coloured=every, lattice=every)
-                       ).samples.n_unseen_painted == 8  # fmt: skip
 
 
 def samples_of(**given: Any) -> WallSamples:
@@ -100,8 +95,8 @@ def samples_of(**given: Any) -> WallSamples:
     usual = {
         "depth_m": none, "sigma_m": none, "step_depth_m": none, "colour": none,
         "filled_colour": none, "step_colour": none, "shift_m": np.zeros((0, 2)),
-        "shift_cells": np.zeros((0, 2)), "n_painted": 0, "n_seen": 0, "n_seen_painted": 0,
-        "n_seen_shown": 0, "n_unseen_painted": 0,
+        "shift_cells": np.zeros((0, 2)), "n_seen": 0, "n_seen_painted": 0,
+        "n_seen_shown": 0,
     }  # fmt: skip
     return WallSamples(**{**usual, **given})
 
@@ -122,7 +117,7 @@ def test_numbers_follow_their_definitions() -> None:
         step_colour=np.array([25.0, 49.0]),
         shift_m=0.01 * shift_cells,
         shift_cells=shift_cells,
-        n_painted=10, n_seen=8, n_seen_painted=6, n_seen_shown=7, n_unseen_painted=3,
+        n_seen=8, n_seen_painted=6, n_seen_shown=7,
     )  # fmt: skip
     found = numbers_of(samples)
     kept = 10.0 * shift_cells[:4]
@@ -143,7 +138,6 @@ def test_numbers_follow_their_definitions() -> None:
         "displaced_share": 0.2,
         "completeness": 0.75,
         "completeness_filled": 0.875,
-        "unseen_painted_share": 0.3,
     }
     assert found == {name: pytest.approx(value, rel=1e-3) for name, value in expected.items()}
     assert {item.wall for item in sample_findings(samples, 2, sources_are_traced=False)} == {2}

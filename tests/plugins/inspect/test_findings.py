@@ -45,8 +45,6 @@ def test_displacements_are_summed_up_by_axis_and_length() -> None:
             f"a_max_{name}_mm": (np.abs(values).max(), "mm"),
             f"a_beyond_2rmse_{name}_share": (np.mean(np.abs(values) > 2 * rmse[axis]), "1"),
         }
-    expected["a_beyond_2rmse_any_share"] = (np.mean((np.abs(mm) > 2 * rmse).any(axis=1)), "1")
-    expected["a_p95_mm"] = (np.percentile(np.hypot(*mm.T), 95), "mm")
     assert found.keys() == expected.keys()
     assert expected["a_beyond_2rmse_x_share"][0] == 0.2
     for name, (value, unit) in expected.items():

@@ -193,7 +193,6 @@ def test_wrong_ties_are_told_of_all_and_of_those_kept() -> None:
         # The photo shows most of wall 0.
         "match_wrong_share_own_wall": pytest.approx(1.0 / 4.0),
         "tie_wrong_share": pytest.approx(2.0 / 5.0),
-        "tie_error_median_cells": pytest.approx(1.0, abs=1e-9),
     }
 
 

@@ -129,9 +129,6 @@ def test_a_tilted_plane_has_its_angle_and_offset(tmp_path: Path, truth: Truth) -
     metrics, _, _ = inspect(tmp_path, truth, shown, wall)
     assert metrics["plane_angle_deg"] == pytest.approx(0.2, abs=1e-6)
     assert metrics["plane_offset_mm"] == pytest.approx(4.0, abs=1e-3)
-    half_width_m = np.linalg.norm(truth.planes.corners[0][3] - truth.planes.corners[0][0]) / 2
-    corner_mm = 4.0 + 1e3 * half_width_m * np.sin(np.radians(0.2))
-    assert metrics["plane_corner_max_mm"] == pytest.approx(corner_mm, abs=0.1)
 
 
 def inspect_planes(folder: Path, truth: Truth, **inputs: Any) -> tuple[dict[str, float], list[str]]:
