@@ -298,12 +298,8 @@ def _is_finished(folder: Path) -> ArgumentError:
 def _check_folder(folder: Path) -> None:
     if files := [place for place in (folder, *folder.parents) if place.is_file()]:
         raise ArgumentError(f"{folder} cannot be created, because {files[0]} is a file; {_ANOTHER}")
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            what = "a link" if path.is_symlink() else "a pipe or a device"
-            raise ArgumentError(
-                f"{folder} contains {what}, {path.name}, which no run creates; {_ANOTHER}"
-            )
+    if (folder / JOURNAL).is_symlink() or (folder / JOURNAL).is_fifo():
+        raise ArgumentError(f"{folder / JOURNAL} is a link or a pipe; {_ANOTHER}")
     if (folder / RECORD_FILE).exists():
         raise _is_finished(folder)
     if not folder.is_dir():

@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
-import numpy as np
-
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
@@ -20,7 +18,7 @@ from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images
 from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
 from orthoflow.files.photo_files import HOW_TO_DEVELOP, photo_format, unreadable
-from orthoflow.files.points import FORMATS, ScanFile, open_scan
+from orthoflow.files.points import FORMATS, open_scan
 from orthoflow.files.points.formats import TEXT
 from orthoflow.files.points.units import refuse_degrees
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
@@ -59,7 +57,6 @@ class Recognised:
         n_points: number of points of a scan.
         n_photos: number of photos, including photos in a scan.
         n_posed: number of photos in a scan that have lens and pose.
-        fields: non-empty point attributes of a scan, without coordinates.
     """
 
     kind: FileKind
@@ -68,7 +65,6 @@ class Recognised:
     n_points: int = 0
     n_photos: int = 0
     n_posed: int = 0
-    fields: frozenset[str] = frozenset()
 
 
 def recognised(paths: Sequence[Path]) -> list[Recognised]:
@@ -149,20 +145,13 @@ def _scan(path: Path) -> Recognised:
     unit = scan.scans[0].unit
     if unit is not None:
         refuse_degrees(path.name, unit)
-    stated = {str(name) for name in scan.fields} & _FIELDS.keys()
-    fields = _fields_of(scan)
     is_e57 = path.suffix.lower() == E57_SUFFIX
     photos = count_e57_images(path) if is_e57 else E57ImageCount()
     words = [scan.format_name, f"{scan.n_most:,} points"]
     if unit is not None:
         words.append(f"unit {unit.name} ({unit.source})")
-    for beginning, names in (
-        ("", fields),
-        ("nothing in its fields for ", stated - fields),
-    ):
-        if names:
-            listed = " and ".join(word for name, word in _FIELDS.items() if name in names)
-            words.append(f"{beginning}{listed}")
+    if stated := [word for name, word in _FIELDS.items() if name in scan.fields]:
+        words.append(" and ".join(stated))
     if photos.n_images:
         count = f"{photos.n_images} photos" if photos.n_images > 1 else "a photo"
         words.append(count if photos.n_posed else f"{count} without a pose")
@@ -173,27 +162,10 @@ def _scan(path: Path) -> Recognised:
         n_points=scan.n_most,
         n_photos=photos.n_images,
         n_posed=photos.n_posed,
-        fields=fields,
     )
 
 
-def _fields_of(scan: ScanFile) -> frozenset[str]:
-    """Return the fields that have values in the first points of a scan."""
-    found: set[str] = set()
-    n_seen = 0
-    for block in scan.read():
-        values = {"intensity": block.intensity, "rgb": block.rgb}
-        found |= {
-            name for name, one in values.items() if one is not None and np.nan_to_num(one).any()
-        }
-        n_seen += block.n_read
-        if n_seen >= _LOOKED_AT:
-            break
-    return frozenset(found)
-
-
-# Number of points read of a scan, and number of bytes read of a photo.
-_LOOKED_AT: Final = 1_000_000
+# Number of bytes read of a photo.
 _HEAD_BYTES: Final = 1 << 20
 _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
@@ -217,8 +189,6 @@ def _table(path: Path) -> Recognised:
         found = _read("cameras", path, lambda file: _cameras_summary([file]))
         if found.kind == "cameras":
             return found
-    elif columns >= _CAMERA_COLUMNS:
-        return _unknown(path, "a list of cameras, which must have the suffix .csv: rename it")
     try:
         return _scan(path)
     except InputError as error:
@@ -236,8 +206,6 @@ _TABLES: Final[
     ),
     ("checkpoints", read_survey_points, "surveyed points", frozenset(("name", "x", "y", "z"))),
 )
-# Columns of a camera list; scans do not have them.
-_CAMERA_COLUMNS: Final = frozenset(("heading", "pitch", "roll"))
 
 
 def _is_cloud(rows: Sequence[object]) -> bool:
@@ -282,8 +250,6 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
 _FEW_SCANS: Final = 3
-# Beginnings of paragraphs in the heading of a recipe that are not copied into a draft.
-_NOT_OWN: Final = ("#   ", "# Without a scan of your own")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -339,13 +305,6 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
         raise InputError("photos-on-scan needs photos, but there are none among the files")
-    has_paint = any({"intensity", "rgb"} & scan.fields for scan in scans)
-    if recipe is None and chosen == "direct" and not has_paint:
-        raise InputError(
-            f"{_some([scan.path.name for scan in scans])}: the points have neither colours nor "
-            "intensity, so they cannot be used for orthoimages: give photos too, or export the "
-            "scan with its colours (--recipe direct writes the workflow anyway)"
-        )
     if own_photos and "photos" not in by_kind:
         # Photos taken by a scanner are in the scan file, with their poses.
         inside = [
@@ -365,7 +324,7 @@ _ByKind: TypeAlias = Mapping[FileKind, Sequence[Recognised]]
 def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
     """Return the text of the recipe with its inputs filled in and a new heading."""
     shipped = shipped_workflow(recipe).read_text(encoding="utf-8")
-    start, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
+    _, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
     taken, left_out = _assigned(by_kind, inputs, recipe)
     lines = []
     for line in inputs.splitlines():
@@ -384,13 +343,9 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
         f"#   orthoflow check {run}       check it for mistakes",
         f"#   orthoflow plan {run}        show what would run",
         f"#   orthoflow run {run} --set wall.gsd_m=0.02    a fast coarse run; then without",
-        "#",
-        "# The following comments are from the recipe.",
-        "#",
+        "",
     ]
-    paragraphs = start.rstrip("\n").split("\n#\n")
-    comments = "\n#\n".join(text for text in paragraphs if not text.startswith(_NOT_OWN))
-    text = "\n".join([*map(_seen, summary), comments, f"{body}\n{_without_stand_ins(steps)}"])
+    text = "\n".join([*map(_seen, summary), f"{body}\n{_without_stand_ins(steps)}"])
     return Draft(recipe=recipe, text=text, inputs=described, left_out=left_out)
 
 

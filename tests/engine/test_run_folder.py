@@ -92,8 +92,8 @@ def test_a_folder_of_something_else_is_refused_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / JOURNAL
     for make, reason in (
         ((tmp_path / "notes.txt").touch, "is not empty and contains no unfinished run; choose"),
-        (lambda: path.symlink_to("elsewhere"), r"contains a link, journal\.jsonl, which no run"),
-        (lambda: os.mkfifo(path), r"contains a pipe or a device, journal\.jsonl, which no run"),
+        (lambda: path.symlink_to("elsewhere"), r"journal\.jsonl is a link or a pipe; choose"),
+        (lambda: os.mkfifo(path), r"journal\.jsonl is a link or a pipe; choose"),
     ):
         make()
         (made,) = tmp_path.iterdir()

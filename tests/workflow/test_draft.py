@@ -164,7 +164,6 @@ def test_a_path_that_is_no_text_is_left_out(data: Path) -> None:
     bad = os.fsdecode(os.fsencode(data) + b"/\xff.las")
     write_scan(data / "b.las").rename(bad)
     assert "not used: \\udcff.las: its path is not UTF-8: rename it" in said("new", data)
-    assert "udcff" not in Path("workflow.yaml").read_text().partition("What follows")[2]
 
 
 @pytest.mark.parametrize("name", ["a.csv", "cameras.json", "a.las", "z.jpg"])
@@ -174,23 +173,6 @@ def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
     zero.symlink_to("/dev/zero")
     told = said("new", data / "hall.las", data / "photos" / name, zero)
     assert f"not used: {name}, link-{name}: a pipe or a device" in told
-
-
-# --- what the data show ---
-
-
-def test_a_scan_with_empty_fields_is_no_source_of_colours(data: Path) -> None:
-    cloud = laspy.read(data / "hall.las")
-    cloud.intensity[:] = cloud.red[:] = 0
-    cloud.write(str(data / "bare.las"))
-    result = asked("new", data / "bare.las")
-    assert result.exit_code == 2
-    assert "bare.las: the points have neither colours nor intensity" in result.output
-    assert not Path("workflow.yaml").exists()
-    out = said("new", data / "bare.las", data / "photos")
-    assert "nothing in its fields for intensity and colours" in out
-    assert "based on the recipe photos-on-scan" in out
-    said("new", data / "bare.las", "--recipe", "direct", "-o", "asked.yaml")
 
 
 def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path) -> None:
@@ -210,9 +192,8 @@ def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path)
 
 
 def found(kind: str, name: str, summary: str = "something", n_photos: int = 0) -> Recognised:
-    posed, fields = (n_photos, frozenset(["rgb"])) if kind == "scan" else (0, frozenset())
-    counts = {"n_photos": n_photos, "n_posed": posed}
-    return Recognised(kind=kind, path=Path(name), summary=summary, **counts, fields=fields)
+    counts = {"n_photos": n_photos, "n_posed": n_photos if kind == "scan" else 0}
+    return Recognised(kind=kind, path=Path(name), summary=summary, **counts)
 
 
 def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
@@ -268,7 +249,6 @@ def test_a_list_of_cameras_is_one_by_its_columns_and_its_ending(tmp_path: Path) 
     text = f"{REALITYCAPTURE}a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0,0\n"
     found = one(tmp_path / "cameras.csv", text)
     assert (found.kind, found.summary) == ("cameras", "1 camera")
-    assert one(tmp_path / "cameras.txt", text).kind == "unknown"
 
 
 def names(paths: list[Path], root: Path) -> list[str]:
