@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, Protocol, cast
@@ -106,13 +106,11 @@ class MethodEntry(Announced):
         spec: id, import string, summary.
         kind: kind with the ports of the method; None if no plugin declares it.
         product_types: all product types that ports may have.
-        contested: product types declared by several plugins -> class that is used.
     """
 
     spec: MethodSpec
     kind: KindSpec | None
     product_types: frozenset[str] = frozenset()
-    contested: Mapping[str, str] = field(default_factory=dict)
 
     def load(self) -> type[Method]:
         """Import the class and check the rules on which the framework relies, once.
@@ -129,9 +127,7 @@ class MethodEntry(Announced):
             raise PluginError(self.problem)
         from orthoflow.catalog.loading import load_method  # noqa: PLC0415 - loads pydantic
 
-        return load_method(
-            self.spec, self.kind, self.distribution, self.product_types, self.contested
-        )
+        return load_method(self.spec, self.kind, self.distribution, self.product_types)
 
     def looked_at(self) -> MethodEntry:
         """Return the entry, with the state `broken` if its class cannot be loaded.

@@ -253,7 +253,6 @@ def _collect_methods(
     products: Mapping[str, ProductEntry],
 ) -> dict[str, MethodEntry]:
     product_types = frozenset(products)
-    contested = {name: entry.spec.target for name, entry in products.items() if entry.problem}
 
     def entry_of(spec: MethodSpec, distribution: DistributionInfo) -> MethodEntry:
         # A kind of the same plugin takes precedence over that of another plugin.
@@ -274,7 +273,6 @@ def _collect_methods(
             distribution=distribution,
             kind=own[0] if own else shared.spec if shared else None,
             product_types=product_types,
-            contested=contested,
             state="broken" if problem else "fine",
             problem=problem,
         )

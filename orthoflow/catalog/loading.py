@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import pkgutil
 import typing
-from collections.abc import Iterator, Mapping
-from importlib import import_module
+from collections.abc import Mapping
 
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.catalog.guarding import UserInterrupt, guarded
-from orthoflow.errors import PluginError, did_you_mean
-from orthoflow.products.product import Product
+from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec
 from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.methods import (
@@ -34,24 +33,16 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
     Raises:
         PluginError: the module cannot be imported or does not contain the name.
     """
-    module_name, _, name = target.partition(":")
-    module: object = None
     try:
         with guarded():
-            module = import_module(module_name)
-            return typing.cast("object", getattr(module, name))
+            return typing.cast("object", pkgutil.resolve_name(target))
     except UserInterrupt:
         raise
     except BaseException as error:
-        problem = describe_error(error)
-        lacks_it = isinstance(error, AttributeError) and error.obj is module
-        if lacks_it and module is not None:
-            near = did_you_mean(name, vars(module))
-            problem = f"{module_name} does not contain {name}{near}"
         raise PluginError(
-            f"{what} of {distribution} cannot be loaded from {target}: {problem}; install "
-            f"missing packages or another version of {distribution.name}, or correct its source "
-            "code"
+            f"{what} of {distribution} cannot be loaded from {target}: {describe_error(error)}; "
+            f"install missing packages or another version of {distribution.name}, or correct its "
+            "source code"
         ) from error
 
 
@@ -60,7 +51,6 @@ def load_method(
     kind: KindSpec,
     distribution: DistributionInfo,
     product_types: frozenset[str],
-    contested: Mapping[str, str],
 ) -> type[Method]:
     """Import the class of a method and check it against its spec and its kind.
 
@@ -74,9 +64,7 @@ def load_method(
     complaint = _class_complaint(method, spec)
     if not complaint:
         try:
-            complaint = _port_complaint(method, kind, product_types) or _contested_complaint(
-                method, contested, distribution
-            )
+            complaint = _port_complaint(method, kind, product_types)
         except (PluginError, NameError, TypeError) as error:
             complaint = f"its ports cannot be read: {describe_error(error)}"
     if complaint:
@@ -114,17 +102,6 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
 
 
-def _hints(ports: type[Ports]) -> tuple[object, ...]:
-    return tuple(typing.get_type_hints(ports).values())
-
-
-def _products_of(*hints: object) -> Iterator[type[Product]]:
-    for hint in hints:
-        for cls in (hint, *typing.get_args(hint)):
-            if isinstance(cls, type) and issubclass(cls, Product):
-                yield cls
-
-
 def _is_subclass(candidate: object, parent: type) -> bool:
     return isinstance(candidate, type) and issubclass(candidate, parent)
 
@@ -144,28 +121,14 @@ def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozens
     for port in given.values():
         wanted = kind.outputs.get(port.name, port.type_name)
         if port.type_name != wanted:
-            cls = next(iter(_products_of(typing.get_type_hints(method.Out)[port.name])))
             return (
-                f"its output port {port.name} has the type {wanted} in kind {kind.name}, but "
-                f"{cls.__module__}:{cls.__qualname__} has type_name '{port.type_name}'"
+                f"output port {port.name} has the type {wanted} in kind {kind.name}, not "
+                f"{port.type_name}"
             )
     if given.keys() != kind.outputs.keys():
         return (
             f"its outputs must be {_join(kind.outputs)} as in kind {kind.name}, got {_join(given)}"
         )
-    return ""
-
-
-def _contested_complaint(
-    method: type[Method], contested: Mapping[str, str], distribution: DistributionInfo
-) -> str:
-    for cls in _products_of(*_hints(method.In), *_hints(method.Out)):
-        target = contested.get(cls.type_name, "")
-        if target and cls is not import_target(target, f"product {cls.type_name}", distribution):
-            return (
-                f"its {cls.type_name} is {cls.__module__}:{cls.__qualname__}, but {target} of "
-                "another plugin has the same name: disable that plugin, or rename the product"
-            )
     return ""
 
 

@@ -66,7 +66,7 @@ def warm(workflow: str | None, *, as_json: bool) -> int:
 def _results(catalog: Catalog, wanted: Collection[str]) -> dict[str, str]:
     """Run the recipes in a temporary store; return why a method failed, or an empty text."""
     from orthoflow.cli.progress import Progress
-    from orthoflow.engine.plan import RunOptions, needed_addresses, plan_run
+    from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.scheduler import execute
     from orthoflow.engine.store import Store
     from orthoflow.workflow.document import load_workflow
@@ -89,7 +89,7 @@ def _results(catalog: Catalog, wanted: Collection[str]) -> dict[str, str]:
                     chosen.add(address)
             for address in reversed(cells):
                 if address in chosen:
-                    chosen.update(needed_addresses(cells[address]))
+                    chosen.update(cells[address].sources)
             kept = tuple(cell for address, cell in cells.items() if address in chosen)
             plan = plan_run(kept, loaded, catalog, store, RunOptions())
             with Progress(plan.cells) as progress:

@@ -21,7 +21,6 @@ from orthoflow.engine.results import RecordedFile, name_problem
 from orthoflow.errors import InputError
 from orthoflow.geometry.threads import in_order
 from orthoflow.sdk.lines import one_line, text_of_path
-from orthoflow.untrusted_text import parse_json
 
 # A file changed so shortly before hashing may change again without a new time stamp.
 _SETTLED_NS: Final = 2_000_000_000
@@ -148,12 +147,7 @@ def _read_memo(memo: Path) -> tuple[dict[str, str], dict[str, str]]:
     """Read the cache file: identity -> digest, and digest -> path."""
     try:
         text = memo.read_text(encoding="utf-8")
-        content = parse_json(text) if is_checked(text) else None
-    except (OSError, ValueError):
-        content = None
-    tables = content if isinstance(content, dict) else {}
-    files, places = (tables.get(name) for name in ("files", "places"))
-    return (
-        dict(files) if isinstance(files, dict) else {},
-        dict(places) if isinstance(places, dict) else {},
-    )
+        content = json.loads(text) if is_checked(text) else {}
+        return content["files"], content["places"]
+    except (OSError, ValueError, KeyError):
+        return {}, {}

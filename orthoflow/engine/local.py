@@ -373,7 +373,15 @@ class _Step:
     def _reason_of_silence(self, log: str) -> OrthoflowError:
         code = self.process.exitcode or 0
         tail = one_line(log.strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
-        return StepFailedError(describe_exit(self.task.who, code, self.peak_bytes, tail))
+        if code >= 0:
+            last = f"; its log ends with: {tail}" if tail else ""
+            how = f"ended its process without a result (exit status {code}){last}"
+        else:
+            kind = "was killed from outside" if -code in _FROM_OUTSIDE else "crashed"
+            reason = signal.strsignal(-code) or f"signal {-code}"
+            memory = f"{self.peak_bytes / GIB:.1f} GiB of memory"
+            how = f"{kind} ({reason.lower()}) while using {memory}"
+        return StepFailedError(f"{self.task.who} {how}")
 
 
 # Tasks of all executors in this process by process id; each Dask worker in this process has one.
@@ -462,7 +470,8 @@ class LocalExecutor:
             if step.kill_at is not None and time_now > step.kill_at:
                 step.kill()
             elif limit is not None and time_now - step.clock > limit:
-                step.stop(describe_timeout(step.task.who, limit))
+                late = f"{step.task.who} exceeded its timeout of {limit:g} s and was stopped"
+                step.stop(StepFailedError(late))
         self._guard_memory()
 
     def _guard_memory(self) -> None:
@@ -479,7 +488,10 @@ class LocalExecutor:
             return
         step = steps[largest]
         step.is_victim = True
-        step.reason = describe_memory(step.task.who, held[largest])
+        step.reason = StepFailedError(
+            f"{step.task.who} needed more memory than the machine has "
+            f"({held[largest] / GIB:.1f} GiB when stopped); use less data or coarser parameters"
+        )
         step.peak_bytes = max(step.peak_bytes, held[largest])
         step.kill()
 
@@ -493,45 +505,3 @@ class LocalExecutor:
         del _all_running[step.pid]
         del self._running[step.task.address]
         step.close()
-
-
-def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
-    """Return the error message for a process that ended without a result.
-
-    Args:
-        who: method and distribution, from `Task.who`.
-        code: exit code as in `subprocess`, negative for signals.
-        n_bytes: peak memory measured.
-        tail: last line of the log.
-    """
-    if code >= 0:
-        last = f"; its log ends with: {tail}" if tail else ""
-        return f"{who} ended its process without a result (exit status {code}){last}"
-    kind = "was killed from outside" if -code in _FROM_OUTSIDE else "crashed"
-    reason = signal.strsignal(-code) or f"signal {-code}"
-    return f"{who} {kind} ({reason.lower()}) while using {n_bytes / GIB:.1f} GiB of memory"
-
-
-def describe_memory(who: str, n_bytes: int) -> StepFailedError:
-    """Return the error for a step that was stopped for lack of memory."""
-    return StepFailedError(
-        f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
-        f"stopped); use less data or coarser parameters"
-    )
-
-
-def describe_timeout(who: str, limit_s: float) -> StepFailedError:
-    """Return the error for a step that exceeded its timeout."""
-    return StepFailedError(f"{who} exceeded its timeout of {duration(limit_s)} and was stopped")
-
-
-def duration(seconds: float) -> str:
-    """Format a duration for display.
-
-    >>> [duration(s) for s in (0.5, 90, 1800, 7200)]
-    ['0.5 s', '90 s', '30 min', '2 h']
-    """
-    for unit, length in (("h", 3600), ("min", 60)):
-        if seconds >= length and seconds % length == 0:
-            return f"{seconds / length:g} {unit}"
-    return f"{seconds:g} s"

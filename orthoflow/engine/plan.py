@@ -22,7 +22,7 @@ from orthoflow.engine.keys import (
 )
 from orthoflow.engine.results import CellResult, ProductRef, ProductTarget
 from orthoflow.engine.store import Store
-from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
+from orthoflow.errors import ArgumentError, InputError, StoreError
 from orthoflow.geometry.threads import usable_cores
 from orthoflow.products.input_files import InputFiles
 from orthoflow.untrusted_text import first_few
@@ -209,12 +209,6 @@ def _require_distinct(
                     )
 
 
-def needed_addresses(cell: Cell) -> tuple[str, ...]:
-    """Return the addresses of all cells whose outputs a cell uses, without duplicates."""
-    sources = (source for source in cell.inputs.values() if isinstance(source, CellOutput))
-    return tuple(dict.fromkeys(source.address for source in sources))
-
-
 def known_inputs(
     cell: Cell,
     inputs: Mapping[str, PlannedInput | None],
@@ -261,7 +255,7 @@ class _Planner:
     def _without_inputs(self, cell: Cell) -> PlannedCell | None:
         if cell.skip_reason:
             return PlannedCell(cell=cell, status="skipped", reason=cell.skip_reason)
-        for earlier in (self.planned[address] for address in needed_addresses(cell)):
+        for earlier in (self.planned[address] for address in cell.sources):
             if earlier.status != "cached":
                 what = "will run" if earlier.status == "will run" else "is not known yet"
                 reason = f"needs {earlier.cell.address}, which {what}"
@@ -269,7 +263,7 @@ class _Planner:
         return None
 
     def _with_inputs(self, cell: Cell) -> PlannedCell:
-        before = (self.planned[address] for address in needed_addresses(cell))
+        before = (self.planned[address] for address in cell.sources)
         results = {item.cell.address: item.result for item in before if item.result is not None}
         refs = known_inputs(cell, self.inputs, results)
         key = cell_key(cell, self.methods[cell.method], refs)
@@ -328,15 +322,9 @@ def _product_targets(
     }
     targets: dict[str, ProductTarget] = {}
     for type_name in sorted(used - {"files"}):
-        entry = catalog.products.get(type_name)
-        if entry is None or entry.state != "fine":
-            raise PluginError(
-                entry.problem if entry else f"no installed plugin provides the product {type_name}"
-            )
+        spec = catalog.products[type_name].spec
         targets[type_name] = ProductTarget(
-            type_name=type_name,
-            target=entry.spec.target,
-            publisher=entry.spec.publisher,
+            type_name=type_name, target=spec.target, publisher=spec.publisher
         )
     return targets
 

@@ -39,7 +39,6 @@ from orthoflow.engine.plan import (
     PlannedInput,
     RunPlan,
     known_inputs,
-    needed_addresses,
     remember_places,
 )
 from orthoflow.engine.results import CellResult, MethodIdentity, ProductRef, shared_fields
@@ -257,7 +256,7 @@ class _Run:
 
     def _prepare(self, cell: Cell) -> None:
         """Use a stored result, or make the cell ready, once its inputs are known."""
-        needed = needed_addresses(cell)
+        needed = cell.sources
         if not all(address in self._results for address in needed):
             return
         if cell.skip_reason:

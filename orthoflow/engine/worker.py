@@ -13,6 +13,7 @@ import io
 import json
 import multiprocessing
 import os
+import pkgutil
 import resource
 import signal
 import sys
@@ -23,7 +24,6 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final, cast
@@ -415,7 +415,7 @@ class _Call:
         )
 
     def run(self) -> CellResult:
-        cls = cast("type[Method]", load_target(self.task.target))
+        cls = cast("type[Method]", pkgutil.resolve_name(self.task.target))
         inputs = {port: self._read(given) for port, given in self.task.inputs.items()}
         params = self._params(cls)
         wall_s, cpu_s, process = self._meter.clock_s(), self._cpu_s(), os.getpid()
@@ -453,7 +453,7 @@ class _Call:
         if given.input_name:
             paths = tuple(file.path for file in given.files)
             return InputFiles(name=given.input_name, paths=paths)
-        cls = cast("type[Product]", load_target(given.target))
+        cls = cast("type[Product]", pkgutil.resolve_name(given.target))
         return self._store.get_product(given.ref.digest, cls, is_checked=True)
 
     def _params(self, cls: type[Method]) -> object:
@@ -493,7 +493,7 @@ class _Call:
         for port, product in products.items():
             expected = self.task.outputs[port]
             target = expected.publisher
-            publisher = cast("Publisher", load_target(target)) if target else None
+            publisher = cast("Publisher", pkgutil.resolve_name(target)) if target else None
             refs[port] = self._store.put_product(product, publisher)
         return refs
 
@@ -505,22 +505,6 @@ class _Call:
             )
             for figure in self._context.figures
         )
-
-
-def load_target(target: str) -> object:
-    """Import `package.module:Name`.
-
-    Raises:
-        PluginError: the module, or a library it needs, is missing or broken.
-    """
-    module, _, name = target.partition(":")
-    try:
-        return cast("object", getattr(import_module(module), name))
-    except Exception as error:
-        raise PluginError(
-            f"{target} cannot be loaded: {type(error).__name__}: {one_line(error)}; "
-            f"`orthoflow doctor` lists what is missing"
-        ) from error
 
 
 def _check_file(file: FileRef) -> None:

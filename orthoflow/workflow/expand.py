@@ -110,8 +110,9 @@ class Cell:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Return the addresses of the cells whose products it uses."""
-        return tuple(one.address for one in self.inputs.values() if isinstance(one, CellOutput))
+        """Return the addresses of the cells whose products it uses, without duplicates."""
+        sources = (one for one in self.inputs.values() if isinstance(one, CellOutput))
+        return tuple(dict.fromkeys(source.address for source in sources))
 
 
 def is_plain(cells: Iterable[Cell]) -> bool:
@@ -280,14 +281,9 @@ def _require_few(workflow: Workflow, count: int) -> None:
     """
     if count < MOST_CELLS:
         return
-    factors, fewer = "combinations", "fewer variants"
-    if workflow.has_seeds:
-        factors, fewer = f"seeds, {factors}", f"fewer seeds, {fewer}"
-    if workflow.chosen_data:
-        factors, fewer = f"datasets, {factors}", f"fewer datasets (--only-data), {fewer}"
     raise WorkflowError(
-        f"the comparison of {workflow.name} runs its steps {MOST_CELLS} times or more ({factors} "
-        f"of variants, and repeats); use design: one-at-a-time, {fewer} or a smaller repeat"
+        f"the comparison of {workflow.name} runs its steps {MOST_CELLS} times or more (datasets, "
+        "seeds, combinations of variants and repeats); use design: one-at-a-time, or fewer of these"
     )
 
 

@@ -39,8 +39,8 @@ MOST_REPEATS: Final = 10_000
 MOST_SWEPT: Final = 100
 #: combinations in `exclude`
 MOST_EXCLUDED: Final = 500
-# Records store numbers of less than 100 digits.
-_MOST_OF_A_NUMBER: Final = 10**80
+# All readers of JSON take such numbers exactly.
+MOST_OF_A_NUMBER: Final = 10**15
 INPUTS: Final = "inputs"
 # Factors in addresses besides the steps: dataset and seed.
 DATA: Final = "data"
@@ -152,53 +152,22 @@ def _each_once(values: list[_Item]) -> list[_Item]:
     return values
 
 
-_Name: TypeAlias = Annotated[
-    str, AfterValidator(check_name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
-]
+_Name: TypeAlias = Annotated[str, AfterValidator(check_name)]
 _Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1)]
 _Flag: TypeAlias = Annotated[bool, Strict()]
 # Integers, except `true`, which Python treats as one.
-_Positive: TypeAlias = Annotated[
-    int,
-    Strict(),
-    Field(ge=1, le=_MOST_OF_A_NUMBER),
-    WithJsonSchema({"type": "integer", "minimum": 1}),
-]
-_Seed: TypeAlias = Annotated[
-    int,
-    Strict(),
-    Field(ge=0, le=_MOST_OF_A_NUMBER),
-    WithJsonSchema({"type": "integer", "minimum": 0}),
-]
+_Positive: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=MOST_OF_A_NUMBER)]
+_Seed: TypeAlias = Annotated[int, Strict(), Field(ge=0, le=MOST_OF_A_NUMBER)]
 _Repeats: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=MOST_REPEATS)]
 _Seconds: TypeAlias = Annotated[
     float,
     BeforeValidator(_seconds),
-    WithJsonSchema(
-        {
-            "anyOf": [
-                {"type": "number", "exclusiveMinimum": 0},
-                {"type": "string", "pattern": f"^{_TIME.pattern}$"},
-            ]
-        }
-    ),
+    WithJsonSchema({"type": ["number", "string"]}),
 ]
-_Source: TypeAlias = Annotated[
-    Reference,
-    BeforeValidator(_reference),
-    WithJsonSchema({"type": "string", "pattern": rf"^{NAME_PATTERN}\.{NAME_PATTERN}$"}),
-]
-_InputSource: TypeAlias = Annotated[
-    Reference,
-    BeforeValidator(_input_reference),
-    WithJsonSchema({"type": "string", "pattern": rf"^{INPUTS}\.{NAME_PATTERN}$"}),
-]
-_Metric: TypeAlias = Annotated[
-    str,
-    Strict(),
-    AfterValidator(_metric),
-    WithJsonSchema({"type": "string", "pattern": rf"^{_METRIC}$"}),
-]
+_IS_TEXT: Final = WithJsonSchema({"type": "string"})
+_Source: TypeAlias = Annotated[Reference, BeforeValidator(_reference), _IS_TEXT]
+_InputSource: TypeAlias = Annotated[Reference, BeforeValidator(_input_reference), _IS_TEXT]
+_Metric: TypeAlias = Annotated[str, Strict(), AfterValidator(_metric)]
 # Levels are text, so a seed is converted.
 _Level: TypeAlias = Annotated[
     str,
