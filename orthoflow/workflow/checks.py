@@ -187,7 +187,12 @@ def check_comparison(
     """Check the section `compare` against steps, datasets and seeds; return None if absent."""
     if section is None:
         return None
-    names = {step.name: [call.name for call in step.calls] for step in steps if step.is_varied}
+    names = {
+        # The name of a swept variant is still valid; it refers to the variants of all its values.
+        step.name: list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
+        for step in steps
+        if step.is_varied
+    }
     factors = dict(names)
     if datasets:
         factors[DATA] = list(datasets)
@@ -205,8 +210,8 @@ def check_comparison(
             continue  # it names a value that is not swept now
         known = _known(combination, ("compare", "exclude", index), factors, log)
         if known:
-            excluded.append(known)
-    chosen = {**first_variants(steps), **baseline}
+            excluded += _spelled_out(known, steps)
+    chosen = {**first_variants(steps), **next(_spelled_out(baseline, steps))}
     comparison = section.model_copy(update={"baseline": chosen, "exclude": tuple(excluded)})
     _check_baseline(comparison, log)
     for index, pattern in enumerate(section.metrics):
@@ -241,6 +246,27 @@ def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
         if call.is_unswept and (not call.name or variant.startswith(f"{call.name}-"))
     ]
     return max(fitting, key=len, default=variant)
+
+
+def _families(step: DraftStep) -> dict[str, list[str]]:
+    """Return name of a swept variant -> variants of its values."""
+    found: dict[str, list[str]] = {}
+    for call in step.calls:
+        if call.family:
+            found.setdefault(call.family, []).append(call.name)
+    return found
+
+
+def _spelled_out(
+    assignment: Mapping[str, str], steps: Sequence[DraftStep]
+) -> Iterator[dict[str, str]]:
+    """Yield an assignment for each value of the swept variants in an assignment, in order."""
+    families = {step.name: _families(step) for step in steps}
+    several = [
+        families.get(step, {}).get(variant, [variant]) for step, variant in assignment.items()
+    ]
+    for names in itertools.product(*several):
+        yield dict(zip(assignment, names, strict=True))
 
 
 def first_variants(steps: Sequence[DraftStep]) -> dict[str, str]:

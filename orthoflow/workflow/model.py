@@ -40,7 +40,7 @@ MOST_SWEPT: Final = 100
 #: combinations in `exclude`
 MOST_EXCLUDED: Final = 500
 # All readers of JSON take such numbers exactly.
-MOST_OF_A_NUMBER: Final = 10**15
+_MOST_OF_A_NUMBER: Final = 10**15
 INPUTS: Final = "inputs"
 # Factors in addresses besides the steps: dataset and seed.
 DATA: Final = "data"
@@ -156,8 +156,8 @@ _Name: TypeAlias = Annotated[str, AfterValidator(check_name)]
 _Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1)]
 _Flag: TypeAlias = Annotated[bool, Strict()]
 # Integers, except `true`, which Python treats as one.
-_Positive: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=MOST_OF_A_NUMBER)]
-_Seed: TypeAlias = Annotated[int, Strict(), Field(ge=0, le=MOST_OF_A_NUMBER)]
+_Positive: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=_MOST_OF_A_NUMBER)]
+_Seed: TypeAlias = Annotated[int, Strict(), Field(ge=0, le=_MOST_OF_A_NUMBER)]
 _Repeats: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=MOST_REPEATS)]
 _Seconds: TypeAlias = Annotated[
     float,
@@ -234,10 +234,10 @@ class ResourcesSection(FileSection):
 class SweepSection(FileSection):
     """A parameter can have several values: `tolerance_m: {sweep: [0.02, 0.05]}` makes the variants
     `tolerance_m-0_02` and `tolerance_m-0_05` of the step. If a variant contains the sweep, their
-    names begin with its name. If values cannot be part of a name, variants are numbered
-    (`sweep-1`); `orthoflow plan` lists them. Sweeps of several parameters make all combinations.
-    The report plots the metrics against the parameter. `--set STEP.PARAM=VALUE` replaces a sweep,
-    `--set 'STEP.PARAM={sweep: [...]}'` makes one.
+    names begin with its name, which `baseline` and `exclude` accept. If values cannot be part of a
+    name, variants are numbered (`sweep-1`); `orthoflow plan` lists them. Sweeps of several
+    parameters make all combinations. The report plots the metrics against the parameter.
+    `--set STEP.PARAM=VALUE` replaces a sweep, `--set 'STEP.PARAM={sweep: [...]}'` makes one.
     """  # noqa: D205
 
     sweep: Annotated[list[Any], Field(min_length=2, max_length=MOST_SWEPT)] = Field(
