@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +15,16 @@ from orthoflow_provenance.document import (
     Metric,
     PayloadLike,
     RecordedCell,
-    RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedProduct,
     RunRecord,
     canonical_json,
     sha256_text,
 )
 from orthoflow_provenance.record import write_record
+
+from tests.report_runs import cell, given, record
 
 WORKFLOW = "orthoflow: 1\nname: court-yard\nseed: 7\n# café\r\n"
 
@@ -80,95 +80,10 @@ class ProductShelf:
         return self.files.get(digest)
 
 
-def sample_record(cloud_digest: str, walls_digest: str) -> RunRecord:
-    environment = RecordedEnvironment(
-        id="sha256:" + "e" * 64,
-        python="3.11.7",
-        os="Linux 6.1",
-        cpu="A processor",
-        cores=2,
-        threads=2,
-        git_commit="",
-        packages={"numpy": "2.4.0", "h5py": "3.16.0"},
-    )
-    cloud = RecordedProduct(type_name="cloud", encoding_version=1, digest=cloud_digest)
-    cells = (
-        _cell("cloud", "read.scan", outputs={"cloud": cloud}, cached_from="earlier-run"),
-        _cell(
-            "wall@plane=hough2d,orient=pnp#2",
-            "raster.grid",
-            seed=2**100 + 1,
-            repeat=2,
-            assignment={"plane": "hough2d", "orient": "pnp"},
-            inputs={
-                "cloud": RecordedProduct(
-                    type_name="cloud", encoding_version=1, digest=cloud_digest, source="cloud.cloud"
-                )
-            },
-            outputs={
-                "walls": RecordedProduct(
-                    type_name="walls", encoding_version=1, digest=walls_digest, embedded=True
-                )
-            },
-            metrics=(
-                Metric(name="rms_mm", value=1.25, unit="mm"),
-                Metric(name="cells", value=5400.0, unit="1", label="cells seen", better="higher"),
-            ),
-            figures=(
-                RecordedFigure(
-                    name="residuals",
-                    caption="Résidus",
-                    media_type="image/png",
-                    data=b"\x89PNG\r\n\x1a\n" + bytes(range(256)),
-                ),
-            ),
-            warnings=("the scan has no intensity",),
-            citations=("doi:10.1/x", "doi:10.2/y"),
-            log="first line\nsecond line\n",
-        ),
-        RecordedCell(
-            address="ortho",
-            step="ortho",
-            method="ortho.pointcloud-direct",
-            status="failed",
-            error_type="MethodError",
-            error_message="no cell has enough points",
-        ),
-    )
-    return RunRecord(
-        run_id="20250102-abc",
-        name="court-yard",
-        created_by="orthoflow 0.1.0",
-        status="failed",
-        started="2025-01-02T03:04:05Z",
-        ended="2025-01-02T03:05:05Z",
-        seed=7,
-        workflow_source=WORKFLOW,
-        workflow_resolved=canonical_json({"name": "court-yard", "seed": 7, "orthoflow": 1}),
-        overrides=("wall.gsd_m=0.01",),
-        inputs=(
-            RecordedInput(
-                name="scan",
-                files=(
-                    RecordedFile(
-                        name="hall.laz", size_bytes=2**40, sha256=hashlib.sha256(b"a").hexdigest()
-                    ),
-                ),
-            ),
-            RecordedInput(name="calibration", files=()),
-        ),
-        environments=(environment,),
-        cells=cells,
-    )
-
-
-def _cell(address: str, method: str, **changes: object) -> RecordedCell:
-    preimage = canonical_json({"what": "orthoflow/step", "id": method, "params": {"gsd_m": 0.01}})
-    values: dict[str, object] = {
-        "address": address,
-        "step": address.partition("@")[0],
-        "method": method,
-        "status": "ok",
+def made(address: str, **more: object) -> RecordedCell:
+    """A cell that went well, with the key of its preimage."""
+    preimage = canonical_json({"what": "orthoflow/step", "params": {"gsd_m": 0.01}})
+    facts: dict[str, object] = {
         "distribution": "orthoflow-tls",
         "distribution_version": "0.1.0",
         "result_version": 1,
@@ -179,18 +94,63 @@ def _cell(address: str, method: str, **changes: object) -> RecordedCell:
         "key_preimage": preimage,
         "started": "2025-01-02T03:04:05Z",
         "ended": "2025-01-02T03:04:06Z",
-        "wall_s": 1.5,
-        "cpu_s": 2.5,
-        "peak_rss_mib": 64.0,
-        "environment": "sha256:" + "e" * 64,
     }
-    return RecordedCell(**(values | changes))  # type: ignore[arg-type] # one table of defaults
+    return cell(address, **{**facts, **more})
+
+
+def sample_record(cloud_digest: str, walls_digest: str) -> RunRecord:
+    cloud = replace(given("", "c", "cloud"), digest=cloud_digest, embedded=False)
+    picture = b"\x89PNG\r\n\x1a\n" + bytes(range(256))
+    cells = (
+        made("cloud", method="read.scan", outputs={"cloud": cloud}, cached_from="earlier-run"),
+        made(
+            "wall@plane=hough2d,orient=pnp#2",
+            method="raster.grid",
+            seed=2**100 + 1,
+            inputs={"cloud": replace(cloud, source="cloud.cloud")},
+            outputs={"walls": replace(given("", "w", "walls"), digest=walls_digest)},
+            metrics=(
+                Metric(name="rms_mm", value=1.25, unit="mm"),
+                Metric(name="cells", value=5400.0, unit="1", label="cells seen", better="higher"),
+            ),
+            figures=(
+                RecordedFigure(
+                    name="residuals", caption="Résidus", media_type="image/png", data=picture
+                ),
+            ),
+            warnings=("the scan has no intensity",),
+            citations=("doi:10.1/x", "doi:10.2/y"),
+            log="first line\nsecond line\n",
+        ),
+        cell(
+            "ortho",
+            method="ortho.pointcloud-direct",
+            status="failed",
+            error_type="MethodError",
+            error_message="no cell has enough points",
+        ),
+    )
+    scan = RecordedFile(name="hall.laz", size_bytes=2**40, sha256=hashlib.sha256(b"a").hexdigest())
+    return record(
+        cells,
+        run_id="20250102-abc",
+        name="court-yard",
+        status="failed",
+        seed=7,
+        workflow_source=WORKFLOW,
+        workflow_resolved=canonical_json({"name": "court-yard", "seed": 7, "orthoflow": 1}),
+        overrides=("wall.gsd_m=0.01",),
+        inputs=(
+            RecordedInput(name="scan", files=(scan,)),
+            RecordedInput(name="calibration", files=()),
+        ),
+    )
 
 
 def write_sample(folder: Path, *, embed: bool = False) -> tuple[Path, RunRecord, ProductShelf]:
     """Write the sample record with its products as `run.h5`."""
     shelf = ProductShelf(folder)
-    record = sample_record(shelf.put(cloud_payload()), shelf.put(walls_payload()))
+    sample = sample_record(shelf.put(cloud_payload()), shelf.put(walls_payload()))
     path = folder / "run.h5"
-    write_record(path, record, shelf.find, embed=embed)
-    return path, record, shelf
+    write_record(path, sample, shelf.find, embed=embed)
+    return path, sample, shelf

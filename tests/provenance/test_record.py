@@ -321,70 +321,48 @@ def test_seal_and_digests_are_those_that_the_specification_describes(tmp_path: P
     assert seal == hashlib.sha256(zeros).hexdigest()
 
 
-CONTENTS = (b"first photo", b"", b"first photo", bytes(range(256)) * 300)
-
-
-def recorded(name: str, content: bytes) -> RecordedFile:
-    return RecordedFile(
-        name=name, size_bytes=len(content), sha256=hashlib.sha256(content).hexdigest()
+def with_photos(*contents: bytes) -> RunRecord:
+    """A record of embedded files of one name, without products."""
+    files = tuple(
+        RecordedFile(
+            name="photo.jpg", size_bytes=len(content), sha256=hashlib.sha256(content).hexdigest()
+        )
+        for content in contents
     )
-
-
-def record_with(inputs: tuple[RecordedInput, ...]) -> RunRecord:
-    """The sample without its products, which these tests do not need."""
     record = sample_record("sha256:" + "a" * 64, "sha256:" + "b" * 64)
-    [failed] = record.cells[2:]
-    return replace(record, cells=(failed,), environments=(), inputs=inputs)
-
-
-def write_embedded(folder: Path, contents: tuple[bytes, ...], name: str = "photo.jpg") -> Path:
-    files = tuple(recorded(name, content) for content in contents)
-    shelf = folder / "shelf"
-    shelf.mkdir(parents=True)
-    for file, content in zip(files, contents, strict=True):
-        (shelf / file.sha256).write_bytes(content)
-    path = folder / "run.h5"
-    record = record_with((RecordedInput(name="photos", files=files, embedded=True),))
-    write_record(path, record, lambda _: None, input_file=shelf.joinpath)
-    assert read_record(path) == record
-    return path
+    photos = RecordedInput(name="photos", files=files, embedded=True)
+    return replace(record, cells=record.cells[2:], inputs=(photos,))
 
 
 def test_embedded_files_come_back_with_their_bytes(tmp_path: Path) -> None:
-    path = write_embedded(tmp_path, CONTENTS)
+    contents = (b"first photo", b"", b"first photo", bytes(range(256)) * 300)
+    record, path = with_photos(*contents), tmp_path / "run.h5"
+    for file, content in zip(record.inputs[0].files, contents, strict=True):
+        (tmp_path / file.sha256).write_bytes(content)
+    write_record(path, record, lambda _: None, input_file=tmp_path.joinpath)
+    assert read_record(path) == record
     assert verify_record(path) == ()
-    taken = extract_files(path, read_record(path).inputs, tmp_path / "out")
-    assert tuple(file.read_bytes() for file in taken["photos"]) == CONTENTS
+    taken = extract_files(path, record.inputs, tmp_path / "out")
+    assert tuple(file.read_bytes() for file in taken["photos"]) == contents
     assert {file.name for file in taken["photos"]} == {"photo.jpg"}
-
-
-def test_a_changed_byte_is_named_and_not_taken_out(tmp_path: Path) -> None:
-    path = write_embedded(tmp_path, CONTENTS)
-    with h5py.File(path, "r+") as file:
-        dataset = file[f"files/{hashlib.sha256(CONTENTS[3]).hexdigest()}"]
+    with h5py.File(path, "r+") as opened:
+        dataset = opened[f"files/{record.inputs[0].files[3].sha256}"]
         dataset[700] = dataset[700] ^ 1
-        hostile.seal(file)
-    [finding] = verify_record(path)
-    assert finding.code == "file"
-    with pytest.raises(RecordFormatError, match=r"has the SHA-256 .* but the record states"):
-        extract_files(path, read_record(path).inputs, tmp_path / "out")
+        hostile.seal(opened)
+    assert [finding.code for finding in verify_record(path)] == ["file"]
+    with pytest.raises(RecordFormatError, match=r"has the SHA-256 .* the record states"):
+        extract_files(path, record.inputs, tmp_path / "out")
 
 
 def test_a_file_that_changed_or_is_gone_is_not_embedded(tmp_path: Path) -> None:
-    changed = tmp_path / "photo.jpg"
+    changed, pipe = tmp_path / "photo.jpg", tmp_path / "pipe"
     changed.write_bytes(b"newer photo")
-    entry = RecordedInput(
-        name="photos", files=(recorded("photo.jpg", b"older photo"),), embedded=True
-    )
-    record = record_with((entry,))
-    pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    for find, sentence in (
-        (lambda _: pipe, "but was changed since it was read"),
-        (lambda _: tmp_path / "gone", "but was changed since it was read"),
-        (lambda _: changed, "but was changed since it was read"),
-        (lambda _: None, "cannot be embedded, because no file has its SHA-256"),
-    ):
+    for place in (pipe, tmp_path / "gone", changed, None):
+        sentence = "was changed since it was read" if place else "no file has its SHA-256"
+        find = {with_photos(b"older photo").inputs[0].files[0].sha256: place}.get
         with pytest.raises(InputFileError, match=sentence):
-            write_record(tmp_path / "run.h5", record, lambda _: None, input_file=find)
+            write_record(
+                tmp_path / "run.h5", with_photos(b"older photo"), lambda _: None, input_file=find
+            )
     assert not (tmp_path / "run.h5").exists()

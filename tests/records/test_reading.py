@@ -24,6 +24,7 @@ from orthoflow.records.runs import Run, published_files
 from orthoflow.records.verify import verify_run
 from orthoflow.records.write import publish_products
 from tests import samples
+from tests.provenance_records import made
 from tests.report_runs import cell, given
 from tests.report_runs import record as a_record
 
@@ -40,17 +41,6 @@ def one_plane() -> Planes:
         rms_m=np.array([0.002]),
         names=("wall 0",),
     )
-
-
-def made(address: str, **more: object) -> RecordedCell:
-    """A cell whose key is that of its preimage."""
-    facts: dict[str, object] = {
-        **dict.fromkeys(("distribution", "distribution_version", "determinism"), "x"),
-        **dict.fromkeys(("started", "ended"), "2026-01-02T03:04:05.000Z"),
-        "key": hashlib.sha256(b"{}").hexdigest(),
-        "key_preimage": "{}",
-    }
-    return cell(address, **{**facts, **more})
 
 
 def planes_cell(digest: str) -> RecordedCell:
