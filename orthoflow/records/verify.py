@@ -9,10 +9,9 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Any, Final, Literal
 
 from orthoflow_provenance.document import (
     RecordedCell,
@@ -44,12 +43,6 @@ from orthoflow.records.runs import (
     record_errors,
 )
 from orthoflow.untrusted_text import first_few
-
-if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import (
-        Ed25519PrivateKey,
-        Ed25519PublicKey,
-    )
 
 SIGNATURE_SUFFIX: Final = ".sig"
 # Keys and signatures have a few hundred bytes.
@@ -92,7 +85,7 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
         StoreError: the disk cannot be written.
         PluginError: the library cryptography is not installed.
     """
-    key = _private_key(key_file, password)
+    key = _read_key(key_file, password)
     earlier = read_signature(path)
     public_key = _openssh(key.public_key())
     if earlier is not None and earlier.public_key != public_key:
@@ -137,7 +130,7 @@ def check_signature(record: Path, signer: Path) -> Signature:
         InputError: the file is not such a key.
         PluginError: the library cryptography is not installed.
     """
-    key = _public_key(signer)
+    key = _read_key(signer)
     found = read_signature(record)
     if found is None:
         raise RecordError(
@@ -175,73 +168,48 @@ def _fingerprint(public_key: str) -> str:
     return f"SHA256:{base64.b64encode(hashlib.sha256(blob).digest()).decode('ascii').rstrip('=')}"
 
 
-def _openssh(key: Ed25519PublicKey) -> str:
-    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
+def _openssh(key: Any) -> str:
+    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - optional
 
     encoding, form = serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH
-    return key.public_bytes(encoding, form).decode("ascii")
+    return str(key.public_bytes(encoding, form), "ascii")
 
 
-def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
-    data = _key_bytes(path)
-    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
-    from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
-
-    if data.startswith(b"ssh-"):
-        raise InputError(
-            f"{path} is a public key, which others use to verify: sign with the private key, "
-            f"{path.with_suffix('')}"
-        )
-    load = serialization.load_ssh_private_key
-    with _key_errors(path, "private", "or the password is wrong: {}"):
-        try:
-            key = load(data, password=None)
-        except TypeError:
-            # The key is protected; an empty password would be treated as no password.
-            key = load(data, password=password().encode("utf-8") or b"\0")
-    if not isinstance(key, ed25519.Ed25519PrivateKey):
-        raise InputError(f"{path} must be an Ed25519 key; create one with `ssh-keygen -t ed25519`")
-    return key
-
-
-def _public_key(path: Path) -> Ed25519PublicKey:
-    data = _key_bytes(path)
-    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
-    from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
-
-    with _key_errors(path, "public", "{}; the signer's file ends with .pub"):
-        key = serialization.load_ssh_public_key(data)
-    if not isinstance(key, ed25519.Ed25519PublicKey):
-        raise InputError(f"{path} must be an Ed25519 key, the only type used for signatures")
-    return key
-
-
-@contextmanager
-def _key_errors(path: Path, kind: str, reason: str) -> Iterator[None]:
-    from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - as above
-
+# `Any`: an optional library.
+def _read_key(path: Path, password: Callable[[], str] | None = None) -> Any:
+    """Read an Ed25519 key in OpenSSH format: a private one if a password can be asked for."""
     try:
-        yield
-    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        what = f"{path} is not a {kind} key in OpenSSH format, {reason.format(error)}"
-        raise InputError(what) from error
-
-
-def _key_bytes(path: Path) -> bytes:
-    try:
-        import cryptography  # noqa: F401, PLC0415 - asked for before anything is read
+        from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - optional
+        from cryptography.hazmat.primitives import serialization  # noqa: PLC0415
+        from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
     except ImportError as error:
         raise PluginError(
             "signatures need the library cryptography, which is missing or fails to import: "
             "python -m pip install 'orthoflow-tls[sign]'"
         ) from error
+    if not path.is_file():
+        raise InputError(f"there is no key file {path}")
+    kind, hint = ("public", "") if password is None else ("private", " or the password is wrong")
+    wanted = (ed25519.Ed25519PublicKey, ed25519.Ed25519PrivateKey)[password is not None]
+    key: object
     try:
-        if not path.is_file():
-            raise InputError(f"there is no key file {path}")
         with path.open("rb") as stream:
-            return stream.read(_LARGEST_BYTES)
-    except OSError as error:
-        raise InputError(f"the key file {path} cannot be read: {error.strerror}") from error
+            data = stream.read(_LARGEST_BYTES)
+        if password is None:
+            key = serialization.load_ssh_public_key(data)
+        else:
+            try:
+                key = serialization.load_ssh_private_key(data, None)
+            except TypeError:
+                # The key is protected; an empty password would be treated as no password.
+                secret = password().encode("utf-8") or b"\0"
+                key = serialization.load_ssh_private_key(data, secret)
+    except (OSError, ValueError, TypeError, UnsupportedAlgorithm) as error:
+        what = f"{path} is not a {kind} key in OpenSSH format,{hint}: {error}"
+        raise InputError(what) from error
+    if not isinstance(key, wanted):
+        raise InputError(f"{path} must be an Ed25519 key; create one with `ssh-keygen -t ed25519`")
+    return key
 
 
 # Contradictions within a record; they may have been there when it was written.
@@ -479,18 +447,12 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
             f"{len(missing)} of {n_published} published files are not in {PRODUCTS_FOLDER}/: "
             f"{first_few(missing)}"
         )
-        if len(missing) == n_published:
-            text = f"the {n_published} published files of the record are not next to it, so they "
-            text += "were not checked"
         yield Note(code="missing", text=text)
-        if len(missing) == n_published:
-            # A record that was passed on alone may be next to unrelated files.
-            return
-    if unnamed := _unnamed(path, record):
-        rest = first_few(unnamed)
-        yield Note(
-            code="foreign", text=f"the record does not list {rest}, found among its published files"
-        )
+    # A record that was passed on alone may be next to unrelated files.
+    is_alone = bool(missing) and len(missing) == n_published
+    if not is_alone and (unnamed := _unnamed(path, record)):
+        text = f"the record does not list {first_few(unnamed)}, found among its published files"
+        yield Note(code="foreign", text=text)
 
 
 def _unnamed(path: Path, record: RunRecord) -> list[str]:

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeAlias
@@ -513,9 +513,8 @@ def from_json(text: str, contents: Callable[[str], bytes]) -> RunRecord:
         first = error.errors(include_url=False, include_input=False)[0]
         place = "/".join(map(str, first["loc"]))
         raise RecordFormatError(f"the document at /{place}: {first['msg']}") from error
-    if (written := codec.dump_python(record, mode="json")) != document:
-        odd = min({*_paths(document)} ^ {*_paths(written)}, default="/")
-        raise RecordFormatError(f"the document lacks {odd}, or contains it where it is not allowed")
+    if codec.dump_python(record, mode="json") != document:
+        raise RecordFormatError("the document lacks a field, or contains one that is not allowed")
     return _with_figures(record, lambda one: replace(one, data=contents(one.data.decode())))
 
 
@@ -524,18 +523,6 @@ def _with_figures(
 ) -> RunRecord:
     cells = (replace(cell, figures=tuple(map(change, cell.figures))) for cell in record.cells)
     return replace(record, cells=tuple(cells))
-
-
-def _paths(value: JsonValue, place: str = "") -> Iterator[str]:
-    """Yield the paths of all values in a document."""
-    below: Iterable[tuple[object, JsonValue]] = ()
-    if isinstance(value, dict):
-        below = value.items()
-    elif isinstance(value, list):
-        below = enumerate(value)
-    for name, item in below:
-        yield f"{place}/{name}"
-        yield from _paths(item, f"{place}/{name}")
 
 
 @cache

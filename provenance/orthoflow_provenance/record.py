@@ -109,16 +109,11 @@ class OpenRecord:
             RecordFormatError: there is no such output, it is not embedded, it is damaged, or it
                 does not match its digest.
         """
-        cell = next((cell for cell in self.record.cells if cell.address == address), None)
-        output = None if cell is None else cell.outputs.get(port)
-        if output is None:
-            raise RecordFormatError(f"the record has no output {port} of the cell {address}")
-        if not output.embedded:
-            raise RecordFormatError(
-                f"the record contains only the digest of the output {port} of {address} "
-                f"({output.type_name}), {output.digest}: read it from the store, or run again "
-                "with --embed"
-            )
+        cells = {cell.address: cell for cell in self.record.cells}
+        try:
+            output = cells[address].outputs[port]
+        except KeyError as error:
+            raise RecordFormatError(f"the record has no output {address}.{port}") from error
         group = open_group(self.file, product_path(output.digest))
         payload = read_payload(group)
         # Check it here, because the caller may not have checked the seal of the file.

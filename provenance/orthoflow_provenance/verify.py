@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -228,35 +228,34 @@ def _embedded(record: RunRecord) -> dict[str, str]:
     }
 
 
-def _contents(document: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
-    """Return SHA-256 -> description and size, for all contents of a document in `/files`."""
-    found: dict[str, tuple[str, int | None]] = {}
-    for cell in document["cells"]:
-        for figure in cell["figures"]:
-            found[figure["data"]] = (f"the figure {figure['name']!r} of {cell['address']}", None)
-    for entry in document["inputs"]:
-        for file in entry["files"] if entry["embedded"] else ():
-            found[file["sha256"]] = (file["name"], file["size_bytes"])
-    return found
+def _contents(document: Mapping[str, Any]) -> dict[str, int | None]:
+    """Return SHA-256 -> size, None for figures, of all contents of a document in `/files`."""
+    return {
+        **{figure["data"]: None for cell in document["cells"] for figure in cell["figures"]},
+        **{
+            file["sha256"]: file["size_bytes"]
+            for entry in document["inputs"]
+            for file in (entry["files"] if entry["embedded"] else ())
+        },
+    }
 
 
 def _content_findings(
-    file: h5py.File, contents: Mapping[str, tuple[str, int | None]], *, with_arrays: bool
+    file: h5py.File, contents: Mapping[str, int | None], *, with_arrays: bool
 ) -> Iterator[Finding]:
     """Check the files that the document references by digest; large ones only with the arrays."""
-    for sha256, (name, size_bytes) in contents.items():
-        problem = ""
+    for sha256, size_bytes in contents.items():
+        problem = "does not contain the bytes that the document states"
         try:
             dataset = dataset_of(open_group(file, FILES), sha256)
-            is_bytes = dataset.dtype == np.uint8 and dataset.ndim == 1
-            if not is_bytes or size_bytes not in (None, dataset.size):
-                problem = f"does not contain the {size_bytes} bytes of {name}"
-            elif (with_arrays or size_bytes is None) and dataset_sha256(dataset) != sha256:
-                problem = f"does not contain the bytes of {name}"
+            is_sized = size_bytes in (None, dataset.size)
+            if dataset.dtype == np.uint8 and dataset.ndim == 1 and is_sized:
+                is_left_out = size_bytes is not None and not with_arrays
+                if is_left_out or dataset_sha256(dataset) == sha256:
+                    continue
         except RecordFormatError as error:
             problem = str(error)
-        if problem:
-            yield Finding("file", f"/{FILES}/{sha256}", problem)
+        yield Finding("file", f"/{FILES}/{sha256}", problem)
 
 
 def _product_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
@@ -284,49 +283,45 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
         parse_json(record.workflow_resolved, "workflow_resolved")
     except RecordFormatError as error:
         yield Finding("field", f"/{DOCUMENT}", str(error))
-    files: list[tuple[str, str, str, RecordedFile | PublishedFile]] = [
-        (f"/inputs/{entry.name}", file.name, name_problem(file.name), file)
-        for entry in record.inputs
-        for file in entry.files
-    ]
-    files += [("/published", one.path, path_problem(one.path), one) for one in record.published]
-    for place, name, problem, file in files:
-        if problem:
-            yield Finding("name", place, f"{name!r} {problem}, so it cannot be a file name")
-        if not (is_sha256(file.sha256) and file.size_bytes >= 0):
-            yield Finding("field", place, f"the file {name!r} needs a size and a SHA-256")
-    if twice := colliding(file.path for file in record.published):
-        yield Finding(
-            "name", "/published", f"{twice!r} occurs twice on file systems that ignore case"
-        )
     yield from _name_findings(record)
 
 
 def _name_findings(record: RunRecord) -> Iterator[Finding]:
     """Check names that are used for folders and files."""
     named = [("/@name", record.name), ("/@run_id", record.run_id)]
-    named += [(f"/inputs/{entry.name}", entry.name) for entry in record.inputs]
+    for entry in record.inputs:
+        place = f"/inputs/{entry.name}"
+        named += [(place, entry.name), *((place, file.name) for file in entry.files)]
+        yield from _file_findings(place, entry.files)
     for cell in record.cells:
         place = f"/{CELLS}/{cell.address}"
         # File names use only the beginning of long addresses.
         named += [(place, cell.address[:_LETTERS_MOST]), (f"{place}@step", cell.step)]
         named += [(f"{place}/outputs/{port}", port) for port in cell.outputs]
         for figure in cell.figures:
-            suffix = FIGURE_SUFFIXES.get(figure.media_type, "")
-            if not suffix:
+            if figure.media_type not in FIGURE_SUFFIXES:
                 problem = f"the figure {figure.name!r} has the media type {figure.media_type!r}"
-                problem += ", not that of a PNG, WebP or SVG file"
-                yield Finding("name", f"{place}/figures", problem)
-            if problem := name_problem(figure.name) or name_problem(f"{figure.name}{suffix}"):
-                problem = f"the name of the figure {figure.name!r} {problem}"
-                yield Finding("name", f"{place}/figures", problem)
-        if twice := colliding(figure.name for figure in cell.figures):
-            problem = f"two figures are named {twice!r} on file systems that ignore case"
-            yield Finding("field", f"{place}/figures", problem)
-    for place, name in named:
-        # Empty names are reported by other checks.
-        if name and (problem := name_problem(name)):
+                yield Finding("field", f"{place}/figures", problem)
+            suffix = FIGURE_SUFFIXES.get(figure.media_type, "")
+            named.append((f"{place}/figures", f"{figure.name}{suffix}"))
+        yield from _twice(f"{place}/figures", [figure.name for figure in cell.figures])
+    yield from _file_findings("/published", record.published)
+    yield from _twice("/published", [file.path for file in record.published])
+    problems = [(place, name, name_problem(name)) for place, name in named if name]
+    problems += [("/published", one.path, path_problem(one.path)) for one in record.published]
+    for place, name, problem in problems:
+        if problem:
             yield Finding("name", place, f"{name!r} {problem}, so it cannot be a file name")
+
+
+def _file_findings(place: str, files: Sequence[RecordedFile | PublishedFile]) -> Iterator[Finding]:
+    if not all(is_sha256(file.sha256) and file.size_bytes >= 0 for file in files):
+        yield Finding("field", place, "each file needs a size and a SHA-256")
+
+
+def _twice(place: str, names: Sequence[str]) -> Iterator[Finding]:
+    if twice := colliding(names):
+        yield Finding("name", place, f"{twice!r} occurs twice on file systems that ignore case")
 
 
 def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:

@@ -57,11 +57,9 @@ def test_embedded_products_come_back_and_others_are_named_by_their_digest(tmp_pa
     path, record, _ = write_sample(tmp_path)
     with open_record(path) as opened:
         stored = opened.payload(WALL, "walls")
-        with pytest.raises(
-            RecordFormatError, match=r"contains only the digest of .*, sha256:.*--embed"
-        ):
+        with pytest.raises(RecordFormatError, match="/ lacks the group /products/"):
             opened.payload("cloud", "cloud")
-        with pytest.raises(RecordFormatError, match="no output walls of the cell nowhere"):
+        with pytest.raises(RecordFormatError, match=r"no output nowhere\.walls"):
             opened.payload("nowhere", "walls")
     assert stored.digest == payload_digest(stored) == payload_digest(walls_payload())
     np.testing.assert_array_equal(
@@ -271,9 +269,8 @@ def test_records_that_contradict_themselves_are_found_even_when_sealed(tmp_path:
         ("field", "/inputs/scan"): 1,
         ("name", "/published"): 2,
         ("name", "/cells/cloud@step"): 1,
-        ("name", f"{wall}/figures"): 1,
-        ("field", f"{wall}/figures"): 1,
-        ("name", "/cells/ortho/figures"): 1,
+        ("name", f"{wall}/figures"): 2,
+        ("field", "/cells/ortho/figures"): 1,
         ("name", "/cells/ortho/outputs/.."): 1,
         ("key", "/cells/cloud@key"): 1,
         ("reference", "/cells/cloud@environment"): 1,
