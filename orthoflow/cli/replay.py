@@ -122,7 +122,6 @@ def replay(
                 opened,
                 folder,
                 run_id,
-                embed=planned.is_embedded,
                 report=lambda made: write_report([made], folder / REPORT_FILE),
             )
             distances = product_distances(

@@ -197,7 +197,7 @@ def executed(  # noqa: PLR0913 - parts of a run
     folder: Path,
     run_id: str,
     *,
-    embed: bool,
+    embed: bool = False,
     report: Callable[[Run], None],
     listen: RunListener = lambda _: None,
 ) -> tuple[RunOutcome, Run]:

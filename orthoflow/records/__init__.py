@@ -1,28 +1,10 @@
 """Finished runs: writing the record, and the read API."""
 
-from __future__ import annotations
-
-from orthoflow_provenance.document import (
-    COSTS,
-    Metric,
-    RecordedCell,
-    RecordedEnvironment,
-    RecordedFigure,
-    RecordedFile,
-    RecordedInput,
-    RecordedProduct,
-    RunRecord,
-)
-
 # Names from the record format, re-exported for the packages above.
-__all__ = [
-    "COSTS",
-    "Metric",
-    "RecordedCell",
-    "RecordedEnvironment",
-    "RecordedFigure",
-    "RecordedFile",
-    "RecordedInput",
-    "RecordedProduct",
-    "RunRecord",
-]
+from orthoflow_provenance.document import COSTS as COSTS
+from orthoflow_provenance.document import Metric as Metric
+from orthoflow_provenance.document import RecordedCell as RecordedCell
+from orthoflow_provenance.document import RecordedEnvironment as RecordedEnvironment
+from orthoflow_provenance.document import RecordedFigure as RecordedFigure
+from orthoflow_provenance.document import RecordedFile as RecordedFile
+from orthoflow_provenance.document import RunRecord as RunRecord

@@ -44,14 +44,12 @@ class Replay:
         plan: plan of its cells with the recorded parameters and seeds.
         notes: changes that may affect results: code, libraries, Python, processor.
         changed_methods: ids of methods whose code has changed but whose result version has not.
-        is_embedded: whether the record contains the arrays of all products and all input files.
     """
 
     workflow: Workflow
     plan: RunPlan
     notes: tuple[str, ...]
     changed_methods: frozenset[str]
-    is_embedded: bool
 
 
 def plan_replay(
@@ -124,14 +122,11 @@ def plan_replay(
     cells = [_cell(cell, workflow) for cell in run.record.cells]
     plan = plan_run(cells, found, catalog, store, options)
     changed, notes = _changes(run, plan)
-    products = [output for cell in run.record.cells for output in cell.outputs.values()]
-    given = [entry for entry in run.record.inputs if entry.files]
     return Replay(
         workflow=workflow,
         plan=plan,
         notes=notes,
         changed_methods=changed,
-        is_embedded=all(one.embedded for one in products) and all(one.embedded for one in given),
     )
 
 

@@ -235,8 +235,6 @@ class Run:
         files_folder: folder of the run's files, if it is not the folder of the record.
         home: run folder of an unfinished run, whose record is elsewhere.
         content_sha256: digest that seals the record; empty if it was not read from a file.
-        later_name: final name of the record file, which it gets after all other files are written;
-            empty if it already has its final name.
     """
 
     path: Path
@@ -245,12 +243,11 @@ class Run:
     files_folder: Path | None = field(default=None, compare=False)
     home: Path | None = field(default=None, compare=False)
     content_sha256: str = field(default="", compare=False)
-    later_name: str = field(default="", compare=False)
 
     @property
     def file_name(self) -> str:
-        """Name of the record file, as given in documents about the run."""
-        return self.later_name or self.path.name
+        """Name of the record file; it gets its own after all other files are written."""
+        return RECORD_FILE if self.path.name.startswith(f".{RECORD_FILE}") else self.path.name
 
     @contextmanager
     def held_open(self) -> Iterator[Run]:
@@ -463,23 +460,14 @@ class Run:
         return self.folder / PRODUCTS_FOLDER
 
 
-def read_run(path: Path, *, later_name: str = "") -> Run:
+def read_run(path: Path) -> Run:
     """Read a record file of any name.
-
-    Args:
-        path: the file.
-        later_name: see `Run`.
 
     Raises:
         RecordError: the record is damaged, not a record, or of another format.
     """
     with record_errors(path), open_record(path) as opened:
-        return Run(
-            path=path,
-            record=opened.record,
-            content_sha256=opened.content_sha256,
-            later_name=later_name,
-        )
+        return Run(path=path, record=opened.record, content_sha256=opened.content_sha256)
 
 
 def find_record(path: str | Path) -> Path:

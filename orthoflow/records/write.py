@@ -302,7 +302,7 @@ def write_run(
             unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
             with writing_to(run_folder):
                 if before_finish is not None:
-                    before_finish(read_run(unfinished, later_name=RECORD_FILE))
+                    before_finish(read_run(unfinished))
                 # All files referenced in the record must be on the disk before the record gets its
                 # name.
                 sync_tree(run_folder)

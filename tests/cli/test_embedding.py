@@ -43,7 +43,7 @@ def assert_record_alone_is_enough(studio: Studio, record: Path) -> None:
     verified = studio("verify", "alone")
     assert verified.exit_code == 0
     assert "2 products (0 more by digest only), 1 input file, " in verified.stdout
-    assert "published files of the record are not next to it" in verified.stdout
+    assert "published files are not in products/" in verified.stdout
     said = studio.json("replay", "alone/run.h5", "-o", "again")
     assert [row["verdict"] for row in said["products"]] == ["identical", "identical"]
     assert sorted(path.name for path in studio.folder.iterdir()) == ["again", "alone"]
