@@ -154,7 +154,7 @@ def _by_number(name: str) -> tuple[tuple[str, int], ...]:
     return tuple((text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name))
 
 
-PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
+PublishedState: TypeAlias = Literal["same", "changed", "missing", "no file"]
 
 
 def published_state(folder: Path, file: PublishedFile) -> PublishedState:
@@ -172,10 +172,8 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
     except (FileNotFoundError, NotADirectoryError):
         return "missing"
-    except UnsafeFileError:
+    except (UnsafeFileError, OSError):
         return "no file"
-    except OSError:
-        return "unreadable"
     return "same" if digest == file.sha256 else "changed"
 
 

@@ -220,8 +220,7 @@ _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
 _PAGE_MARK: Final = "orthoflow report of"
 _WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
-    "unreadable": "unreadable since it was published",
-    "no file": "a link, a folder or a device in place of the published file, so it was not read",
+    "no file": "a link, a folder or a device in place of the published file, or it is unreadable",
 }
 
 
