@@ -242,7 +242,7 @@ def test_a_record_that_was_changed_opens_with_a_warning(tmp_path: Path) -> None:
         file.attrs["seed"] = type(file.attrs["seed"])(b"8")
     with pytest.warns(UserWarning, match="does not match /; do not rely on this output"):
         run = orthoflow.open_run(path)
-    assert run.verify().findings[0].startswith("/: its attribute 'seed' is not what")
+    assert run.verify().findings[0].startswith("/: its attribute 'seed' differs")
 
 
 def cloud_at(x_m: float) -> PointCloud:
