@@ -60,7 +60,7 @@ class ConformanceCase:
         if self.expected_failure and not problem:
             raise ConformanceError(
                 f"{self}: passes, although it was expected to fail ({self.expected_failure}): "
-                "take it out of expected_failures"
+                "remove it from expected_failures"
             )
         if problem and not self.expected_failure:
             raise ConformanceError(f"{self}: {problem}")

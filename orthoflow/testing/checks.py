@@ -71,7 +71,7 @@ def _parameter_faults(name: str, info: FieldInfo) -> Iterator[str]:
     is_float = info.annotation is float or info.annotation == (float | None)
     if is_float and not re.search(rf"_({'|'.join(UNIT_SUFFIXES)})(_|$)", f"_{name}"):
         yield (
-            f"parameter {name} does not state its unit: end it with one of "
+            f"the name of parameter {name} lacks a unit: end it with one of "
             f"{', '.join(UNIT_SUFFIXES)}"
         )
 
@@ -81,13 +81,16 @@ def parameters_round_trip(subject: Subject) -> None:
     model = subject.method.Params
     params = model(**subject.witness.trial.params)
     text = json.dumps(params.model_dump(mode="json"), allow_nan=False)
-    require(model.model_validate_json(text) == params, f"parameters change through JSON: {text}")
+    require(
+        model.model_validate_json(text) == params,
+        (f"parameters change when converted to JSON and back: {text}"),
+    )
     require(model.model_config.get("frozen"), "parameters are not frozen")
     try:
         model.model_validate({"no_such_parameter": 1})
     except ValidationError:
         return
-    raise AssertionError("an unknown parameter is accepted in silence")
+    raise AssertionError("an unknown parameter is accepted")
 
 
 def outputs_are_valid(subject: Subject) -> None:
@@ -100,7 +103,7 @@ def outputs_are_valid(subject: Subject) -> None:
             continue
         require(
             product.type_name == port.type_name,
-            f"output {name} is a {product.type_name}, declared is {port.type_name}",
+            f"output {name} is a {product.type_name}, but {port.type_name} is declared",
         )
         again = type(product).from_payload(product.to_payload())
         require(digest_of(again) == run.digests[name], f"output {name} changes when stored")
@@ -108,7 +111,7 @@ def outputs_are_valid(subject: Subject) -> None:
         require(metric.unit, f"metric {metric.name} has no unit (`1` for counts and shares)")
         require(
             subject.method.may_report(metric.name),
-            f"metric {metric.name} is none of those that the method declares (`metrics`)",
+            f"metric {metric.name} is not declared by the method (`metrics`)",
         )
 
 
@@ -122,7 +125,7 @@ def global_state_stays_untouched(subject: Subject) -> None:
     """The global random generator of numpy is not used."""
     require(
         not subject.witness.first.drew_globally,
-        "the method draws from numpy's global generator, not from ctx.rng",
+        "the method uses numpy's global random generator instead of ctx.rng",
     )
 
 
@@ -144,7 +147,7 @@ def results_repeat(subject: Subject) -> None:
     for name, digest in first.digests.items():
         require(
             not exact or second.digests[name] == digest,
-            f"output {name} differs between two runs with one seed in one process",
+            f"output {name} differs between two runs with the same seed in the same process",
         )
         require(
             name in elsewhere.digests and (not exact or elsewhere.digests[name] == digest),
@@ -170,14 +173,14 @@ def _refuses(subject: Subject, cloud: PointCloud, what: str) -> None:
         try:
             subject.run_on(f"{port}-{what}", **{port: cloud})
         except OrthoflowError as error:
-            require(str(error).strip(), f"a cloud with {what} is refused without a word")
+            require(str(error).strip(), f"a cloud with {what} is refused without a message")
         except Exception as error:
             raise AssertionError(
-                f"a cloud with {what} ends in {type(error).__name__}, not in an OrthoflowError: "
-                f"{error}"
+                f"a cloud with {what} raises {type(error).__name__} instead of an "
+                f"OrthoflowError: {error}"
             ) from error
         else:
-            raise AssertionError(f"a cloud with {what} is accepted in silence")
+            raise AssertionError(f"a cloud with {what} is accepted")
 
 
 def empty_cloud_is_refused(subject: Subject) -> None:
@@ -207,7 +210,7 @@ def a_huge_coordinate_does_no_harm(subject: Subject) -> None:
             continue
         except Exception as error:
             raise AssertionError(
-                f"a cloud with a coordinate of 1e30 m ends in {type(error).__name__}: {error}"
+                f"a cloud with a coordinate of 1e30 m raises {type(error).__name__}: {error}"
             ) from error
 
 
@@ -225,7 +228,7 @@ def missing_ties_are_reported(subject: Subject) -> None:
         return
     cameras = output_of(run, "cameras", Cameras).cameras
     oriented = [camera.photo for camera in cameras if camera.status == "ok"]
-    require(not oriented, f"without any ties {', '.join(oriented)} was oriented all the same")
+    require(not oriented, f"{', '.join(oriented)} was oriented without any ties")
 
 
 def progress_never_goes_back(subject: Subject) -> None:
@@ -234,7 +237,7 @@ def progress_never_goes_back(subject: Subject) -> None:
     for before, after in pairwise((0.0, *fractions, 1.0)):
         require(
             math.isfinite(after) and before <= after <= 1.0,
-            f"progress goes from {before:.3f} to {after:.3f}",
+            f"progress decreases from {before:.3f} to {after:.3f}",
         )
 
 
@@ -245,8 +248,8 @@ def cancel_is_honoured(subject: Subject) -> None:
     except CancelledStepError:
         return
     raise AssertionError(
-        "a cancelled step ran to its end: call ctx.progress(fraction, text) between parts of the "
-        "work; it raises when the step is cancelled"
+        "a cancelled step ran to completion: call ctx.progress(fraction, text) regularly; it "
+        "raises when the step is cancelled"
     )
 
 

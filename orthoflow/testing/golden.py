@@ -126,8 +126,8 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
             )
         if moved:
             return (
-                f"output {port} is another one than {file.name} has ({moved}), but result_version "
-                f"is {now.result_version} still: raise it, or find out why the result moved"
+                f"output {port} differs from {file.name} ({moved}), but result_version is still "
+                f"{now.result_version}: increment it, or find out why the result has changed"
             )
     return ""
 
@@ -155,8 +155,8 @@ def _parsed(text: str, file: Path) -> dict[str, Golden]:
         return _FORMAT.validate_json(text) if text else {}
     except ValidationError as error:
         raise InputError(
-            f"{file.name} is not a file of golden results ({error.error_count()} mistakes): remove "
-            "it, and the next run writes another"
+            f"{file.name} is not a valid file of golden results ({error.error_count()} errors): "
+            "remove it, and the next run writes a new one"
         ) from error
 
 
@@ -209,7 +209,7 @@ def sample_problem(
             _is_apart(a, b, amount, share) for a, b in zip(old.values, new.values, strict=True)
         )
         if n_apart > _STRAY_SHARE * len(old.values):
-            return f"{n_apart} of {len(old.values)} sampled values of {name} moved"
+            return f"{n_apart} of {len(old.values)} sampled values of {name} changed"
     return ""
 
 

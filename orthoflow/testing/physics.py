@@ -83,7 +83,7 @@ def _match_planes(found: Planes, truth: Planes) -> None:
         fits = (angles_deg < 0.02) & (gaps_m < 0.001)
         require(
             bool(fits.any()),
-            f"plane {index} of a moved room is {angles_deg.min():.3f} deg and "
+            f"plane {index} of a rotated and shifted room is {angles_deg.min():.3f} deg and "
             f"{1000 * gaps_m[np.argmin(angles_deg)]:.2f} mm from the nearest true plane",
         )
 
@@ -95,7 +95,7 @@ def stated_errors_of_planes_hold(subject: Subject) -> None:
         cloud, truth = example_room(seed=seed, n_points=_ROOM_POINTS)
         run = subject.run_on(f"stated{seed}", cloud=cloud)
         ratios += _plane_ratios(output_of(run, "planes", Planes), truth)
-    _check_ratios(ratios, "distances of planes to their true corners")
+    _check_ratios(ratios, "distances of true corners from planes")
 
 
 def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
@@ -140,9 +140,9 @@ def _check_ratios(ratios: list[float], what: str) -> None:
     low, high = _STATED_LIMITS
     require(
         low <= factor <= high,
-        f"{what} are off by {factor:.3g} times what the covariances state (allowed: {low:.2g} to "
-        f"{high:g} times, RMS over {len(ratios)}): state what your fit and the noise that it meets "
-        "give",
+        f"{what} are {factor:.3g} times the standard deviations from the covariances (allowed: "
+        f"{low:.2g} to {high:g} times, RMS over {len(ratios)}): return covariances that "
+        "correspond to your fit and the noise of the points",
     )
 
 
@@ -154,8 +154,8 @@ def poses_are_recovered(subject: Subject) -> None:
         error_m = wall_error_m(photographed_scene(), camera.viewing(), true)
         require(
             error_m < _POSE_LIMIT_M,
-            f"{camera.photo} is oriented {1000 * error_m:.2f} mm beside its true pose on the wall, "
-            f"allowed are {1000 * _POSE_LIMIT_M:.1f} mm",
+            f"the pose of {camera.photo} is off by {1000 * error_m:.2f} mm on the wall; the "
+            f"limit is {1000 * _POSE_LIMIT_M:.1f} mm",
         )
 
 
@@ -188,7 +188,7 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
             _check_cells(scene, image, image.name, painted)
             require(
                 painted.mean() > _JOINED_SHARE,
-                f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are painted, "
+                f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are covered, "
                 "although the layers show all",
             )
 
@@ -205,7 +205,7 @@ def _check_cells(
     truth_grey = 255.0 * scene.grey(*places_of_cells(image.frame))
     where = f"{name} at {image.frame.gsd_m} m"
     share = float(painted.mean())
-    require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is painted")
+    require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is covered")
     gradient: list[NDArray[np.float64]] = list(np.gradient(truth_grey))
     down, across = gradient
     # Shown minus true = gradient * displacement: one displacement per layer, by least squares.
@@ -214,8 +214,11 @@ def _check_cells(
     shift_cells = np.linalg.solve(design.T @ design, design.T @ difference)[:2]
     require(
         bool(np.abs(shift_cells).max() < _SHIFT_LIMIT_CELLS),
-        f"{where}: colours lie {shift_cells[0]:+.2f} columns and {shift_cells[1]:+.2f} rows beside "
-        "their place",
+        f"{where}: colours are shifted by {shift_cells[0]:+.2f} columns and "
+        f"{shift_cells[1]:+.2f} rows",
     )
     off_grey = float(np.median(np.abs(difference)))
-    require(off_grey < 16.0, f"{where}: half of the colours are off by {off_grey:.0f} grey or more")
+    require(
+        off_grey < 16.0,
+        (f"{where}: half of the colours are wrong by {off_grey:.0f} grey levels or more"),
+    )

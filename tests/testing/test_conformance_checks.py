@@ -98,7 +98,7 @@ class Guess(Floor):
 CHEATS: dict[str, tuple[str, str, str]] = {
     "unitless": (
         "parameters-are-documented",
-        "parameter tolerance does not state its unit: end it with one of m, mm, m2, px",
+        "the name of parameter tolerance lacks a unit: end it with one of m, mm, m2, px",
         """
         class Params(MethodParams):
             tolerance: float | None = Field(None, description="Near enough.")
@@ -117,7 +117,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "unitless_metric": (
         "outputs-are-valid",
-        "metric n_walls is none of those that the method declares",
+        "metric n_walls is not declared by the method",
         """
         metrics = ("n_planes",)
 
@@ -128,7 +128,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "lenient": (
         "parameters-round-trip",
-        "an unknown parameter is accepted in silence",
+        "an unknown parameter is accepted",
         """
         class Params(MethodParams):
             model_config = ConfigDict(extra="ignore", frozen=True)
@@ -137,7 +137,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "boasting": (
         "stated-errors-of-planes-hold",
-        "distances of planes to their true corners are off by",
+        "distances of true corners from planes are",
         """
         def covariance(self):
             return 1e-16 * np.eye(4)[np.newaxis]
@@ -155,7 +155,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "global_dice": (
         "global-state-stays-untouched",
-        "draws from numpy's global generator",
+        "uses numpy's global random generator",
         """
         def lift_m(self, cloud, ctx):
             np.random.rand()
@@ -174,7 +174,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "unseeded": (
         "results-repeat",
-        "differs between two runs with one seed in one process",
+        "differs between two runs with the same seed in the same process",
         """
         def lift_m(self, cloud, ctx):
             return float(np.random.default_rng().random())
@@ -198,7 +198,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "backwards": (
         "progress-never-goes-back",
-        "progress goes from 0.800 to 0.300",
+        "progress decreases from 0.800 to 0.300",
         """
         def lift_m(self, cloud, ctx):
             ctx.progress(0.8)
@@ -208,7 +208,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "deaf": (
         "cancel-is-honoured",
-        "a cancelled step ran to its end",
+        "a cancelled step ran to completion",
         """
         def listen(self, ctx):
             pass
@@ -216,7 +216,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "overflowing": (
         "a-huge-coordinate-does-no-harm",
-        "a cloud with a coordinate of 1e30 m ends in ValueError",
+        "a cloud with a coordinate of 1e30 m raises ValueError",
         """
         def lift_m(self, cloud, ctx):
             np.zeros(int(cloud.x.max() / 1e-3) % 10**6 - 10**7 * (cloud.x.max() > 1e6))
@@ -225,7 +225,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "careless": (
         "empty-cloud-is-refused",
-        "a cloud with no points ends in IndexError, not in an OrthoflowError",
+        "a cloud with no points raises IndexError instead of an OrthoflowError",
         """
         def look_at(self, cloud):
             cloud.x[0]
@@ -272,8 +272,8 @@ class Cell(MosaicSeams):
         return self.Out(orthoimages=replace(made, images=images))
 """
 BESIDE_SAYS = {
-    "mosaic.cell": ("mosaics-show-cells-in-place", "wall 0 at 0.006 m: colours lie "),
-    "orient.sure": ("stated-errors-of-poses-hold", "e+03 times what the covariances state"),
+    "mosaic.cell": ("mosaics-show-cells-in-place", "wall 0 at 0.006 m: colours are shifted by "),
+    "orient.sure": ("stated-errors-of-poses-hold", "e+03 times the standard deviations"),
 }
 
 
@@ -421,8 +421,9 @@ def test_a_result_that_moved_without_its_version_is_noticed(
     floor = discover_catalog().method("plane.floor").load()
     monkeypatch.setattr(floor, "lift_m", lambda self, cloud, ctx: 0.1)
     assert problem() == (
-        "output planes is another one than golden.json has (4 of 12 sampled values of corners "
-        "moved), but result_version is 1 still: raise it, or find out why the result moved"
+        "output planes differs from golden.json (4 of 12 sampled values of corners "
+        "changed), but result_version is still 1: increment it, or find out why the result has "
+        "changed"
     )
     assert golden.read_text() == recorded
 

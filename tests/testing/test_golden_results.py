@@ -42,7 +42,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-MOVED = "output planes is another one than golden.json has (6 of 6 sampled values of offset moved)"
+MOVED = "output planes differs from golden.json (6 of 6 sampled values of offset changed)"
 
 
 def test_a_result_that_moved_is_noticed_and_not_recorded(file: Path) -> None:
@@ -90,9 +90,9 @@ def test_what_other_numbers_went_into_is_held_to_its_tolerances_alone(tmp_path: 
 
 def test_an_output_that_appears_and_another_file_are_noticed(file: Path) -> None:
     problem = golden_problem(file, trial(), {"planes": planes(), "walls": planes()})
-    assert problem.startswith("output walls is another one than golden.json has (one of them has")
+    assert problem.startswith("output walls differs from golden.json (one of them has")
     file.write_text('{"plane.mine": {"1": {}}}')
-    with pytest.raises(InputError, match=r"is not a file of golden results .*: remove it"):
+    with pytest.raises(InputError, match=r"is not a valid file of golden results .*: remove it"):
         golden_problem(file, trial(), {"planes": planes()})
 
 

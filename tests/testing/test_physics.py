@@ -39,7 +39,9 @@ def test_planes_may_be_a_fiftieth_of_a_degree_off(
     if fits:
         physics._match_planes(found, truth)
         return
-    with pytest.raises(AssertionError, match=r"plane 0 of a moved room is 0\.030 deg and 0\.00 mm"):
+    with pytest.raises(
+        AssertionError, match=r"plane 0 of a rotated and shifted room is 0\.030 deg and 0\.00 mm"
+    ):
         physics._match_planes(found, truth)
 
 
@@ -58,7 +60,7 @@ def oriented(shift_m: float) -> Any:
 def test_photos_may_be_oriented_a_little_beside_their_true_pose() -> None:
     # A shift along the wall moves every pixel's place by as much: 1 mm is 0.7 mm per coordinate.
     physics.poses_are_recovered(oriented(0.001))
-    with pytest.raises(AssertionError, match=r"a\.png is oriented 0\.99 mm beside its true pose"):
+    with pytest.raises(AssertionError, match=r"the pose of a\.png is off by 0\.99 mm on the wall"):
         physics.poses_are_recovered(oriented(0.0014))
 
 
@@ -97,10 +99,13 @@ def layer(
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        ({"columns": 0.3}, r"a\.png at 0\.01 m: colours lie -0\.\d\d columns and [+-]0\.0\d rows"),
-        ({"rows": -0.3}, r"colours lie [+-]0\.0\d columns and \+0\.\d\d rows beside their place"),
-        ({"share": 0.25}, r"only 25% of the wall is painted"),
-        ({"lighter": 24}, r"half of the colours are off by 2\d grey or more"),
+        (
+            {"columns": 0.3},
+            r"a\.png at 0\.01 m: colours are shifted by -0\.\d\d columns and [+-]0\.0\d rows",
+        ),
+        ({"rows": -0.3}, r"colours are shifted by [+-]0\.0\d columns and \+0\.\d\d rows"),
+        ({"share": 0.25}, r"only 25% of the wall is covered"),
+        ({"lighter": 24}, r"half of the colours are wrong by 2\d grey levels or more"),
     ],
     ids=str,
 )
@@ -129,5 +134,5 @@ def test_a_mosaic_paints_what_its_layers_show(hidden: float, passes: bool) -> No
     if passes:
         physics.mosaics_show_cells_in_place(subject)
         return
-    with pytest.raises(AssertionError, match=r"wall 0 at 0\.006 m: 95% of the cells are painted"):
+    with pytest.raises(AssertionError, match=r"wall 0 at 0\.006 m: 95% of the cells are covered"):
         physics.mosaics_show_cells_in_place(subject)
