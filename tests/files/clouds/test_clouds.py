@@ -12,6 +12,7 @@ import pye57
 import pytest
 from laspy.copc import CopcReader
 from plyfile import PlyData
+from syrupy.assertion import SnapshotAssertion
 
 from orthoflow.files.clouds import attributes, copc
 from orthoflow.files.clouds.attributes import AttributedCloud, describe_cloud, plane_colour
@@ -61,50 +62,45 @@ def with_attributes(**more: Any) -> AttributedCloud:
     return AttributedCloud(**(plain | more))
 
 
-@dataclasses.dataclass
-class Read:
-    """What another program read."""
-
-    world: np.ndarray
-    rgb: np.ndarray
-    normal: np.ndarray
-    fields: dict[str, np.ndarray]
+# Any: an array of any kind.
+Read = dict[str, Any]
 
 
 def read_laz(path: Path) -> Read:
     found = laspy.read(path)
-    names = ("plane", "deviation", "photo")
-    extra = {n: np.asarray(found[n]) for n in names if n in found.point_format.dimension_names}
-    extra["scan"] = np.asarray(found.point_source_id)
-    extra["intensity"] = np.asarray(found.intensity) / 65535.0
-    rgb = np.column_stack([found.red, found.green, found.blue]) / 257.0
-    normal = np.column_stack([found["NormalX"], found["NormalY"], found["NormalZ"]])
-    return Read(found.xyz, rgb, normal, extra)
+    names = [n for n in ("plane", "deviation", "photo") if n in found.point_format.dimension_names]
+    return {
+        "world": found.xyz,
+        "rgb": np.column_stack([found.red, found.green, found.blue]) / 257.0,
+        "normal": np.column_stack([found["NormalX"], found["NormalY"], found["NormalZ"]]),
+        "scan": np.asarray(found.point_source_id),
+        "intensity": np.asarray(found.intensity) / 65535.0,
+        **{name: np.asarray(found[name]) for name in names},
+    }
 
 
 def read_ply(path: Path) -> Read:
     found = PlyData.read(path)["vertex"]
     names = [p.name for p in found.properties]
-
-    def three(*wanted: str) -> np.ndarray:
-        return np.column_stack([found[name] for name in wanted])
-
-    extra = {n: np.asarray(found[n]) for n in names[9:]}
-    return Read(three("x", "y", "z"), three("red", "green", "blue"), three("nx", "ny", "nz"), extra)
+    parts = {"world": "x y z", "rgb": "red green blue", "normal": "nx ny nz"}
+    joined = {
+        part: np.column_stack([found[name] for name in text.split()])
+        for part, text in parts.items()
+    }
+    return joined | {name: np.asarray(found[name]) for name in names[9:]}
 
 
 def read_e57(path: Path) -> Read:
     with pye57.E57(str(path)) as file:
         scans = [file.read_scan(k, intensity=True, colors=True) for k in range(file.scan_count)]
-        sizes = [len(scan["cartesianX"]) for scan in scans]
-
-    def three(prefix: str, *ends: str) -> np.ndarray:
-        return np.vstack([np.column_stack([s[prefix + end] for end in ends]) for s in scans])
-
-    extra = {"scan": np.repeat(np.arange(len(scans)), sizes)}
-    extra["intensity"] = np.concatenate([scan["intensity"] for scan in scans])
-    rgb = three("color", "Red", "Green", "Blue")
-    return Read(three("cartesian", "X", "Y", "Z"), rgb, np.zeros((0, 3)), extra)
+    whole = {name: np.concatenate([scan[name] for scan in scans]) for name in scans[0]}
+    sizes = [len(scan["cartesianX"]) for scan in scans]
+    return {
+        "world": np.column_stack([whole[f"cartesian{axis}"] for axis in "XYZ"]),
+        "rgb": np.column_stack([whole[f"color{name}"] for name in ("Red", "Green", "Blue")]),
+        "scan": np.repeat(np.arange(len(scans)), sizes),
+        "intensity": whole["intensity"],
+    }
 
 
 FORMATS = {
@@ -131,21 +127,21 @@ def test_another_program_reads_every_point_as_it_is(
     order = np.argsort(cloud.scan, kind="stable") if name == "e57" else np.arange(len(cloud))
     # LAZ keeps tenths of a millimetre, doubles of 4e6 m nanometres.
     limit_m = 0.51e-4 if name == "laz" else 2e-9
-    np.testing.assert_allclose(found.world, cloud.points_world()[order], atol=limit_m, rtol=0)
-    np.testing.assert_array_equal(np.rint(found.rgb), cloud.rgb[order])
-    np.testing.assert_array_equal(found.fields["scan"], cloud.scan[order])
-    np.testing.assert_allclose(found.fields["intensity"], cloud.intensity[order], atol=1e-5)
+    np.testing.assert_allclose(found["world"], cloud.points_world()[order], atol=limit_m, rtol=0)
+    np.testing.assert_array_equal(np.rint(found["rgb"]), cloud.rgb[order])
+    np.testing.assert_array_equal(found["scan"], cloud.scan[order])
+    np.testing.assert_allclose(found["intensity"], cloud.intensity[order], atol=1e-5)
     if name == "e57":
         return
-    np.testing.assert_array_equal(found.fields["plane"], labels(cloud).plane_index)
+    np.testing.assert_array_equal(found["plane"], labels(cloud).plane_index)
     on_plane = labels(cloud).plane_index >= 0
-    np.testing.assert_array_equal(np.isfinite(found.fields["deviation"]), on_plane)
-    np.testing.assert_allclose(found.fields["deviation"][on_plane], DEVIATION_M, atol=1e-6)
+    np.testing.assert_array_equal(np.isfinite(found["deviation"]), on_plane)
+    np.testing.assert_allclose(found["deviation"][on_plane], DEVIATION_M, atol=1e-6)
     # Away from the edge, where two surfaces meet, normals are those of wall and floor.
     away = (cloud.x + cloud.z > 0.5) & (cloud.y > 0.0)
     is_wall = np.arange(len(cloud)) < N_SIDE**2
     truth = np.where(is_wall[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    np.testing.assert_allclose(found.normal[away], truth[away], atol=1e-4)
+    np.testing.assert_allclose(found["normal"][away], truth[away], atol=1e-4)
 
 
 def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
@@ -218,53 +214,48 @@ def test_the_same_cloud_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_e57_keeps_a_pose_per_scan_and_fields_as_extensions(tmp_path: Path) -> None:
-    write_e57(tmp_path / "a.e57", with_attributes(crs_wkt="PROJCS[x]"))
-    with pye57.E57(str(tmp_path / "a.e57")) as file:
-        assert file.root["coordinateMetadata"].value() == "PROJCS[x]"
-        headers = [file.get_header(k) for k in range(file.scan_count)]
-        np.testing.assert_allclose([h.translation for h in headers], STATIONS)
-        assert {"nor:normalX", "orthoflow:plane", "orthoflow:deviation"} <= set(
-            headers[0].point_fields
-        )
-    without = corner(stations=None, stations_source=None)
-    write_e57(tmp_path / "b.e57", with_attributes(cloud=without))
-    with pye57.E57(str(tmp_path / "b.e57")) as file:
-        np.testing.assert_allclose(file.get_header(0).translation, ORIGIN)
-
-
-def test_an_e57_says_of_each_scan_what_it_holds(tmp_path: Path) -> None:
+def test_an_e57_says_of_each_scan_what_it_holds(
+    tmp_path: Path, snapshot: SnapshotAssertion
+) -> None:
     cloud = corner()
     path = tmp_path / "a.e57"
-    write_e57(path, with_attributes())
+    write_e57(path, with_attributes(crs_wkt="PROJCS[x]"))
     points = cloud.points_world()
+    colours = ("colorRed", "colorGreen", "colorBlue")
     with pye57.E57(str(path)) as file:
         root = file.image_file.root()
+        assert root["coordinateMetadata"].value() == "PROJCS[x]"
         created = root["creationDateTime"]
         assert created["dateTimeValue"].value() == created["isAtomicClockReferenced"].value() == 0
         for scan in (0, 1):
             node = root["data3D"][scan]
             assert node["name"].value() == f"scan {scan}"
+            np.testing.assert_allclose(file.get_header(scan).translation, STATIONS[scan])
             own = points[cloud.scan == scan] - STATIONS[scan]
             bounds = limits_of(node["cartesianBounds"], *"xyz")
-            assert np.ravel(bounds) == pytest.approx(
-                np.ravel(list(zip(own.min(axis=0), own.max(axis=0), strict=True))), abs=1e-8
+            np.testing.assert_allclose(
+                np.transpose(bounds), [own.min(axis=0), own.max(axis=0)], atol=1e-8
             )
-            colours = ("colorRed", "colorGreen", "colorBlue")
             assert limits_of(node["colorLimits"], *colours) == [(0, 255)] * 3
             assert limits_of(node["intensityLimits"], "intensity") == [(0.0, 1.0)]
             turned = node["pose"]["rotation"]
             assert [turned[name].value() for name in "wxyz"] == [1.0, 0.0, 0.0, 0.0]
-            fields = pye57.libe57.StructureNode(node["points"].prototype())
-            ranges = {**dict.fromkeys(colours, (0, 255)), "cartesianInvalidState": (0, 2)}
-            ranges |= {"orthoflow:plane": (-32_768, 32_767), "intensity": (0.0, 1.0)}
-            for name, ends in ranges.items():
-                assert (fields[name].minimum(), fields[name].maximum()) == ends
-            assert fields["cartesianInvalidState"].value() == 0
             # Metres from the scanner have every digit, normals and distances those of float32.
-            assert fields["cartesianX"].precision() == pye57.libe57.E57_DOUBLE
-            for name in ("nor:normalZ", "orthoflow:deviation", "intensity"):
-                assert fields[name].precision() == pye57.libe57.E57_SINGLE
+            fields = pye57.libe57.StructureNode(node["points"].prototype())
+            found = {
+                name: [
+                    getattr(fields[name], limit, lambda: "")()
+                    for limit in ("minimum", "maximum", "precision")
+                ]
+                for name in file.get_header(scan).point_fields
+            }
+            assert {name: list(map(str, limits)) for name, limits in found.items()} == snapshot(
+                name="fields"
+            )
+    without = corner(stations=None, stations_source=None)
+    write_e57(tmp_path / "b.e57", with_attributes(cloud=without))
+    with pye57.E57(str(tmp_path / "b.e57")) as file:
+        np.testing.assert_allclose(file.get_header(0).translation, ORIGIN)
 
 
 def limits_of(node: Any, *names: str) -> list[tuple[float, float]]:
@@ -275,12 +266,12 @@ def limits_of(node: Any, *names: str) -> list[tuple[float, float]]:
 def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:
     cloud = corner()
     write_laz(tmp_path / "a.laz", with_attributes(colouring="intensity"))
-    grey = read_laz(tmp_path / "a.laz").rgb
+    grey = read_laz(tmp_path / "a.laz")["rgb"]
     assert (grey[:, 0] == grey[:, 1]).all()
     assert (np.diff(grey[:, 0]) >= 0).all()
     assert (grey[0, 0], grey[-1, 0]) == (0, 255)
     write_laz(tmp_path / "b.laz", with_attributes(colouring="plane"))
-    by_plane = read_laz(tmp_path / "b.laz").rgb
+    by_plane = read_laz(tmp_path / "b.laz")["rgb"]
     for plane in (-1, 0, 1):
         mine = by_plane[labels(cloud).plane_index == plane]
         shade = mine.max(axis=1) / max(plane_colour(plane))
@@ -290,7 +281,7 @@ def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:
     attributed = with_attributes(colouring="deviation")
     assert attributed.scale_m == 0.005
     write_laz(tmp_path / "c.laz", attributed)
-    by_distance = read_laz(tmp_path / "c.laz").rgb
+    by_distance = read_laz(tmp_path / "c.laz")["rgb"]
     on_plane = labels(cloud).plane_index >= 0
     # 4 of 5 mm: four fifths of the way from white to red.
     assert set(map(tuple, np.rint(by_distance[on_plane]).tolist())) == {(192, 69, 84)}
@@ -312,10 +303,10 @@ def test_only_what_is_asked_for_is_written(tmp_path: Path) -> None:
     # The floor, up to 2 m from the plane of the wall, is not written and sets no scale.
     assert with_attributes(wall=slab, wall_plane=0).scale_m == 0.1
     # Of points on no plane as well, and of those of the floor beside the wall.
-    np.testing.assert_allclose(found.fields["deviation"], cloud.x[expected], atol=1e-6)
+    np.testing.assert_allclose(found["deviation"], cloud.x[expected], atol=1e-6)
     box = ORIGIN + np.array([[0.5, 0.5, -1.0], [1.0, 1.5, 1.0]])
     write_ply(tmp_path / "a.ply", with_attributes(box_world=box))
-    inside = read_ply(tmp_path / "a.ply").world
+    inside = read_ply(tmp_path / "a.ply")["world"]
     assert ((inside >= box[0]) & (inside <= box[1])).all()
     expected = np.all((cloud.points_world() >= box[0]) & (cloud.points_world() <= box[1]), axis=1)
     assert len(inside) == np.count_nonzero(expected)

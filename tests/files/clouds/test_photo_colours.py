@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,19 @@ def cloud(points_m: NDArray[np.float64]) -> PointCloud:
     return PointCloud(origin=ORIGIN, x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]))
 
 
+def photo(grey: int) -> Photo:
+    encoded = encode_png(np.full((HEIGHT, WIDTH, 3), grey, np.uint8))
+    return Photo(name=f"{grey}.png", width=WIDTH, height=HEIGHT, encoded=encoded)
+
+
+def colours_of(count: int) -> PointColours:
+    return PointColours(
+        rgb=np.full((count, 3), 99, dtype=np.uint8),
+        best=np.zeros(count, dtype=np.float32),
+        photo=np.full(count, -1, dtype=np.int16),
+    )
+
+
 @pytest.mark.parametrize("keeps_photo", [True, False])
 def test_a_point_gets_the_colour_of_the_photo_that_shows_it_largest(keeps_photo: bool) -> None:
     rng = np.random.default_rng(1)
@@ -39,21 +53,10 @@ def test_a_point_gets_the_colour_of_the_photo_that_shows_it_largest(keeps_photo:
         [rng.uniform(-3.0, 3.0, 4_000), np.full(4_000, 2.0), rng.uniform(-1.4, 1.4, 4_000)]
     )
     cameras = [camera(), camera((0.8, 1.0, 0.0))]
-    photos = [
-        Photo(
-            name=f"{k}.png",
-            width=WIDTH,
-            height=HEIGHT,
-            encoded=encode_png(np.full((HEIGHT, WIDTH, 3), grey, np.uint8)),
-        )
-        for k, grey in enumerate((40, 200))
-    ]
-    colours = PointColours(
-        rgb=np.full((4_000, 3), 99, dtype=np.uint8),
-        best=np.zeros(4_000, dtype=np.float32),
-        photo=np.full(4_000, -1, dtype=np.int16) if keeps_photo else None,
-    )
-    colour_points(cloud(points), list(zip(photos, cameras, strict=True)), colours)
+    colours = colours_of(4_000)
+    if not keeps_photo:
+        colours = replace(colours, photo=None)
+    colour_points(cloud(points), list(zip(map(photo, (40, 200)), cameras, strict=True)), colours)
     qualities = []
     for one in cameras:
         placed = one.project(points + ORIGIN)
@@ -77,14 +80,8 @@ def test_a_point_behind_a_board_is_not_coloured() -> None:
     a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1.0, 1.0, 161)] * 2))
     wall = np.column_stack([2.0 * a, np.full(len(a), 4.0), b])
     board = np.column_stack([0.25 * a, np.full(len(a), 2.0), 0.25 * b])
-    grey = encode_png(np.full((HEIGHT, WIDTH, 3), 40, np.uint8))
-    photo = Photo(name="a.png", width=WIDTH, height=HEIGHT, encoded=grey)
-    colours = PointColours(
-        rgb=np.full((2 * len(a), 3), 99, np.uint8),
-        best=np.zeros(2 * len(a), np.float32),
-        photo=np.full(2 * len(a), -1, np.int16),
-    )
-    colour_points(cloud(np.vstack([wall, board])), [(photo, camera(focal=150.0))], colours)
+    colours = colours_of(2 * len(a))
+    colour_points(cloud(np.vstack([wall, board])), [(photo(40), camera(focal=150.0))], colours)
     assert colours.photo is not None
     # The board, 0.25 m at 2 m, hides 0.5 m at 4 m.
     off = np.maximum(np.abs(2.0 * a), np.abs(b))

@@ -210,8 +210,8 @@ def test_text_columns_are_known_by_header_or_by_number(
 ) -> None:
     (block,) = read_all(text(name, content)(tmp_path))
     np.testing.assert_array_equal(block.points, [[1, 2, 3]])
-    assert (None if block.rgb is None else block.rgb.tolist()[0]) == rgb
-    assert (None if block.intensity is None else float(block.intensity[0])) == intensity
+    for found, right in ((block.rgb, rgb), (block.intensity, intensity)):
+        assert (None if found is None else found.tolist()[0]) == right
 
 
 def test_the_user_can_say_what_the_columns_are(tmp_path: Path) -> None:
@@ -267,36 +267,30 @@ def test_a_pcd_grid_has_rows_and_comments_are_no_entries(tmp_path: Path) -> None
     assert block.row is None
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_pcd_values_of_several_numbers_stand_between_those_of_one(
-    count: int, tmp_path: Path
-) -> None:
+def test_pcd_values_of_several_numbers_stand_between_those_of_one(tmp_path: Path) -> None:
     head = (
-        f"FIELDS x y histogram z\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 {count} 1\n"
+        "FIELDS x y histogram z\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 3 1\n"
         "WIDTH 2\nHEIGHT 1\nPOINTS 2\n"
     )
-    rows = np.arange(2 * (3 + count), dtype="<f4").reshape(2, -1)
+    rows = np.arange(12, dtype="<f4").reshape(2, -1)
     lines = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist())
     for data, content in (("ascii", lines.encode()), ("binary", rows.tobytes())):
         path = text("a.pcd", f"{head}DATA {data}\n".encode() + content)(tmp_path)
         np.testing.assert_array_equal(read_points(path), rows[:, [0, 1, -1]])
 
 
-@pytest.mark.parametrize(
-    ("reference", "plain"),
-    [
+def test_lzf_repeats_what_it_refers_to() -> None:
+    for reference, plain in (
         # Three bits of length less two, the distance less one; 7 takes a byte more of length.
         (b"\x20\x02", b"abcabc"),
         (b"\xc0\x01", b"abcbcbcbcbc"),
         (b"\xe0\x05\x02", b"abc" + b"abcabcabcabcab"),
+        # Before the beginning.
         (b"\x21\x02", None),
-    ],
-    ids=["short", "overlapping", "long", "before the beginning"],
-)
-def test_lzf_repeats_what_it_refers_to(reference: bytes, plain: bytes | None) -> None:
-    found = np.zeros(64, np.uint8)
-    count = decompress_lzf(np.frombuffer(b"\x02abc" + reference, np.uint8), found)
-    assert (found[:count].tobytes() if count >= 0 else None) == plain
+    ):
+        found = np.zeros(64, np.uint8)
+        count = decompress_lzf(np.frombuffer(b"\x02abc" + reference, np.uint8), found)
+        assert (found[:count].tobytes() if count >= 0 else None) == plain
 
 
 def test_a_ptx_file_of_fewer_lines_than_places_is_read_without_its_grid(tmp_path: Path) -> None:
@@ -339,24 +333,20 @@ def test_a_tilted_e57_scanner_turns_each_axis_where_its_pose_says(
     np.testing.assert_allclose(block.points, expected, atol=1e-14)
 
 
-def test_e57_leaves_out_points_without_a_position(tmp_path: Path) -> None:
+def test_e57_points_are_cartesian_or_spherical_and_some_have_no_position(tmp_path: Path) -> None:
     state = np.arange(40) % 3
     fields = scan_files.cartesian(POINTS, cartesianInvalidState=state, intensity=np.arange(40.0))
-    (block,) = read_all(e57(tmp_path, fields))
-    np.testing.assert_allclose(block.points, POINTS[state == 0], atol=1e-6)
-    np.testing.assert_array_equal(block.intensity, np.flatnonzero(state == 0))
-    assert (block.n_read, block.left_out) == (40, {"invalid": 26})
-
-
-def test_e57_spherical_coordinates_become_cartesian(tmp_path: Path) -> None:
     distance = np.linalg.norm(POINTS, axis=1)
-    fields = {
+    spherical = {
         "sphericalRange": distance,
         "sphericalAzimuth": np.arctan2(POINTS[:, 1], POINTS[:, 0]),
         "sphericalElevation": np.arcsin(POINTS[:, 2] / distance),
     }
-    (block,) = read_all(e57(tmp_path, fields))
-    np.testing.assert_allclose(block.points, POINTS, atol=1e-12)
+    first, second = read_all(e57(tmp_path, fields, spherical))
+    np.testing.assert_allclose(first.points, POINTS[state == 0], atol=1e-6)
+    np.testing.assert_array_equal(first.intensity, np.flatnonzero(state == 0))
+    assert (first.n_read, first.left_out) == (40, {"invalid": 26})
+    np.testing.assert_allclose(second.points, POINTS, atol=1e-12)
 
 
 def vector(n_children: int) -> str:
@@ -409,11 +399,9 @@ def test_whatever_a_library_throws_becomes_one_sentence(error: BaseException) ->
         raise error
     assert "\n" not in str(caught.value)
     assert caught.value.__cause__ is error
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OrthoflowError("own")])
-def test_interrupts_and_own_errors_pass(error: BaseException) -> None:
-    with pytest.raises(type(error)), reading(Path("a.laz"), "LAZ"):
-        raise error
+    # Interrupts and our own errors pass.
+    for own in (KeyboardInterrupt(), OrthoflowError("own")):
+        with pytest.raises(type(own)), reading(Path("a.laz"), "LAZ"):
+            raise own
     with pytest.raises(PluginError, match=r"a\.foo needs the library no_such_reader"):
         load_library("no_such_reader", Path("a.foo"))
