@@ -18,7 +18,6 @@ from orthoflow.files.calibration import (
     write_calibration,
 )
 from orthoflow.files.cube_faces import FisheyeLens
-from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Calibration, Intrinsics
 
 GOOD = "width: 4000, height: 3000, fx: 3000, fy: 3001.5, cx: 1999.5, cy: 1500"
@@ -43,15 +42,8 @@ def refusal(folder: Path, text: str) -> str:
 
 
 def camera(width: int = 4000, height: int = 3000) -> Intrinsics:
-    return Intrinsics(
-        width=width,
-        height=height,
-        fx=3004.25,
-        fy=3003.125,
-        cx=2000.5,
-        cy=1499.0,
-        distortion=(-0.08, 0.05, 1e-4, -2e-4, 0.003),
-    )
+    lens = Intrinsics(width=width, height=height, fx=3004.25, fy=3003.125, cx=2000.5, cy=1499.0)
+    return replace(lens, distortion=(-0.08, 0.05, 1e-4, -2e-4, 0.003))
 
 
 def test_pixels_are_converted_from_opencv_to_ours(tmp_path: Path) -> None:
@@ -62,23 +54,12 @@ def test_pixels_are_converted_from_opencv_to_ours(tmp_path: Path) -> None:
     )
     ours = the_lens(calibration)
     assert (ours.cx, ours.cy, ours.source) == (2000.0, 1500.5, "calibration")
-    viewing = ViewingCamera(
-        width=4000,
-        height=3000,
-        fx=ours.fx,
-        fy=ours.fy,
-        cx=ours.cx,
-        cy=ours.cy,
-        distortion=np.array(ours.distortion),
-        rotation=np.eye(3),
-        translation=np.zeros(3),
-    )
     points = np.random.default_rng(1).uniform([-1, -1, 3], [1, 1, 5], (50, 3))
     matrix = np.array([[3000, 0, 1999.5], [0, 3001.5, 1500], [0, 0, 1]])
     lens = np.array([-0.1, 0.02, 1e-3, -2e-3, 0.001])
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)
     np.testing.assert_allclose(
-        viewing.project(points)[:, :2], theirs.reshape(-1, 2) + 0.5, atol=1e-8
+        ours.posed().project(points)[:, :2], theirs.reshape(-1, 2) + 0.5, atol=1e-8
     )
 
 
@@ -98,25 +79,11 @@ def test_a_fisheye_has_terms_of_its_own(tmp_path: Path) -> None:
     entry = "{model: fisheye, " + GOOD + ", distortion: [0.04, 0.01, -0.01, 0.002]}"
     wide = entry.replace("}", ", field_of_view_deg: 200, skew: 2}")
     calibration = read(tmp_path, f"cameras:\n  a.jpg: {entry}\n  b.jpg: {wide}\n")
-    plain = FisheyeLens(
-        width=4000,
-        height=3000,
-        fx=3000.0,
-        fy=3001.5,
-        cx=2000.0,
-        cy=1500.5,
-        radial=(0.04, 0.01, -0.01, 0.002),
-    )
+    plain = FisheyeLens(width=4000, height=3000, fx=3000.0, fy=3001.5, cx=2000.0, cy=1500.5)
+    plain = replace(plain, radial=(0.04, 0.01, -0.01, 0.002))
     assert calibration.lenses == (plain, replace(plain, skew=2.0, field_of_view_deg=200.0))
     without = read(tmp_path, "cameras: {a: {model: fisheye, " + GOOD + "}}").lenses
     assert without == (replace(plain, radial=(0.0, 0.0, 0.0, 0.0)),)
-
-
-def folds(radii: np.ndarray, k1: float, k2: float, k3: float) -> bool:
-    """Whether the distorted radius ever shrinks on the way to the corner, by plain differences."""
-    squares = radii**2
-    bent = radii * (1.0 + squares * (k1 + squares * (k2 + squares * k3)))
-    return bool((np.diff(bent) <= 0.0).any())
 
 
 @pytest.mark.parametrize("place", [0, 1, 4], ids=["k1", "k2", "k3"])
@@ -130,8 +97,6 @@ def test_a_lens_is_refused_just_where_its_radius_turns_back(tmp_path: Path, plac
     for share, is_refused in ((0.97, False), (1.03, True)):
         lens = [0.0] * 5
         lens[place] = share * limit
-        radii = np.linspace(0.0, radius, 2000)
-        assert folds(radii, lens[0], lens[1], lens[4]) is is_refused
         text = f"cameras: {{a.jpg: {{{entry}, distortion: {lens}}}}}"
         if is_refused:
             assert "the lens model folds back inside the image" in refusal(tmp_path, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
@@ -19,7 +20,8 @@ from orthoflow.files.drawing import (
     round_scale,
 )
 from orthoflow.files.images import decode_image
-from orthoflow.geometry import WallFrame, frame_over
+from orthoflow.geometry import frame_over
+from tests import samples
 
 
 def test_no_letter_is_smaller_than_six_points_at_the_width_of_a_column() -> None:
@@ -59,28 +61,22 @@ def test_a_picture_keeps_its_proportions_and_leaves_room(shape: tuple[int, int])
 @pytest.mark.parametrize(
     ("up", "normal", "axes", "left", "top"),
     [
-        ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0), ("along the wall [m]", "height [m]"), 2.5, 6.0),
-        ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), ("x [m]", "y [m]"), 4.0, 5.0),
-        (None, (0.0, -1.0, 0.0), ("across [m]", "up [m]"), 0.0, 0.0),
+        ((0.0, 0.0, 1.0), [0.0, -1.0, 0.0], ("along the wall [m]", "height [m]"), 2.5, 6.0),
+        ((0.0, 0.0, 1.0), [0.0, 0.0, 1.0], ("x [m]", "y [m]"), 4.0, 5.0),
+        (None, [0.0, -1.0, 0.0], ("across [m]", "up [m]"), 0.0, 0.0),
     ],
 )
 def test_a_picture_of_a_wall_has_the_axes_of_its_files(
     up: tuple[float, float, float] | None,
-    normal: tuple[float, float, float],
+    normal: list[float],
     axes: tuple[str, str],
     left: float,
     top: float,
 ) -> None:
-    normal_world = np.array(normal)
-    u_world = np.array([1.0, 0.0, 0.0])
-    frame = WallFrame(
-        origin_world=np.array([4.0, 5.0, 6.0]),
-        u_world=u_world,
-        v_world=np.cross(u_world, normal_world),
-        normal_world=normal_world,
-        gsd_m=0.01,
-        width=200,
-        height=100,
+    frame = replace(
+        samples.facing_south(0.01, 200, 100, (4.0, 5.0, 6.0)),
+        v_world=np.cross([1.0, 0.0, 0.0], normal),
+        normal_world=np.array(normal),
         left_m=2.5,
         up=up,
     )
@@ -92,11 +88,9 @@ def test_a_picture_of_a_wall_has_the_axes_of_its_files(
     along, up_axis = shown.child_axes
     assert (along.get_xlabel(), up_axis.get_ylabel()) == axes
     # A number stands where its place in the raster is drawn.
-    column, row = 60.0, 30.0
-    drawn = shown.transData.transform((column, row))
-    down = 0.01 * row
-    assert along.transData.transform((left + 0.01 * column, 0.0))[0] == pytest.approx(drawn[0])
-    assert up_axis.transData.transform((0.0, top - down))[1] == pytest.approx(drawn[1])
+    drawn = shown.transData.transform((60.0, 30.0))
+    assert along.transData.transform((left + 0.6, 0.0))[0] == pytest.approx(drawn[0])
+    assert up_axis.transData.transform((0.0, top - 0.3))[1] == pytest.approx(drawn[1])
 
 
 def test_means_of_a_large_map_leave_out_what_is_unknown() -> None:

@@ -12,8 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
@@ -98,16 +96,6 @@ def test_tags_that_share_the_bytes_of_a_file_take_no_more_memory_than_it() -> No
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 30_000_000
-
-
-@given(st.binary(max_size=200), st.integers(0, 200))
-def test_no_block_of_any_content_raises(noise: bytes, at: int) -> None:
-    block = made.exif_block(MAIN, INNER)
-    for content in (b"II*\0" + noise, block[:at] + noise, block[:at] + noise + block[at:]):
-        exif = read_exif(made.jpeg(made.picture(8, 8), content))
-        focal = focal_length(exif, 64, 48)
-        assert 1 <= exif.orientation <= 8
-        assert focal.value_px is None or focal.value_px > 0.0
 
 
 # Focal length

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,19 +27,12 @@ def test_all_columns_are_read_in_any_order(tmp_path: Path, mark: str) -> None:
     lines += ["P1,flat,634512.3475,-2,1e-3,0,20.25,10.5", " ", "P 2,,4,5,6,,,", "  # the end"]
     lines += ["P3,flat,7,8,9,32000,1,2"]
     text = "\r\n".join(lines)
-    assert read(tmp_path, text.replace(",", mark)) == (
-        SurveyPoint(
-            name="P1",
-            position=(634512.3475, -2.0, 0.001),
-            class_name="flat",
-            wall=0,
-            pixel_wall=(10.5, 20.25),
-        ),
-        SurveyPoint(name="P 2", position=(4, 5, 6), class_name="", wall=None, pixel_wall=None),
-        SurveyPoint(
-            name="P3", position=(7, 8, 9), class_name="flat", wall=32_000, pixel_wall=(2, 1)
-        ),
-    )
+    first, second, third = read(tmp_path, text.replace(",", mark))
+    plain = SurveyPoint(name="P1", position=(634512.3475, -2.0, 0.001), class_name="flat")
+    assert first == replace(plain, wall=0, pixel_wall=(10.5, 20.25))
+    assert second == SurveyPoint(name="P 2", position=(4, 5, 6))
+    third_is = replace(plain, name="P3", position=(7, 8, 9), wall=32_000, pixel_wall=(2, 1))
+    assert third == third_is
 
 
 @pytest.mark.parametrize(
@@ -58,24 +52,15 @@ def test_usual_exports_are_read(tmp_path: Path, text: str, classes: tuple[str, s
     )
 
 
-def test_points_measured_in_metres(tmp_path: Path) -> None:
-    points = read(
-        tmp_path, "name,x,y,z,map_x,map_y,wall\nA,1,2,3,634512.5,486215,\nB,1,2,3,4,-5,2\n"
-    )
-    assert [(point.place_m, point.wall, point.pixel_wall) for point in points] == [
-        ((634512.5, 486215.0), None, None),
-        ((4.0, -5.0), 2, None),
-    ]
-
-
-def test_points_by_what_is_shown_where_they_were_measured(tmp_path: Path) -> None:
+def test_points_measured_in_metres_or_by_what_is_shown_there(tmp_path: Path) -> None:
+    head = "name,x,y,z,wall,map_x,map_y"
+    first, second = read(tmp_path, f"{head}\nA,1,2,3,,634512.5,486215\nB,1,2,3,2,4,-5\n")
+    assert (first.place_m, first.wall, first.pixel_wall) == ((634512.5, 486215.0), None, None)
+    assert (second.place_m, second.wall) == ((4.0, -5.0), 2)
     head = "name,x,y,z,wall,shown_x,shown_y,shown_z"
-    text = f"{head}\nA,1,2,3,2,1.5,2.5,3.5\nB,1,2,3,,4,5,6\nC,1,2,3,,,,\n"
-    assert [(point.shown_m, point.wall, point.pixel_wall) for point in read(tmp_path, text)] == [
-        ((1.5, 2.5, 3.5), 2, None),
-        ((4.0, 5.0, 6.0), None, None),
-        (None, None, None),
-    ]
+    first, second = read(tmp_path, f"{head}\nA,1,2,3,2,1.5,2.5,3.5\nC,1,2,3,,,,\n")
+    assert (first.shown_m, first.wall, first.pixel_wall) == ((1.5, 2.5, 3.5), 2, None)
+    assert (second.shown_m, second.wall) == (None, None)
 
 
 def test_ties_know_how_exactly_they_were_measured_where_somebody_says_so(tmp_path: Path) -> None:

@@ -63,7 +63,6 @@ from tests.files.test_e57_images import pinhole, spherical, written
 from tests.files.test_exif import INNER, MAIN
 from tests.files.test_given_cameras import HEAD as REALITYCAPTURE
 from tests.files.test_given_cameras import oriented
-from tests.files.test_other_programs import BUNDLE
 from tests.files.test_polygons import HOLE, SQUARE, feature, features
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import (
@@ -269,7 +268,8 @@ def _camera_files(folder: Path) -> None:
     for suffix in ("txt", "bin"):
         (folder / f"points3D.{suffix}").unlink()
     (folder / "metashape.xml").write_text(_METASHAPE)
-    (folder / "bundle.out").write_text(BUNDLE)
+    pose = "60 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n"
+    (folder / "bundle.out").write_text(f"# Bundle file v0.3\n2 0\n{2 * pose}")
     (folder / "list.txt").write_text("walls/a.jpg 0 60.5\nwalls/b.jpg\n")
     row = "a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
     (folder / "list.csv").write_text(REALITYCAPTURE + row)

@@ -46,14 +46,8 @@ def box_cloud() -> PointCloud:
     table = np.random.default_rng(7).uniform([2.0, 1.5, 0.0], [2.6, 1.9, 1.5], (40_000, 3))
     points = box_points(np.concatenate([*places, table]))
     origin = points.mean(axis=0)
-    x, y, z = (points - origin).astype(np.float32).T
-    return PointCloud(
-        origin=origin,
-        x=np.ascontiguousarray(x),
-        y=np.ascontiguousarray(y),
-        z=np.ascontiguousarray(z),
-        up=np.array([0.0, 0.0, 1.0]),
-    )
+    x, y, z = np.ascontiguousarray((points - origin).T, dtype=np.float32)
+    return PointCloud(origin=origin, x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]))
 
 
 def test_a_plan_has_the_corners_of_the_room_in_world_coordinates() -> None:
@@ -96,18 +90,12 @@ def test_two_sides_of_a_wall_give_its_thickness() -> None:
     planes = box_planes()
     inside = int(np.argmax(planes.normal @ AXES[1]))  # the wall y = 0, whose normal is y
     shift = -0.4 * AXES[1]
-    both = replace(
-        planes,
-        normal=np.vstack([planes.normal, -planes.normal[inside]]),
-        offset=np.append(planes.offset, 0.4 - planes.offset[inside]),
-        corners=np.concatenate([planes.corners, (planes.corners[inside] + shift)[None]]),
-        covariance=np.concatenate([planes.covariance, planes.covariance[inside][None]]),
-        n_points=np.append(planes.n_points, 1000),
-        rms_m=np.append(planes.rms_m, 0.001),
-        names=(*planes.names, f"wall {len(planes)}"),
-        part_corners=None,
-        part_plane=None,
-    )
+    arrays = ("normal", "offset", "corners", "covariance", "n_points", "rms_m")
+    twice = {name: np.append(v := getattr(planes, name), v[[inside]], axis=0) for name in arrays}
+    both = replace(planes, **twice, names=(*planes.names, f"wall {len(planes)}"))
+    both.normal[-1] *= -1.0
+    both.offset[-1] = 0.4 - planes.offset[inside]
+    both.corners[-1] += shift
     section = section_of(plan_cut(both, 1.2), both)
     thickness = {line.plane: line.thickness_m for line in section.lines}
     assert thickness.pop(inside) == pytest.approx(0.4, abs=1e-6)
@@ -118,7 +106,7 @@ def test_two_sides_of_a_wall_give_its_thickness() -> None:
 def test_a_cut_that_meets_nothing_is_refused() -> None:
     with pytest.raises(ArgumentError, match="meets no plane"):
         section_of(section_cut(box_planes(), [0.0, 0.0, 1.0, 0.0]), box_planes())
-    with pytest.raises(ArgumentError, match="twice"):
+    with pytest.raises(ArgumentError, match="two different points"):
         section_cut(box_planes(), [1.0, 2.0, 1.0, 2.0])
 
 
