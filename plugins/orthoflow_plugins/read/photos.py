@@ -68,19 +68,9 @@ NO_PHOTOS: Final = DiagnosticSpec(
     "HEIC) and were left out: {names}",
     rank_by="n",
 )
-EXIF_DAMAGED: Final = DiagnosticSpec(
-    code="exif-damaged",
-    text="the EXIF data of {photos} are damaged; the readable part was used",
-    rank_by="n",
-)
 REMARK: Final = DiagnosticSpec(
     code="photo-file-limited",
     text="{photos}: {remark}",
-    rank_by="n",
-)
-EXIF_IMPOSSIBLE: Final = DiagnosticSpec(
-    code="exif-impossible",
-    text="{photos}: {doubt}: it is ignored",
     rank_by="n",
 )
 FOCAL_UNKNOWN: Final = DiagnosticSpec(
@@ -215,7 +205,6 @@ class ReadPhotos(Method):
 @dataclass(frozen=True, kw_only=True)
 class _ReadPhoto:
     photo: Photo
-    exif: Exif
     focal: FocalLength
     whole: str = ""
     remarks: tuple[str, ...] = ()
@@ -496,10 +485,11 @@ def _read_photo(
         "boundaries: check it, copy it again from the camera, or remove it",
         f"contains bytes that the decoder skips ({odd}), so it may be damaged" if odd else "",
         f"has {n_pages} pages, of which the largest is read" if n_pages > 1 else "",
+        "has damaged EXIF data, of which the readable part was used" if exif.is_damaged else "",
+        f"{focal.doubt}: it is ignored" if focal.doubt else "",
     )
     return _ReadPhoto(
         photo=photo,
-        exif=exif,
         focal=focal,
         whole=source.whole,
         remarks=tuple(filter(None, remarks)),
@@ -516,16 +506,9 @@ def _camera(exif: Exif) -> str:
 def _warn(
     ctx: StepContext, read: Sequence[_ReadPhoto], calibration: CalibratedLenses | None
 ) -> None:
-    damaged = [item.photo.name for item in read if item.exif.is_damaged]
-    if damaged:
-        ctx.report(EXIF_DAMAGED, n=len(damaged), photos=_counted(damaged))
     for remark in dict.fromkeys(remark for item in read for remark in item.remarks):
         names = [item.photo.name for item in read if remark in item.remarks]
         ctx.report(REMARK, subject=remark, n=len(names), photos=_counted(names), remark=remark)
-    doubts = dict.fromkeys(item.focal.doubt for item in read if item.focal.doubt)
-    for doubt in doubts:
-        doubted = [item.photo.name for item in read if item.focal.doubt == doubt]
-        ctx.report(EXIF_IMPOSSIBLE, n=len(doubted), photos=_counted(doubted), doubt=doubt)
     if calibration is not None:
         _warn_of_matches(ctx, read, calibration)
     unknown = [

@@ -38,9 +38,9 @@ NO_EFFECT: Final = DiagnosticSpec(
     text="{step}.{setting} has no effect: {why}",
 )
 FILE_NOTE: Final = DiagnosticSpec(code="scan-file-differs", text="{text}")
-COLOURS_ZERO: Final = DiagnosticSpec(
-    code="scan-colours-zero",
-    text="{subject}: the colours of all points are zero: they are treated as missing, not as black",
+FIELD_ZERO: Final = DiagnosticSpec(
+    code="scan-field-zero",
+    text="{subject}: the {field} of all points is zero: it is treated as missing, not as black",
 )
 COLOUR_LIMIT: Final = DiagnosticSpec(
     code="scan-colour-limit-misfit",
@@ -56,10 +56,6 @@ COLOUR_DEPTH: Final = DiagnosticSpec(
 COLOURS_GREY: Final = DiagnosticSpec(
     code="scan-colours-grey",
     text="the colours are all grey and follow the intensity: they do not come from photos",
-)
-INTENSITY_ZERO: Final = DiagnosticSpec(
-    code="scan-intensity-zero",
-    text="{subject}: the intensity of all points is zero: it is treated as missing",
 )
 INTENSITY_LIMITS: Final = DiagnosticSpec(
     code="scan-intensity-limits-misfit",
@@ -84,14 +80,9 @@ INTENSITY_LUMINANCE: Final = DiagnosticSpec(
     text="the intensity is not laser intensity but the luminance of the colours (correlation "
     "{correlation:.5f}): it is ignored, the colours contain it",
 )
-SCAN_WITHOUT: Final = DiagnosticSpec(
-    code="scan-without-field",
-    text="{subject} has no {field}: its {n_points} points have only coordinates",
-    rank_by="n_points",
-)
-POINTS_WITHOUT: Final = DiagnosticSpec(
+WITHOUT_FIELD: Final = DiagnosticSpec(
     code="points-without-field",
-    text="{n_points} points have no valid {field}: they have only coordinates",
+    text="{subject}: {n_points} points have no {field}, only coordinates",
     rank_by="n_points",
 )
 NO_INTENSITY: Final = DiagnosticSpec(
@@ -213,14 +204,9 @@ def report_fields(ctx: StepContext, counts: Sequence[ScanCount], cloud: PointClo
     if cloud.rgb is None:
         del without["colour"]
     for name, missing in without.items():
-        n_invalid = 0
         for count, n_missing in zip(counts, missing, strict=True):
-            if n_missing == count.n_kept:
-                ctx.report(SCAN_WITHOUT, subject=count.title, field=name, n_points=n_missing)
-            else:
-                n_invalid += n_missing
-        if n_invalid:
-            ctx.report(POINTS_WITHOUT, field=name, n_points=n_invalid)
+            if n_missing:
+                ctx.report(WITHOUT_FIELD, subject=count.title, field=name, n_points=n_missing)
     unused = _names(count.scan.fields_not_used for count in counts)
     candidates = [name for name in unused if may_be_intensity(name)]
     if cloud.intensity is None and candidates:

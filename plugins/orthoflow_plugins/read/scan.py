@@ -27,10 +27,9 @@ from orthoflow_plugins.read.reporting import (
     COLOUR_DEPTH,
     COLOUR_LIMIT,
     COLOURS_GREY,
-    COLOURS_ZERO,
     FEW_STATIONS,
+    FIELD_ZERO,
     INTENSITY_LUMINANCE,
-    INTENSITY_ZERO,
     NO_EFFECT,
     report_fields,
     report_notes,
@@ -314,7 +313,7 @@ def _colours(
         if colours is None or not count.n_kept:
             continue
         if not rgb[part].any():
-            ctx.report(COLOURS_ZERO, subject=count.title)
+            ctx.report(FIELD_ZERO, subject=count.title, field="colour")
             count.n_without_rgb = count.n_kept
             has_rgb = assembly.colour_mask()
             has_rgb[part] = False
@@ -346,7 +345,7 @@ def _intensity(
         values = intensity[count.start : count.stop]
         seen = robust_range(values)
         if seen == (0.0, 0.0) and not np.nan_to_num(values).any():
-            ctx.report(INTENSITY_ZERO, subject=count.title)
+            ctx.report(FIELD_ZERO, subject=count.title, field="intensity")
             values[:] = np.nan
             seen = None
         ranges.append(seen)

@@ -241,7 +241,7 @@ def test_zero_intensity_and_zero_colours_are_absent_not_black(
     assert cloud.rgb is None
     assert cloud.source["intensity_source"] == "none"
     assert "the intensity of all points is zero: it is treated as missing" in read.warnings
-    assert "the colours of all points are zero" in read.warnings
+    assert "the colour of all points is zero" in read.warnings
 
 
 def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
