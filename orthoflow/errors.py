@@ -1,8 +1,7 @@
-"""Every error that orthoflow raises on purpose, in one page.
+"""All errors that orthoflow raises deliberately.
 
-A message is one sentence: what was given, what was expected, where, and the way out if there is
-one. The command line turns the class into an exit code (`exit_code`) and never shows a traceback
-unless `--debug` is given.
+A message is one sentence: what was given, what was expected, where, and what to do. The command
+line derives the exit code from the class (`exit_code`) and shows tracebacks only with `--debug`.
 """
 
 from __future__ import annotations
@@ -12,17 +11,17 @@ from typing import ClassVar, Final
 
 
 class OrthoflowError(Exception):
-    """Root of all errors that orthoflow raises on purpose.
+    """Base class of all errors that orthoflow raises deliberately.
 
     Attributes:
-        exit_code: process exit code when this error ends a command.
+        exit_code: exit code of a command that ends with this error.
     """
 
     exit_code: ClassVar[int] = 1
 
 
 class InputError(OrthoflowError, ValueError):
-    """A file or value that the user gave cannot be used: unreadable, empty, of the wrong kind."""
+    """A given file or value cannot be used: it is unreadable, empty or of the wrong type."""
 
     exit_code = 2
 
@@ -44,59 +43,59 @@ class GeometryError(OrthoflowError, ValueError):
 
 
 class ProductError(OrthoflowError, ValueError):
-    """A product breaks its own rules: shapes that disagree, values out of range, unknown type."""
+    """A product is invalid: inconsistent shapes, values out of range, or an unknown type."""
 
 
 class MethodError(OrthoflowError, RuntimeError):
-    """A method cannot give a result for these inputs, e.g. no plane has enough points."""
+    """A method has no result for these inputs, e.g. because no plane has enough points."""
 
 
 class StepFailedError(OrthoflowError, RuntimeError):
-    """A step ended without a result: crashed, killed, out of memory, or past its timeout."""
+    """A step ended without a result: it crashed, was killed, or exceeded memory or timeout."""
 
 
 class ClusterError(OrthoflowError, RuntimeError):
-    """The scheduler of a run was lost, or its workers; the same command goes on."""
+    """The scheduler or the workers of a run were lost; the same command continues the run."""
 
 
 class CancelledStepError(OrthoflowError, RuntimeError):
-    """A step was asked to stop and did."""
+    """A step stopped because it was cancelled."""
 
     exit_code = 130
 
 
 class PluginError(OrthoflowError, ImportError):
-    """A plugin, a method or a library that a plugin needs is missing, broken or claimed twice."""
+    """A plugin, method or required library is missing, cannot be loaded, or is declared twice."""
 
     exit_code = 4
 
 
 class StoreError(OrthoflowError, OSError):
-    """The store or a run folder cannot be read or written: full disk, no permission, damage."""
+    """The store or a run folder cannot be read or written: full disk, no permission, or damage."""
 
 
 class DamageError(StoreError):
-    """The store does not hold any more what was put into it; what is computed again heals it."""
+    """Data in the store is missing or damaged; recomputing it restores it."""
 
 
 class RecordError(OrthoflowError, ValueError):
-    """A record is damaged, differs from its seal, or has a format this version cannot read."""
+    """A record is damaged, does not match its seal, or has an unsupported format."""
 
     exit_code = 3
 
 
-# Comparing takes some microseconds for each, for every name that is misspelt.
+# Each comparison takes some microseconds.
 _MOST_CANDIDATES: Final = 1000
 _LONGEST_NAME: Final = 200
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return the known name most like another, or nothing when none is near.
+    """Return the known name that is most similar; empty if none is similar.
 
     >>> nearest("hugh2d", ["hough2d", "ransac"])
     'hough2d'
     """
-    import difflib  # noqa: PLC0415 - for a mistake only
+    import difflib  # noqa: PLC0415 - only needed for mistakes
 
     candidates = sorted(known)
     if len(candidates) > _MOST_CANDIDATES or len(name) > _LONGEST_NAME:
@@ -106,7 +105,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return ` (did you mean X?)` for the nearest known name, or nothing when none is near.
+    """Return ` (did you mean X?)` with the most similar known name; empty if none is similar.
 
     >>> did_you_mean("gsd", ["gsd_m", "buffer_m"])
     ' (did you mean gsd_m?)'

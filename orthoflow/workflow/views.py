@@ -315,7 +315,7 @@ def _check_resolved(workflow: Workflow) -> None:
         if unknown := dataset.inputs.keys() - workflow.inputs.keys():
             raise ValueError(f"dataset {dataset.name} refers to an unknown input {min(unknown)!r}")
     if taken := factors & workflow.steps.keys():
-        raise ValueError(f"a step is called {min(taken)}, which is a factor of addresses")
+        raise ValueError(f"a step must not be called {min(taken)}, which is reserved in addresses")
     for step in workflow.steps.values():
         _check_resolved_step(workflow, step)
     if not is_acyclic({name: step.upstream() for name, step in workflow.steps.items()}):
