@@ -14,7 +14,7 @@ import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table, number
-from orthoflow.untrusted_text import first_few
+from orthoflow.untrusted_text import csv_text, first_few
 
 if TYPE_CHECKING:
     from orthoflow.report.browsing import RunSummary
@@ -95,7 +95,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.errors import ArgumentError
     from orthoflow.records.open import open_run
-    from orthoflow.records.tables import join_runs, joined_csv
+    from orthoflow.records.tables import join_runs
     from orthoflow.report.browsing import run_folders
 
     if not table.absolute().parent.is_dir():
@@ -108,7 +108,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
         )
     joined = join_runs([open_run(place) for place in places])
     with writing_to(table):
-        write_whole(table, joined_csv(joined).encode("utf-8", "backslashreplace"))
+        write_whole(table, csv_text(joined.rows()).encode("utf-8", "backslashreplace"))
     n_shared = sum(len(one.found) > 1 for one in joined.cells)
     shared = f", {n_shared} of them in several runs" if n_shared else ""
     echo(

@@ -278,38 +278,6 @@ class Pair(Generic[Side]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Difference:
-    """Numbers of rows that differ between two runs.
-
-    Attributes:
-        n_different: number of rows with values in both runs that differ by more than rounding.
-        n_shared: number of rows with values in both runs.
-        n_left: number of rows with a value only in the first run.
-        n_right: number of rows with a value only in the second run.
-        n_rounded: number of rows that differ only by rounding.
-    """
-
-    n_different: int
-    n_shared: int
-    n_left: int
-    n_right: int
-    n_rounded: int = 0
-
-    @classmethod
-    def of(cls, rows: Iterable[Pair[Any]]) -> Difference:
-        """Count the rows."""
-        rows = tuple(rows)
-        shared = [row for row in rows if row.is_shared]
-        return cls(
-            n_different=sum(row.is_moved for row in shared),
-            n_shared=len(shared),
-            n_left=sum(row.right is None and row.left is not None for row in rows),
-            n_right=sum(row.left is None and row.right is not None for row in rows),
-            n_rounded=sum(row.is_rounded for row in shared),
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
 class ParameterValue:
     """The resolved value of a parameter.
 
@@ -431,12 +399,16 @@ class RunComparison:
     products: tuple[ProductDistance, ...]
 
     def __repr__(self) -> str:
-        rows = {
-            "inputs": Difference.of(self.inputs),
-            "parameters": Difference.of(self.shared(self.parameters)),
-            "metrics": Difference.of(self.measured),
+        rows: dict[str, Sequence[Pair[Any]]] = {
+            "inputs": self.inputs,
+            "parameters": self.shared(self.parameters),
+            "metrics": self.measured,
         }
-        parts = [f"{one.n_different} of {one.n_shared} {name}" for name, one in rows.items()]
+        both = {name: [row for row in found if row.is_shared] for name, found in rows.items()}
+        parts = [
+            f"{sum(row.is_moved for row in found)} of {len(found)} {name}"
+            for name, found in both.items()
+        ]
         verdicts = Counter(item.verdict for item in self.products)
         parts.append(f"{verdicts['different']} of {len(self.products)} products differ")
         parts.append(f"{verdicts['not measured']} products not measured")

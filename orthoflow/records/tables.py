@@ -407,11 +407,6 @@ def join_runs(runs: Sequence[Run]) -> RunSet:
     return RunSet(runs=tuple(runs))
 
 
-def joined_csv(runs: RunSet) -> str:
-    """Return the table of `RunSet.metrics` as CSV."""
-    return csv_text(runs.rows())
-
-
 def _choice(cell: RecordedCell) -> Choice:
     return cell.method, json.dumps(dict(cell.params), sort_keys=True)
 

@@ -15,7 +15,6 @@ from orthoflow.records.compare import (
     ParameterValue,
     RunComparison,
 )
-from orthoflow.records.compare import Difference as DifferenceCounts
 from orthoflow.report.rankings import number, number_with_unit
 
 Side = TypeVar("Side")
@@ -44,7 +43,6 @@ class DifferenceTable:
         n_different: number of those that differ.
         rows: values that differ, and values that only one run has; equal rows are grouped.
         n_alone: number of values that only one run has.
-        n_rounded: number of values that differ by rounding only; they have no row.
         whose: steps to which the table is restricted; empty for all.
     """
 
@@ -53,7 +51,6 @@ class DifferenceTable:
     n_different: int
     rows: tuple[Difference, ...]
     n_alone: int = 0
-    n_rounded: int = 0
     whose: str = ""
 
 
@@ -103,15 +100,14 @@ def _table(
         whose: steps to which the table is restricted; empty for all.
     """
     steps = step_of or {}
-    counts = DifferenceCounts.of(pairs)
+    shared = [pair for pair in pairs if pair.is_shared]
     if different is None:
         different = [pair for pair in pairs if not pair.is_same]
     return DifferenceTable(
         title=title,
-        n_compared=counts.n_shared,
-        n_different=counts.n_different,
-        n_alone=counts.n_left + counts.n_right,
-        n_rounded=counts.n_rounded,
+        n_compared=len(shared),
+        n_different=sum(pair.is_moved for pair in shared),
+        n_alone=sum((pair.left is None) != (pair.right is None) for pair in pairs),
         whose=whose,
         rows=tuple(
             Difference(

@@ -21,7 +21,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, Product, is_shown
 from orthoflow.records import RecordedFigure
-from orthoflow.records.compare import Difference, RunComparison, RunProducts, compare_runs
+from orthoflow.records.compare import RunComparison, RunProducts, compare_runs
 from orthoflow.records.open import open_run as open_plain_run
 from orthoflow.records.runs import Run, cell_metrics, parts_of
 from orthoflow.records.tables import RunSet, join_runs
@@ -308,7 +308,7 @@ class ShownComparison(RunComparison):
             "comparison",
             repr(self),
             first_few(parameters, most=_PARAMETERS_MOST) if parameters else "",
-            Difference.of(self.measured).n_shared,
+            sum(row.is_shared for row in self.measured),
             Markup(table),
             max(0, len(moved) - _ROWS_MOST),
         )
