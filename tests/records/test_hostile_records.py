@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import re
 import shutil
@@ -15,7 +14,7 @@ import pytest
 from orthoflow.diagnostics import PLAIN_WARNING
 from orthoflow.records.verify import verify_run
 from tests import hostile_records as hostile
-from tests.studios import Studio, open_studio
+from tests.studios import Studio, open_studio, said
 
 COMMANDS = (
     ("show",),
@@ -93,9 +92,7 @@ def test_figures_that_some_systems_take_for_one_are_not_laid_over_each_other(
 
     run = hostile.changed(finished.folder / "first", folder / "run", draw)
     for command in (("verify", run), ("export", run, "--to", "figures"), ("report", run)):
-        done = finished(*command)
-        assert done.exit_code == 3
-        assert "file systems that ignore case" in done.output
+        assert "file systems that ignore case" in said(*command, code=3)
     assert not list((run / "figures").rglob("*epth*"))
 
 
@@ -121,9 +118,9 @@ def test_links_and_devices_beside_a_record_are_not_followed(
     assert {"a", "b", "c"}.isdisjoint(path.name for path in Path("crate").rglob("*"))
     (run / "report.html").unlink()
     (run / "report.html").symlink_to(secret)
-    done = finished("export", run, "--to", "ro-crate", "-o", "other")
-    assert done.exit_code == 3
-    assert "'report.html' must be a file, but is a link" in done.output
+    assert "'report.html' must be a file, but is a link" in said(
+        "export", run, "--to", "ro-crate", "-o", "other", code=3
+    )
     assert b"secret" not in b"".join(
         p.read_bytes() for p in Path("other").rglob("*") if p.is_file()
     )
@@ -139,17 +136,15 @@ def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> No
     run = hostile.changed(finished.folder / "first", folder / "run", lambda record: None)
     os.truncate(run / "products" / "metrics.csv", 1 << 40)
     before = os.times()
-    done = finished("verify", run)
-    assert done.exit_code == 3
-    assert "products/metrics.csv: changed since it was published" in done.output
-    done = finished("export", run, "--to", "ro-crate", "-o", "crate")
-    assert done.exit_code == 3
-    assert "products/metrics.csv was changed after the run" in done.output
+    assert "products/metrics.csv: changed since it was published" in said("verify", run, code=3)
+    assert "products/metrics.csv was changed after the run" in said(
+        "export", run, "--to", "ro-crate", "-o", "crate", code=3
+    )
     (run / "products" / "metrics.csv").unlink()
     os.truncate(run / "report.html", 1 << 40)
-    done = finished("export", run, "--to", "ro-crate", "-o", "other")
-    assert done.exit_code == 3
-    assert "report.html has 1099511627776 bytes: no report is so large" in done.output
+    assert "report.html has 1099511627776 bytes: no report is so large" in said(
+        "export", run, "--to", "ro-crate", "-o", "other", code=3
+    )
     after = os.times()
     assert after.user + after.system - before.user - before.system < 5
 
@@ -207,8 +202,7 @@ def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Pa
     assert done.exit_code == 0, done.output
     assert f"name {written}, run " in done.output
     assert f"warning, paint: warnings {written}\n" in done.output
-    said = json.loads(finished("show", run, "--json").output)
-    assert said["name"] == f"name {evil}"
+    assert finished.json("show", run)["name"] == f"name {evil}"
     outputs = [done.output]
     outputs += [
         finished(words[0], run, *words[1:]).output

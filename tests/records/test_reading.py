@@ -56,15 +56,10 @@ def planes_cell(digest: str) -> RecordedCell:
     )
 
 
-def cloud_cell() -> RecordedCell:
-    cloud = dataclasses.replace(given("", "c", "cloud"), embedded=False)
-    return made("cloud", outputs={"cloud": cloud})
-
-
-def failed_cell() -> RecordedCell:
-    return cell(
-        "wall", status="failed", error_type="MethodError", error_message="no cell has a point"
-    )
+CLOUD = made(
+    "cloud", outputs={"cloud": dataclasses.replace(given("", "c", "cloud"), embedded=False)}
+)
+FAILED = cell("wall", status="failed", error_type="MethodError", error_message="no point")
 
 
 def as_stored(*paths: Path) -> dict[Path, str]:
@@ -79,7 +74,7 @@ def run_folder(tmp_path: Path) -> Path:
     digest = write_product_file(product, one_plane().to_payload())
     folder = tmp_path / "run"
     folder.mkdir()
-    cells = (cloud_cell(), planes_cell(digest), failed_cell())
+    cells = (CLOUD, planes_cell(digest), FAILED)
     record = a_record(cells, run_id="20260102-abc", status="failed")
     write_record(folder / "run.h5", record, lambda asked: product if asked == digest else None)
     published = tmp_path / "planes.json"
@@ -124,7 +119,7 @@ def test_no_published_file_takes_the_place_of_another_or_of_the_metrics(tmp_path
         for path in paths:
             path.write_text(f"{port} {path.name}", encoding="utf-8")
         files[port] = as_stored(*paths)
-    published = publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files}, "r")
+    published = publish_products(tmp_path / "run", [CLOUD], {"cloud": files}, "r")
     cell = tmp_path / "run" / "products" / "cloud"
     assert {path.name: path.read_text(encoding="utf-8")[:20] for path in cell.iterdir()} == {
         "b_x.csv": "a b_x.csv",
@@ -177,9 +172,7 @@ def test_published_files_come_by_number_and_replace_older_ones(run_folder: Path)
     files = {"cloud": {"cloud": first, "more": as_stored(store / "wall_10.tif")}}
     (run_folder / "products" / "old").touch()
     # A cell without a result publishes nothing.
-    found = publish_products(
-        run_folder, [cloud_cell(), failed_cell()], {**files, "wall": {"x": first}}, "r"
-    )
+    found = publish_products(run_folder, [CLOUD, FAILED], {**files, "wall": {"x": first}}, "r")
     there = [path.name for path in published_files(run_folder, "cloud")]
     assert " ".join(there) == "2.tif a.txt metrics.csv more_wall_10.tif wall_2.tif wall_10.tif"
     assert published_files(run_folder, "wall") == ()

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import (
 
 from orthoflow.cli import sign
 from tests import hostile_records as hostile
-from tests.studios import Studio, open_studio
+from tests.studios import Studio, open_studio, said
 
 PASSWORD = "correct horse"
 
@@ -62,18 +62,18 @@ def test_a_signed_record_verifies_with_the_key_of_its_signer_and_no_other(
     finished: Studio, run: Path, tmp_path: Path
 ) -> None:
     before = (run / "run.h5").read_bytes()
-    said = verified(finished, run, 3)
-    assert "run.h5 is not signed: there is no run.h5.sig next to it" in said
-    assert "run.h5 is intact, but its signature is not from the given signer" in said
+    output = verified(finished, run, 3)
+    assert "run.h5 is not signed: there is no run.h5.sig next to it" in output
+    assert "run.h5 is intact, but its signature is not from the given signer" in output
     for _ in range(2):  # signed again with the same key it stays signed
-        done = finished("sign", run, "--key", "jane")
-        assert done.exit_code == 0, done.output
-        assert f"signed: {run / 'run.h5'}.sig, with the key SHA256:" in done.output
-        said = verified(finished, run, 0)
+        assert f"signed: {run / 'run.h5'}.sig, with the key SHA256:" in said(
+            "sign", run, "--key", "jane"
+        )
+        output = verified(finished, run, 0)
     assert (run / "run.h5").read_bytes() == before
-    assert "not checked" not in said
+    assert "not checked" not in output
     told = finished.json("verify", run, "--signer", "jane.pub")
-    assert told["signed_with"] == said.rpartition("signed with ")[2].strip()
+    assert told["signed_with"] == output.rpartition("signed with ")[2].strip()
     # A crate takes the signature along; another record has another seal.
     assert finished("export", run, "--to", "ro-crate", "-o", tmp_path / "crate").exit_code == 0
     verified(finished, tmp_path / "crate", 0)
@@ -82,16 +82,14 @@ def test_a_signed_record_verifies_with_the_key_of_its_signer_and_no_other(
     assert not (whole / "run.h5.sig").exists()
     # A record is signed by one person.
     signature = (run / "run.h5.sig").read_text()
-    done = finished("sign", run, "--key", "joe")
-    assert done.exit_code == 2
-    assert ": remove run.h5.sig to sign with another" in done.output
+    assert ": remove run.h5.sig to sign with another" in said("sign", run, "--key", "joe", code=2)
     assert (run / "run.h5.sig").read_text() == signature
     (run / "run.h5.sig").unlink()
     assert finished("sign", run, "--key", "joe").exit_code == 0
     # Nobody has checked that it is joe's: it may be what is left of another record.
-    said = verified(finished, run, 3)
-    assert "the signature of run.h5 was made with the key SHA256:" in said
-    assert ", not with SHA256:" in said
+    output = verified(finished, run, 3)
+    assert "the signature of run.h5 was made with the key SHA256:" in output
+    assert ", not with SHA256:" in output
     # Who says to be jane has not her key.
     forged = json.loads((run / "run.h5.sig").read_text())
     forged["public_key"] = json.loads(signature)["public_key"]
@@ -104,9 +102,7 @@ def test_the_password_of_a_key_is_asked_for(
 ) -> None:
     key = "jane-protected"
     monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: "wrong")
-    done = finished("sign", run, "--key", key)
-    assert done.exit_code == 2
-    assert "or the password is wrong" in done.output
+    assert "or the password is wrong" in said("sign", run, "--key", key, code=2)
     monkeypatch.undo()
     monkeypatch.chdir(finished.folder)
     # On a terminal, out of sight, and where messages go: stdout may be a file.
@@ -126,12 +122,8 @@ def test_without_the_library_the_commands_say_so_and_others_do_without(
     finished("sign", run, "--key", "jane")
     monkeypatch.setitem(sys.modules, "cryptography.exceptions", None)
     for command in (("sign", run, "--key", "jane"), ("verify", run, "--signer", "jane.pub")):
-        done = finished(*command)
-        assert done.exit_code == 4, done.output
-        assert "python -m pip install 'orthoflow-tls[sign]'" in done.output
-    done = finished("verify", run)
-    assert done.exit_code == 0
-    assert "there is a signature" in done.output
+        assert "python -m pip install 'orthoflow-tls[sign]'" in said(*command, code=4)
+    assert "there is a signature" in said("verify", run)
 
 
 def test_a_signature_of_something_else_does_not_fit(finished: Studio, run: Path) -> None:
@@ -147,9 +139,7 @@ def test_a_signature_of_something_else_does_not_fit(finished: Studio, run: Path)
         else:
             path.write_text(content)
         # A finding only where a signature is asked for.
-        done = finished("verify", run)
-        assert done.exit_code == 0, done.output
-        assert "note: run.h5.sig is not a signature, or is damaged" in done.output
+        assert "note: run.h5.sig is not a signature, or is damaged" in said("verify", run)
         assert "\nrun.h5.sig is not a signature, or is damaged" in verified(finished, run, 3)
 
 
@@ -177,7 +167,7 @@ def test_keys_that_cannot_be_used_are_refused(
 
 def test_only_a_run_that_verifies_is_signed(finished: Studio, run: Path) -> None:
     (run / "products" / "metrics.csv").write_text("changed")
-    done = finished("sign", run, "--key", "jane")
-    assert done.exit_code == 3
-    assert "so it is not signed: products/metrics.csv: changed" in done.output
+    assert "so it is not signed: products/metrics.csv: changed" in said(
+        "sign", run, "--key", "jane", code=3
+    )
     assert not (run / "run.h5.sig").exists()
