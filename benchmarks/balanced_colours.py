@@ -290,9 +290,9 @@ def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
     if params.gains != "none":
         cameras = {item.photo: item for item in inputs.cameras.cameras if item.status == "ok"}
         seen = [cameras.get(layer.source) for layer in painters]
-        balance = balance_of(painters, wall, seen, is_local=params.local_balance)
+        balance = balance_of(painters, wall, seen)
         if balance is not None:
-            balance = with_seams(balance, image.source, wall, feather_cells=params.feather_cells)
+            balance = with_seams(balance, image.source, wall)
     made = coloured(painters, image.source, balance, allocate=in_memory)
     np.testing.assert_array_equal(made, image.rgb)
     metrics = {item.name: item.value for item in ctx.metrics}

@@ -10,9 +10,8 @@ resemble the laser intensity.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from threading import Lock
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -231,52 +230,39 @@ def colour_channels(colours: NDArray[np.float32]) -> Channels:
     return Channels(values=_evened(np.stack(layers, axis=-1), known), known=known)
 
 
-CHANNELS: Final[Mapping[str, Callable[[NDArray[np.float32]], Channels]]] = {
-    "gradients": gradient_channels,
-    "grey": grey_channels,
-}
-"""Functions that compute channels of a wall's intensity, by name."""
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class WallTarget:
-    """A wall prepared for matching.
+    """A wall to match photos with; its gradients and grey values are computed when needed.
 
     Attributes:
         wall: the wall.
-        grey: its intensity, NaN where the depth is unknown or at relief steps; None if the wall has
-            no intensity.
-        channels: channels of the intensity by name, computed when needed.
-        textures: texture of these channels by name, computed when needed.
-        grain: result of `grain_of`, computed when needed.
-        lock: lock of the values computed when needed.
     """
 
     wall: Wall
-    grey: NDArray[np.float32] | None
-    channels: dict[str, Channels] = field(default_factory=dict)
-    textures: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-    grain: list[NDArray[np.float32]] = field(default_factory=list)
-    lock: Lock = field(default_factory=Lock)
 
-    def prepare(self, content: str) -> None:
-        """Compute channels and texture unless another thread has done so."""
-        with self.lock:
-            if self.grey is None or content in self.channels:
-                return
-            channels = CHANNELS[content](self.grey)
-            self.textures[content] = texture(channels)
-            self.channels[content] = channels
-            if not self.grain:
-                self.grain.append(grain_of(self.wall))
+    @cached_property
+    def gradients(self) -> tuple[Channels, NDArray[np.float32]]:
+        """Oriented gradients of the usable intensity, and their texture."""
+        channels = gradient_channels(self.grey)
+        return channels, texture(channels)
 
+    @cached_property
+    def greys(self) -> tuple[Channels, NDArray[np.float32]]:
+        """Grey values of the usable intensity, and their texture."""
+        channels = grey_channels(self.grey)
+        return channels, texture(channels)
 
-def target_of(wall: Wall) -> WallTarget:
-    """Prepare a wall for matching."""
-    if wall.intensity is None:
-        return WallTarget(wall=wall, grey=None)
-    known = np.isfinite(wall.depth_m) & ~_at_steps(wall)
-    return WallTarget(wall=wall, grey=np.where(known, wall.intensity, np.nan).astype(np.float32))
+    @cached_property
+    def grain(self) -> NDArray[np.float32]:
+        """Result of `grain_of`."""
+        return grain_of(self.wall)
+
+    @property
+    def grey(self) -> NDArray[np.float32]:
+        """Intensity, NaN where the depth is unknown or at relief steps."""
+        assert self.wall.intensity is not None  # noqa: S101 - other walls are not matched
+        known = np.isfinite(self.wall.depth_m) & ~_at_steps(self.wall)
+        return np.where(known, self.wall.intensity, np.nan).astype(np.float32)
 
 
 def _at_steps(wall: Wall) -> NDArray[np.bool_]:

@@ -39,8 +39,9 @@ class MatchGuided(Method):
 
     Only the visible part of a wall is searched, within a small radius (an extension of the mask of
     markiewicz2015). Oriented gradients, grey values and combinations of the photo's colours are
-    compared, since laser and camera have different wavelengths. Cells finer than the point spacing
-    are joined. Patches at relief steps are excluded and, if the cloud is connected, those hidden by
+    compared, since laser and camera have different wavelengths; each photo keeps the channels with
+    the smallest held-out error for their number and spread. Cells finer than the point spacing are
+    joined. Patches at relief steps are excluded and, if the cloud is connected, those hidden by
     objects in front of the walls. The pose is estimated again and the photo projected again until
     held-out ties no longer improve. Photos without a pose are first matched with the other photos
     projected onto the walls; if that fails, they get no ties.
@@ -83,7 +84,7 @@ class MatchGuided(Method):
     )
 
     class Params(MethodParams):
-        """Channels to compare, and number of ties."""
+        """How positions are matched, and number of ties."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
@@ -97,15 +98,6 @@ class MatchGuided(Method):
             le=1,
             description="Only with preset: paper. Maximum ratio of the distances of the best and "
             "the second best match; 1 accepts any. Default: 0.8, as in openMVG.",
-        )
-        channels: Literal["auto", "gradients", "grey", "colours"] = Field(
-            default="auto",
-            description="Channels to compare. gradients: oriented gradients; grey: grey values, "
-            "more accurate if laser and camera have similar contrast; colours: in each patch, the "
-            "combination of colours that fits the wall best, for different contrast. auto: "
-            "gradients and grey, and also colours if grey is not better; each photo keeps the "
-            "channels with the smallest error of held-out ties, divided by the square root of "
-            "their number and by their spread.",
         )
         max_ties: int = Field(
             default=1200, ge=50, description="Positions measured per photo, evenly distributed."
@@ -160,9 +152,8 @@ def _traced(
     ctx: StepContext,
 ) -> dict[str, Trace]:
     """Match oriented photos with the walls, then the others; return results by name."""
-    from orthoflow_plugins.match.channels import in_cells_of_points, target_of
+    from orthoflow_plugins.match.channels import WallTarget, in_cells_of_points
     from orthoflow_plugins.match.tracing import (
-        CONTENTS,
         Setup,
         estimated_lens,
         recovered_traces,
@@ -173,10 +164,9 @@ def _traced(
     indices = [index for index, photo in enumerate(photos) if photo.name in oriented]
     ctx.progress(0.0, "walls")
     setup = Setup(
-        targets=[target_of(in_cells_of_points(wall)) for wall in inputs.walls.walls],
+        targets=[WallTarget(in_cells_of_points(wall)) for wall in inputs.walls.walls],
         before=_before(inputs, [oriented[photos[index].name] for index in indices]),
         max_ties=params.max_ties,
-        contents=CONTENTS if params.channels == "auto" else (params.channels,),
         threads=max(1, ctx.cores // max(1, len(indices))),
     )
 

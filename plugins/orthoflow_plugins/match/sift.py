@@ -37,13 +37,6 @@ from orthoflow_plugins.match.ties import (
 if TYPE_CHECKING:
     from orthoflow_plugins.match.placing import Placed
 
-BY_EDGES: Final = DiagnosticSpec(
-    code="photo-placed-by-edges",
-    severity="warning",
-    text="photo {subject}: its position was found from edges only, which can be wrong where "
-    "patterns repeat",
-    remedy="check its overlay",
-)
 MIRRORED: Final = DiagnosticSpec(
     code="photo-mirrored",
     severity="warning",
@@ -98,15 +91,13 @@ class MatchSift(Method):
             "and the best match in the photo for each key point of a wall; of the other "
             "parameters, only `ratio` is used.",
         )
-        structure: Literal["never", "confirmed", "alone"] = Field(
+        structure: Literal["never", "confirmed"] = Field(
             default="confirmed",
             description="Whether photos without clear key point matches are compared with the "
             "walls by their edges, at many scales, in colours, intensity and relief. confirmed: a "
             "position is accepted if another photo, at its own position, shows the same key "
-            "points there. alone: also without confirmation; this may accept a photo of another "
-            "object with the same pattern, so check the overlays. The errors of such ties are "
-            "correlated, so the predicted error of an orientation from them is too small; "
-            "match.guided measures them again.",
+            "points there. The errors of such ties are correlated, so the predicted error of an "
+            "orientation from them is too small; match.guided measures them again.",
         )
 
     class In(Ports):
@@ -195,9 +186,7 @@ def _placed(
         for index, pairs in enumerate(paired)
         if not pairs.is_mirrored and pairs.n_recognised < CLEARLY
     ]
-    if params.structure == "never" or not unclear:
-        return {}
-    if params.structure == "confirmed" and len(paired) < 2:
+    if params.structure == "never" or not unclear or len(paired) < 2:
         return {}
     structures = [wall_structure(wall) for wall in walls.walls]
     places: dict[int, list[Placed]] = {}
@@ -209,21 +198,7 @@ def _placed(
         ctx.progress(1.0 - 1.0 / (len(paired) + 1), f"{photos.photos[index].name}, by structure")
         places[index] = found
     recognised = {k: pairs for k, pairs in enumerate(paired) if pairs.n_recognised >= LEAST}
-    placed = confirmed(photos, places, recognised, (walls.walls, structures), ctx.cores)
-    for index, found in places.items():
-        if index in placed or index in recognised or not found or not found[0].is_clear:
-            continue
-        name = photos.photos[index].name
-        if params.structure == "alone":
-            placed[index] = found[0]
-            ctx.report(BY_EDGES, subject=name)
-        else:
-            ctx.log(
-                f"photo {name}: edges suggest a position on "
-                f"{walls.walls[found[0].piece.wall].name}, but no other photo confirms it; "
-                f"structure: alone would accept it"
-            )
-    return placed
+    return confirmed(photos, places, recognised, (walls.walls, structures), ctx.cores)
 
 
 def _pieces(

@@ -30,9 +30,10 @@ from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
 from orthoflow.products import Camera, Intrinsics, JsonValue, Photo, Photos, Wall
 from orthoflow_plugins.match.channels import (
-    CHANNELS,
     WallTarget,
     colour_channels,
+    gradient_channels,
+    grey_channels,
     textured_places,
 )
 from orthoflow_plugins.match.displacements import CORRELATION_AREA_CELLS, Displacements, measure
@@ -67,8 +68,9 @@ _MAX_ROUNDS: Final = 4
 _SETTLED_CELLS: Final = 0.3
 # Relative decrease of the held-out error required for another round.
 _MIN_GAIN: Final = 0.03
-# Compared only if the other channels do not give clearly good results.
-_LAST: Final = "colours"
+# Channels to compare, in the order in which they are tried; colours only if the others do not give
+# clearly good results.
+_CONTENTS: Final = ("gradients", "grey", "colours")
 _FEW_SHARE: Final = 0.25
 
 # Two photos of a wall share hundreds of key points; fewer than this may be a repeated motif.
@@ -79,9 +81,6 @@ _PARAMS: Final = PairingParams()
 # A lens may be that of the same camera if it deviates by less than this from the EXIF focal length.
 _NEAR_FOCAL: Final = 0.1
 
-CONTENTS: Final = ("gradients", "grey", _LAST)
-"""Channels to compare, in the order in which they are tried."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
@@ -91,14 +90,12 @@ class Setup:
         targets: all walls; they may hide one another.
         before: points in front of the walls, None if unknown; cells that they hide are not matched.
         max_ties: positions measured per photo.
-        contents: channels to compare, from `CONTENTS`; the best result is kept.
         threads: number of threads per photo.
     """
 
     targets: Sequence[WallTarget]
     before: Before | None = None
     max_ties: int = 1200
-    contents: tuple[str, ...] = CONTENTS
     threads: int = 1
 
     @property
@@ -176,8 +173,8 @@ def trace_photo(
     """
     view = view_of(index, photo, camera, setup.walls, setup.before)
     found: tuple[Trace, View] | None = None
-    for content in setup.contents:
-        if content == _LAST and found is not None:
+    for content in _CONTENTS:
+        if content == "colours" and found is not None:
             # If laser and camera differ, grey values match worse than edges, or only at few
             # positions.
             is_little = found[0].n_ties < _FEW_SHARE * setup.max_ties
@@ -296,24 +293,25 @@ def _measured(view: View, setup: Setup, radius: int, content: str) -> _Round:
     # Largest wall first, since planes close to each other contain the same surface.
     for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
         projection, target = view.projections[index], targets[index]
-        if projection is None or target.grey is None or sizes[index] == 0:
+        if projection is None or target.wall.intensity is None or sizes[index] == 0:
             continue
         share = sizes[index] / sum(sizes)
-        on_wall = "grey" if content == "colours" else content
-        target.prepare(on_wall)
-        channels = target.channels[on_wall].part(projection.part)
+        whole, textures = target.gradients if content == "gradients" else target.greys
+        channels = whole.part(projection.part)
         usable = (channels.known > 0.0) & np.isfinite(projection.u)
-        strength = target.textures[on_wall][projection.part]
+        strength = textures[projection.part]
         places = textured_places(strength, usable, max(50, round(setup.max_ties * share)))
         places = _unoccupied(places, projection, occupied)
         if content == "colours":
             shown = colour_channels(view.colours_on_wall(projection))
+        elif content == "grey":
+            shown = grey_channels(view.on_wall(index, projection))
         else:
-            shown = CHANNELS[content](view.on_wall(index, projection))
+            shown = gradient_channels(view.on_wall(index, projection))
         moved = measure(channels, shown, places, radius, threads=setup.threads)
         n_measured += len(moved.places)
         moved = moved.take(agrees_around(moved))
-        grain = target.grain[0][projection.part]
+        grain = target.grain[projection.part]
         pieces.append(_piece(view.index, index, target.wall, (moved, projection), grain))
     pieces.sort(key=lambda piece: piece.wall)
     return pieces, n_measured

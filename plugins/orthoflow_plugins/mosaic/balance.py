@@ -62,12 +62,12 @@ _SPREAD_LEAST: Final = 0.01
 _EXPOSURE_PRIOR: Final = 1.0
 _LENS_PRIOR: Final = 0.5
 _FIELD_PRIOR: Final = 0.05
-# Prior that fixes the fields at 0.
-_NO_FIELD: Final = 1e-9
 # Number of nodes along each side of a field.
 _NODES: Final = 4
 _SWEEPS: Final = 6
 _OUTLIER: Final = 2.0
+# Distance from a seam within which colours are blended.
+_FEATHER_CELLS: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +128,6 @@ def balance_of(
     layers: Sequence[Layer],
     wall: Wall | None,
     cameras: Sequence[Camera | None],
-    *,
-    is_local: bool,
 ) -> Balance | None:
     """Find corrections that equalise the layers of a wall; None if they already agree.
 
@@ -137,14 +135,12 @@ def balance_of(
         layers: layers with painted cells, at least one.
         wall: the wall, or None.
         cameras: camera of each layer, or None if unknown.
-        is_local: whether to estimate vignetting and smooth fields, too.
     """
     shape = layers[0].frame.shape
     blocks = Blocks.over(shape, _block_cells(shape))
     lights = [block_light(layer, blocks) for layer in layers]
-    seen = cameras if is_local else [None] * len(layers)
-    radii = _radii(layers[0].frame, wall, seen, blocks, lights)
-    exposures = estimate(lights, radii, is_local=is_local)
+    radii = _radii(layers[0].frame, wall, cameras, blocks, lights)
+    exposures = estimate(lights, radii)
     logs = [
         exposures.logs(index, light, seen).astype(np.float32)
         for index, (light, seen) in enumerate(zip(lights, radii, strict=True))
@@ -196,9 +192,7 @@ def _depths_at(wall: Wall, middles: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.nan_to_num(depths_m), dtype=np.float64)
 
 
-def with_seams(
-    balance: Balance, source: NDArray[np.int16], wall: Wall | None, *, feather_cells: int
-) -> Balance:
+def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -> Balance:
     """Add corrections that blend the remaining differences of layers near their seams.
 
     Towards a seam, each layer changes to the mean of the layers on both sides, weighted by their
@@ -209,11 +203,10 @@ def with_seams(
         balance: the colour balance of the layers.
         source: (rows, cols) index of the layer used in each cell, -1 for none.
         wall: the wall, or None.
-        feather_cells: distance from a seam within which colours change.
     """
     blocks = balance.blocks
     side = float(np.diff(blocks.rows).max())
-    spread = max(0.5, 0.5 * feather_cells / side)
+    spread = max(0.5, 0.5 * _FEATHER_CELLS / side)
     shares = _Shares.of(balance, source, spread)
     says = np.ones(blocks.shape, dtype=np.float32)
     if wall is not None:
@@ -383,9 +376,7 @@ class _Overlap:
     apart: NDArray[np.float64]
 
 
-def estimate(
-    lights: Sequence[BlockLight], radii: Sequence[Radii | None], *, is_local: bool = True
-) -> Exposures:
+def estimate(lights: Sequence[BlockLight], radii: Sequence[Radii | None]) -> Exposures:
     """Estimate the corrections that equalise overlaps, robust against moved objects and glare.
 
     Exposures and vignetting are first estimated from the mean of the channels; exposures per
@@ -394,7 +385,6 @@ def estimate(
     Args:
         lights: light of the layers of a wall.
         radii: radii of the same layers; None if the camera of a layer is unknown.
-        is_local: whether to estimate smooth fields, too.
     """
     count = len(lights)
     n_lenses = 1 + max((item.lens for item in radii if item is not None), default=-1)
@@ -415,11 +405,10 @@ def estimate(
         overlaps,
     )
     lenses = alike[count:]
-    field_prior = _FIELD_PRIOR if is_local else _NO_FIELD
     found = _solved(
         [exposures, _field_columns(overlaps, lights)],
         apart - bends @ lenses,
-        np.repeat([_EXPOSURE_PRIOR, field_prior], [count, count * _NODES**2]),
+        np.repeat([_EXPOSURE_PRIOR, _FIELD_PRIOR], [count, count * _NODES**2]),
         overlaps,
     )
     return Exposures(

@@ -24,21 +24,9 @@ class SeamsParams(MethodParams):
     )
     gains: Literal["none", "global"] = Field(
         "global",
-        description="none: the colours of the photos are not changed, and the next two "
-        "parameters have no effect; global: if photos differ, the linear intensities of each "
-        "are multiplied by a factor per channel, so that overlaps agree.",
-    )
-    local_balance: bool = Field(
-        default=True,
-        description="Also balance vignetting and other smooth differences, as measured in "
-        "overlaps.",
-    )
-    feather_cells: int = Field(
-        64,
-        ge=0,
-        le=4096,
-        description="Blend the remaining smooth differences within this many cells on either side "
-        "of a seam; photos are not mixed. 0: do not blend.",
+        description="none: the colours of the photos are not changed; global: if photos differ, "
+        "each is corrected by an exposure per channel, vignetting and other smooth differences, as "
+        "measured in overlaps, and what remains is blended near seams.",
     )
     island_cells_min: int = Field(
         default=100,

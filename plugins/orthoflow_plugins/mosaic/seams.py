@@ -298,7 +298,7 @@ def _join(
     balance = None
     if params.gains != "none" and len(painters) > 1:
         seen = [cameras.get(source) for source in sources]
-        balance = balance_of(painters, wall, seen, is_local=params.local_balance)
+        balance = balance_of(painters, wall, seen)
     mask, source = joined(
         painters,
         others,
@@ -314,8 +314,7 @@ def _join(
             mask[rows][is_alone] = OrthoMask.CONTRADICTED
     steps = untouched = seam_steps(source, painters)
     if balance is not None:
-        if params.feather_cells:
-            balance = with_seams(balance, source, wall, feather_cells=params.feather_cells)
+        balance = with_seams(balance, source, wall)
         steps = seam_steps(source, painters, balance)
     n_control, n_check = ties_on(inputs.cameras, number)
     error_m: NDArray[np.float32] | None = None

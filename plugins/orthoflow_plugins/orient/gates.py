@@ -1,7 +1,6 @@
 """Gates: the criteria that an orientation must meet.
 
-Each gate declares a value of the orientation, a limit, the source of the limit, and the reason to
-give for a refusal.
+Each gate declares a value of the orientation, a limit, and the reason to give for a refusal.
 """
 
 from __future__ import annotations
@@ -432,7 +431,6 @@ class Gate:
         value: computes the value to test; None passes.
         limit: the smallest value that passes, or the name of a parameter that contains it.
         is_upper: whether the limit is the largest value that passes instead.
-        source: source of the limit.
         reason: returns the reason for a refusal from the candidate, its value and the limit.
     """
 
@@ -440,7 +438,6 @@ class Gate:
     value: Callable[[Candidate], float | None]
     limit: float | str
     is_upper: bool = False
-    source: str
     reason: Callable[[Candidate, float, float], str]
 
 
@@ -452,8 +449,7 @@ CONTROL_GATES: Final = (
     Gate(
         name="control",
         value=lambda c: int(c.control.sum()),
-        limit=12,
-        source="twice the unknowns of a pose",
+        limit=12,  # twice the unknowns of a pose
         reason=lambda c, value, limit: (
             f"only {value} of {(~c.is_check).sum()} control ties agree with one pose; at least "
             f"{limit} are required"
@@ -462,8 +458,7 @@ CONTROL_GATES: Final = (
     Gate(
         name="share",
         value=lambda c: float(c.estimate.agreeing.mean()),
-        limit=0.04,
-        source="robust sampling finds a pose among these outliers (benchmarks/robust_pose.py)",
+        limit=0.04,  # robust sampling finds a pose among these outliers (benchmarks/robust_pose.py)
         reason=lambda c, value, limit: (
             f"only {value:.1%} of {len(c.seen)} ties agree with one pose; at least {limit:.1%} are "
             "required"
@@ -474,14 +469,12 @@ CONTROL_GATES: Final = (
         value=lambda c: c.chance,
         limit=1e-5,
         is_upper=True,
-        source="one in 100 000 wrong poses passes (binomial test)",
         reason=lambda c, *_: f"{_checks(c)}, no more than would agree with a wrong pose by chance",
     ),
     Gate(
         name="check-share",
         value=lambda c: c.check_over_control,
         limit=0.5,
-        source="with a correct pose, withheld ties agree as often as control ties",
         reason=lambda c, *_: (
             f"{_checks(c)}, but {c.control_share:.0%} of the control ties do: the pose was "
             "fitted to ties that agree by chance"
@@ -492,7 +485,6 @@ CONTROL_GATES: Final = (
         value=lambda c: c.check_rms_over_control,
         limit=2.0,
         is_upper=True,
-        source="with a correct pose, withheld ties deviate as much as control ties",
         reason=lambda _, value, limit: (
             f"the withheld ties deviate {value:.1f} times as much as the control ties; the limit "
             f"is {limit:g} times"
@@ -505,7 +497,6 @@ _SIDE: Final = Gate(
     name="side",
     value=lambda c: c.before_wall_m,
     limit=0.0,
-    source="a photo shows the front of a wall",
     reason=lambda *_: "the camera would be behind the wall it shows, so the pose is wrong",
 )
 
@@ -524,7 +515,6 @@ _ON_WALLS: Final = (
         value=lambda c: c.in_cells(c.error.rms_m) if c.error else None,
         limit="max_sigma_wall_cells",
         is_upper=True,
-        source="the job",
         reason=partial(_too_inexact, "on the wall"),
     ),
     Gate(
@@ -532,7 +522,6 @@ _ON_WALLS: Final = (
         value=lambda c: c.in_cells(c.error.worst_m) if c.error else None,
         limit="max_sigma_corner_cells",
         is_upper=True,
-        source="the job",
         reason=partial(_too_inexact, "at the worst position on the wall"),
     ),
 )
@@ -540,7 +529,6 @@ _SHOWN: Final = Gate(
     name="shown",
     value=lambda c: c.error is not None,
     limit=1.0,
-    source="a photo that shows no wall is of no use",
     reason=lambda *_: "with this pose, the photo would show none of the walls of its ties",
 )
 
@@ -550,7 +538,6 @@ GATES: Final = (
         name="quarters",
         value=lambda c: c.poor_quarter[0] if c.poor_quarter else None,
         limit="min_quadrant_ties",
-        source="markiewicz2015, 4.3",
         reason=lambda c, value, limit: (
             f"a quarter of the photo has {value} ties; each needs {limit:g}"
             f"{c.poor_quarter[1] if c.poor_quarter else ''}"
@@ -562,7 +549,6 @@ GATES: Final = (
         name="hull",
         value=lambda c: c.hull_ratio,
         limit="min_hull_ratio",
-        source="the job",
         reason=lambda _, value, limit: (
             f"the control ties cover {value:.1%} of the part of the photo that shows the walls; "
             f"at least {limit:.1%} is required"
@@ -594,7 +580,6 @@ GATES_BY_HAND: Final = (
         value=lambda c: c.needed_tie[0] if c.needed_tie else None,
         limit="max_sigma_corner_cells",
         is_upper=True,
-        source="the job",
         reason=_unchecked_tie,
     ),
 )

@@ -101,10 +101,8 @@ def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
 
 
 def _details(unchecked: Sequence[str]) -> dict[str, JsonValue]:
-    return {
-        "given": list(unchecked),
-        "given_meaning": "photos whose poses were used unchecked",
-    }
+    """Name the photos whose poses were used unchecked."""
+    return {"given": list(unchecked)}
 
 
 def _oriented(

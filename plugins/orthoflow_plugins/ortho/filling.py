@@ -1,7 +1,4 @@
-"""Gaps between painted cells: which to fill, their colours, and a figure of the result.
-
-The rule and the figure are those of skarlatos2012 (section 3, Figure 5).
-"""
+"""Gaps between painted cells: which to fill (skarlatos2012, section 3), and their colours."""
 
 from __future__ import annotations
 
@@ -11,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.levels import Colours, eight_bits
-from orthoflow.products import Layer, LayerMask
+from orthoflow.geometry.levels import Colours
 from orthoflow_plugins.ortho.parameters import Inpainting
 
 if TYPE_CHECKING:
@@ -24,11 +20,6 @@ _WINDOWS: Final = (3, 5, 7)
 _BESIDE_CELLS: Final = 2
 # OpenCV propagates colours through successive gaps; beyond this, the effect is below 8 bits.
 _FRONT_CELLS: Final = 64
-# The figure: side of the area shown, its magnification, its gutter, and the colour of voids.
-_SIDE_CELLS: Final = 240
-_ZOOM: Final = 3
-_GUTTER_PX: Final = 12
-_VOID_RGB: Final = (255, 0, 255)
 
 
 def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
@@ -142,32 +133,3 @@ def painted_between(
     found = interpolate(gaps, around, values, into, reach_cells=reach_cells, threads=threads)
     is_filled.ravel()[gaps[found]] = True
     return is_filled
-
-
-def filling_preview(layer: Layer) -> bytes:
-    """Return an enlarged PNG of the part with most filled cells, before and after filling."""
-    import cv2
-
-    filled = np.zeros((1, 1), dtype=np.uint8) if layer.filled is None else layer.filled
-    part = _busiest_part(np.broadcast_to(filled, layer.mask.shape))
-    is_shown, after = layer.mask[part] == LayerMask.PAINTED, eight_bits(layer.rgb[part]).copy()
-    after[~is_shown] = _VOID_RGB
-    # Before filling, only the filled cells were void.
-    before = after.copy()
-    if layer.filled is not None:
-        before[layer.filled[part] > 0] = _VOID_RGB
-    pair = [np.repeat(np.repeat(picture, _ZOOM, 0), _ZOOM, 1) for picture in (before, after)]
-    gutter = np.full((pair[0].shape[0], _GUTTER_PX, 3), 255, dtype=np.uint8)
-    picture = np.hstack([pair[0], gutter, pair[1]])
-    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
-
-
-def _busiest_part(filled: NDArray[np.uint8]) -> tuple[slice, slice]:
-    """Return the tile with the most filled cells; of several, the first."""
-    rows, columns = filled.shape
-    tiles = [
-        (slice(row, row + _SIDE_CELLS), slice(column, column + _SIDE_CELLS))
-        for row in range(0, rows, _SIDE_CELLS)
-        for column in range(0, columns, _SIDE_CELLS)
-    ]
-    return max(tiles, key=lambda tile: np.count_nonzero(filled[tile]))

@@ -24,7 +24,6 @@ from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.ortho.filling import (
     fillable_gaps,
-    filling_preview,
     inpainted,
     painted_between,
     reach_rows,
@@ -126,7 +125,7 @@ class PointcloudDirect(Method):
             painters = _balanced(painters, slabs, ctx)
         layers: list[Layer] = []
         seconds = np.zeros(2)
-        n_filled, preview = [0], b""
+        n_filled = 0
         reach = reach_rows(params.inpaint, params.inpaint_radius_px)
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
@@ -151,10 +150,7 @@ class PointcloudDirect(Method):
                 # Release this band before the next one is projected.
                 del found
             layers.append(layer)
-            n_here = int(np.count_nonzero(filled))
-            if not preview or n_here > max(n_filled):
-                preview = filling_preview(layer)
-            n_filled.append(n_here)
+            n_filled += int(np.count_nonzero(filled))
         if not any(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers):
             raise MethodError(
                 "no point of the cloud is within the buffer of a wall: the walls were made from "
@@ -163,13 +159,7 @@ class PointcloudDirect(Method):
         names = tuple(wall.name for wall in inputs.walls.walls)
         ctx.metric("projection_s", seconds[0], "s")
         ctx.metric("filling_s", seconds[1], "s")
-        _report(ctx, layers, names, sum(n_filled))
-        ctx.figure(
-            "filling",
-            preview,
-            "Before and after filling; void cells are magenta. Single cells are filled well; "
-            "large areas would be extrapolated from their border.",
-        )
+        _report(ctx, layers, names, n_filled)
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
 

@@ -46,7 +46,7 @@ def grey_of(depth_m: NDArray[np.float32], *, spread_m: float = 0.001) -> NDArray
         count=np.full(depth_m.shape, 3, dtype=np.uint32),
         intensity=np.full_like(depth_m, 0.5),
     )
-    grey = channels.target_of(made).grey
+    grey = channels.WallTarget(made).grey
     assert grey is not None
     return grey
 
@@ -68,8 +68,8 @@ def test_gradients_have_six_directions_and_do_not_tell_light_from_dark() -> None
 def test_cells_within_two_of_a_void_are_not_known() -> None:
     grey = texture()
     grey[40, 50] = np.nan
-    for content in ("grey", "gradients"):
-        found = channels.CHANNELS[content](grey)
+    for content in (channels.grey_channels, channels.gradient_channels):
+        found = content(grey)
         expected = np.ones(grey.shape, dtype=np.float32)
         expected[38:43, 48:53] = 0.0
         np.testing.assert_array_equal(found.known, expected)

@@ -113,13 +113,12 @@ def test_photos_that_agree_stay_untouched(tmp_path: Path) -> None:
     assert not factors(images, layers).any()
     assert "gain_max" not in metrics
     assert images.details == {}
-    # One layer needs no balance, and lenses count where fields do.
+    # One layer needs no balance.
     pair, cameras = two_photos(0.5), [photographed(900.0)] * 2
-    assert balance_of(pair[:1], None, [None], is_local=True) is None
-    for is_local in (False, True):
-        found = balance_of(pair, None, cameras, is_local=is_local)
-        assert found is not None
-        assert len(found.exposures.lenses) == is_local
+    assert balance_of(pair[:1], None, [None]) is None
+    found = balance_of(pair, None, cameras)
+    assert found is not None
+    assert len(found.exposures.lenses) == 1
 
 
 def surface(depth_m: NDArray[np.float32]) -> Walls:
@@ -230,7 +229,7 @@ def test_photos_differ_where_either_has_to_change_by_two_percent(
 ) -> None:
     # Each goes half of the way.
     pair = two_photos(factor)
-    found = balance_of(pair, None, [None, None], is_local=False)
+    found = balance_of(pair, None, [None, None])
     assert (found is not None) is differs
     if found is not None:
         apart = found.exposures.exposures[0] - found.exposures.exposures[1]
@@ -240,22 +239,25 @@ def test_photos_differ_where_either_has_to_change_by_two_percent(
 def test_near_a_seam_layers_go_over_to_each_other_unless_depths_leap_everywhere() -> None:
     bend = np.ones(SHAPE)
     bend[60:] = 0.8
-    found = balance_of(two_photos(bend[..., None]), None, [None, None], is_local=False)
+    found = balance_of(two_photos(bend[..., None]), None, [None, None])
     assert found is not None
     source = np.zeros(SHAPE, dtype=np.int16)
     source[:, 120:] = 1
     steps = np.add(*np.indices(SHAPE)) % 2 * np.float32(0.5)
     (flat,), (rough,) = (surface(depth).walls for depth in (0.0 * steps, steps))
-    plain = with_seams(found, source, None, feather_cells=20)
+    plain = with_seams(found, source, None)
     for wall, expected in ((None, plain), (flat, plain), (rough, found)):
-        joined = with_seams(found, source, wall, feather_cells=20)
+        joined = with_seams(found, source, wall)
         for logs, wanted in zip(joined.logs, expected.logs, strict=True):
             np.testing.assert_array_equal(logs, wanted)
     assert max(np.abs(a - b).max() for a, b in zip(plain.logs, found.logs, strict=True)) > 0.03
 
 
 @pytest.mark.parametrize("apart", [0.05, -0.15, 0.3])
-def test_layers_meet_at_a_seam_by_what_each_paints_about_it(apart: float) -> None:
+def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
+    apart: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(balancing, "_FEATHER_CELLS", 40)
     # Two layers all over a wall of 16 x 24 blocks, whose seam lies in the middle; what the second
     # shows beyond the fourth block after the seam is not known.
     shape = (16, 24)
@@ -270,7 +272,7 @@ def test_layers_meet_at_a_seam_by_what_each_paints_about_it(apart: float) -> Non
         exposures=nothing_added(2),
     )
     source = np.repeat([[0, 1]], 120, axis=1).repeat(160, axis=0).astype(np.int16)
-    one, other = with_seams(found, source, None, feather_cells=40).logs
+    one, other = with_seams(found, source, None).logs
     # As far as both show one thing, and as far as that is known within a block and a half.
     alike = 1.0 / (1.0 + (apart / 0.15) ** 2) ** 2
     offsets = np.arange(-5, 6)
@@ -387,10 +389,9 @@ def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
     slope = np.broadcast_to(np.linspace(-0.05, 0.05, 40)[None, :, None], (10, 40, 3))
     first = light(slice(0, 10), slice(0, 40), 3)
     lights = [first, replace(first, log_light=first.log_light + slope.astype(np.float32))]
-    for is_local, wanted, atol in ((True, slope, 0.015), (False, 0.0 * slope, 0.01)):
-        found = estimate(lights, [None, None], is_local=is_local)
-        added = found.logs(0, lights[0], None) - found.logs(1, lights[1], None)
-        np.testing.assert_allclose(added, wanted, atol=atol)
+    found = estimate(lights, [None, None])
+    added = found.logs(0, lights[0], None) - found.logs(1, lights[1], None)
+    np.testing.assert_allclose(added, slope, atol=0.015)
 
 
 SMALL_SHAPE = (40, 60)

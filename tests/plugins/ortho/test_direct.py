@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho.filling import fillable_gaps, filling_preview, void_counts
+from orthoflow_plugins.ortho.filling import fillable_gaps, void_counts
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
@@ -232,7 +232,6 @@ def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:
     shares = {"painted_share": 99 / 200, "filled_share": 1 / 200, "void_share": 100 / 200}
     seconds = {"projection_s": 1.0, "filling_s": 1.0}
     assert scenes.numbers(ctx) == pytest.approx(shares | seconds)
-    assert [figure.name for figure in ctx.figures] == ["filling"]
     assert any(line.startswith("wall 0: 50.0% of its cells contain no point") for line in lines)
 
 
@@ -347,26 +346,6 @@ def test_a_gap_is_fillable_where_no_window_has_too_many_void_cells() -> None:
         np.testing.assert_array_equal(fillable_gaps(is_void, limits), wanted)
         assert wanted.sum() < is_void.sum()
     assert fillable_gaps(is_void, (9, 25, 49)).sum() == is_void.sum()
-
-
-def test_a_small_layer_is_shown_before_and_after_it_was_filled() -> None:
-    mask = np.full((20, 30), LayerMask.PAINTED, dtype=np.uint8)
-    mask[:, -5:] = LayerMask.OCCLUDED
-    colours = np.where((mask == LayerMask.PAINTED)[..., None], (10, 20, 30), VOID).astype(np.uint8)
-    filled = np.zeros_like(mask)
-    for n_filled in (0, 2):
-        filled.ravel()[[127, 311][:n_filled]] = 1
-        layer = samples.layer(mask, rgb=colours, filled=filled if n_filled else None)
-        encoded = np.frombuffer(filling_preview(layer), np.uint8)
-        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB)
-        zoom = picture.shape[0] // 20
-        assert zoom >= 2
-        before = np.where(filled[..., None] > 0, np.uint8(VOID), colours)
-        # White between.
-        white = np.full((20 * zoom, picture.shape[1] - 60 * zoom, 3), 255, np.uint8)
-        parts = [np.kron(part, np.ones((zoom, zoom, 1), np.uint8)) for part in (before, colours)]
-        np.testing.assert_array_equal(picture, np.hstack([parts[0], white, parts[1]]))
-        assert white.size
 
 
 # Factors on the light of one scan: yellowish.
