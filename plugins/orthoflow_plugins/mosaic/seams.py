@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -141,7 +140,6 @@ class MosaicSeams(Method):
         MetricSpec("no_surface_share", label="cells without a surface"),
         MetricSpec("gain_min", label="smallest gain of a photo"),
         MetricSpec("gain_max", label="largest gain of a photo"),
-        MetricSpec("lens_loss_share", label="vignetting, largest"),
         MetricSpec("seam_share", label="cells along seams"),
         MetricSpec("seam_on_depth_edge_share", label="share of seam cells on depth edges"),
         MetricSpec(
@@ -209,7 +207,7 @@ class MosaicSeams(Method):
             ctx.progress(index / (layers[-1].wall + 1), inputs.layers.name(index))
             group, allocate = tuple(members), partial(_allocated, ctx, index)
             verdicts.append(_join(inputs, group, params, polygons, ctx, allocate))
-            _show(ctx, verdicts[-1].image, inputs.cameras)
+            _show(ctx, verdicts[-1].image)
         _report(ctx, verdicts)
         gains: dict[str, JsonValue] = {
             item.image.name: dict(
@@ -355,11 +353,11 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
     return {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
 
 
-def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
+def _show(ctx: StepContext, image: Orthoimage) -> None:
     if not image.sources:
         ctx.report(EMPTY_IMAGE, subject=image.name)
     else:
-        _report_empty(ctx, image, cameras)
+        _report_empty(ctx, image)
         white = 255.0 if image.rgb.dtype == np.uint8 else 65535.0
         if (plain := plain_tone(image.rgb, image.mask, SHOWN_STATES, white=white)) is not None:
             sources = ", ".join(image.sources[:3]) + (" ..." if len(image.sources) > 3 else "")
@@ -369,10 +367,10 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
         ctx.figure(f"wall_{image.number}_sources", partial(_source_map, image), _caption(image))
 
 
-def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
+def _report_empty(ctx: StepContext, image: Orthoimage) -> None:
     """Report the causes of empty cells, unless they only lack a surface."""
     words = {
-        OrthoMask.NONE: f"are in no oriented photo ({_way_to_a_photo(cameras)})",
+        OrthoMask.NONE: "are in no oriented photo (check which are refused, or take another)",
         OrthoMask.OCCLUDED: "are hidden in all photos, or seen too obliquely (take a "
         "photo from another side)",
         OrthoMask.NO_SURFACE: "have no surface (see the step that rastered the wall)",
@@ -385,15 +383,6 @@ def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) 
         f"{shares[state]:.0%} {words[state]}" for state in ordered if shares[state] >= _CAUSE_LEAST
     )
     ctx.report(EMPTY_CELLS, subject=image.name, share=sum(shares.values()), causes=causes)
-
-
-def _way_to_a_photo(cameras: Cameras | None) -> str:
-    """Return how cells that are in no oriented photo might be filled."""
-    if cameras is None:
-        return "check which photos are refused, or take another one"
-    n_photos = len(cameras.cameras)
-    n_refused = n_photos - len(_oriented(cameras))
-    return f"{n_refused} of {n_photos} photos are not oriented" if n_refused else "take another one"
 
 
 @in_column_style()
@@ -491,6 +480,3 @@ def _report_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         exposures = np.exp(np.concatenate([item.exposures for item in balances]))
         ctx.metric("gain_min", float(exposures.min()), "1")
         ctx.metric("gain_max", float(exposures.max()), "1")
-    losses = [1.0 - math.exp(-bend.sum()) for item in balances for bend in item.lenses]
-    if losses:
-        ctx.metric("lens_loss_share", max(losses), "1")

@@ -74,7 +74,7 @@ DLT_MISFIT: Final = DiagnosticSpec(
     text="photo {subject}: its ties deviate {sigma0:.1f} times as much as expected, and a complete "
     "lens model moves its points by {moved_px:.1f} px: its lens has distortion that this DLT does "
     "not model, mostly at the corners; the predicted error was multiplied by {factor:.1f}",
-    remedy="set {step}.distortion=k1k2, or provide a calibration",
+    remedy='set {step}.distortion to "k1 k2 p1 p2", or provide a calibration',
     rank_by="sigma0",
 )
 

@@ -64,18 +64,6 @@ _NAME_LETTERS: Final = 14
 _MAX_KERNELS: Final = 5000
 _KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
-RESIDUAL_COLUMNS: Final[Mapping[str, JsonValue]] = {
-    "residual": "observed minus computed; u and v of the photo",
-    "unit": "px of the photo, cell of the wall's raster, or mm on the wall (px times the median "
-    "pixel size on the wall)",
-    "shift_p": "probability of such a mean by chance (two-sided Student's t test)",
-    "nmad": "normalised median absolute deviation: 1.4826 times that from the median",
-    "p95": "95th percentile of the absolute residuals",
-    "beyond_own": "share of residuals beyond twice the coordinate's own RMSE",
-    "beyond_cells": "share of residuals beyond two raster cells of the wall, a fixed reference",
-    "beyond_any": "share of ties whose u or v exceeds twice its own RMSE",
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Oriented:
@@ -237,17 +225,11 @@ def hand_over(
     draw_wall_errors(ctx, candidates)
     draw_positions(ctx, candidates)
     draw_residuals(ctx, [item for item in found if item.camera.status == "ok"])
-    common: dict[str, JsonValue] = {
-        "photos": {item.camera.photo: item.entry for item in found},
-        "residual_columns": dict(RESIDUAL_COLUMNS),
-        "sigma_wall": "standard deviation of one coordinate in the wall's plane, from the "
-        "covariance, RMS over the part of its walls that the photo shows",
-    }
     return Cameras(
         cameras=tuple(item.camera for item in found),
         ties=replace(ties, role=role, residual_px=residuals),
         residual_table=tuple(row for each in candidates for row in residual_table(each)),
-        details=common | (details or {}),
+        details={"photos": {item.camera.photo: item.entry for item in found}, **(details or {})},
     )
 
 

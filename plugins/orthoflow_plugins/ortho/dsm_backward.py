@@ -92,7 +92,6 @@ class DsmBackward(Method):
             footprints.extend(painting.footprints[key] for key in sorted(painting.footprints))
             is_bare = not holds_cells(painting.mask, LayerMask.PAINTED)
             if is_bare or painting.rgb is None or painting.quality is None:
-                stack.note_reached(wall, painting.mask)
                 return
             layer = Layer(
                 frame=surface.frame,

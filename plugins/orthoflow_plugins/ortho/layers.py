@@ -36,8 +36,6 @@ class LayerStack:
     def __init__(self, walls: Walls, ctx: StepContext) -> None:
         self.painted: list[Layer] = []
         self._walls, self._ctx = walls, ctx
-        # Visibility masks of walls on which no photo has coloured a cell so far.
-        self._reached: dict[int, NDArray[np.uint8]] = {}
 
     def allocator(self, wall: int) -> Allocate:
         """Return a function that allocates the arrays of the next layer, in files."""
@@ -50,26 +48,7 @@ class LayerStack:
 
     def add(self, layer: Layer) -> None:
         """Add the layer of a photo that gives a colour to at least one cell."""
-        self._reached.pop(layer.wall, None)
         self.painted.append(layer)
-
-    def note_reached(self, wall: int, mask: NDArray[np.uint8]) -> None:
-        """Record the visibility of a wall on which a photo colours no cell.
-
-        Args:
-            wall: index of the wall.
-            mask: (rows, cols) `LayerMask`; it is copied, since the next layer may reuse its file.
-        """
-        if any(layer.wall == wall for layer in self.painted):
-            return
-        if wall in self._reached:
-            for rows in row_bands(mask.shape):
-                is_hidden = mask[rows] == LayerMask.OCCLUDED
-                self._reached[wall][rows][is_hidden] = LayerMask.OCCLUDED
-            return
-        kept = np.asarray(self._new(f"{wall}.reached", mask.shape, np.uint8), np.uint8)
-        kept[...] = mask
-        self._reached[wall] = kept
 
     def joined(self, level: Level) -> Layers:
         """Sort the layers by wall, and add an empty layer for each wall that has no layer.
@@ -95,15 +74,13 @@ class LayerStack:
         )
 
     def _bare_layer(self, place: int, level: Level) -> Layer:
-        """Return an empty layer of a wall, with the visibility that was recorded."""
+        """Return an empty layer of a wall."""
         wall = self._walls.walls[place]
         shape, prefix = wall.frame.shape, f"{place}.bare"
-        mask = self._reached.get(place)
-        if mask is None:
-            mask = np.asarray(self._new(f"{prefix}.mask", shape, np.uint8), np.uint8)
-            for rows in row_bands(shape):
-                is_void = np.isnan(wall.depth_m[rows])
-                mask[rows] = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
+        mask = np.asarray(self._new(f"{prefix}.mask", shape, np.uint8), np.uint8)
+        for rows in row_bands(shape):
+            is_void = np.isnan(wall.depth_m[rows])
+            mask[rows] = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
         return Layer(
             frame=wall.frame,
             wall=place,

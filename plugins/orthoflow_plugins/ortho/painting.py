@@ -37,6 +37,8 @@ _REACH_PX: Final = 5
 # A weaker filter changes colours by less than one level.
 _SIGMA_LEAST_PX: Final = 0.2
 _BASE_CELLS: Final = 4.0
+# Cells this close to a hidden area take no colour from a photo, because its edges are blurred.
+_EROSION_CELLS: Final = 1
 # Twenty bits are enough to rank photos by quality, and compress to half the size.
 _QUALITY_BITS: Final = np.uint32(0xFFFFF000)
 
@@ -103,9 +105,8 @@ def paint(
 
     shape, lock = surface.frame.shape, Lock()
     painting = Painting(mask=np.asarray(allocate("mask", shape, np.uint8), np.uint8))
-    erosion_cells = params.erosion_cells if params.visibility == "full" else 0
     # Patches of 2 x 2 hidden cells need one more cell.
-    margin = erosion_cells + 1 if erosion_cells else 0
+    margin = _EROSION_CELLS + 1 if params.visibility == "full" else 0
 
     def paint_tile(tile: Tile) -> None:
         visible, inner = _visible(view, surface, buffer, tile, margin)
@@ -129,8 +130,8 @@ def paint(
                 level = level_of(photo)
                 painting.rgb = np.asarray(allocate("rgb", (*shape, 3), level), level)
                 painting.quality = np.asarray(allocate("quality", shape, np.float32), np.float32)
-        if erosion_cells:
-            is_near = near_patches(visible.mask == OCCLUDED, erosion_cells)
+        if params.visibility == "full":
+            is_near = near_patches(visible.mask == OCCLUDED, _EROSION_CELLS)
             np.copyto(visible.mask, np.uint8(OCCLUDED), where=is_painted & is_near)
             np.copyto(visible.quality, np.float32(0.0), where=is_near)
         painting.mask[tile] = visible.mask[inner]
@@ -274,9 +275,8 @@ def sample(
     import cv2
 
     resampling, is_nearest = params.resampling, params.resampling == "nearest"
-    is_averaged = params.antialias and not is_nearest
     sigmas = [
-        0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if is_averaged else 0.0
+        0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if not is_nearest else 0.0
         for pixels in (footprint.pixels_across, footprint.pixels_down)
     ]
     reach = 0 if is_nearest else _REACH_PX + math.ceil(4.0 * max(sigmas))

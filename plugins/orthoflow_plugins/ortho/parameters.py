@@ -31,26 +31,13 @@ class BackwardParams(VisibilityParams):
 
     resampling: Literal["nearest", "bilinear", "cubic", "lanczos"] = Field(
         default="bilinear",
-        description="Interpolation of colours; nearest takes the pixels of the photo unchanged.",
-    )
-    antialias: bool = Field(
-        default=True,
-        description="Average colours over the cell if the photo has a higher resolution than "
-        "the wall (not with nearest).",
+        description="Interpolation of colours, averaged over the cell if the photo has a higher "
+        "resolution than the wall; nearest takes the pixels of the photo unchanged.",
     )
     visibility: Literal["full", "none"] = Field(
         default="full",
         description="Objects that can hide cells. full: relief and cloud; none: nothing, for "
         "comparisons and for flat walls without objects in front of them.",
-    )
-    erosion_cells: int = Field(
-        default=1,
-        ge=0,
-        le=20,
-        description=(
-            "Cells this close to a hidden area take no colour from the photo, because its edges "
-            "are blurred."
-        ),
     )
 
 

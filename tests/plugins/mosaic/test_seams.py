@@ -6,14 +6,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic import joining, seams
+from orthoflow_plugins.mosaic import joining
 from orthoflow_plugins.mosaic.agreement import count_seams
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
@@ -24,8 +23,6 @@ from orthoflow.files.geotiff import read_raster
 from orthoflow.files.images import decode_image
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.products import (
-    Camera,
-    Cameras,
     InputFiles,
     Layer,
     LayerMask,
@@ -200,36 +197,22 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("missing", "n_rows", "no_surface", "n_refused", "causes"),
+    ("missing", "n_rows", "no_surface", "causes"),
     [
         # Causes of a hundredth of the cells are named.
-        (LayerMask.OUTSIDE, 10, 15, None, ["25% are in no oriented photo (check which"]),
-        (LayerMask.OCCLUDED, 10, 17, None, ["25% are hidden in all photos", "1% have no surface"]),
-        # A new photo is asked for only where none was refused.
-        (LayerMask.OUTSIDE, 10, 0, 0, ["25% are in no oriented photo (take another"]),
-        (LayerMask.OUTSIDE, 10, 0, 2, ["25% are in no oriented photo (2 of 3 photos are not"]),
+        (LayerMask.OUTSIDE, 10, 15, ["25% are in no oriented photo"]),
+        (LayerMask.OCCLUDED, 10, 17, ["25% are hidden in all photos", "1% have no surface"]),
         # A tenth at least is missing, apart from what has no surface.
-        (LayerMask.OUTSIDE, 3, 800, None, []),
+        (LayerMask.OUTSIDE, 3, 800, []),
     ],
-    ids=["no photo", "hidden", "all oriented", "two refused", "no surface"],
+    ids=["no photo", "hidden", "no surface"],
 )
 def test_empty_cells_are_reported_with_their_causes(
-    tmp_path: Path,
-    missing: LayerMask,
-    n_rows: int,
-    no_surface: int,
-    n_refused: int | None,
-    causes: list[str],
+    tmp_path: Path, missing: LayerMask, n_rows: int, no_surface: int, causes: list[str]
 ) -> None:
     mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
     mask[:n_rows], mask.ravel()[mask.size - no_surface :] = missing, LayerMask.NO_SURFACE
-    cameras = None
-    if n_refused is not None:
-        states = ["ok", *["too few ties"] * n_refused]
-        cameras = Cameras(
-            cameras=tuple(Camera(photo=f"{k}", status=state) for k, state in enumerate(states))
-        )
-    _, ctx = joined(tmp_path, layer("one", mask), inputs={"cameras": cameras})
+    _, ctx = joined(tmp_path, layer("one", mask))
     found = [one.values for one in ctx.diagnostics if one.code == "orthoimage-cells-empty"]
     assert len(found) == bool(causes)
     for values in found:
@@ -283,26 +266,6 @@ def test_layers_are_published_when_asked_for(tmp_path: Path) -> None:
         said = json.loads((tmp_path / f"{stem}.json").read_text())
         assert (said["source"], said["name"]) == (layer.source, "west")
         assert sum(said["mask_counts"].values()) == layer.mask.size
-
-
-def test_gains_and_what_a_lens_loses_in_its_corners_are_told(tmp_path: Path) -> None:
-    def joined_with(exposures: list[list[float]], lenses: list[list[float]]) -> Any:
-        of = SimpleNamespace(exposures=np.log(exposures), lenses=np.array(lenses).reshape(-1, 2))
-        return SimpleNamespace(balance=SimpleNamespace(exposures=of))
-
-    untouched: Any = SimpleNamespace(balance=None)
-    plain = joined_with([[1.0, 1.4, 1.0]], [])
-    # In the corners r is 1: both terms add up in the logarithm of what has to be made good.
-    bent = joined_with([[0.8, 1.0, 1.1], [1.2, 0.9, 1.0]], [[0.1, 0.2], [0.0, 0.05]])
-    loss = {"lens_loss_share": 1.0 - np.exp(-0.3)}
-    for verdicts, expected in (
-        ([bent, untouched, plain], {"gain_min": 0.8, "gain_max": 1.4, **loss}),
-        ([plain], {"gain_min": 1.0, "gain_max": 1.4}),
-        ([untouched], {}),
-    ):
-        ctx = context(tmp_path)
-        seams._report_gains(ctx, verdicts)
-        assert numbers(ctx) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("rgb", "tone"), [(2, "black"), (254, "white"), (128, "one value")])
