@@ -129,8 +129,6 @@ class WallSamples:
         sigma_m: (n,) predicted standard deviation of each; NaN if unknown.
         step_depth_m: (m,) the same error within 2 cells of a true depth step.
         colour: (c,) mean square error of a painted cell over the three channels, away from steps.
-        filled_colour: (f,) the same for filled cells.
-        step_colour: (s,) the same for painted cells at steps.
         shift_m: (p, 2) displacement of patches along u and v, measured minus true position.
         shift_cells: (p, 2) the same in cells.
         n_seen: cells with a visibility test whose true surface is seen from a station.
@@ -142,8 +140,6 @@ class WallSamples:
     sigma_m: NDArray[np.float64]
     step_depth_m: NDArray[np.float64]
     colour: NDArray[np.float64]
-    filled_colour: NDArray[np.float64]
-    step_colour: NDArray[np.float64]
     shift_m: NDArray[np.float64]
     shift_cells: NDArray[np.float64]
     n_seen: int
@@ -210,8 +206,6 @@ def wall_errors(
         sigma_m=sigma_m[measured & ~steps][::error_step].astype(np.float64),
         step_depth_m=depth[measured & steps][::error_step],
         colour=square[compares & painted & ~steps],
-        filled_colour=square[compares & filled & ~steps],
-        step_colour=square[compares & painted & steps],
         shift_m=patches.shift * true.frame.gsd_m,
         shift_cells=patches.shift,
         n_seen=count_true(seen),
@@ -249,7 +243,6 @@ def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
     numbers = (
         *_depth_numbers(samples),
-        *_colour_numbers(samples),
         *_shift_numbers(samples),
         *_share_numbers(samples),
     )
@@ -303,17 +296,6 @@ def _depth_numbers(samples: WallSamples) -> list[Number]:
     return numbers
 
 
-def _colour_numbers(samples: WallSamples) -> list[Number]:
-    named = (
-        ("colour_rmse_grey", samples.colour),
-        ("filled_colour_rmse_grey", samples.filled_colour),
-        ("step_colour_rmse_grey", samples.step_colour),
-    )
-    return [
-        (name, float(np.sqrt(squares.mean())), "grey") for name, squares in named if squares.size
-    ]
-
-
 def _shift_numbers(samples: WallSamples) -> list[Number]:
     kept = _kept_shifts(samples)
     numbers: list[Number] = [("n_patches", float(len(kept)), "1")]
@@ -342,6 +324,8 @@ def _kept_shifts(samples: WallSamples) -> NDArray[np.bool_]:
 
 def _share_numbers(samples: WallSamples) -> list[Number]:
     numbers: list[Number] = []
+    if samples.colour.size:
+        numbers.append(("colour_rmse_grey", float(np.sqrt(samples.colour.mean())), "grey"))
     if samples.n_seen:
         numbers += [
             ("completeness", samples.n_seen_painted / samples.n_seen, "1"),

@@ -64,13 +64,14 @@ from orthoflow_plugins.inspect.point_doubts import (
 )
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
-# Maximum number of points whose residuals are logged.
+# Maximum number of unused points that are logged.
 _MAX_LOGGED: Final = 200
 MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
     severity="warning",
     text="{n_missed} of {n_points} check points are not used: {reasons}",
-    remedy="{ways}",
+    remedy="measure them in an orthoimage, or include them by {step[raster.grid]}.margin_m or "
+    "{step[raster.grid]}.buffer_m",
     rank_by="n_missed",
 )
 CAPPED_RULE: Final = DiagnosticSpec(
@@ -180,37 +181,26 @@ class InspectCheckpoints(Method):
         report_doubts(points, inputs.checkpoints, pictures, ctx)
         # In a simulated room, some points are hidden on purpose.
         if missed and not is_simulated:
-            ways = ["measure them in an orthoimage"]
-            if any(point.is_beside for point in missed.values()):
-                ways.append("enlarge the walls by {step[raster.grid]}.margin_m")
-            ctx.report(
-                MISSED,
-                n_missed=len(missed),
-                n_points=len(points),
-                reasons=with_reasons(missed),
-                ways=", or ".join(ways),
-            )
+            reasons = with_reasons(missed)
+            ctx.report(MISSED, n_missed=len(missed), n_points=len(points), reasons=reasons)
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
         numbers = {picture.wall: picture.image.number for picture in pictures}
-        shift_m = np.array(
-            [gsd_m[points[k].wall] * (points[k].place - points[k].expected) for k in found]
-        )
-        surveyed_m = np.array([gsd_m[points[k].wall] * points[k].expected for k in found])
-        walls = np.array([points[k].wall for k in found], dtype=np.int32)
+        shown = [points[k] for k in found]
+        shift_m = np.array([gsd_m[one.wall] * (one.place - one.expected) for one in shown])
+        surveyed_m = np.array([gsd_m[one.wall] * one.expected for one in shown])
+        walls = np.array([one.wall for one in shown], dtype=np.int32)
         classes = [inputs.checkpoints.classes[k] for k in found]
         findings = _findings(shift_m, classes, max(gsd_m.values()))
         findings += length_findings(surveyed_m, shift_m, walls)
-        findings += _findings_in_space([points[k] for k in found], inputs.checkpoints, found)
+        findings += _findings_in_space(shown, inputs.checkpoints, found)
         if inputs.orthoimages is not None:
             findings += _findings_of_images(pictures, inputs.cameras)
         ctx.metric("n_points", len(points), "1")
         report(findings, pictures[0].wall, numbers, ctx)
         _warn_of_cap(findings, ctx)
-        own_names = [inputs.checkpoints.names[k] for k in found]
-        _draw(pictures, [points[k] for k in found], own_names, ctx)
-        _log_residuals(shift_m, own_names, ctx)
-        for name, point in list(missed.items())[:_MAX_LOGGED]:
-            ctx.log(f"check point {name}: not used, {point.reason}")
+        _draw(pictures, shown, [inputs.checkpoints.names[k] for k in found], ctx)
+        for name, reason in list(missed.items())[:_MAX_LOGGED]:
+            ctx.log(f"check point {name}: not used, {reason}")
         names = tuple(dict.fromkeys(classes))
         return self.Out(
             inspection=Inspection(
@@ -332,13 +322,6 @@ def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
     if capped:
         numbers = ", ".join(f"{item.name} {item.value:.0f}" for item in capped)
         ctx.report(CAPPED_RULE, numbers=numbers)
-
-
-def _log_residuals(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:
-    """Log the residuals, the largest first."""
-    for k in np.argsort(-np.linalg.norm(shift_m, axis=1), kind="stable")[:_MAX_LOGGED]:
-        u_mm, v_mm = 1e3 * shift_m[k]
-        ctx.log(f"check point {names[k]}: u {u_mm:+.2f} mm, v {v_mm:+.2f} mm")
 
 
 def _draw(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Final
@@ -196,7 +197,7 @@ def _true_wall(
     from orthoflow.geometry.scene_views import render
 
     scene, slab = inputs.truth.scene, inputs.walls.slab(place)
-    step = _step(slab.n_cells)
+    step = max(1, math.ceil(math.sqrt(slab.n_cells / _MAX_SAMPLES)))
     rows, columns = (-(-count // step) for count in slab.frame.shape)
     sampled = replace(slab.frame, gsd_m=step * slab.frame.gsd_m, width=columns, height=rows)
     nowhere = np.zeros(sampled.shape, dtype=np.bool_)
@@ -227,14 +228,6 @@ def _true_wall(
         scene=scene,
         views=views,
     )
-
-
-def _step(n_cells: int) -> int:
-    """Return how many raster cells to merge along each side, to limit the number of samples."""
-    step = 1
-    while n_cells // step**2 > _MAX_SAMPLES:
-        step += 1
-    return step
 
 
 def _labelled(

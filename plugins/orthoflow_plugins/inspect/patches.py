@@ -345,7 +345,7 @@ def _refined(
         expected, design, inside = sampler.at(part, shift[active])
         weight = part.weight * inside
         step[active], sigma[active] = _normal_step(design, part.grey - expected, weight)
-        correlation[active] = _correlations(part.grey, expected, weight)
+        correlation[active] = correlations(part.grey, expected, weight)
         # Move by at most half a cell, the range of the linear model.
         shift[active] += np.clip(step[active], -0.5, 0.5)
     good = (
@@ -362,7 +362,7 @@ def _refined(
     )
 
 
-def _correlations(
+def correlations(
     first: NDArray[np.float64], second: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return weighted correlation coefficients (p,) of patches (p, n)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,13 +74,6 @@ def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
     return off_m if off_m > frame.gsd_m * size.max() else 0.0
 
 
-class Missed(NamedTuple):
-    """Why a point is not used; `is_beside` if a larger wall would include it."""
-
-    reason: str
-    is_beside: bool = False
-
-
 def missed_points(
     points: Sequence[ShownPoint],
     surveyed: CheckPoints,
@@ -88,7 +81,7 @@ def missed_points(
     walls: Walls,
     *,
     is_simulated: bool = False,
-) -> dict[str, Missed]:
+) -> dict[str, str]:
     """Return the reasons why points are not used, by name, in the order of the survey.
 
     Args:
@@ -100,33 +93,30 @@ def missed_points(
     """
     sought = "nothing similar" if is_simulated else "no black and white quadrant target"
     names = {picture.wall: picture.image.name for picture in pictures}
-    found: dict[str, Missed] = {}
+    found: dict[str, str] = {}
     for index, point in enumerate(points):
         if np.isfinite(point.place).all():
             continue
         if point.how != "outside":
-            reason = f"{sought} was recognised on {names[point.wall]}"
-            found[surveyed.names[index]] = Missed(reason)
+            found[surveyed.names[index]] = f"{sought} was recognised on {names[point.wall]}"
             continue
         number = int(surveyed.wall[index])
         found[surveyed.names[index]] = (
-            Missed(f"there is no orthoimage of wall {number}")
+            f"there is no orthoimage of wall {number}"
             if number >= 0
             else min(_beside(surveyed, index, picture, walls) for picture in pictures)[1]
         )
     return found
 
 
-def with_reasons(missed: Mapping[str, Missed]) -> str:
+def with_reasons(missed: Mapping[str, str]) -> str:
     """List the first few results of `missed_points` with their reasons."""
-    named = [f"{name} ({point.reason})" for name, point in list(missed.items())[:_NAMED]]
+    named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
     more = f" and {len(missed) - _NAMED} more, see the log" if len(missed) > _NAMED else ""
     return f"{', '.join(named)}{more}"
 
 
-def _beside(
-    surveyed: CheckPoints, index: int, picture: Picture, walls: Walls
-) -> tuple[float, Missed]:
+def _beside(surveyed: CheckPoints, index: int, picture: Picture, walls: Walls) -> tuple[float, str]:
     """Return how far a point is outside an image, in metres, and the reason in words."""
     frame, slab = picture.frame, walls.slab(picture.wall)
     column, row, depth_m = frame.wall_from_world(surveyed.points_world[index][None])[0]
@@ -141,6 +131,5 @@ def _beside(
     side = max(off_m, key=off_m.__getitem__)
     far_m = float(np.linalg.norm([max(0.0, value) for value in off_m.values()]))
     said = f"{1e3 * off_m[side]:.3g} mm" if off_m[side] < _NEAR_M else f"{off_m[side]:.3g} m"
-    is_beside = side not in {"before", "behind"}
-    limit = "" if is_beside else ", beyond its buffer"
-    return far_m, Missed(f"{said} {side} {picture.image.name}{limit}", is_beside)
+    limit = ", beyond its buffer" if side in {"before", "behind"} else ""
+    return far_m, f"{said} {side} {picture.image.name}{limit}"

@@ -17,6 +17,7 @@ from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,
     GreyCells,
     GreyImage,
+    correlations,
     refine_shifts,
     unrefined,
 )
@@ -262,17 +263,8 @@ def _whole_shift(
             weight = focus * (shown.valid[part] & true.valid[middle, middle])
             if weight.sum() < _LEAST_VALID * focus.sum():
                 continue
-            likeness = _weighted_correlation(shown.grey[part], pattern, weight)
+            flat = (grey.reshape(1, -1) for grey in (shown.grey[part], pattern, weight))
+            likeness = float(correlations(*flat)[0])
             if likeness > best:
                 best, best_shift = likeness, np.array([column, row], dtype=np.int64)
     return best_shift
-
-
-def _weighted_correlation(
-    one: NDArray[np.float64], other: NDArray[np.float64], weight: NDArray[np.float64]
-) -> float:
-    total = weight.sum()
-    first = one - (weight * one).sum() / total
-    second = other - (weight * other).sum() / total
-    spread = (weight * first**2).sum() * (weight * second**2).sum()
-    return float((weight * first * second).sum() / np.sqrt(spread + 1e-12))

@@ -119,8 +119,6 @@ _OF_WALLS: Final = (
         "depth_within_3sigma", label="share of depths within three predicted standard deviations"
     ),
     lower("colour_rmse_grey", label="colour error, RMS"),
-    lower("filled_colour_rmse_grey", label="colour error of filled cells, RMS"),
-    lower("step_colour_rmse_grey", label="colour error near depth steps, RMS"),
     lower("ghost_share", label="share of the cells that show an occluder"),
     higher(
         "completeness",
@@ -487,7 +485,7 @@ class _Judge:
             viewers=viewers,
             supersample=_SUPERSAMPLE,
             coloured=chosen.coloured,
-            judged=chosen.coloured | chosen.lattice,
+            judged=chosen.lattice,
             cores=self.ctx.cores,
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Final, TypeVar
 
 import numpy as np
@@ -29,8 +28,6 @@ _CAUSE_WORTH_WORDS: Final = 0.01
 _LEFT_OUT_WORTH_WORDS: Final = 0.05
 # Smallest share that is not printed as 0.0 %.
 _SHARE_LEAST: Final = 0.0005
-# If cells with points have this mean number of points, cells are not too small.
-_DENSE_POINTS: Final = 4.0
 
 FRONT_LEFT_OUT: Final = DiagnosticSpec(
     code="wall-front-left-out",
@@ -73,7 +70,6 @@ SPARSE: Final = DiagnosticSpec(
     remedy="a larger {step}.gsd_m or {step}.recover_gap_cells closes narrow gaps",
     rank_by="share",
 )
-SPARSE_DENSE: Final = replace(SPARSE, remedy="{step}.recover_gap_cells closes narrow gaps")
 UNSEEN: Final = DiagnosticSpec(
     code="wall-unseen",
     severity="warning",
@@ -114,8 +110,8 @@ NO_POINT: Final = DiagnosticSpec(
 CLOSE_CELLS: Final = DiagnosticSpec(
     code="cells-finer-than-points",
     severity="warning",
-    text="{subject}: cells of gsd_m = {gsd_m:g} m {finer} about {step_m:.2g} m apart; "
-    "{measured:.0%} of the cells have a point, {interpolated:.0%} are interpolated{empty}",
+    text="{subject}: cells of gsd_m = {gsd_m:g} m are used for points about {step_m:.2g} m "
+    "apart; {measured:.0%} of the cells have a point, {interpolated:.0%} are interpolated",
     remedy="{remedy}",
     rank_by="interpolated",
 )
@@ -147,22 +143,14 @@ def warn(
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
             measured = np.count_nonzero(wall.count) / wall.count.size
-            empty = 1.0 - measured - filled
-            finer = (
-                "are finer than the scan, whose points are"
-                if step_m > gsd_m
-                else "are used for points"
-            )
             larger = f"{{step}}.gsd_m={_least_gsd_m(step_m):g} or more leaves fewer"
             ctx.report(
                 CLOSE_CELLS,
                 subject=wall.name,
                 gsd_m=gsd_m,
-                finer=finer,
                 step_m=step_m,
                 measured=measured,
                 interpolated=filled,
-                empty=f", {empty:.0%} are empty" if empty >= _SHARE_WORTH_WORDS else "",
                 remedy=larger if is_close else "",
             )
 
@@ -266,14 +254,12 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
         )
         # No warning for the few tiles at the border of a hole, which also contain its surroundings.
         least = max(_CAUSE_WORTH_WORDS, 0.1 * of_wall.share)
-        is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
         if shares_of["before"] < _LEFT_OUT_WORTH_WORDS and of_wall.share < _SHARE_WORTH_WORDS:
             continue
         for cause, share in shares_of.items():
             if share >= least:
-                spec = SPARSE_DENSE if cause == "sparse" and is_dense else _CAUSES[cause]
-                if cause == "before" and wall.frame.raster_axes in {"level", "map"}:
-                    spec = STOOD_ON
+                is_floor = wall.frame.raster_axes in {"level", "map"}
+                spec = STOOD_ON if cause == "before" and is_floor else _CAUSES[cause]
                 ctx.report(
                     spec,
                     subject=wall.name,

@@ -76,9 +76,7 @@ def test_cells_are_compared_away_from_steps_and_by_what_they_are() -> None:
     assert np.isnan(errors.depth_m[[0, 11]]).all()
     # Per row of sixteen cells away from steps: six rows right, one off by 10.
     assert np.count_nonzero(samples.colour == 100.0) == 16
-    np.testing.assert_allclose(samples.filled_colour, np.full(16, 400.0 / 3.0))
     assert len(samples.colour) == 8 * 16
-    assert len(samples.step_colour) == 8 * 4 + 20
     np.testing.assert_allclose(errors.grey[5, :8], 10.0)
     assert np.isnan(errors.grey[10:]).all()
     painted = (image_.mask == OrthoMask.PAINTED) & (true.rectangle >= 0)
@@ -94,9 +92,8 @@ def samples_of(**given: Any) -> WallSamples:
     none = np.zeros(0)
     usual = {
         "depth_m": none, "sigma_m": none, "step_depth_m": none, "colour": none,
-        "filled_colour": none, "step_colour": none, "shift_m": np.zeros((0, 2)),
-        "shift_cells": np.zeros((0, 2)), "n_seen": 0, "n_seen_painted": 0,
-        "n_seen_shown": 0,
+        "shift_m": np.zeros((0, 2)), "shift_cells": np.zeros((0, 2)),
+        "n_seen": 0, "n_seen_painted": 0, "n_seen_shown": 0,
     }  # fmt: skip
     return WallSamples(**{**usual, **given})
 
@@ -113,8 +110,6 @@ def test_numbers_follow_their_definitions() -> None:
         sigma_m=np.array([0.0004, 0.0005, 0.0011, np.nan]),
         step_depth_m=np.array([0.01, 0.02]),
         colour=np.array([4.0, 16.0]),
-        filled_colour=np.array([9.0]),
-        step_colour=np.array([25.0, 49.0]),
         shift_m=0.01 * shift_cells,
         shift_cells=shift_cells,
         n_seen=8, n_seen_painted=6, n_seen_shown=7,
@@ -128,8 +123,6 @@ def test_numbers_follow_their_definitions() -> None:
         "depth_within_3sigma": 2.0 / 3.0,
         "depth_step_rmse_mm": np.sqrt(250.0),
         "colour_rmse_grey": np.sqrt(10.0),
-        "filled_colour_rmse_grey": 3.0,
-        "step_colour_rmse_grey": np.sqrt(37.0),
         "n_patches": 5.0,
         "rmse_u_mm": np.sqrt((kept[:, 0] ** 2).mean()),
         "rmse_v_mm": np.sqrt((kept[:, 1] ** 2).mean()),

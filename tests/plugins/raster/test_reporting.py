@@ -94,8 +94,6 @@ def test_cells_that_are_advised_are_no_longer_too_fine(ctx: StepContext) -> None
     [advised] = re.findall(r"gsd_m=([0-9.]+)", said.remedy)
     assert float(advised) == 0.0051
     assert step_m <= 2 / 3 * float(advised)
-    # Of cells that are not empty nothing is said of empty ones.
-    assert "empty" not in said.text
 
 
 def emptiness(**shares: float) -> Emptiness:
@@ -152,16 +150,3 @@ def test_what_stands_before_a_wall_is_left_out_and_what_stands_on_a_floor_is_not
     assert first.values["buffer_front_m"] == 2.8
     assert "buffer_front_m=2.8" in first.remedy
     assert (second.code, second.severity, second.remedy) == ("floor-stood-on", "note", "")
-
-
-@pytest.mark.parametrize(
-    ("counts", "is_dense"), [([[8, 0, 0, 1]], True), ([[7, 0, 0, 0.9]], False)]
-)
-def test_larger_cells_are_advised_only_where_cells_lack_points(
-    ctx: StepContext, counts: list[list[float]], *, is_dense: bool
-) -> None:
-    raster = replace(wall([[1, 1, 1, 1]]), count=np.array(counts))
-    reporting.report_empty(ctx, [raster], [emptiness(sparse=0.5)])
-    (one,) = ctx.diagnostics
-    assert ("gsd_m" in one.remedy) != is_dense
-    assert "recover_gap_cells" in one.remedy
