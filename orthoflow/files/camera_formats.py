@@ -82,7 +82,7 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
         if len(files) == 1 or len(usual) == 1:
             return reader((usual or files)[0])
         if files and not several:
-            several = f"{len(files)} {suffix} files, of which one must be chosen; "
+            several = f"{len(files)} {suffix} files, one of which must be chosen; "
     names = first_few([path.name for path in paths])
     raise InputError(
         f"{names or 'nothing'} contains no cameras that orthoflow can read: {several}expected a "

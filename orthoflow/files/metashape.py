@@ -176,7 +176,7 @@ def _from_geocentric(crs: Any, path: Path) -> Any:
 
     level = crs.sub_crs_list[0] if crs.is_compound else crs
     if level.geodetic_crs is None:
-        raise damaged(path, f"its coordinate system {crs.name} has no place on Earth")
+        raise damaged(path, f"its coordinate system {crs.name} is not georeferenced")
     geodetic = level.geodetic_crs.to_json_dict()
     datum = "datum_ensemble" if "datum_ensemble" in geodetic else "datum"
     axes = [

@@ -87,7 +87,7 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         "crs": frame.map_crs or local_crs_name(frame.crs),
         "raster": {
             "world_from_raster": "origin_world + gsd_m * (column * u_world + row * v_world) + "
-            "depth_m * normal_world; v_world points down, cell centres lie at .5",
+            "depth_m * normal_world; v_world points down, cell centres are at .5",
             "geotiff": f"{geotiff}; pixel is area",
         },
     }

@@ -345,7 +345,7 @@ def _pictured(run: Run, cell: str | None) -> str:
     everything = [*found["orthoimages"], *found["walls"]]
     if cell not in everything:
         raise ArgumentError(
-            f"the step {cell} has no orthoimages or walls; steps of this run that have: "
+            f"the step {cell} has no orthoimages or walls; steps of this run that have them: "
             f"{', '.join(everything) or 'none'}"
         )
     return cell

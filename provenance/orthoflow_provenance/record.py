@@ -466,7 +466,7 @@ def _copy_product(products: h5py.Group, digest: str, source: h5py.Group) -> None
     stored = text_attribute(source, "digest")
     if stored != digest:
         name = Path(source.file.filename).name
-        raise RecordFormatError(f"{name} must hold the product {digest}, got {stored}")
+        raise RecordFormatError(f"{name} must contain the product {digest}, got {stored}")
     # Copies chunks unchanged; decompressing and compressing again would take ten times as long.
     source.file.copy(source, products, name=digest.removeprefix(DIGEST_PREFIX))
 

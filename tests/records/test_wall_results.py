@@ -137,7 +137,7 @@ def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
         module._pictured(held(e, plane), None)
     with pytest.raises(ArgumentError, match=r"e has no orthoimages or walls; .*: none"):
         module._pictured(held(e), "e")
-    with pytest.raises(ArgumentError, match="steps of this run that have: b, c, a, d"):
+    with pytest.raises(ArgumentError, match="steps of this run that have them: b, c, a, d"):
         module._pictured(run, "e")
 
 

@@ -87,7 +87,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "copc": Format(
         "clouds:export_copc",
-        "the same as COPC (LAZ with an octree), of which viewers load only the visible part",
+        "the same as COPC (LAZ with an octree), from which viewers load only the visible part",
     ),
     "ply": Format(
         "clouds:export_ply",

@@ -415,7 +415,7 @@ def _source_map(image: Orthoimage) -> bytes:
 
 def _caption(image: Orthoimage) -> str:
     n_more = max(0, len(image.sources) - _NAMED_MOST)
-    more = f", of which {n_more} with few cells are not named" if n_more else ""
+    more = f" (the legend omits {n_more} with few cells)" if n_more else ""
     return (
         f"{image.name}, coloured by source{more}; seams in white. Large uniform areas are good; "
         "small patches of many colours mark areas that no photo shows well, where edges may appear "

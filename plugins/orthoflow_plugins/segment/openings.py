@@ -70,7 +70,7 @@ NO_CLOUD: Final = DiagnosticSpec(
 OTHER_SURFACE: Final = DiagnosticSpec(
     code="wall-behind-its-plane",
     severity="warning",
-    text="{subject}: most of it lies {behind_m:.2f} m behind its plane, so {what}",
+    text="{subject}: most of its surface is {behind_m:.2f} m behind its plane, so {what}",
     rank_by="behind_m",
 )
 OTHER_CELLS: Final = DiagnosticSpec(

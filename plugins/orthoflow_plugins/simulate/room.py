@@ -231,8 +231,8 @@ class SimulateRoom(Method):
             ge=0,
             le=20,
             description="Number of people who walk in front of the main wall while photos are "
-            "taken: in each photo, each of them is at another position or absent. The scan "
-            "does not contain them.",
+            "taken: each appears in about half of the photos, in different positions. The "
+            "scan does not contain them.",
         )
         photo_supersample: int = Field(
             2,

@@ -199,7 +199,7 @@ def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
         (("--grid", "0.01"), "--grid 0.01 puts crosses closer together than 2 mm at 1:"),
         (
             ("--step", "plane"),
-            "the step plane has no orthoimages or walls; steps of this run that have:",
+            "the step plane has no orthoimages or walls; steps of this run that have them:",
         ),
         (("--step", "none"), "has no step 'none'"),
         (("--title-block", "missing.yaml"), "missing.yaml cannot be read"),
