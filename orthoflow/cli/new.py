@@ -60,6 +60,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
                 "recipe": draft.recipe,
                 "inputs": dict(draft.inputs),
                 "left_out": list(draft.left_out),
+                "advice": list(draft.advice),
             }
         )
     else:
@@ -82,6 +83,8 @@ def _print(draft: Draft, output: Path) -> None:
         echo(f"{name}: {text}")
     for text in draft.left_out:
         echo(f"not used: {text}")
+    for text in draft.advice:
+        echo(f"note: {text}")
     name = shlex.quote(str(output))
     echo(
         f"wrote {output}, based on the recipe {draft.recipe}",

@@ -60,6 +60,7 @@ from orthoflow.errors import (
     ProductError,
     StepFailedError,
 )
+from orthoflow.geometry.compile_events import on_compiling
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
@@ -272,10 +273,10 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         is_cancelled: whether the task should stop.
     """
     started = now()
-    meter = LoadingMeter()
-    call = _Call(task, listen, is_cancelled, meter)
+    meter, progress = LoadingMeter(), _ProgressWithCompiling(listen)
+    call = _Call(task, progress.listen, is_cancelled, meter)
     try:
-        with meter:
+        with meter, on_compiling(progress.compiling):
             result = call.run()
     except BaseException as error:
         # If Ctrl-C is ignored, only the method can have raised KeyboardInterrupt.
@@ -285,7 +286,7 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         result = failed_result(task, explain_failure(task, error))
         if not isinstance(error, OrthoflowError):
             # Write the traceback to the log, and so to the record, for the author of the method.
-            listen(StepEvent(kind="log", text=_trace(error)))
+            progress.listen(StepEvent(kind="log", text=_trace(error)))
             result = dataclasses.replace(result, is_bug=True)
     return dataclasses.replace(
         result,
@@ -348,6 +349,24 @@ def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
         # Not a StoreError: the method needed more than is available, so it counts as failed.
         return StepFailedError(str(store_error(error, store)))
     return store_error(error, store) if is_broken(error, store) else None
+
+
+class _ProgressWithCompiling:
+    """Forwards messages of a step, and reports which kernel is being compiled."""
+
+    def __init__(self, listen: Listener) -> None:
+        self._listen = listen
+        self._last = StepEvent(kind="progress", text="", fraction=0.0)
+
+    def listen(self, event: StepEvent) -> None:
+        """Forward a message of the method."""
+        if event.kind == "progress":
+            self._last = event
+        self._listen(event)
+
+    def compiling(self, text: str) -> None:
+        """Report the kernel being compiled, or the previous message once it is compiled."""
+        self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 
 @dataclass(kw_only=True)

@@ -21,10 +21,12 @@ from typing import Any, Final, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core import config, types
+from numba.core import config, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import TypingError
+
+from orthoflow.geometry.compile_events import report_compiling
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
@@ -254,3 +256,35 @@ def _give_constants_no_version(kernel: Any) -> None:
             return template_for(args, kws)
 
     kernel.get_call_template = template_for_any
+
+
+class _Compilation(event.Listener):
+    """Reports which kernel is being compiled, including the kernels needed by another one.
+
+    The lock of the compiler ensures that only one thread compiles at a time.
+    """
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._n_begun = 0
+
+    def on_start(self, event: event.Event) -> None:
+        """Report the kernel being compiled, and the number compiled so far in this process.
+
+        The total number depends on the data of a step and is unknown.
+        """
+        kernel = event.data["dispatcher"]
+        self._depth += 1
+        self._n_begun += 1
+        # Functions that numba generates have no informative names.
+        name = kernel.py_func.__qualname__.partition(".")[0]
+        report_compiling(f"compiling {name} ({self._n_begun} so far)")
+
+    def on_end(self, event: event.Event) -> None:
+        """Report the end of compilation."""
+        self._depth -= 1
+        if self._depth == 0:
+            report_compiling("")
+
+
+event.register("numba:compile", _Compilation())  # type: ignore[no-untyped-call]

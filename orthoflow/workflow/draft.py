@@ -6,10 +6,14 @@ import json
 import os
 import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
@@ -17,11 +21,12 @@ from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images
 from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
-from orthoflow.files.photo_files import HOW_TO_DEVELOP, photo_format, unreadable
-from orthoflow.files.points import FORMATS, open_scan
+from orthoflow.files.photo_files import HOW_TO_DEVELOP, photo_format, read_exif, unreadable
+from orthoflow.files.points import FORMATS, ScanFile, open_scan
 from orthoflow.files.points.formats import TEXT
 from orthoflow.files.points.units import refuse_degrees
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
+from orthoflow.geometry.cloud_quality import judge_quality
 from orthoflow.sdk.lines import text_of_path
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.source import shipped_workflow
@@ -57,6 +62,10 @@ class Recognised:
         n_points: number of points of a scan.
         n_photos: number of photos, including photos in a scan.
         n_posed: number of photos in a scan that have lens and pose.
+        fields: non-empty point attributes of a scan, without coordinates.
+        lens: camera and focal length of a photo, from its EXIF data.
+        up: up axis suggested by the surfaces, if it is clearly not z.
+        advice: suggested settings and inputs, as far as they follow from the data.
     """
 
     kind: FileKind
@@ -65,6 +74,10 @@ class Recognised:
     n_points: int = 0
     n_photos: int = 0
     n_posed: int = 0
+    fields: frozenset[str] = frozenset()
+    lens: str = ""
+    up: str = ""
+    advice: tuple[str, ...] = ()
 
 
 def recognised(paths: Sequence[Path]) -> list[Recognised]:
@@ -137,7 +150,11 @@ def _photo(path: Path) -> Recognised:
     problem = unreadable(path.read_bytes() if photo_format(head) == "HEIC" else head)
     if problem:
         return _unknown(path, problem)
-    return Recognised(kind="photos", path=path, summary="a photo", n_photos=1)
+    exif = read_exif(head)
+    lengths = {"mm": exif.focal_mm, "mm (35 mm equivalent)": exif.focal_35mm}
+    stated = [f"{value:g} {unit}" for unit, value in lengths.items() if value]
+    lens = f"{exif.camera} {stated[0]}".strip() if stated else ""
+    return Recognised(kind="photos", path=path, summary="a photo", n_photos=1, lens=lens)
 
 
 def _scan(path: Path) -> Recognised:
@@ -145,16 +162,32 @@ def _scan(path: Path) -> Recognised:
     unit = scan.scans[0].unit
     if unit is not None:
         refuse_degrees(path.name, unit)
+    stated = {str(name) for name in scan.fields} & _FIELDS.keys()
+    fields, points_m = _seen_in(scan, np.ones(3) if unit is None else np.array(unit.metres))
     is_e57 = path.suffix.lower() == E57_SUFFIX
     photos = count_e57_images(path) if is_e57 else E57ImageCount()
     words = [scan.format_name, f"{scan.n_most:,} points"]
     if unit is not None:
         words.append(f"unit {unit.name} ({unit.source})")
-    if stated := [word for name, word in _FIELDS.items() if name in scan.fields]:
-        words.append(" and ".join(stated))
+    for beginning, names in (
+        ("", fields),
+        ("nothing in its fields for ", stated - fields),
+    ):
+        if names:
+            listed = " and ".join(word for name, word in _FIELDS.items() if name in names)
+            words.append(f"{beginning}{listed}")
     if photos.n_images:
         count = f"{photos.n_images} photos" if photos.n_images > 1 else "a photo"
         words.append(count if photos.n_posed else f"{count} without a pose")
+    up = _axis_up(points_m)
+    # Largest extent along a coordinate axis.
+    extent_m = float(np.ptp(points_m, axis=0).max()) if len(points_m) else 0.0
+    advice = _about_extent(path.name, extent_m, "m" if unit is None else unit.name)
+    if up:
+        advice.append(
+            f"{_word(path.name)}: its surfaces suggest that {up} points up, not z: cloud.up is "
+            f"{up} in the workflow; change it to -{up} if floors are labelled as ceilings"
+        )
     return Recognised(
         kind="scan",
         path=path,
@@ -162,10 +195,58 @@ def _scan(path: Path) -> Recognised:
         n_points=scan.n_most,
         n_photos=photos.n_images,
         n_posed=photos.n_posed,
+        fields=fields,
+        up=up,
+        advice=tuple(advice),
     )
 
 
-# Number of bytes read of a photo.
+def _axis_up(points_m: NDArray[np.float64]) -> str:
+    """Return the up axis if the surfaces show that it is clearly not z; otherwise ""."""
+    if not len(points_m):
+        return ""
+    offsets = (points_m - np.median(points_m, axis=0)).astype(np.float32)
+    quality = judge_quality(list(offsets.T), None)
+    axis = None if quality is None else quality.plainly_up(np.array([0.0, 0.0, 1.0]))
+    return "" if axis is None else "xyz"[axis]
+
+
+def _seen_in(
+    scan: ScanFile, unit_m: NDArray[np.float64]
+) -> tuple[frozenset[str], NDArray[np.float64]]:
+    """Return non-empty fields of a scan's first points, and their (n, 3) positions in metres."""
+    kept: list[NDArray[np.float64]] = []
+    found: set[str] = set()
+    n_seen = 0
+    for block in scan.read():
+        kept.append(block.points[np.isfinite(block.points).all(axis=1)] * unit_m)
+        values = {"intensity": block.intensity, "rgb": block.rgb}
+        found |= {
+            name for name, one in values.items() if one is not None and np.nan_to_num(one).any()
+        }
+        n_seen += block.n_read
+        if n_seen >= _LOOKED_AT:
+            break
+    return frozenset(found), np.concatenate([np.empty((0, 3)), *kept])
+
+
+def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
+    """Return advice to check the unit if a scan is unusually large or small."""
+    if extent_m > _MAX_EXTENT_M:
+        size, hint = f"{extent_m:,.0f} m", "if its coordinates are millimetres, set cloud.unit=mm"
+    elif 0 < extent_m < _MIN_EXTENT_M:
+        size = f"{extent_m * 1000:.3g} mm"
+        hint = "check the unit of the export, and set cloud.unit"
+    else:
+        return []
+    return [f"{_word(name)} is {size} long if its unit is {unit}: {hint}"]
+
+
+# Usual extents of terrestrial scans.
+_MAX_EXTENT_M: Final = 2000.0
+_MIN_EXTENT_M: Final = 0.2
+# Number of points read of a scan, and number of bytes read of a photo, which begins with EXIF.
+_LOOKED_AT: Final = 1_000_000
 _HEAD_BYTES: Final = 1 << 20
 _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
@@ -261,12 +342,14 @@ class Draft:
         text: text of the workflow file.
         inputs: description of each input.
         left_out: files that are not used as input, with the reason.
+        advice: suggested settings and inputs, as far as they follow from the data.
     """
 
     recipe: Recipe
     text: str
     inputs: Mapping[str, str]
     left_out: Sequence[str]
+    advice: Sequence[str] = ()
 
 
 def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | None) -> Draft:
@@ -294,9 +377,18 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     own_formats = [scan for scan in scans if scan.path.suffix.lower() not in TEXT.suffixes]
     if own_formats and len(own_formats) < len(scans):
         # Text files next to scans in other formats are probably notes with numbers.
-        notes = [scan.path for scan in scans if scan not in own_formats]
-        ignored = "text file, ignored because there are scans in other formats"
-        by_kind.setdefault("unknown", []).extend(_unknown(path, ignored) for path in notes)
+        by_kind["unknown"] = [
+            *by_kind.get("unknown", []),
+            *(
+                replace(
+                    scan,
+                    summary="text file, ignored because there are scans in other formats",
+                    advice=(),
+                )
+                for scan in scans
+                if scan not in own_formats
+            ),
+        ]
         scans = by_kind["scan"] = own_formats
     own_photos = [scan for scan in scans if scan.n_photos]
     has_posed = any(scan.n_posed for scan in own_photos)
@@ -305,6 +397,13 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
         raise InputError("photos-on-scan needs photos, but there are none among the files")
+    has_paint = any({"intensity", "rgb"} & scan.fields for scan in scans)
+    if recipe is None and chosen == "direct" and not has_paint:
+        raise InputError(
+            f"{_some([scan.path.name for scan in scans])}: the points have neither colours nor "
+            "intensity, so they cannot be used for orthoimages: give photos too, or export the "
+            "scan with its colours (--recipe direct writes the workflow anyway)"
+        )
     if own_photos and "photos" not in by_kind:
         # Photos taken by a scanner are in the scan file, with their poses.
         inside = [
@@ -332,6 +431,7 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
         files = taken.get(match[1], ()) if match else ()
         lines.append(_input_line(match[1], files, target) if match and files else line)
     described = {name: _described(files) for name, files in taken.items()}
+    advice = _advice(by_kind)
     name = re.sub(r"[^A-Za-z0-9_-]+", "-", target.stem).strip("-") or recipe
     body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
     run = shlex.quote(target.name)
@@ -339,14 +439,34 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
         f"# Made by `orthoflow new` from the recipe {recipe}.yaml.",
         *(f"#   {name}: {text}" for name, text in described.items()),
         *(f"# Not used: {text}" for text in left_out[:_MOST_LISTED]),
+        *(f"# Note: {text}" for text in advice[:_MOST_LISTED]),
         "#",
         f"#   orthoflow check {run}       check it for mistakes",
         f"#   orthoflow plan {run}        show what would run",
         f"#   orthoflow run {run} --set wall.gsd_m=0.02    a fast coarse run; then without",
         "",
     ]
-    text = "\n".join([*map(_seen, summary), f"{body}\n{_without_stand_ins(steps)}"])
-    return Draft(recipe=recipe, text=text, inputs=described, left_out=left_out)
+    # Steps of the recipe, with the up axis if it follows from the scans.
+    steps = _without_stand_ins(steps)
+    axes = {item.up for item in by_kind["scan"]}
+    (up,) = axes if len(axes) == 1 else ("",)
+    if up:
+        reading = "in: {files: inputs.scan}\n"
+        steps = steps.replace(reading, f"{reading}    params: {{up: {up}}}\n", 1)
+    text = "\n".join([*map(_seen, summary), f"{body}\n{steps}"])
+    return Draft(recipe=recipe, text=text, inputs=described, left_out=left_out, advice=advice)
+
+
+def _advice(by_kind: _ByKind) -> list[str]:
+    advice = [text for items in by_kind.values() for item in items for text in item.advice]
+    photos = [item for item in by_kind.get("photos", ()) if item.kind == "photos"]
+    without = [item.path.name for item in photos if not item.lens]
+    if without and not {"calibration", "cameras"} & by_kind.keys():
+        advice.append(
+            f"{len(without)} of {len(photos)} photos have no focal length in EXIF: {_some(without)}"
+            "; give a calibration if you have one"
+        )
+    return advice
 
 
 def _assigned(
@@ -416,7 +536,9 @@ def _described(items: Sequence[Recognised]) -> str:
         return "; ".join(f"{_word(item.path.name)}, {item.summary}" for item in items)
     n_photos = sum(item.n_photos for item in items)
     if n_photos == len(items):
-        return f"{n_photos} photos"
+        lenses = Counter(item.lens for item in items if item.lens)
+        listed = [f"{_word(lens)} ({count})" for lens, count in lenses.most_common()]
+        return ", ".join([f"{n_photos} photos", *([first_few(listed, most=4)] if listed else [])])
     return f"{len(items)} files: {_some([item.path.name for item in items])}"
 
 

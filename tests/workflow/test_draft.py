@@ -175,6 +175,33 @@ def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
     assert f"not used: {name}, link-{name}: a pipe or a device" in told
 
 
+# --- what the data show ---
+
+
+def test_a_scan_with_empty_fields_is_no_source_of_colours(data: Path) -> None:
+    cloud = laspy.read(data / "hall.las")
+    cloud.intensity[:] = cloud.red[:] = 0
+    cloud.write(str(data / "bare.las"))
+    result = asked("new", data / "bare.las")
+    assert result.exit_code == 2
+    assert "bare.las: the points have neither colours nor intensity" in result.output
+    assert not Path("workflow.yaml").exists()
+    out = said("new", data / "bare.las", data / "photos")
+    assert "nothing in its fields for intensity and colours" in out
+    assert "based on the recipe photos-on-scan" in out
+    said("new", data / "bare.las", "--recipe", "direct", "-o", "asked.yaml")
+
+
+@pytest.mark.parametrize(("scale", "note"), [(1000, "set cloud.unit=mm"), (1, ""), (1e-4, "unit")])
+def test_a_scan_of_another_unit_is_asked_about(data: Path, scale: float, note: str) -> None:
+    points = np.random.default_rng(1).uniform(0, 8, (50, 3)) * scale
+    rows = "\n".join(f"{x:.6f} {y:.6f} {z:.6f} {k % 7}" for k, (x, y, z) in enumerate(points))
+    (data / "room.xyz").write_text(rows)
+    out = json.loads(said("new", data / "room.xyz", "--json"))
+    assert bool(out["advice"]) is bool(note)
+    assert note in "".join(out["advice"])
+
+
 def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path) -> None:
     cloud = laspy.read(data / "hall.las")
     for epsg, name in ((2260, "feet"), (4326, "degrees")):
@@ -183,17 +210,36 @@ def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path)
         cloud.write(str(data / f"{name}.las"))
     out = said("new", data / "feet.las")
     assert "unit us-ft (GeoTIFF keys + NAD83 / New York East (ftUS))" in out
+    assert "note:" not in out
     result = asked("new", data / "degrees.las", "-o", "degrees.yaml")
     assert result.exit_code == 2
     assert "degrees.las has geographic coordinates in degrees" in result.output
+
+
+@pytest.mark.parametrize("up", ["x", "z"])
+def test_the_axis_that_surfaces_show_to_be_up_is_set_and_reported(data: Path, up: str) -> None:
+    # Two slopes on one floor, as a roof: by no other axis they are level and upright.
+    rng = np.random.default_rng(2)
+    u, v = rng.uniform(0.0, 4.0, (2, 20_000))
+    walls = np.array([[np.cos(a), np.sin(a), 0.0] for a in (0.4, 1.1, 1.8, 2.5)])
+    height = np.stack([np.zeros_like(u), np.zeros_like(u), v]).T
+    parts = [np.stack([u, v, 0.0 * u], axis=1), *(u[:, None] * wall + height for wall in walls)]
+    points = np.roll(np.concatenate(parts), "xyz".index(up) - 2, axis=1)
+    np.savetxt(data / "hall.xyz", np.column_stack([points, rng.uniform(0, 9, len(points))]))
+    out = said("new", data / "hall.xyz")
+    steps = Path("workflow.yaml").read_text()
+    assert (f"cloud.up is {up} in the workflow" in " ".join(out.split())) is (up != "z")
+    assert (f"    params: {{up: {up}}}\n" in steps) is (up != "z")
+    assert said("check", "workflow.yaml").startswith("workflow is valid")
 
 
 # --- drafts by themselves ---
 
 
 def found(kind: str, name: str, summary: str = "something", n_photos: int = 0) -> Recognised:
-    counts = {"n_photos": n_photos, "n_posed": n_photos if kind == "scan" else 0}
-    return Recognised(kind=kind, path=Path(name), summary=summary, **counts)
+    posed, fields = (n_photos, frozenset(["rgb"])) if kind == "scan" else (0, frozenset())
+    counts = {"n_photos": n_photos, "n_posed": posed}
+    return Recognised(kind=kind, path=Path(name), summary=summary, **counts, fields=fields)
 
 
 def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:

@@ -1,0 +1,31 @@
+"""Progress of the compilation of kernels; this module does not load the compiler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+Listener = Callable[[str], None]
+
+_listeners: list[Listener] = []
+
+
+@contextmanager
+def on_compiling(listener: Listener) -> Iterator[None]:
+    """Report the kernels that are compiled within a `with` block, in any thread.
+
+    Args:
+        listener: called with `compiling NAME (3 so far)` when a compilation begins, and with an
+            empty string when it is complete.
+    """
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
+
+
+def report_compiling(text: str) -> None:
+    """Call all listeners."""
+    for listener in tuple(_listeners):
+        listener(text)
