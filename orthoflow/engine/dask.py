@@ -49,6 +49,20 @@ _POLL_S: Final = 0.1
 _LOOK_S: Final = 1.0
 
 
+def look_around(path: str, methods: str) -> tuple[str, str]:
+    """Check the environment of a worker; runs on each worker before it gets a task.
+
+    Returns:
+        The content of the file, or the reason why it cannot be read; and how the methods or
+        libraries of the worker differ, empty if they are the same.
+    """
+    try:
+        seen = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        seen = error.strerror or "it cannot be read"
+    return seen, misfit(methods)
+
+
 def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -> str:
     """Run a task in a child process of this worker; return its result as JSON.
 
@@ -72,8 +86,7 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
     if n_before > retries:
         return _refused(own, StepFailedError(describe_loss(task.who, n_before)))
     if wrong := methods and misfit(methods):
-        message = f"{task.who} cannot run on {worker.address}: {wrong}; install the plan's version"
-        return _refused(own, PluginError(message))
+        return _refused(own, PluginError(f"{task.who} cannot run on {worker.address}: {wrong}"))
 
     def forward(_: str, event: StepEvent) -> None:
         worker.log_event(topic, (task.address, EVENTS.dump_json(event)))
@@ -116,6 +129,7 @@ def _refused(task: Task, error: StepFailedError | PluginError) -> str:
 
 # Dask resource of the workers: cores available for steps.
 CORES: Final = "cores"
+_PROOF_FILE: Final = "workers-see-this"
 _CONNECT_S: Final = 15.0
 # Time to wait for the first worker, for a lost scheduler, and after all workers are lost.
 _PATIENCE_S: Final = 60.0
@@ -133,16 +147,21 @@ _QUIET: Final = {
 class DaskExecutor:
     """Runs tasks on the workers of a cluster, or on its own workers."""
 
-    def __init__(self, plan: RunPlan, capacity: Capacity, listen: StepListener) -> None:
-        """Connect to the scheduler.
+    def __init__(
+        self, plan: RunPlan, scratch: Path, capacity: Capacity, listen: StepListener
+    ) -> None:
+        """Connect to the scheduler, and check that all workers can execute the plan.
 
         Args:
             plan: the plan; its options contain the scheduler address.
+            scratch: folder of the run in the store.
             capacity: limits of its own workers, if no scheduler is given.
             listen: called with the address of a task and its message.
 
         Raises:
-            ArgumentError: there is no such scheduler or no worker.
+            ArgumentError: there is no such scheduler or no worker, or a worker cannot access the
+                store.
+            PluginError: a worker has no orthoflow, or other versions of methods or libraries.
         """
         self._listen = listen
         self._retries = plan.options.retries
@@ -160,6 +179,7 @@ class DaskExecutor:
             self._client.subscribe_topic(self._topic, self._receive)
             if self._address:
                 self._wait_for_workers()
+                self._look_at_workers(scratch)
         except BaseException:
             self.close()
             raise
@@ -302,6 +322,30 @@ class DaskExecutor:
                 )
             time.sleep(0.1)
         self._capacity = _capacity(workers)
+
+    def _look_at_workers(self, scratch: Path) -> None:
+        path, word = scratch / _PROOF_FILE, uuid.uuid4().hex
+        write_whole(path, word.encode())
+        found: Mapping[str, tuple[str, str] | Exception] = self._client.run(
+            look_around, str(path), self._methods, workers=list(self._workers()), on_error="return"
+        )
+        for address, answer in found.items():
+            if isinstance(answer, Exception):
+                raise PluginError(
+                    f"worker {address} cannot run orthoflow ({type(answer).__name__}: "
+                    f"{one_line(answer)}); install the same version there"
+                )
+            seen, wrong = answer
+            if seen != word:
+                raise ArgumentError(
+                    f"worker {address} cannot access the store {scratch.parent.parent} "
+                    f"({one_line(seen)}): give a --store on a file system that all workers "
+                    f"have mounted at the same path"
+                )
+            if wrong:
+                raise PluginError(
+                    f"worker {address}: {wrong}; install the version of the plan there"
+                )
 
 
 def _client(address: str, capacity: Capacity) -> Client:

@@ -137,7 +137,7 @@ def execute(
             recomputes it.
         CancelledStepError: the run was interrupted by Ctrl-C or SIGTERM.
         ClusterError: the scheduler was lost or does not respond.
-        PluginError: Dask is not installed.
+        PluginError: workers have other versions of a method or library, or Dask is not installed.
     """
     folder = Path(run_folder).absolute()
     for what, path in (("run folder", folder), ("store", store.folder)):
@@ -156,7 +156,7 @@ def execute(
         )
         with _scratch(store, journal.run_id) as scratch, _watching_interruptions() as interruption:
             run = _Run(plan, store, journal, listen, scratch=scratch, logs=folder / LOGS)
-            executor = _executor_of(plan, run.report, lambda: interruption.is_asked)
+            executor = _executor_of(plan, scratch, run.report, lambda: interruption.is_asked)
             with closing(executor):
                 run.go(executor, interruption)
         return run.outcome()
@@ -439,12 +439,13 @@ def _lock_of(folder: Path) -> Path:
 
 
 def _executor_of(
-    plan: RunPlan, listen: StepListener, is_asked_to_stop: Callable[[], bool]
+    plan: RunPlan, scratch: Path, listen: StepListener, is_asked_to_stop: Callable[[], bool]
 ) -> Executor:
     """Return the executor selected in the options of a run.
 
     Args:
         plan: plan of the run.
+        scratch: scratch folder of the run.
         listen: called with messages of steps.
         is_asked_to_stop: whether the run is interrupted.
 
@@ -460,7 +461,7 @@ def _executor_of(
             raise PluginError(
                 "--executor dask needs dask: pip install 'orthoflow-tls[dask]'"
             ) from error
-        return DaskExecutor(plan, capacity, listen)
+        return DaskExecutor(plan, scratch, capacity, listen)
     if options.executor == "inline":
         return InlineExecutor(capacity, listen, is_asked_to_stop)
     return LocalExecutor(capacity, listen)

@@ -158,11 +158,14 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
     sources: dict[str, list[str]] = {}
     for source, user in wires:
         sources.setdefault(user, []).append(source)
-    try:
-        TopologicalSorter(sources).prepare()
-    except CycleError as error:
-        # Each step of this list is the source of the next; the last one is the first again.
-        names_in_cycle: list[str] = error.args[1]
+    while True:
+        try:
+            TopologicalSorter(sources).prepare()
+        except CycleError as error:
+            # Each step of this list is the source of the next; the last one is the first again.
+            names_in_cycle: list[str] = error.args[1]
+        else:
+            return
         edges = list(itertools.pairwise(names_in_cycle))
         places = {edge: log.position(wires[edge][0]) for edge in edges}
         first = min(range(len(edges)), key=lambda index: places[edges[index]])
@@ -171,6 +174,8 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
             f"{edge[1]} takes {wires[edge][1]} (line {places[edge].line})" for edge in edges
         )
         log.report(wires[edges[0]][0], f"the steps form a cycle: {listed}")
+        for name in names_in_cycle:
+            sources.pop(name, None)
 
 
 # Comparison ---------------------------------------------------------------------------------------
@@ -355,6 +360,9 @@ def _has_wildcard(text: str) -> bool:
 # Valid but implausible settings -------------------------------------------------------------------
 
 _GSD: Final = "gsd_m"
+_CROP: Final = "crop"
+# Prefix of the methods that find photos on walls.
+_MATCHING: Final = "match."
 # Limits for pixel sizes of walls and plans: finer than any scan, coarser than any building drawing.
 _MIN_GSD_M: Final = 0.0001
 _MAX_GSD_M: Final = 0.5
@@ -363,7 +371,7 @@ _MILLIMETRES: Final = 1000.0
 
 def lint_workflow(workflow: Workflow) -> tuple[str, ...]:
     """Yield a sentence for each implausible setting."""
-    return (*_idle_inputs(workflow), *_cell_sizes(workflow))
+    return (*_idle_inputs(workflow), *_cell_sizes(workflow), *_cropped_matching(workflow))
 
 
 def _idle_inputs(workflow: Workflow) -> Iterator[str]:
@@ -392,6 +400,29 @@ def _cell_sizes(workflow: Workflow) -> Iterator[str]:
             yield (
                 f"{place}{whose} is {gsd_m:g} m, which is implausible: cells are "
                 f"{_MIN_GSD_M:g} to {_MAX_GSD_M:g} m wide{hint}"
+            )
+
+
+def _cropped_matching(workflow: Workflow) -> Iterator[str]:
+    cropped = {
+        step
+        for _, step, variant in _calls(workflow, _CROP)
+        if variant.params.get(_CROP) is not None
+    }
+    matching = [
+        step
+        for step in workflow.steps.values()
+        if any(variant.method.startswith(_MATCHING) for variant in step.variants)
+    ]
+    # If cameras are given, no matching is needed.
+    if any(step.unless and workflow.inputs[step.unless].files for step in matching):
+        return
+    for first in matching[:1]:
+        for wall in cropped.intersection(first.upstream()):
+            yield (
+                f"{wall}.{_CROP} leaves a smaller area for {first.name}, so fewer photos are "
+                "oriented, and less accurately; run without it first, and use the cameras of that "
+                "run: --input cameras=RUN/products/orient/cameras.json"
             )
 
 

@@ -18,7 +18,7 @@ from orthoflow.engine.journal import CellReported, RunEvent, RunListener
 from orthoflow.engine.keys import methods_text, misfit
 from orthoflow.engine.plan import RunPlan
 from orthoflow.engine.scheduler import RunOutcome, execute
-from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError
+from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
 from tests.engine_world import World, digests, preload_for_toys, start_fork_server, toy_world
 from tests.long_loops import long_only
 
@@ -187,24 +187,27 @@ def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
     assert digests(execute(world.plan(STEPS), folder, world.store)) == office.quiet
 
 
-def test_steps_fail_on_workers_with_other_versions_which_are_named(office: Office) -> None:
+def test_workers_with_other_versions_are_refused_by_name(office: Office) -> None:
     plan = office.plan()
     tools = plan.methods["work.slow"].tools
-    for number, (change, said) in enumerate(
-        (
-            ({"result_version": 7}, "work.slow has the result version 1 there, 7 in the plan"),
-            ({"tools": {**tools, "far": "2.0"}}, "work.slow has far none there, 2.0 in the plan"),
-            ({"code": {"toy_plugin": "0"}}, "work.slow has different code there"),
-        )
+    for change, said in (
+        ({"result_version": 7}, "work.slow has the result version 1 there, 7 in the plan"),
+        ({"tools": {**tools, "far": "2.0"}}, "work.slow has far none there, 2.0 in the plan"),
+        ({"code": {"toy_plugin": "0"}}, "work.slow has different code there"),
     ):
         facts = dataclasses.replace(plan.methods["work.slow"], **change)
         other = dataclasses.replace(plan, methods={**plan.methods, "work.slow": facts})
-        outcome = execute(other, office.world.folder / f"misfit{number}", office.world.store)
-        failed = outcome.results["second"]
-        assert (failed.error_type, failed.exit_code) == ("PluginError", 4)
-        assert "cannot run on tcp://127.0.0.1" in failed.error_message
-        assert said in failed.error_message
+        with pytest.raises(PluginError, match=f"^worker .*{said}; install "):
+            execute(other, office.world.folder / "misfit", office.world.store)
     assert misfit(methods_text(plan.methods)) == ""
+
+
+def test_workers_that_do_not_see_the_store_are_refused(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_dask, "write_whole", lambda *_: None)
+    with pytest.raises(ArgumentError, match=r"cannot access the store .*No such file"):
+        office.run()
 
 
 def test_an_address_without_scheduler_is_refused(

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.checks import lint_workflow
+from orthoflow.workflow.document import load_workflow
 from tests.laboratories import GOOD, load
 
 
@@ -19,6 +23,18 @@ def test_cells_that_cannot_be_meant_are_told(catalog: Catalog, tmp_path: Path) -
     ):
         workflow = load(GOOD.replace("{gsd_m: 1}", f"{{gsd_m: {gsd_m}}}"), tmp_path / "a", catalog)
         assert lint_workflow(workflow) == ((said,) if said else ())
+
+
+@pytest.mark.parametrize(("recipe", "n"), [("photos-on-scan", 1), ("direct", 0)])
+def test_a_crop_is_reported_where_photos_are_matched_to_it(recipe: str, n: int) -> None:
+    """A scan's own colours lose nothing by a crop."""
+    catalog, sets = discover_catalog(), ["wall.crop=[0, 0, 1, 1]"]
+    reported = lint_workflow(load_workflow(recipe, catalog, sets=sets))
+    assert len([text for text in reported if text.startswith("wall.crop leaves ")]) == n
+    # Cameras from elsewhere need no matches.
+    given = ["cameras=cameras.json"] if n else []
+    reported = lint_workflow(load_workflow(recipe, catalog, inputs=given, sets=sets))
+    assert not [text for text in reported if "crop" in text]
 
 
 def test_inputs_that_nothing_takes_are_told(catalog: Catalog, tmp_path: Path) -> None:

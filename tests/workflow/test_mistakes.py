@@ -60,6 +60,10 @@ STEPS = [
         "z: {use: raster.grid, in: {cloud: cloud.cloud, planes: p.planes}}\n"
         "p: {use: plane.hough2d, in: {cloud: cloud.cloud}}"
     ),
+    (
+        "a: {use: raster.grid, in: {cloud: a.cloud, planes: b.planes}}\n"
+        "b: {use: plane.hough2d, in: {cloud: b.planes}}"
+    ),
     "x: {in: {cloud: cloud.cloud}, params: {cell_m: 1}, variants: {a: {use: plane.hough2d}}}",
     "x: {in: {cloud: cloud.cloud}, variants: {}}",
     "x: {in: {cloud: cloud.cloud}, variants: {a: {use: plane.hough2d}, b: {use: orient.pnp}}}",
