@@ -82,7 +82,7 @@ def test_a_plane_before_the_wall_is_not_its_face_and_far_before_it_of_something_
     openings, ctx = found(tmp_path, walls=scenes.walls(face_m=-0.1), cloud=scenes.cloud())
     assert [opening.kind for opening in openings.openings] == ["niche", "through", "no data"]
     assert openings.openings[0].depth_m == pytest.approx(scenes.NICHE_M, abs=0.001)
-    assert any("lies 0.10 m behind its plane" in warning for warning in ctx.warnings)
+    assert any("is 0.10 m behind its plane" in warning for warning in ctx.warnings)
     openings, ctx = found(tmp_path, walls=scenes.walls(face_m=-0.35), cloud=scenes.cloud())
     assert (openings.openings, openings.walls) == ((), (4,))
     assert any("it is another surface, with no openings" in text for text in ctx.warnings)
