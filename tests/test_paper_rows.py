@@ -26,7 +26,7 @@ from orthoflow_plugins.plane.planes import normality
 from orthoflow_plugins.register.similarity import fit_similarity
 from scipy import ndimage, stats
 
-from orthoflow.geometry import Plane, frame_over
+from orthoflow.geometry import frame_over
 from orthoflow.geometry.key_points import mutual_matches
 from tests import raster_scenes, samples
 from tests.inspect_scenes import displaced
@@ -64,16 +64,6 @@ def test_the_fullest_bin_of_the_plan(accumulator: str) -> None:
     # Cells and bins begin elsewhere, and votes are shared between two bins.
     np.testing.assert_allclose(sign * found.plane.normal, normal, atol=np.radians(1.01))
     assert float(sign * found.plane.offset_m) == pytest.approx(r_m, abs=0.06)
-
-
-def test_equations_of_planes() -> None:
-    """Equations 1 and 3 of markiewicz2015: points of a plane by omega, phi and R have no rest."""
-    normal = normal_of(101.6, 0.57)
-    axes = np.linalg.svd(normal[None])[2][1:]
-    points = 3.65 * normal + np.random.default_rng(1).normal(size=(50, 2)) @ axes
-    plane = Plane(normal=normal, offset_m=3.65)
-    np.testing.assert_allclose(plane.distances_m(points), 0.0, atol=1e-12)
-    np.testing.assert_allclose(points @ normal - 3.65, plane.distances_m(points), atol=1e-12)
 
 
 def test_deviations_from_a_plane() -> None:

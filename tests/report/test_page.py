@@ -193,22 +193,6 @@ def test_nothing_sticks_out_of_a_phone(page: Page) -> None:
     assert page.evaluate(whole) <= width
 
 
-def test_pictures_open_large_and_the_arrow_keys_lead_on(page: Page) -> None:
-    page.show_as(1440)
-    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
-    inline = page.evaluate("document.querySelector('.plain .picture img').clientWidth")
-    page.evaluate("document.querySelector('.plain .enlarge').click()")
-    assert page.evaluate(f"{VIEWER}.open")
-    first = page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText")
-    assert page.evaluate(f"{VIEWER}.querySelector('img').getBoundingClientRect().width") > inline
-    page.press("ArrowRight")
-    assert page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText") != first
-    page.press("ArrowLeft")
-    assert page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText") == first
-    page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
-    assert not page.evaluate(f"{VIEWER}.open")
-
-
 def test_points_are_read_and_collected_in_the_enlarged_view(page: Page) -> None:
     rows = "document.querySelectorAll('.points [data-part=list] > div')"
     before = page.evaluate(f"{rows}.length")
@@ -249,19 +233,6 @@ def test_points_are_read_and_collected_in_the_enlarged_view(page: Page) -> None:
     page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
 
 
-def test_the_slider_remembers_what_was_compared(page: Page) -> None:
-    path = page.evaluate("location.pathname")
-    position = "document.querySelector('[data-part=position]')"
-    page.evaluate(
-        "(() => { const right = document.querySelector('[data-part=right]'); right.value = 3;"
-        f" right.dispatchEvent(new Event('change')); {position}.value = 30;"
-        f" {position}.dispatchEvent(new Event('input')); }})()"
-    )
-    page.open(Path(path))
-    assert page.evaluate("document.querySelector('[data-part=right]').value") == "3"
-    assert page.evaluate(f"{position}.value") == "30"
-
-
 def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> None:
     bar = "document.querySelector('.chooser')"
     page.evaluate(AS_ROWS)
@@ -283,17 +254,6 @@ def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> No
     )
     assert any("error along u, RMS / mm" in name for name in names)
     assert not any("points to the first plane" in name for name in names)
-
-
-def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:
-    page.open(Path(page.evaluate("location.pathname")))
-    way = "document.querySelector('.way')"
-    assert not page.evaluate(f"{way}.open")
-    assert page.evaluate("!!document.querySelector('[data-chooser] .turned a')")
-    page.evaluate(f"document.querySelector('a[href=\"#' + {way}.id + '\"]').click()")
-    page.evaluate("new Promise(done => setTimeout(done, 50))")
-    assert page.evaluate(f"{way}.open")
-    assert "plane=coarse" in page.evaluate(f"{way}.querySelector('summary').innerText")
 
 
 def test_axe_finds_nothing_that_keeps_people_out(page: Page) -> None:
