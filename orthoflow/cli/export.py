@@ -270,19 +270,11 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
 
     make_empty(folder)
     record = embedded(run, folder, chosen)
-    after = record.content_sha256
-    is_same = after == run.content_sha256
     n_products = sum(len(cell.outputs) for cell in record.cells.values())
     n_files = sum(len(entry.files) for entry in record.record.inputs)
     return (
         f"{record.path.name} with {counted(n_products, 'product')} and "
-        f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes, "
-        + (
-            "everything was already embedded, so the seal is the same"
-            if is_same
-            else "sealed again"
-        )
-        + f": sha256:{after}"
+        f"{counted(n_files, 'input file')}, seal sha256:{record.content_sha256}"
     )
 
 

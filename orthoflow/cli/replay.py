@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shutil
 from collections.abc import Iterator, Sequence
@@ -162,6 +163,7 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
         yield given
         return
     fresh = folder.with_name(f"{folder.name}.store")
+    is_new = not fresh.parent.exists()
     fresh.mkdir(parents=True, exist_ok=True)
     try:
         yield fresh
@@ -170,6 +172,10 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
         raise
     except BaseException:
         shutil.rmtree(fresh, ignore_errors=True)
+        if is_new:
+            # A folder such as `runs`, if nothing was run.
+            with contextlib.suppress(OSError):
+                fresh.parent.rmdir()
         raise
     shutil.rmtree(fresh, ignore_errors=True)
 

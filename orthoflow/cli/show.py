@@ -218,15 +218,6 @@ def _as_json(run: Run) -> dict[str, object]:
 
 def _cell_json(cell: RecordedCell) -> dict[str, object]:
     values = dataclasses.asdict(dataclasses.replace(cell, figures=()))
-    # Empty fields of metrics are omitted, as in the record.
-    values["metrics"] = [
-        {
-            name: value
-            for name, value in dataclasses.asdict(metric).items()
-            if not (value == "" or value is False)
-        }
-        for metric in cell.metrics
-    ]
     # Pictures are in the record and the report; only their names are listed here.
     values["figures"] = [
         {"name": figure.name, "caption": figure.caption, "media_type": figure.media_type}

@@ -120,18 +120,15 @@ def _points(
 ) -> tuple[PointCloud | None, PointLabels | None]:
     """Return the cloud in which planes were detected, and its labels; None if not stored."""
     cells = branch_of(run, address)
-    for cell in reversed(cells.values()):
-        labels = [out.digest for out in cell.outputs.values() if out.type_name == "labels"]
-        taken = [item.digest for item in cell.inputs.values() if item.type_name == "cloud"]
-        if labels and len(taken) == 1:
-            try:
+    try:
+        for cell in reversed(cells.values()):
+            labels = [out.digest for out in cell.outputs.values() if out.type_name == "labels"]
+            taken = [item.digest for item in cell.inputs.values() if item.type_name == "cloud"]
+            if labels and len(taken) == 1:
                 return (
                     product_of(run, taken[0], PointCloud, chosen.store),
                     product_of(run, labels[0], PointLabels, chosen.store),
                 )
-            except ArgumentError:
-                return None, None
-    try:
         return last_product(run, cells, PointCloud, chosen.store), None
     except ArgumentError:
         return None, None
