@@ -54,7 +54,6 @@ _WRITER_MARKS: Final = 0b101
 _DEEPEST: Final = 32
 # Upper limit for valid files: deflate compresses by a factor of at most 1032.
 _LARGEST_RATIO: Final = 1100
-_ALWAYS_ALLOWED_BYTES: Final = 64 << 20
 _LARGEST_CHUNK_BYTES: Final = 64 << 20
 _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
 _LONGEST_NAME: Final = 256
@@ -392,7 +391,6 @@ class _Inspection:
         self._file = file
         self._name = path.name
         self._n_objects = 0
-        self._unfounded_bytes = 0
         self._seen: set[tuple[int, int]] = set()
 
     def run(self) -> None:
@@ -469,15 +467,8 @@ class _Inspection:
         self._refuse(place, chunk > _LARGEST_CHUNK_BYTES, "has chunks of more than 64 MiB")
         declared = math.prod(dataset.shape or ()) * itemsize
         stored = dataset.get_storage_size()
-        unfounded = declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored)
         sizes = f"declares {declared} bytes, but the file contains {stored}"
-        self._refuse(place, unfounded, sizes)
-        # Many datasets, each below the limit that is always allowed, could be excessive together.
-        self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
-        together = (
-            "and the datasets before it declare more than 64 MiB that the file does not contain"
-        )
-        self._refuse(place, self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES, together)
+        self._refuse(place, declared > _LARGEST_RATIO * stored, sizes)
 
     def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
         n_attributes = h5py.h5a.get_num_attrs(item)
