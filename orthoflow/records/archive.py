@@ -82,7 +82,6 @@ def write_crate(
     *,
     license_text: str = NO_LICENSE,
     author: str = "",
-    record: Run | None = None,
 ) -> tuple[Path, ...]:
     """Write a run as an RO-Crate: record, report, products, workflow and their metadata.
 
@@ -91,10 +90,9 @@ def write_crate(
 
     Args:
         run: the run.
-        folder: existing folder, empty except for `record`.
+        folder: existing folder, empty except for a record that was embedded into it.
         license_text: URL or name of the license of the results.
         author: author of the results, as name or ORCID; empty if unknown.
-        record: the run with another record, which is already in the folder.
 
     Returns:
         The files; the metadata file is first.
@@ -116,8 +114,8 @@ def write_crate(
     }
     for name, text in texts.items():
         _write(folder, name, text)
-    names = [*texts, *_copy_files(run, folder, record or run)]
-    crate = crate_metadata((record or run).record, names, license_text=license_text, author=author)
+    names = [*texts, *_copy_files(run, folder)]
+    crate = crate_metadata(run.record, names, license_text=license_text, author=author)
     _write(folder, METADATA_FILE, json.dumps(crate, indent=1, ensure_ascii=False) + "\n")
     return (folder / METADATA_FILE, *(path_inside(folder, name) for name in names))
 
@@ -128,21 +126,19 @@ def _write(folder: Path, name: str, text: str) -> None:
         stream.write(text.encode("utf-8", "backslashreplace"))
 
 
-def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
+def _copy_files(run: Run, folder: Path) -> list[str]:
     """Copy the record, the report with figures, and the published files; return their paths."""
-    if record.path != folder / RECORD_FILE:
+    is_new = run.path == folder / RECORD_FILE
+    if not is_new:
         with writing_to(folder):
-            shutil.copyfile(record.path, folder / RECORD_FILE)
+            shutil.copyfile(run.path, folder / RECORD_FILE)
     pages = [REPORT_FILE, *pages_of(run).values()]
     wanted = [*pages]
     # The report contains links to these files, if it was written with links.
     wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
-    signed: tuple[str, ...] = ()
-    if record is run and run.path.name == RECORD_FILE:
-        # Recreated rasters are in a separate folder, so the signature is copied from the run
-        # folder.
-        signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
-        signed = copy_files(run.path.parent, folder, [signature], ())
+    # Files may be in another folder than the record and its signature.
+    signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
+    signed = copy_files(run.path.parent, folder, [signature], ()) if not is_new else ()
     wanted += [
         f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/{file.name}"
         for address, files in run.files.items()
@@ -151,9 +147,9 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
     # Published files that belong to no cell, such as the table of all metrics.
     wanted += [file.path for file in run.record.published if file.path.count("/") == 1]
     copied = copy_files(run.folder, folder, wanted, run.record.published)
-    for page in set(pages) & set(copied) if record is not run else ():
+    for page in set(pages) & set(copied) if is_new else ():
         text = path_inside(folder, page).read_text(encoding="utf-8")
-        _write(folder, page, page_of(text, record))
+        _write(folder, page, page_of(text, run))
     return [RECORD_FILE, *signed, *copied]
 
 

@@ -494,7 +494,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         inputs: `NAME=PATH` as for `--input`; other input files are searched for by their content.
 
     Returns:
-        The run, with the new record.
+        The run, with the new record and its own files.
 
     Raises:
         InputError: an input file is missing.
@@ -520,7 +520,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
     with embedded_inputs(run, path.parent) as placed:
         files = _input_files(run, store.file_digests(), inputs, placed.extracted)
         _write_again(path, dataclasses.replace(run.record, inputs=whole), run, store, files)
-    return read_run(path)
+    return replace(read_run(path), files_folder=run.folder)
 
 
 def _write_again(

@@ -98,9 +98,10 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     if run.files_folder is not None:
         # If the record was alone in its folder, its rasters were restored to a folder of their own.
         write_page(run, run.folder / REPORT_FILE)
-    record = embedded(run, folder, chosen) if chosen.embed else None
+    if chosen.embed:
+        run = embedded(run, folder, chosen)
     author = (chosen.author or "").strip()
-    files = write_crate(run, folder, license_text=license_text, author=author, record=record)
+    files = write_crate(run, folder, license_text=license_text, author=author)
     lacking = "" if chosen.license_text and author else "; license or author unknown"
     return f"{counted(len(files), 'file')}, described in {files[0].name}{lacking}"
 

@@ -50,15 +50,15 @@ def test_a_crate_says_what_it_does_not_say(
 ) -> None:
     asked: dict[str, Any] = {}
 
-    def write_crate(_run: object, folder: Path, **known: object) -> list[Path]:
-        asked.update(known)
+    def write_crate(run: object, folder: Path, **known: object) -> list[Path]:
+        asked.update(known, run=run)
         return [folder / "ro-crate-metadata.json", folder / "run.h5"]
 
     monkeypatch.setattr("orthoflow.records.archive.write_crate", write_crate)
     monkeypatch.setattr(module, "embedded", lambda *_args: "the record")
     said = module.export_crate(Cells(), tmp_path / "out", Choices(**choices))  # type: ignore[arg-type]
     assert said == f"2 files, described in ro-crate-metadata.json{lacking}"
-    assert asked["record"] == ("the record" if choices.get("embed") else None)
+    assert (asked["run"] == "the record") is bool(choices.get("embed"))
     assert asked["author"] == choices.get("author", "").strip()
     # A crate without a license says that it has none.
     assert asked["license_text"] == choices.get("license_text", asked["license_text"])
