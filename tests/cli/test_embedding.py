@@ -105,7 +105,7 @@ def test_a_refused_export_of_a_record_alone_leaves_nothing(
         refused = studio(*command)
         assert refused.exit_code == 2
         assert "was found; give it with --input number=PATH" in refused.stderr
-    assert [path.name for path in alone.iterdir()] == ["run.h5"]
+    assert [path.name for path in alone.rglob("*") if path.is_file()] == ["run.h5"]
 
 
 def test_products_that_nobody_has_are_named_and_no_store_is_made(
