@@ -43,37 +43,41 @@ def plane_name(kind: PlaneKind, place: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Thickness of the cloud on one material.
+    """Thickness of the cloud for one class of points.
 
     Attributes:
-        low: lowest intensity of the material.
-        high: highest intensity of the material.
+        low: lower limit of the class, in its unit.
+        high: upper limit of the class.
         n_points: number of measured points.
         sigma_m: robust standard deviation of their distances.
-        name: name of the material.
+        name: name of the material, or None for other classes.
     """
 
     low: float
     high: float
     n_points: int
     sigma_m: float
-    name: str
+    name: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Thickness:
-    """Thickness of the cloud on one plane.
+    """Thickness of the cloud on one plane; classes are empty if their values are unknown.
 
     Attributes:
         sigma_m: robust standard deviation of the distances, relief removed.
         width_95_m: width of the range that contains 95 % of the distances.
         scan_step_m: median distance between neighbouring points on the plane.
+        incidence_deg: classes of the angle of incidence.
+        range_m: classes of the distance from the scanner.
         material: thickness by material.
     """
 
     sigma_m: float
     width_95_m: float
     scan_step_m: float
+    incidence_deg: tuple[Spread, ...] = ()
+    range_m: tuple[Spread, ...] = ()
     material: tuple[Spread, ...] = ()
 
 

@@ -63,7 +63,7 @@ def cameras() -> Cameras:
 def planes() -> Planes:
     spread = Spread(low=0.0, high=1.0, n_points=60, sigma_m=0.001, name="plaster")
     thickness = Thickness(
-        sigma_m=0.001, width_95_m=0.004, scan_step_m=0.003, material=(spread, spread)
+        sigma_m=0.001, width_95_m=0.004, scan_step_m=0.003, range_m=(spread,), material=(spread,)
     )
     row = ScanRow(row=3, scan=0, n_points=50, sigma_m=0.001, material=(spread,))
     known = {"tolerance_m": 0.02, "scan_row": row, "side_from": ("photos",) * 6}

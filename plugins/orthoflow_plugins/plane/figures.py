@@ -178,30 +178,54 @@ def draw_thickness(
     known = [(k, item) for k, item in enumerate(found) if item is not None][:_PLANES_MOST]
     if not known:
         return
+    first = known[:_CLASSED_MOST]
+    classes = [
+        (label, name)
+        for label, name in _CLASSES.items()
+        if any(getattr(item, name) for _, item in first)
+    ]
     bars = [
         (f"{spread.name}, {planes.names[k]}", 1000.0 * spread.sigma_m, plane_ink(k))
-        for k, item in known[:_CLASSED_MOST]
+        for k, item in first
         for spread in item.material
     ]
-    figure = column_figure(1.75 + (0.0 if row is None else 1.3))
-    grid = figure.add_gridspec(1 + (row is not None), 1 + bool(bars))
+    n_panels = 1 + len(classes) + bool(bars)
+    n_rows = -(-n_panels // 2)
+    figure = column_figure(1.75 * n_rows + (0.0 if row is None else 1.3))
+    grid = figure.add_gridspec(n_rows + (row is not None), 2 if n_panels > 1 else 1)
+    places = iter([grid[k // 2, k % 2] for k in range(n_panels)])
     sigmas = [(planes.names[k], 1000.0 * item.sigma_m, plane_ink(k)) for k, item in known]
-    axes = _draw_bars(figure.add_subplot(grid[0, 0]), sigmas, "thickness [mm]")
+    axes = _draw_bars(figure.add_subplot(next(places)), sigmas, "thickness [mm]")
     steps_mm = [1000.0 * item.scan_step_m for _, item in known]
     axes.plot(steps_mm, range(len(known)), "|", color="black", label="scan step")
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    for label, name in classes:
+        axes = figure.add_subplot(next(places))
+        for k, item in first:
+            spreads = getattr(item, name)
+            middles = [0.5 * (spread.low + spread.high) for spread in spreads]
+            sigmas_mm = [1000.0 * spread.sigma_m for spread in spreads]
+            axes.plot(middles, sigmas_mm, "o-", markersize=2, color=plane_ink(k))
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlabel(label)
+        axes.set_ylabel("thickness [mm]")
     if bars:
-        _draw_bars(figure.add_subplot(grid[0, 1]), bars, "thickness by material [mm]")
+        _draw_bars(figure.add_subplot(next(places)), bars, "thickness by material [mm]")
     if row is not None:
         _draw_row(figure.add_subplot(grid[-1, :]), planes, row, materials)
+    drawn = [label.partition(" [")[0] for label, _ in classes] + ["material"] * bool(bars)
     ctx.figure(
         "thickness",
         figure,
         "Thickness of the cloud, one standard deviation in millimetres: on each plane, with the "
-        f"scan step{', and by material' if bars else ''}."
+        f"scan step{''.join(f', by {name}' for name in drawn)}."
         f"{'' if row is None else ' Below: one row of the scan on the first plane.'} "
         "If the thickness exceeds the scan step, the cloud is noisy or its scans are misaligned.",
     )
+
+
+# Attributes against which the thickness is plotted, by axis label.
+_CLASSES: Final = {"angle of incidence [deg]": "incidence_deg", "range [m]": "range_m"}
 
 
 def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -27,6 +27,9 @@ _TILE_M: Final = 0.1
 _TILE_LEAST: Final = 4
 # Minimum number of points for a standard deviation.
 _SPREAD_LEAST: Final = 50
+_INCIDENCE_DEG: Final = tuple(float(edge) for edge in range(0, 91, 10))
+# Number of classes of range with equal numbers of points.
+_CLASSES: Final = 6
 # Share of the distances outside the reported width, on each side.
 _TAIL: Final = 0.025
 # Minimum number of points of a scan row on a plane.
@@ -102,15 +105,27 @@ def measure_thickness(
             found.append(None)
             continue
         low_m, high_m = np.quantile(deviation_m, (_TAIL, 1.0 - _TAIL))
-        material: tuple[Spread, ...] = ()
+        kept = members[crowded]
+        incidence, ranges, material = (tuple[Spread, ...](),) * 3
+        stations_m = _stations_of(sample.index[kept], cloud)
+        if stations_m is not None:
+            rays_m = sample.offsets_m[kept] - stations_m
+            range_m = np.linalg.norm(rays_m, axis=1)
+            cosine = np.abs(rays_m @ normal) / np.maximum(range_m, 1e-9)
+            incidence_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
+            incidence = _spreads(incidence_deg, np.array(_INCIDENCE_DEG), deviation_m)
+            edges_m = np.quantile(range_m, np.linspace(0.0, 1.0, _CLASSES + 1))
+            ranges = _spreads(range_m, np.unique(edges_m), deviation_m)
         if cloud.intensity is not None:
-            intensity = cloud.intensity[sample.index[members[crowded]]].astype(np.float64)
+            intensity = cloud.intensity[sample.index[kept]].astype(np.float64)
             material = _by_material(intensity, materials, deviation_m)
         found.append(
             Thickness(
                 sigma_m=median_deviation(deviation_m, 0.0),
                 width_95_m=float(high_m - low_m),
                 scan_step_m=_TILE_M / float(np.sqrt(usual * sample.n_represented)),
+                incidence_deg=incidence,
+                range_m=ranges,
                 material=material,
             )
         )
@@ -188,16 +203,45 @@ def _from_tiles(
     return crowded, deviation_m, usual
 
 
+def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.float64] | None:
+    """Return the station of each point, offsets (m, 3) or (3,) for one station; None if unknown."""
+    stations = cloud.stations
+    if stations is None or len(stations) == 0 or cloud.stations_source == "view_from":
+        return None
+    if len(stations) == 1:
+        return np.asarray(stations[0] - cloud.origin)
+    if cloud.scan is None or not len(index) or int(cloud.scan[index].max()) >= len(stations):
+        return None
+    return stations[cloud.scan[index]] - cloud.origin
+
+
+def _spreads(
+    values: NDArray[np.float64], edges: NDArray[np.float64], deviation_m: NDArray[np.float64]
+) -> tuple[Spread, ...]:
+    """Return the spread of each class of points; classes with too few points are omitted."""
+    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    found = (
+        _spread(None, float(edges[k]), float(edges[k + 1]), deviation_m[place == k])
+        for k in range(len(edges) - 1)
+    )
+    return tuple(one for one in found if one is not None)
+
+
 def _by_material(
     intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
     """Return the spread on each material; materials with too few points are omitted."""
-    found = []
-    for name, (low, high) in materials.items():
-        own_m = deviation_m[(intensity >= low) & (intensity <= high)]
-        if len(own_m) >= _SPREAD_LEAST:
-            sigma_m = median_deviation(own_m, 0.0)
-            found.append(
-                Spread(low=low, high=high, n_points=len(own_m), sigma_m=sigma_m, name=name)
-            )
-    return tuple(found)
+    found = (
+        _spread(name, low, high, deviation_m[(intensity >= low) & (intensity <= high)])
+        for name, (low, high) in materials.items()
+    )
+    return tuple(one for one in found if one is not None)
+
+
+def _spread(
+    name: str | None, low: float, high: float, deviation_m: NDArray[np.float64]
+) -> Spread | None:
+    if len(deviation_m) < _SPREAD_LEAST:
+        return None
+    sigma_m = median_deviation(deviation_m, 0.0)
+    return Spread(low=low, high=high, n_points=len(deviation_m), sigma_m=sigma_m, name=name)

@@ -111,11 +111,17 @@ def test_thickness_is_drawn_by_plane_material_and_row(
     materials = {"dark": (0.0, 0.15), "bright": (0.15, 1.0)}
     planes, _ = detected(Ransac, tmp_path, materials=materials)
     found = planes.thickness
-    sigmas, by_material, in_row = drawings["thickness"].axes
+    sigmas, *by_class, by_material, in_row = drawings["thickness"].axes
     widths_mm = [1e3 * item.sigma_m for item in found]
     np.testing.assert_allclose([bar.get_width() for bar in sigmas.patches], widths_mm)
     assert [text.get_text() for text in sigmas.get_yticklabels()] == list(planes.names)
     np.testing.assert_allclose(lines(sigmas)[0][0], [1e3 * item.scan_step_m for item in found])
+    for axes, name in zip(by_class, ("incidence_deg", "range_m"), strict=True):
+        for line, item in zip(lines(axes), found, strict=False):
+            expected = [
+                (0.5 * (one.low + one.high), 1e3 * one.sigma_m) for one in getattr(item, name)
+            ]
+            np.testing.assert_allclose(line.T, np.reshape(expected, (-1, 2)))
     bars = [
         (f"{spread.name}, {planes.names[k]}", 1e3 * spread.sigma_m)
         for k, item in enumerate(found[:4])

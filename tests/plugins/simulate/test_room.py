@@ -13,7 +13,6 @@ from orthoflow_plugins.simulate.room import SimulateRoom, _turn_about_up
 
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.geometry import UpDirection, basis_from_up
-from orthoflow.geometry.scenes import TextureKind
 from orthoflow.products import Photo, Photos, PointCloud, Truth
 from orthoflow.sdk import StepContext
 from tests import samples, scenes
@@ -131,20 +130,6 @@ def test_a_drawn_geometry_moves_planes_and_stations_and_keeps_the_truth(tmp_path
     for one, other in ((0, 1), (0, 2), (1, 2)):
         apart = [np.ptp(at, axis=0) @ np.ptp(at, axis=0) for at in (stations[one], stations[other])]
         assert abs(apart[0] - apart[1]) > 0.001
-
-
-def test_a_cloth_may_hang_on_drawn_walls(tmp_path: Path) -> None:
-    drawn = {**COARSE, "decoration": "drawn"}
-    bare = simulate(tmp_path / "bare", **drawn)
-    hung = simulate(tmp_path / "hung", **drawn, textile_share=0.2)
-    areas = []
-    for out in (bare, hung):
-        scene = out.truth.scene
-        cloth = scene.extent[scene.texture == TextureKind.TEXTILE]
-        areas.append(float(np.sum((cloth[:, 1] - cloth[:, 0]) * (cloth[:, 3] - cloth[:, 2]))))
-    assert areas == pytest.approx([0.0, 0.2 * 16.7])
-    # The cloth lies in the wall; openings go through it.
-    np.testing.assert_array_equal(bare.truth.labels, hung.truth.labels)
 
 
 def test_plaques_give_drawn_walls_check_points_at_edges(tmp_path: Path) -> None:
