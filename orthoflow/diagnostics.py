@@ -27,7 +27,6 @@ __all__ = [
     "placed",
     "standing",
     "step_names",
-    "unique",
     "warning_texts",
 ]
 
@@ -170,15 +169,6 @@ def grouped(reported: Iterable[tuple[str, Diagnostic]]) -> tuple[DiagnosticGroup
             ),
         )
     )
-
-
-def unique(reported: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """Return the distinct diagnostics."""
-    found: list[Diagnostic] = []
-    for one in reported:
-        if one not in found:
-            found.append(one)
-    return found
 
 
 def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:

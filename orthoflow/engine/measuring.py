@@ -68,7 +68,6 @@ _IMPORTS: Final = ("_find_and_load", "_lock_unlock_module")
 _NUMBA_EVENTS: Final = "numba.core.event"
 # Event of numba while a kernel is compiled or read from its file.
 _COMPILER_LOCK: Final = "numba:compiler_lock"
-_SAMPLE_S: Final = 0.05
 
 
 class LoadingMeter:

@@ -23,7 +23,6 @@ from orthoflow.engine.keys import (
 from orthoflow.engine.results import CellResult, ProductRef, ProductTarget
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, InputError, StoreError
-from orthoflow.geometry.threads import usable_cores
 from orthoflow.products.input_files import InputFiles
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import (
@@ -58,7 +57,6 @@ class RunOptions(Selection):
         scheduler: address of the Dask scheduler; if empty, `jobs` local workers are created.
         retries: maximum number of repetitions of a cell after a loss of its worker.
         force: steps to run even if their results are in the store.
-        cores: total number of processors; None for all that this process may use.
     """
 
     jobs: int = 1
@@ -66,24 +64,16 @@ class RunOptions(Selection):
     scheduler: str = ""
     retries: int = 2
     force: tuple[str, ...] = ()
-    cores: int | None = None
 
     def __post_init__(self) -> None:
         if self.jobs < 1:
             raise ArgumentError(f"--jobs must be 1 or more, got {self.jobs}")
-        if self.cores is not None and self.cores < 1:
-            raise ArgumentError(f"cores must be 1 or more, got {self.cores}")
         if self.executor not in ("local", "inline", "dask"):
             raise ArgumentError(f"--executor must be local, inline or dask, got {self.executor}")
         if self.scheduler and self.executor != "dask":
             raise ArgumentError("--scheduler is for --executor dask")
         if self.retries < 0:
             raise ArgumentError(f"--retries must be 0 or more, got {self.retries}")
-
-    @property
-    def all_cores(self) -> int:
-        """Return the number of processors available to the run."""
-        return self.cores or usable_cores()
 
 
 @dataclass(frozen=True, kw_only=True)

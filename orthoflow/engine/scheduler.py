@@ -50,6 +50,7 @@ from orthoflow.errors import (
     DamageError,
     PluginError,
 )
+from orthoflow.geometry.threads import usable_cores
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
@@ -453,7 +454,7 @@ def _executor_of(
         PluginError: Dask is not installed.
     """
     options = plan.options
-    capacity = Capacity.of_jobs(options.jobs, options.all_cores)
+    capacity = Capacity.of_jobs(options.jobs, usable_cores())
     if options.executor == "dask":
         try:
             from orthoflow.engine.dask import DaskExecutor  # noqa: PLC0415 - an extra

@@ -27,11 +27,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Final, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
 from orthoflow_provenance.document import (
     RecordFormatError,
-    canonical_json,
     shared_fields,
 )
 from pydantic import TypeAdapter
@@ -116,22 +115,10 @@ def make_store(folder: Path) -> None:
             ignore.write_text("*\n", encoding="utf-8")
 
 
-__all__ = [
-    "Publisher",
-    "Store",
-    "canonical_json",
-    "digest_of",
-]
-
+if TYPE_CHECKING:
+    from orthoflow.catalog.catalog import Publisher
 
 ProductT = TypeVar("ProductT", bound=Product)
-
-
-class Publisher(Protocol):
-    """Writes the files of a product for other programs."""
-
-    def __call__(self, product: Product, folder: Path, digest: str, /) -> object:
-        """Write the files into an existing empty folder."""
 
 
 @dataclass(frozen=True, kw_only=True)

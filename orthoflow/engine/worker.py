@@ -26,7 +26,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 import psutil
@@ -51,7 +51,7 @@ from orthoflow.engine.results import (
     result_to_json,
     shared_fields,
 )
-from orthoflow.engine.store import Publisher, Store
+from orthoflow.engine.store import Store
 from orthoflow.errors import (
     InputError,
     MethodError,
@@ -63,10 +63,13 @@ from orthoflow.errors import (
 from orthoflow.geometry.compile_events import on_compiling
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
-from orthoflow.sdk.context import Drawing, StepContext, StepEvent
+from orthoflow.sdk.context import StepContext, StepEvent
 from orthoflow.sdk.lines import describe_error, one_line
 from orthoflow.sdk.methods import Method, labelled
 from orthoflow.untrusted_text import shown
+
+if TYPE_CHECKING:
+    from orthoflow.catalog.catalog import Publisher
 
 # Leaves a margin for the method's own message, which is cut shorter, and the text around it.
 _LONGEST_ERROR: Final = 4000
@@ -369,28 +372,6 @@ class _ProgressWithCompiling:
         self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 
-@dataclass(kw_only=True)
-class _TimedContext(StepContext):
-    """A context that measures the time spent on figures, which is not the method's own time.
-
-    Attributes:
-        drawing_s: elapsed and processor seconds spent on figures.
-    """
-
-    drawing_s: tuple[float, float] = (0.0, 0.0)
-
-    def figure(
-        self, name: str, content: bytes | Callable[[], bytes] | Drawing, caption: str = ""
-    ) -> None:
-        """See `StepContext.figure`."""
-        clock_s, processor_s = self.clock_s(), self.processor_s()
-        try:
-            super().figure(name, content, caption)
-        finally:
-            taken_s = self.clock_s() - clock_s, self.processor_s() - processor_s
-            self.drawing_s = self.drawing_s[0] + taken_s[0], self.drawing_s[1] + taken_s[1]
-
-
 class _Call:
     """One call of a method, with its measurements so far, even if it fails."""
 
@@ -408,7 +389,7 @@ class _Call:
         self._store = Store(Path(task.store), workspace=Path(task.folder))
         with writing_to(self._store.folder):
             task.scratch.mkdir(parents=True, exist_ok=True)
-        self._context = _TimedContext(
+        self._context = StepContext(
             rng=np.random.default_rng(task.seed),
             cores=task.cores,
             scratch=task.scratch,

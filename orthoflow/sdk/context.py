@@ -95,6 +95,8 @@ class StepContext:
         metrics: metrics reported by `metric`.
         figures: figures reported by `figure`.
         diagnostics: diagnostics reported by `report` and `warn`.
+        drawing_s: elapsed and processor seconds spent on figures, which the engine does not count
+            as the method's own.
     """
 
     rng: np.random.Generator
@@ -107,6 +109,7 @@ class StepContext:
     metrics: list[Metric] = field(default_factory=list)
     figures: list[DrawnFigure] = field(default_factory=list)
     diagnostics: list[Diagnostic] = field(default_factory=list)
+    drawing_s: tuple[float, float] = (0.0, 0.0)
     _fraction: float = 0.0
     _named: set[str] = field(default_factory=set)
     _n_diagnostics: int = 0
@@ -159,6 +162,7 @@ class StepContext:
                 image or is larger than 64 MiB.
         """
         _require_name("figure", name)
+        clock_s, processor_s = self.clock_s(), self.processor_s()
         if callable(content):
             content = content()
         suffix = _suffix(content, name) if isinstance(content, bytes) else ".png"
@@ -184,6 +188,8 @@ class StepContext:
         self.figures.append(
             DrawnFigure(name=name, caption=one_line(caption), media_type=media_type, path=path)
         )
+        taken_s = self.clock_s() - clock_s, self.processor_s() - processor_s
+        self.drawing_s = self.drawing_s[0] + taken_s[0], self.drawing_s[1] + taken_s[1]
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Report the progress, 0 to 1, which never decreases; stop a cancelled step.

@@ -12,7 +12,6 @@ from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.errors import ArgumentError
-from orthoflow.geometry.threads import usable_cores
 from orthoflow.workflow.expand import Cell
 from tests.engine_world import World, forget_toys
 
@@ -66,9 +65,7 @@ RIGHT = dataclasses.replace(LEFT, digest="sha256:" + "2" * 64)
 INPUTS = {"left": LEFT, "right": RIGHT}
 
 
-def test_an_executor_and_its_cores_are_those_that_are_asked_for() -> None:
-    assert RunOptions(cores=3).all_cores == 3
-    assert RunOptions().all_cores == usable_cores()
+def test_an_executor_is_the_one_that_is_asked_for() -> None:
     assert RunOptions(executor="dask", scheduler="tcp://x:1").scheduler == "tcp://x:1"
     with pytest.raises(ArgumentError, match="--scheduler is for --executor dask"):
         RunOptions(scheduler="tcp://x:1")

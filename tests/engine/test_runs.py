@@ -115,8 +115,11 @@ values = np.array([ctx.cores, *[float(os.environ[name]) for name in names]])
 
 
 @pytest.mark.parametrize(("jobs", "cores"), [(2, 2), (8, 1)])
-def test_threads_are_fixed_before_any_library_loads(world: World, jobs: int, cores: int) -> None:
-    outcome = world.run(doing(THREADS), cores=4, jobs=jobs)
+def test_threads_are_fixed_before_any_library_loads(
+    world: World, monkeypatch: pytest.MonkeyPatch, jobs: int, cores: int
+) -> None:
+    monkeypatch.setattr("orthoflow.engine.scheduler.usable_cores", lambda: 4)
+    outcome = world.run(doing(THREADS), jobs=jobs)
     assert world.values(outcome, "b") == [float(cores)] * 5
     numba, where, scratch = outcome.results["b"].log.split()
     assert not numba.startswith(str(world.folder))
