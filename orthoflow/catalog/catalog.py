@@ -222,10 +222,9 @@ class Catalog:
         entry = self._product(type_name)
         if not entry.spec.publisher:
             return None
-        what = f"publisher of {type_name}"
-        publish = import_target(entry.spec.publisher, what, entry.distribution)
-        if not callable(publish):
-            raise PluginError(f"{what} of {entry.distribution} must be a function, got {publish!r}")
+        publish = import_target(
+            entry.spec.publisher, f"publisher of {type_name}", entry.distribution
+        )
         return cast("Publisher", publish)
 
     def _product(self, type_name: str) -> ProductEntry:
