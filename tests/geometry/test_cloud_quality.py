@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read.reporting import report_quality, warn_of_up
 
+from orthoflow.geometry import cloud_quality
 from orthoflow.geometry.cloud_quality import CloudQuality, judge_quality, scan_step_m
 from orthoflow.sdk import StepContext
 
@@ -148,9 +149,13 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
         "thickness_scan_steps": 1.55,
         "scans_apart_mm": 9.4,
     }
-    thick, apart = ctx.warnings
-    assert "scatter by 3.1 mm (95 % within 12.5 mm)" in thick
-    assert "they are 9.4 mm apart (median), while the scatter of each is 3.1 mm" in apart
+    thick, apart = ctx.diagnostics
+    assert [round(thick.values[name], 6) for name in ("sigma_mm", "width_mm", "step_mm")] == [
+        3.1,
+        12.5,
+        2.0,
+    ]
+    assert [round(apart.values[name], 6) for name in ("apart_mm", "sigma_mm")] == [9.4, 3.1]
     quiet = context(tmp_path)
     report_quality(replace(quality, scan_step_m=0.0032, scans_apart_m=0.003), quiet)
     report_quality(None, quiet)
@@ -170,12 +175,14 @@ def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
         assert quality_of(sigma_m=sigma_m, **apart).disagrees is (off > 0.0)
 
 
-def test_of_a_large_cloud_a_part_is_measured() -> None:
-    # Of more than four million points some slabs, and of dense pieces some.
-    quality = judged(wall(step_m=0.0011, noise_m=0.001))
+def test_of_a_large_cloud_a_part_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Of more points some slabs, and of dense pieces some.
+    monkeypatch.setattr(cloud_quality, "_LOOKED_AT_MOST", 400_000)
+    monkeypatch.setattr(cloud_quality, "_GATHERED_MOST", 150_000)
+    quality = judged(wall(step_m=0.0035, noise_m=0.001))
     assert quality.n_pieces >= 20
     assert quality.sigma_m == pytest.approx(0.001, rel=0.15)
-    assert quality.scan_step_m == pytest.approx(0.0011, rel=0.1)
+    assert quality.scan_step_m == pytest.approx(0.0035, rel=0.1)
 
 
 GSD_M = 0.01

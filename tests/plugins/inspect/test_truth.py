@@ -220,6 +220,7 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
         )
         for x in (0.6, 0.603)
     )
+    monkeypatch.setattr("orthoflow_plugins.inspect.truth._SUPERSAMPLE", 1)
     given = finer(2)
     inputs = given | {"truth": replace(given["truth"], cameras=true), "cameras": found}
 
