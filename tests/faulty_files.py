@@ -215,15 +215,11 @@ class FaultyFiles:
         _REAL["fsync"](descriptor)
         self._volatile.sync(descriptor, path)
 
+    # Any: the arguments are those of the operation.
     def _rename(
-        self,
-        source: Any,
-        target: Any,
-        *,
-        src_dir_fd: int | None = None,
-        dst_dir_fd: int | None = None,
+        self, source: Any, target: Any, *, src_dir_fd: int | None = None, **more: Any
     ) -> None:
-        old, new = _place(source, src_dir_fd), _place(target, dst_dir_fd)
+        old, new = _place(source, src_dir_fd), _place(target, more.get("dst_dir_fd"))
         self.step(new, "name")
         overwritten = self._volatile.keep(new)
         _REAL["rename"](old, new)
@@ -235,15 +231,7 @@ class FaultyFiles:
 
         self._named(new, undo)
 
-    def _replace(
-        self,
-        source: Any,
-        target: Any,
-        *,
-        src_dir_fd: int | None = None,
-        dst_dir_fd: int | None = None,
-    ) -> None:
-        self._rename(source, target, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd)
+    _replace = _rename
 
     def _mkdir(self, path: Any, mode: int = 0o777, *, dir_fd: int | None = None) -> None:
         place = _place(path, dir_fd)

@@ -68,65 +68,46 @@ def write_copc(path: Path, levels: Sequence[Mapping[tuple[int, int, int], Any]])
     import laspy
     import lazrs
 
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = np.zeros(3), np.full(3, 1e-4)
+    packed = lazrs.LazVlr.new_for_compression(6, 0, True)
+    info = laspy.VLR("copc", 1, "", bytes(160))
+    header.vlrs.extend([info, laspy.vlrs.known.LasZipVlr(packed.record_data())])
+    header.are_points_compressed = True
     keys = [(level, *place) for level, nodes in enumerate(levels) for place in nodes]
-    chunks = [np.asarray(levels[level][x, y, z]) for level, x, y, z in keys]
-    record = lazrs.LazVlr.new_for_compression(6, 0, True)
-    plain = path.with_suffix(".las")
-    write_las(plain, np.concatenate(chunks))
-    with laspy.open(plain) as reader:
-        vlrs = [
-            laspy.VLR("copc", 1, "", bytes(160)),
-            laspy.VLR("laszip encoded", 22204, "", bytes(record.record_data())),
-        ]
-        points = reader.read_points(-1).array.tobytes()
-    content = bytearray(plain.read_bytes()[:375])
-    for vlr in vlrs:
-        data = vlr.record_data_bytes()
-        name = vlr.user_id.encode().ljust(16, b"\0")
-        content += struct.pack("<H16sHH32s", 0, name, vlr.record_id, len(data), b"") + data
-    struct.pack_into("<HII", content, 94, 375, len(content), len(vlrs))
-    content[104] |= 0x80
     with path.open("w+b") as file:
-        file.write(content)
-        compressor = lazrs.LasZipCompressor(file, record)
-        compressor.reserve_offset_to_chunk_table()
-        size, begin, places = len(points) // sum(map(len, chunks)), 0, [file.tell()]
-        for chunk in chunks:
-            if begin:
+        header.write_to(file)
+        compressor = lazrs.LasZipCompressor(file, packed)
+        for level, *place in keys:
+            points = np.asarray(levels[level][tuple(place)])
+            record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+            record.x, record.y, record.z = points.T
+            if header.point_count:
                 # Also after the last one, it would begin another.
                 compressor.finish_current_chunk()
-                places.append(file.tell())
-            compressor.compress_many(points[begin : begin + size * len(chunk)])
-            begin += size * len(chunk)
+            header.grow(record)
+            compressor.compress_many(np.frombuffer(record.array, np.uint8))
         compressor.done()
-        end_of_file = file.tell()
-        file.seek(len(content))
-        places += struct.unpack("<q", file.read(8))  # the chunk table
-        file.seek(end_of_file)
-        entries = [
-            struct.pack("<4iQii", *key, at, end - at, len(chunk))
-            for key, at, end, chunk in zip(keys, places, places[1:], chunks, strict=False)
-        ]
-        _add_hierarchy(file, [key[0] for key in keys], entries)
+        file.seek(header.offset_to_point_data)
+        chunks = lazrs.read_chunk_table(file, packed)
+        at, pages = header.offset_to_point_data + 8, [b""] * len(levels)
+        for key, (count, size) in zip(keys, chunks, strict=False):
+            pages[key[0]] += struct.pack("<4iQii", *key, at, size, count)
+            at += size
+        header.start_of_first_evlr, header.number_of_evlrs = file.seek(0, 2), 1
+        start = file.tell() + 60
+        n_root = len(pages[0]) + 32 * (len(levels) - 1)
+        at = start + n_root
+        for level, page in enumerate(pages[1:], start=1):
+            pages[0] += struct.pack("<4iQii", level, 0, 0, 0, at, len(page), -1)
+            at += len(page)
+        tree = laspy.VLR("copc", 1000, "", b"".join(pages))
+        laspy.vlrs.vlrlist.VLRList([tree]).write_to(file, as_extended=True)
+        info.record_data = struct.pack("<5d2Q", 4.0, 4.0, 4.0, 4.0, 0.5, start, n_root)
+        info.record_data += bytes(160 - len(info.record_data))
+        file.seek(0)
+        header.write_to(file, ensure_same_size=True)
     return path
-
-
-def _add_hierarchy(file: Any, levels: list[int], entries: list[bytes]) -> None:
-    start = file.tell() + 60
-    pages = [
-        b"".join(entries[k] for k in range(len(levels)) if levels[k] == level)
-        for level in range(max(levels) + 1)
-    ]
-    root, at = pages[0], start + len(pages[0]) + 32 * (len(pages) - 1)
-    for level, page in enumerate(pages[1:], start=1):
-        root += struct.pack("<4iQii", level, 0, 0, 0, at, len(page), -1)
-        at += len(page)
-    data = root + b"".join(pages[1:])
-    file.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(data), b"hierarchy") + data)
-    file.seek(235)
-    file.write(struct.pack("<QI", start - 60, 1))
-    file.seek(375 + 54)
-    file.write(struct.pack("<5d2Q", 4.0, 4.0, 4.0, 4.0, 0.5, start, len(root)))
 
 
 # Any: arrays of every kind.
