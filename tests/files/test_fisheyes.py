@@ -47,24 +47,19 @@ def random_directions(count: int, widest_deg: float) -> NDArray[np.float64]:
     rng = np.random.default_rng(12)
     theta = np.radians(rng.uniform(0.0, widest_deg, count))
     around = rng.uniform(0.0, 2.0 * np.pi, count)
-    return np.column_stack(
-        [np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)]
-    )
+    level = np.sin(theta)
+    return np.column_stack([level * np.cos(around), level * np.sin(around), np.cos(theta)])
 
 
 def test_a_fisheye_projects_as_opencv_does() -> None:
     lens = replace(LENS, skew=3.0)
-    rays = random_directions(200, 80.0)
+    rays = 2.5 * random_directions(200, 80.0)
     matrix = np.array([[lens.fx, 0.0, lens.cx - 0.5], [0.0, lens.fy, lens.cy - 0.5], [0, 0, 1.0]])
+    still, skew = np.zeros(3), lens.skew / lens.fx
     found, _ = cv2.fisheye.projectPoints(
-        (2.5 * rays)[:, None],
-        np.zeros(3),
-        np.zeros(3),
-        matrix,
-        np.array(lens.radial),
-        alpha=lens.skew / lens.fx,
+        rays[:, None], still, still, matrix, np.array(lens.radial), alpha=skew
     )
-    np.testing.assert_allclose(lens.project(2.5 * rays), found[:, 0] + 0.5, atol=1e-9)
+    np.testing.assert_allclose(lens.project(rays), found[:, 0] + 0.5, atol=1e-9)
 
 
 def test_tangential_terms_and_skew_are_those_of_metashape() -> None:

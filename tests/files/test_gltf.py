@@ -217,7 +217,6 @@ def test_a_page_shows_the_model_without_a_server(
     write_page(tmp_path / "carved.html", carved)
     page.open(tmp_path / "carved.html")
     page.evaluate("new Promise(done => setTimeout(done, 1000))")
-    page.evaluate("show(0)")
     drawn = "walls.map(w => [w.kind === gl.UNSIGNED_INT, w.count > 6, gl.getError()])"
     assert page.evaluate(drawn) == [[True, True, 0]] * 2
     # What the browser says of a machine without a graphics card.

@@ -38,17 +38,9 @@ def frame(kind: str, up: NDArray[np.float64], *, name: str = "wall 0") -> WallFr
     }[kind]
     u, v = wall_axes(normal, up)
     east, north, top = up.tolist()
-    return WallFrame(
-        origin_world=CORNER.copy(),
-        u_world=u,
-        v_world=v,
-        normal_world=normal,
-        gsd_m=GSD_M,
-        width=SHAPE[1],
-        height=SHAPE[0],
-        up=(east, north, top),
-        name=name,
-    )
+    plain = samples.facing_south(GSD_M, SHAPE[1], SHAPE[0], CORNER)
+    placed = {"u_world": u, "v_world": v, "normal_world": normal}
+    return replace(plain, **placed, up=(east, north, top), name=name)
 
 
 def published(of: WallFrame, folder: Path) -> Path:
@@ -133,11 +125,7 @@ def test_a_floor_and_the_ceiling_over_it_lie_upon_each_other(tmp_path: Path) -> 
 def test_what_neither_stands_nor_lies_counts_from_its_corner() -> None:
     turn = scenes.random_rotation(np.random.default_rng(4))
     wall = frame("wall", UPS[0])
-    sloping = replace(
-        wall,
-        u_world=turn @ wall.u_world,
-        v_world=turn @ wall.v_world,
-        normal_world=turn @ wall.normal_world,
-    )
+    axes = ("u_world", "v_world", "normal_world")
+    sloping = replace(wall, **{name: turn @ getattr(wall, name) for name in axes})
     for of in (sloping, replace(wall, up=None)):
         assert (of.raster_axes, of.raster_corner_m) == ("plane", (0.0, 0.0))

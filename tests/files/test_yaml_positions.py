@@ -15,18 +15,17 @@ class Problems:
         self.found.append((position.line, position.column, path, message))
 
 
-def read(text: str, most_values: int = MOST_VALUES) -> Document:
-    problems = Problems()
-    value = read_yaml(text, problems, most_values)
-    assert not problems.found
-    assert value is not None
-    return value
-
-
 def problems_of(text: str, most_values: int = MOST_VALUES) -> list[tuple[int, int, str, str]]:
     problems = Problems()
     read_yaml(text, problems, most_values)
     return problems.found
+
+
+def read(text: str, most_values: int = MOST_VALUES) -> Document:
+    assert not problems_of(text, most_values)
+    value = read_yaml(text, Problems(), most_values)
+    assert value is not None
+    return value
 
 
 def test_every_value_knows_its_line_and_column() -> None:

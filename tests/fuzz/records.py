@@ -40,9 +40,7 @@ RECORD_COMMANDS: Final[Sequence[Command]] = (
     ("replay", "-o", "out/again"),
 )
 CRATE_COMMANDS: Final[Sequence[Command]] = (
-    ("show",),
-    ("compare", "ORIGINAL"),
-    ("export", "--to", "ro-crate", "-o", "out/crate"),
+    *(command for command in RECORD_COMMANDS if {"show", "compare", "ro-crate"} & {*command}),
     ("export", "--to", "ro-crate", "--embed", "-o", "out/embedded"),
     ("replay", "-o", "out/again"),
 )

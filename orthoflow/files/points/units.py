@@ -142,8 +142,11 @@ def unit_of_geo_keys(keys: Mapping[int, int]) -> StatedUnit | None:
     names, is_degrees = [], keys.get(_MODEL_TYPE) == _GEOGRAPHIC
     level = _PROJECTED if _PROJECTED in keys else _GEOGRAPHIC_TYPE
     for part, key in (("level", level), ("height", _VERTICAL)):
+        # Other numbers are not codes of EPSG, for which PROJ searches all databases.
+        if not 1024 < (code := keys.get(key, 0)) < 32767:
+            continue
         try:
-            crs = pyproj.CRS.from_epsg(code if 1024 < (code := keys.get(key, 0)) < 32767 else 0)
+            crs = pyproj.CRS.from_epsg(code)
         except pyproj.exceptions.CRSError:
             continue
         names.append(crs.name)
