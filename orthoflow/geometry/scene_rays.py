@@ -571,7 +571,7 @@ class _BoxTree:
         if len(members) == 1:
             return None
         low, high = self._low[members], self._high[members]
-        whole = _surface_m2(high.max(axis=0) - low.min(axis=0))
+        whole = float(_surfaces_m2(high.max(axis=0) - low.min(axis=0)))
         # Process all three axes at once, (n, axis), since most nodes have few members.
         order = np.argsort(low + high, axis=0, kind="stable")
         heads = _running_surfaces(low[order], high[order])[:-1]
@@ -586,16 +586,16 @@ class _BoxTree:
         return best
 
 
-def _surface_m2(sides: NDArray[np.float64]) -> float:
-    return float(sides[0] * sides[1] + sides[1] * sides[2] + sides[2] * sides[0])
+def _surfaces_m2(sides: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return half the surfaces (...) of boxes with these sides (..., 3)."""
+    x, y, z = np.moveaxis(sides, -1, 0)
+    surfaces: NDArray[np.float64] = x * y + y * z + z * x
+    return surfaces
 
 
 def _running_surfaces(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return surfaces (n, k) of boxes around the first 1, 2, ... members of k orders (n, k, 3)."""
-    sides = np.maximum.accumulate(high) - np.minimum.accumulate(low)
-    x, y, z = sides[..., 0], sides[..., 1], sides[..., 2]
-    surfaces: NDArray[np.float64] = x * y + y * z + z * x
-    return surfaces
+    return _surfaces_m2(np.maximum.accumulate(high) - np.minimum.accumulate(low))
 
 
 def _tightest_axes(scene: Scene) -> NDArray[np.float64]:
@@ -604,9 +604,6 @@ def _tightest_axes(scene: Scene) -> NDArray[np.float64]:
     # Many rectangles have the same axes, so each set of axes is tried once.
     _, first = np.unique(axes.reshape(-1, 9).round(9), axis=0, return_index=True)
     axes = axes[np.sort(first)]
-    surfaces = []
-    for candidate in axes:
-        x, y, z = np.ptp(corners @ candidate.T, axis=1).T
-        surfaces.append(float(np.sum(x * y + y * z + z * x)))
-    chosen: NDArray[np.float64] = axes[int(np.argmin(surfaces))]
+    surfaces_m2 = [_surfaces_m2(np.ptp(corners @ turn.T, axis=1)).sum() for turn in axes]
+    chosen: NDArray[np.float64] = axes[int(np.argmin(surfaces_m2))]
     return chosen

@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.rastering import wall_from_offset
+from orthoflow.geometry.rastering import NO_POINT, wall_from_offset
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 
 if TYPE_CHECKING:
     from scipy.spatial import Delaunay
 
-NO_POINT: Final = np.uint32(0xFFFFFFFF)
 _ROWS_AT_ONCE: Final = 256
 _ROUNDING_CELLS: Final = 1e-6
 

@@ -30,7 +30,7 @@ from orthoflow.geometry.slabs import Slab, read_only
 from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.raster import kernels
-from orthoflow_plugins.raster.nets import NO_POINT, interpolate_net
+from orthoflow_plugins.raster.nets import interpolate_net
 from orthoflow_plugins.raster.parameters import RasterParams
 
 # Rules for which a cell has the values of a single point, not the mean of several.
@@ -182,9 +182,8 @@ def _surface_of_winners(
     )
     if params.surface != "tin":
         return surface
-    vertices = np.where(winners["n_points"] > 0, winners["point"], NO_POINT)
     # The values of the triangulation at cell centres replace those of points.
-    depth_m, intensity, rgb = interpolate_net(cloud, slab, vertices, winners["depth_m"])
+    depth_m, intensity, rgb = interpolate_net(cloud, slab, winners["point"], winners["depth_m"])
     is_known = np.isfinite(depth_m)[:, np.newaxis]
     places = np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1)
     return replace(surface, depth_m=depth_m, intensity=intensity, rgb=rgb, places=places)

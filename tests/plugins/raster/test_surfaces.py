@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import surfaces
-from orthoflow_plugins.raster.nets import NO_POINT, interpolate_net
+from orthoflow_plugins.raster.nets import interpolate_net
 from orthoflow_plugins.raster.surfaces import denoised, without_specks
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
+from orthoflow.geometry.rastering import NO_POINT
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, SurfaceMask, Wall, Walls
 from tests import raster_scenes as scenes
