@@ -73,7 +73,7 @@ def name_problem(name: str) -> str:
     """Return why a name is not allowed as a file or folder name on all systems; empty if it is.
 
     >>> name_problem("hall.e57"), name_problem(".."), name_problem("a/b")
-    ('', 'is . or ..', 'holds / or a backslash')
+    ('', 'is . or ..', 'contains / or a backslash')
     """
     return next((problem for problem, is_found in _PROBLEMS if is_found(name)), "")
 

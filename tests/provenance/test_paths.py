@@ -23,23 +23,14 @@ from orthoflow_provenance.paths import (
 )
 
 REFUSED = {
-    "": "is empty",
-    ".": "is . or ..",
-    "..": "is . or ..",
-    "/etc/passwd": "contains / or a backslash",
-    "..\\x": "contains / or a backslash",
-    "a\nb": "contains a control character",
-    "a\x85b": "contains a control character",
-    "a\u2028b": "contains a control character",
-    "a\ud800b": "contains a control character",
-    "ä" * 128: "is longer than 255 bytes",
-    "photo.": "ends with a dot or a space",
-    "con": "is a reserved device name",
-    "Aux .tar.gz": "is a reserved device name",
-    "com1": "is a reserved device name",
-    "LPT³": "is a reserved device name",
-    "CONIN$": "is a reserved device name",
-    "C:x": "begins with a drive letter",
+    "is empty": ("",),
+    "is . or ..": (".", ".."),
+    "contains / or a backslash": ("/etc/passwd", "..\\x"),
+    "contains a control character": ("a\nb", "a\x85b", "a\u2028b", "a\ud800b"),
+    "is longer than 255 bytes": ("ä" * 128,),
+    "ends with a dot or a space": ("photo.",),
+    "is a reserved device name": ("con", "Aux .tar.gz", "com1", "LPT³", "CONIN$"),
+    "begins with a drive letter": ("C:x",),
 }
 TAKEN = ("hall.e57", "ortho@plane=ransac,orient=pnp#2", ".hidden", "Saal 12:30.jpg", "ä" * 127)
 TAKEN += ("console", "com10", "null", "a..b", "..a", "שלום.jpg", "a\u200cb", "👩‍🚒.png")
@@ -47,11 +38,12 @@ TAKEN += ("console", "com10", "null", "a..b", "..a", "שלום.jpg", "a\u200cb",
 NAMES = st.text(st.sampled_from("./\\ab:\0\n ~-") | st.characters(), max_size=12)
 
 
-@pytest.mark.parametrize("name", REFUSED, ids=ascii)
-def test_names_that_lead_elsewhere_or_are_no_names_everywhere_are_refused(name: str) -> None:
-    assert name_problem(name) == REFUSED[name]
-    with pytest.raises(UnsafeFileError, match="so it cannot be a file name here"):
-        path_below(Path("folder"), name)
+@pytest.mark.parametrize("problem", REFUSED)
+def test_names_that_lead_elsewhere_or_are_no_names_everywhere_are_refused(problem: str) -> None:
+    for name in REFUSED[problem]:
+        assert name_problem(name) == problem
+        with pytest.raises(UnsafeFileError, match="so it cannot be a file name here"):
+            path_below(Path("folder"), name)
 
 
 @pytest.mark.parametrize(

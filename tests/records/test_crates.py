@@ -22,7 +22,7 @@ from orthoflow.errors import RecordError
 from orthoflow.files.images import encode_png
 from orthoflow.records.archive import crate_metadata, write_crate
 from orthoflow.records.open import open_run
-from orthoflow.report import write_page, write_report
+from orthoflow.report import write_page
 from tests.crate_contexts import context_of
 from tests.studios import Studio, open_studio
 
@@ -192,11 +192,6 @@ def test_what_the_report_links_to_is_in_the_crate(studio: Studio, tmp_path: Path
     assert [link for link in sorted(links) if not (folder / link).is_file()] == []
     told = json.loads((folder / "ro-crate-metadata.json").read_text(encoding="utf-8"))
     assert links <= {entity["@id"] for entity in entities(told, "File")}
-    # A report that stands alone leads to no figures, and says how they are had.
-    write_report([run], tmp_path / "alone.html")
-    page = (tmp_path / "alone.html").read_text(encoding="utf-8")
-    assert 'href="figures/' not in page
-    assert "--to figures</code> writes them as PNG" in page
 
 
 def test_tables_hold_what_the_record_says(studio: Studio) -> None:
