@@ -15,7 +15,7 @@ from orthoflow.engine.store import Store
 from tests.long_loops import IS_LONG
 from tests.stored_runs import StoredRuns, stored_runs
 
-DAMAGES = 300 if IS_LONG else 8
+DAMAGES = 300 if IS_LONG else 7
 
 
 # Kinds of damage ----------------------------------------------------------------------------------
