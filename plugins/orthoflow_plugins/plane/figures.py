@@ -311,10 +311,11 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
         norm=SymLogNorm(1.0, vmin=0.0, vmax=max(1.0, float(image.max()))),
     )
     figure.colorbar(plan, ax=above, label="points per cell", format="{x:g}")
-    shown = _show_votes(below, _thinned_sum(votes.first), (0.0, 180.0, -reach_m, reach_m))
+    n_angles, n_bins = votes.first.shape
+    extent = (*_around(0.0, 180.0, n_angles), -reach_m, reach_m)
+    shown = _show_votes(below, _thinned_sum(votes.first), extent)
     figure.colorbar(shown, ax=below, label="votes")
     # The global maximum, as a line in the plan and as a point in the parameter space.
-    n_angles, n_bins = votes.first.shape
     row, column = np.unravel_index(int(votes.first.argmax()), votes.first.shape)
     angle, distance_m = math.pi * row / n_angles, reach_m * (2.0 * (column + 0.5) / n_bins - 1.0)
     across = np.array([math.cos(angle), math.sin(angle)])
@@ -371,7 +372,9 @@ def draw_space(
     """
     figure = column_figure(2.4)
     axes = figure.subplots()
-    shown = _show_votes(axes, np.maximum(best, 0.0), (0.0, 180.0, -90.0, 90.0))
+    omegas = _around(0.0, 180.0, len(best))
+    phis = _around(-90.0, 180.0 / len(best) + 90.0, best.shape[1])
+    shown = _show_votes(axes, np.maximum(best, 0.0), (*omegas, *phis))
     figure.colorbar(shown, ax=axes, label="score [votes]")
     for index, normal in enumerate(planes.normal):
         omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
@@ -393,8 +396,8 @@ def draw_space(
     # The same scale for all sections, so that they can be compared.
     most = max(float(votes.max()) for votes in (*over_omega.values(), *over_phi.values()))
     for (left, right), phi_deg, omega_deg in zip(panels, over_omega, over_phi, strict=True):
-        shown = _show_votes(left, over_omega[phi_deg], (0.0, 180.0, -reach_m, reach_m), most)
-        _show_votes(right, over_phi[omega_deg], (-90.0, 90.0, -reach_m, reach_m), most)
+        shown = _show_votes(left, over_omega[phi_deg], (*omegas, -reach_m, reach_m), most)
+        _show_votes(right, over_phi[omega_deg], (*phis, -reach_m, reach_m), most)
         left.set_title(f"phi = {phi_deg:.0f} deg")
         right.set_title(f"omega = {omega_deg:.0f} deg")
         left.set_ylabel("distance [m]")
@@ -409,6 +412,12 @@ def draw_space(
         "of constant phi (left) and omega (right); brightness is the square root of the votes. "
         "Planes are sharp spots where bands cross; without such spots there are no planes.",
     )
+
+
+def _around(first_deg: float, end_deg: float, count: int) -> tuple[float, float]:
+    """Return the limits of an axis whose pixels are centred on angles from the first, evenly."""
+    half_deg = 0.5 * (end_deg - first_deg) / count
+    return first_deg - half_deg, end_deg - half_deg
 
 
 def _show_votes(
