@@ -8,14 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match import displacements
-from orthoflow_plugins.match.channels import (
-    colour_channels,
-    gradient_channels,
-    grey_channels,
-    texture,
-    textured_places,
-)
+from orthoflow_plugins.match import channels, displacements
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from scipy.ndimage import gaussian_filter, shift
@@ -46,16 +39,16 @@ def rough(camera: ViewingCamera) -> Cameras:
 
 
 @pytest.mark.parametrize("moved", [(2.37, -1.41), (-3.5, 0.25)], ids=str)
-@pytest.mark.parametrize("channels", [gradient_channels, grey_channels])
-def test_a_known_shift_is_measured_without_bias(channels, moved: tuple[float, float]) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.parametrize("content", [channels.gradient_channels, channels.grey_channels])
+def test_a_known_shift_is_measured_without_bias(content, moved: tuple[float, float]) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(3)
     grey = 40.0 * gaussian_filter(rng.normal(size=(240, 300)), 2.0, mode="wrap")
     later = shift(grey, (moved[1], moved[0]), order=5, mode="grid-wrap")
     noisy = [
         (image + 0.1 * rng.normal(size=image.shape)).astype(np.float32) for image in (grey, later)
     ]
-    first, second = (channels(image) for image in noisy)
-    places = textured_places(texture(first), first.known > 0.0, 200)
+    first, second = (content(image) for image in noisy)
+    places = channels.textured_places(channels.texture(first), first.known > 0.0, 200)
     found = measure(first, second, places)
     assert len(found.places) > 100
     error = found.shift_cells - moved
@@ -72,12 +65,12 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them() -> None:
     response = np.where(np.arange(300)[None, :, None] < 150, [0.7, 0.1, 0.2], [-0.6, 0.5, 0.0])
     wall = (colours * response).sum(axis=2)
     later = shift(colours, (moved[1], moved[0], 0.0), order=5, mode="grid-wrap")
-    first = grey_channels((wall + rng.normal(size=wall.shape)).astype(np.float32))
+    first = channels.grey_channels((wall + rng.normal(size=wall.shape)).astype(np.float32))
     noisy = (later + rng.normal(size=later.shape)).astype(np.float32)
-    places = textured_places(texture(first), first.known > 0.0, 200)
+    places = channels.textured_places(channels.texture(first), first.known > 0.0, 200)
     places = places[np.abs(places[:, 0] - 150) > 12]
-    found = measure(first, colour_channels(noisy), places)
-    as_grey = measure(first, grey_channels(noisy.mean(axis=2)), places)
+    found = measure(first, channels.colour_channels(noisy), places)
+    as_grey = measure(first, channels.grey_channels(noisy.mean(axis=2)), places)
     assert len(found.places) > 100
     # In the half whose contrast is mixed, grey finds next to nothing.
     n_right = [int((each.places[:, 0] > 150).sum()) for each in (found, as_grey)]
@@ -87,10 +80,20 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them() -> None:
     assert np.sqrt(np.mean(error**2)) < 0.12
 
 
-def test_a_rough_pose_suffices(tmp_path: Path) -> None:
-    camera = ms.camera_before(SCENE, roll=0.1)
-    photos = ms.photos(ms.photo_of(SCENE, camera))
-    ties = guided(photos, mw.walls(2), rough(camera), tmp_path)
+@pytest.mark.parametrize("content", ["grey", "colours"])
+def test_a_rough_pose_suffices(tmp_path: Path, content: str) -> None:
+    camera, walls = ms.camera_before(SCENE, roll=0.1), mw.walls(2)
+    photo = ms.photo_of(SCENE, camera)
+    if content == "colours":
+        # The laser sees red bright and green dark.
+        (wall,), (other,) = walls.walls, mw.walls(3).walls
+        green = decode_image(ms.photo_of(ms.textured_wall(3), camera).encoded, "a.png")[..., 0]
+        red = decode_image(photo.encoded, "a.png")[..., 0]
+        photo = replace(photo, encoded=encode_png(np.dstack([red, green, red])))
+        intensity = np.asarray(0.5 + 0.6 * (wall.intensity - other.intensity), np.float32)
+        walls = replace(walls, walls=(replace(wall, intensity=intensity),))
+    ties = guided(ms.photos(photo), walls, rough(camera), tmp_path)
+    assert ties.details["photos"]["a.png"]["channels"] == content  # type: ignore[call-overload,index]
     error = mw.off_px(ties, camera)
     assert len(error) > 200
     assert np.linalg.norm(error, axis=1).max() < 1.5

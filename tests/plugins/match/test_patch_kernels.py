@@ -10,10 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import displacements
 from orthoflow_plugins.match.channels import Channels
-from orthoflow_plugins.match.displacements import (
-    match_patches,
-    search_shifts,
-)
 from scipy.ndimage import gaussian_filter, shift
 
 from tests.long_loops import seeds
@@ -92,7 +88,7 @@ def test_the_shift_of_highest_correlation_is_found_with_its_lead(seed: int) -> N
     edge = np.roll(first, (0, radius), axis=(0, 1))
     for other, wanted in ((second, shift), (edge, (radius, 0))):
         found = np.zeros((6, 4))
-        search_shifts(first, other, places, (half, radius), found)
+        displacements.search_shifts(first, other, places, (half, radius), found)
         for (column, row), result in zip(places, found, strict=True):
             scores, own = np.empty((7, 7)), patch(first, column, row)
             for down, across in np.ndindex(7, 7):
@@ -123,7 +119,7 @@ def matched(
     window, found = _window(HALF), np.array([[*start, 0.0, 0.0]])
     side = len(window)
     work = tuple(np.empty(shape) for shape in ((side, side), (side + 3, side, 2), (side, side, 2)))
-    match_patches(first, second, np.array([place]), window, work, found)
+    displacements.match_patches(first, second, np.array([place]), window, work, found)
     return found[0]
 
 
@@ -226,7 +222,7 @@ def test_gains_are_ridge_regression_and_the_score_is_corrected_for_what_they_fit
     wall = colours @ [0.8, -0.5, 0.3] + noise * rng.normal(size=(SIDE, SIDE)) + 7.0
     first, second = wall[..., None].astype(np.float32), colours.astype(np.float32)
     found = np.zeros((1, 7))
-    search_shifts(first, second, np.array([[21, 23]]), (half, 0), found)
+    displacements.search_shifts(first, second, np.array([[21, 23]]), (half, 0), found)
     # Every second cell of the patch.
     cells = np.ix_(23 + np.arange(-half, half + 1, 2), 21 + np.arange(-half, half + 1, 2))
     a = first[cells].reshape(-1).astype(np.float64)

@@ -10,13 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.match import structures
 from orthoflow_plugins.match.key_points import PairingParams, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.placing import Placed, confirmed, places_of
-from orthoflow_plugins.match.structures import (
-    likely_places,
-    structure_of,
-    wall_structure,
-)
 from orthoflow_plugins.match.ties import TiePiece
 
 from orthoflow.files.images import decode_image, encode_png, photo_grey
@@ -37,7 +33,7 @@ def patchy_wall() -> Wall:
     return replace(wall, intensity=(0.5 + sign * (wall.intensity - 0.5)).astype(np.float32))
 
 
-STRUCTURES = [wall_structure(patchy_wall())]
+STRUCTURES = [structures.wall_structure(patchy_wall())]
 
 
 def placed(photo: Photo) -> Placed | None:
@@ -70,7 +66,7 @@ def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
     assert placed(ms.photo_of(other, ms.camera_before(other), calibrated=False)) is None
     # Nor is any on a wall that shows nothing.
     blind = replace(patchy_wall(), intensity=None)
-    assert places_of(0, PHOTO, [wall_structure(blind)]) == []
+    assert places_of(0, PHOTO, [structures.wall_structure(blind)]) == []
 
 
 SCENE = ms.textured_wall(1)
@@ -85,7 +81,7 @@ CAMERAS = [
 PHOTOS = ms.photos(
     *(ms.photo_of(SCENE, camera, name=f"{nth}.png") for nth, camera in enumerate(CAMERAS))
 )
-ON_WALLS = (WALLS.walls, [wall_structure(wall) for wall in WALLS.walls])
+ON_WALLS = (WALLS.walls, [structures.wall_structure(wall) for wall in WALLS.walls])
 NEAR = pytest.approx(0.0, abs=1e-9)
 
 
@@ -169,9 +165,11 @@ def picture(height: int, width: int) -> NDArray[np.float32]:
 
 def test_edges_are_the_same_whichever_side_is_brighter_and_turn_with_the_picture() -> None:
     grey, known = picture(120, 120), np.ones((120, 120), dtype=np.bool_)
-    upright = structure_of(grey, known).values
-    np.testing.assert_allclose(structure_of(1.0 - grey, known).values, upright, atol=1e-4)
-    turned = structure_of(np.ascontiguousarray(np.rot90(grey)), known).values
+    upright = structures.structure_of(grey, known).values
+    np.testing.assert_allclose(
+        structures.structure_of(1.0 - grey, known).values, upright, atol=1e-4
+    )
+    turned = structures.structure_of(np.ascontiguousarray(np.rot90(grey)), known).values
     # A quarter turn is half a turn of doubled angles, and a whole one of fourfold ones.
     signs = np.array([-1.0, -1.0, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(turned, np.rot90(upright) * signs, atol=1e-4)
@@ -184,7 +182,7 @@ def test_edges_are_the_same_whichever_side_is_brighter_and_turn_with_the_picture
 def test_what_is_not_known_and_its_border_has_no_structure() -> None:
     known = np.ones((80, 90), dtype=np.bool_)
     known[20:40, 30:60] = False
-    found = structure_of(picture(80, 90), known)
+    found = structures.structure_of(picture(80, 90), known)
     void = np.zeros_like(known)
     void[19:41, 29:61] = True
     np.testing.assert_array_equal(found.known == 0.0, void)
@@ -194,7 +192,7 @@ def test_what_is_not_known_and_its_border_has_no_structure() -> None:
 
 def test_a_piece_of_the_wall_lies_where_it_was_taken_from() -> None:
     (wall,) = WALLS.walls
-    structure = wall_structure(wall)
+    structure = structures.wall_structure(wall)
     assert structure is not None
     assert wall.intensity is not None
     # A half of both sides of it.
@@ -204,7 +202,7 @@ def test_a_piece_of_the_wall_lies_where_it_was_taken_from() -> None:
     grey = np.rint(255 * np.clip(np.nan_to_num(wall.intensity, nan=0.5), 0.0, 1.0)).astype(np.uint8)
     # Inverted: edges stay where they are.
     cut = 255 - grey[top:bottom, left:right]
-    places = likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=3)
+    places = structures.likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=3)
     assert 1 < len(places) <= 3
     for one, other in itertools.combinations(places, 2):
         assert one.lead >= other.lead

@@ -183,18 +183,19 @@ def wall_with(red: float, green: float) -> Walls:
     return replace(mw.walls(1), walls=(replace(first, intensity=intensity.astype(np.float32)),))
 
 
-def test_a_photo_is_found_in_the_mixture_that_the_laser_sees(tmp_path: Path) -> None:
-    rgb = np.stack([grey_of(1), grey_of(2), grey_of(1)], axis=-1)
-    ties, _ = sift(tmp_path, photo_with(rgb), wall_with(0.6, -0.6))
+@pytest.mark.parametrize(
+    ("green", "laser", "mixture"),
+    [(2, (0.6, -0.6), "red less green"), (1, (-1.0, 0.0), "red as dark")],
+    ids=["two materials", "without colours"],
+)
+def test_a_photo_is_found_in_the_mixture_that_the_laser_sees(
+    tmp_path: Path, green: int, laser: tuple[float, float], mixture: str
+) -> None:
+    rgb = np.stack([grey_of(1), grey_of(green), grey_of(1)], axis=-1)
+    ties, _ = sift(tmp_path, photo_with(rgb), wall_with(*laser))
     assert right(ties) > 150
     assert right(ties) > 0.9 * (ties.role != TieRole.REJECTED).sum()
-    assert picture_of(ties) == "red less green"
-
-
-def test_a_negative_is_found_in_a_photo_without_colours(tmp_path: Path) -> None:
-    ties, _ = sift(tmp_path, photo_with(np.stack([grey_of(1)] * 3, axis=-1)), wall_with(-1.0, 0.0))
-    assert right(ties) > 500
-    assert picture_of(ties) != "grey"
+    assert picture_of(ties) == mixture
 
 
 def test_a_photo_of_something_else_gets_no_ties_in_any_mixture(tmp_path: Path) -> None:

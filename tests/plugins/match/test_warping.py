@@ -12,11 +12,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import tracing, warping
 from orthoflow_plugins.match.displacements import Displacements
-from orthoflow_plugins.match.tracing import (
-    lens_of,
-    painted_walls,
-    pose_of_most,
-)
 from orthoflow_plugins.match.warping import Projection
 
 from orthoflow.files.images import encode_png
@@ -250,10 +245,10 @@ def test_a_lens_is_taken_from_a_photo_of_the_same_size_and_nearly_the_same_focal
     exif_px: float | None, is_known: bool
 ) -> None:
     old, new = (photo(name=name, exif_focal_px=exif_px) for name in ("old.png", "new.png"))
-    found = lens_of(new, OLD, ms.photos())
+    found = tracing.lens_of(new, OLD, ms.photos())
     assert (found.fx if found else None) == (1000.0 if is_known else None)
     # If EXIF contradicts it, it is that of photos with the same EXIF.
-    found = lens_of(new, OLD, ms.photos(old, new))
+    found = tracing.lens_of(new, OLD, ms.photos(old, new))
     assert found is not None
     assert found.fx == 1000.0
 
@@ -282,7 +277,7 @@ def test_of_photos_the_one_that_shows_a_place_largest_paints_it() -> None:
     # What the largest does not know is the next one's.
     expected[3, 7] = 100.0
     for order in ((small, middle, large), (large, small, middle)):
-        first, second = painted_walls(order, walls)  # type: ignore[arg-type]
+        first, second = tracing.painted_walls(order, walls)  # type: ignore[arg-type]
         assert first[0].intensity is not None
         np.testing.assert_allclose(first[0].intensity, expected / 255.0, atol=1e-6)
         assert first[1] is not None
@@ -299,7 +294,7 @@ def test_the_pose_is_the_one_that_most_points_agree_with() -> None:
     seen = seen_by(VIEW, 80)
     points, wrong = seen.points_world + SURVEY_SHIFT_M, seen.pixels_photo.copy()
     wrong[:32] = np.random.default_rng(5).uniform([0, 0], [900, 640], (32, 2))
-    found = pose_of_most(wrong, points, LENS, 2.0)
+    found = tracing.pose_of_most(wrong, points, LENS, 2.0)
     assert found is not None
     np.testing.assert_allclose(found.centre_world, VIEW.centre_world + SURVEY_SHIFT_M, atol=2e-3)
     assert (found.fx, found.cx) == (VIEW.fx, VIEW.cx)
@@ -310,4 +305,4 @@ def test_two_dozen_points_must_agree_with_a_pose(n_right: int, is_found: bool) -
     seen = seen_by(VIEW, 40)
     pixels = seen.pixels_photo.copy()
     pixels[n_right:] = np.random.default_rng(6).uniform([0, 0], [900, 640], (40 - n_right, 2))
-    assert (pose_of_most(pixels, seen.points_world, LENS, 0.5) is not None) == is_found
+    assert (tracing.pose_of_most(pixels, seen.points_world, LENS, 0.5) is not None) == is_found

@@ -9,14 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import balance as balancing
-from orthoflow_plugins.mosaic.balance import (
-    Balance,
-    Exposures,
-    Radii,
-    balance_of,
-    estimate,
-    with_seams,
-)
 from orthoflow_plugins.mosaic.blocks import BlockLight, Blocks, block_light, common, inside, pairs
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from scipy.ndimage import map_coordinates
@@ -115,8 +107,8 @@ def test_photos_that_agree_stay_untouched(tmp_path: Path) -> None:
     assert images.details == {}
     # One layer needs no balance.
     pair, cameras = two_photos(0.5), [photographed(900.0)] * 2
-    assert balance_of(pair[:1], None, [None]) is None
-    found = balance_of(pair, None, cameras)
+    assert balancing.balance_of(pair[:1], None, [None]) is None
+    found = balancing.balance_of(pair, None, cameras)
     assert found is not None
     assert len(found.exposures.lenses) == 1
 
@@ -148,8 +140,8 @@ def radial(shape: tuple[int, int], at: tuple[float, float]) -> NDArray[np.float3
     return (np.hypot(rows - at[0], columns - at[1]) / 40.0).astype(np.float32)
 
 
-def nothing_added(n_layers: int) -> Exposures:
-    return Exposures(
+def nothing_added(n_layers: int) -> balancing.Exposures:
+    return balancing.Exposures(
         exposures=np.zeros((n_layers, 3)),
         lenses=np.zeros((0, 2)),
         nodes=np.zeros((n_layers, 4, 4, 3)),
@@ -162,14 +154,14 @@ def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> No
     true = np.array([0.2, -0.3, 0.1])
     seen = radial((40, 50), (19.5, 24.5))
     bent = 0.1 * seen.astype(np.float64) ** 2 + 0.3 * seen.astype(np.float64) ** 4
-    lights, radii = [], [Radii(values=seen, lens=0)] * 3
+    lights, radii = [], [balancing.Radii(values=seen, lens=0)] * 3
     for exposure, first in zip(true, (0, 25, 50), strict=True):
         columns = slice(first, first + 50)
         logs = wall[:, columns] + exposure - bent[..., None]
         logs += rng.normal(0.0, 0.01, logs.shape)
         logs[rng.random(logs.shape[:2]) < 0.05] += 0.8
         lights.append(BlockLight(box=(slice(0, 40), columns), log_light=logs.astype(np.float32)))
-    found = estimate(lights, radii)
+    found = balancing.estimate(lights, radii)
     apart = found.exposures.mean(axis=1) + true
     np.testing.assert_allclose(apart, apart.mean(), atol=0.02)
     at = np.linspace(0.0, 0.75, 6)
@@ -183,7 +175,7 @@ def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> No
         one, other = (balanced[k][inside(shared, lights[k].box)] for k in (i, j))
         assert np.median(np.abs(one - other)) < 0.02
     # Where nothing overlaps nothing is changed.
-    alone = estimate(lights[:1], radii[:1])
+    alone = balancing.estimate(lights[:1], radii[:1])
     assert not alone.exposures.any()
     assert not alone.nodes.any()
     assert (alone.lenses.shape, alone.nodes.shape) == ((1, 2), (1, 4, 4, 3))
@@ -207,7 +199,9 @@ def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slic
     shape = tuple(part.stop - part.start for part in box)
     logs = np.random.default_rng(1).normal(size=(*shape, 3)).astype(np.float32)
     light = BlockLight(box=box, log_light=np.zeros((*shape, 3), np.float32))
-    balance = Balance(blocks=blocks, lights=(light,), logs=(logs,), exposures=nothing_added(1))
+    balance = balancing.Balance(
+        blocks=blocks, lights=(light,), logs=(logs,), exposures=nothing_added(1)
+    )
     rows, columns = (grid.ravel() for grid in np.indices((48, 70)))
     found = balance.log_gains(0, rows, columns)
     middles = [centres[part] for centres, part in zip(blocks.centres(), box, strict=True)]
@@ -229,7 +223,7 @@ def test_photos_differ_where_either_has_to_change_by_two_percent(
 ) -> None:
     # Each goes half of the way.
     pair = two_photos(factor)
-    found = balance_of(pair, None, [None, None])
+    found = balancing.balance_of(pair, None, [None, None])
     assert (found is not None) is differs
     if found is not None:
         apart = found.exposures.exposures[0] - found.exposures.exposures[1]
@@ -239,15 +233,15 @@ def test_photos_differ_where_either_has_to_change_by_two_percent(
 def test_near_a_seam_layers_go_over_to_each_other_unless_depths_leap_everywhere() -> None:
     bend = np.ones(SHAPE)
     bend[60:] = 0.8
-    found = balance_of(two_photos(bend[..., None]), None, [None, None])
+    found = balancing.balance_of(two_photos(bend[..., None]), None, [None, None])
     assert found is not None
     source = np.zeros(SHAPE, dtype=np.int16)
     source[:, 120:] = 1
     steps = np.add(*np.indices(SHAPE)) % 2 * np.float32(0.5)
     (flat,), (rough,) = (surface(depth).walls for depth in (0.0 * steps, steps))
-    plain = with_seams(found, source, None)
+    plain = balancing.with_seams(found, source, None)
     for wall, expected in ((None, plain), (flat, plain), (rough, found)):
-        joined = with_seams(found, source, wall)
+        joined = balancing.with_seams(found, source, wall)
         for logs, wanted in zip(joined.logs, expected.logs, strict=True):
             np.testing.assert_array_equal(logs, wanted)
     assert max(np.abs(a - b).max() for a, b in zip(plain.logs, found.logs, strict=True)) > 0.03
@@ -265,14 +259,14 @@ def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
     logs[1] = apart
     logs[1, :, 16:] = np.nan
     box = (slice(0, 16), slice(0, 24))
-    found = Balance(
+    found = balancing.Balance(
         blocks=Blocks.over((160, 240), 10),
         lights=tuple(BlockLight(box=box, log_light=one) for one in logs),
         logs=(np.zeros((*shape, 3), np.float32),) * 2,
         exposures=nothing_added(2),
     )
     source = np.repeat([[0, 1]], 120, axis=1).repeat(160, axis=0).astype(np.int16)
-    one, other = with_seams(found, source, None).logs
+    one, other = balancing.with_seams(found, source, None).logs
     # As far as both show one thing, and as far as that is known within a block and a half.
     alike = 1.0 / (1.0 + (apart / 0.15) ** 2) ** 2
     offsets = np.arange(-5, 6)
@@ -352,8 +346,10 @@ def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(lens: int | None)
     rows, columns = given.log_light.shape[:2]
     radii = None
     if lens is not None:
-        radii = Radii(values=rng.uniform(0.0, 1.0, (rows, columns)).astype(np.float32), lens=lens)
-    found = Exposures(
+        radii = balancing.Radii(
+            values=rng.uniform(0.0, 1.0, (rows, columns)).astype(np.float32), lens=lens
+        )
+    found = balancing.Exposures(
         exposures=rng.normal(size=(2, 3)),
         lenses=rng.normal(size=(2, 2)),
         nodes=rng.normal(size=(2, 4, 4, 3)),
@@ -389,7 +385,7 @@ def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
     slope = np.broadcast_to(np.linspace(-0.05, 0.05, 40)[None, :, None], (10, 40, 3))
     first = light(slice(0, 10), slice(0, 40), 3)
     lights = [first, replace(first, log_light=first.log_light + slope.astype(np.float32))]
-    found = estimate(lights, [None, None])
+    found = balancing.estimate(lights, [None, None])
     added = found.logs(0, lights[0], None) - found.logs(1, lights[1], None)
     np.testing.assert_allclose(added, slope, atol=0.015)
 

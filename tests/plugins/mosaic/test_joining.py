@@ -12,19 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import agreement, blocks, graph_cut, joining
-from orthoflow_plugins.mosaic.agreement import (
-    count_seams,
-    is_seam,
-    overlaps_of,
-    seam_steps,
-)
 from orthoflow_plugins.mosaic.blocks import Blocks, depth_edges
-from orthoflow_plugins.mosaic.joining import (
-    NOBODY,
-    best_views,
-    preferences,
-    without_islands,
-)
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from scipy import ndimage
 
@@ -69,7 +57,7 @@ LAYERS = [layer(1), layer(2, has_filled=False), layer(3), layer(4, painted=0.1)]
 
 
 def test_a_cell_is_painted_by_the_best_of_those_that_know_most_of_it() -> None:
-    rank, source = best_views(LAYERS, [one.quality for one in LAYERS])
+    rank, source = joining.best_views(LAYERS, [one.quality for one in LAYERS])
     states = states_of(LAYERS)
     np.testing.assert_array_equal(rank, states.max(axis=0))
     # The first of equals.
@@ -87,8 +75,8 @@ def test_a_cell_is_painted_by_the_best_of_those_that_know_most_of_it() -> None:
 def test_preferences_are_the_same_row_by_row(rule: str) -> None:
     options = PLAIN.model_copy(update={"seams": rule, "priority": ("3.jpg", "1.jpg")})
     whole = slice(0, SHAPE[0])
-    every = [preference(whole) for preference in preferences(LAYERS, options)]
-    for preference, values in zip(preferences(LAYERS, options), every, strict=True):
+    every = [preference(whole) for preference in joining.preferences(LAYERS, options)]
+    for preference, values in zip(joining.preferences(LAYERS, options), every, strict=True):
         np.testing.assert_array_equal(preference(slice(5, 9)), values[5:9])
     for one, values in zip(LAYERS, every, strict=True):
         if rule == "priority":
@@ -117,7 +105,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
     specks = rng.random(SHAPE) < 0.15
     wanted[specks] = rng.integers(0, 3, specks.sum())
     painted = np.array([one.mask == LayerMask.PAINTED for one in layers])
-    source = np.where(np.take_along_axis(painted, wanted[None], 0)[0], wanted, NOBODY)
+    source = np.where(np.take_along_axis(painted, wanted[None], 0)[0], wanted, joining.NOBODY)
     rank = np.where(source >= 0, ORDER.index(OrthoMask.PAINTED), 0).astype(np.uint8)
     owner = source.astype(np.int16)
     island = np.zeros(SHAPE, dtype=bool)
@@ -136,7 +124,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
         if counts.max():
             # The first of equals.
             expected[row, column] = int(np.argmax(counts))
-    np.testing.assert_array_equal(without_islands(rank, owner, layers, cells_min), expected)
+    np.testing.assert_array_equal(joining.without_islands(rank, owner, layers, cells_min), expected)
 
 
 def test_without_a_small_patch_nothing_changes() -> None:
@@ -145,8 +133,8 @@ def test_without_a_small_patch_nothing_changes() -> None:
     source[:3, :3] = 1
     rank = np.full(SHAPE, ORDER.index(OrthoMask.PAINTED), dtype=np.uint8)
     # Nine cells are a patch of nine.
-    assert without_islands(rank, source, layers, 9) is source
-    assert (without_islands(rank, source, layers, 10) == 0).all()
+    assert joining.without_islands(rank, source, layers, 9) is source
+    assert (joining.without_islands(rank, source, layers, 10) == 0).all()
 
 
 @pytest.mark.parametrize("cells_min", [1, 7])
@@ -181,7 +169,7 @@ def test_each_cell_has_the_colour_of_its_layer(
     source = rng.integers(-1, 2, SHAPE).astype(np.int16)
     rgb = joining.coloured(layers, source, None, allocate=in_memory)
     assert rgb.dtype == (np.uint16 if is_deep else np.uint8)
-    assert not rgb[source == NOBODY].any()
+    assert not rgb[source == joining.NOBODY].any()
     np.testing.assert_array_equal(rgb[source == 1], layers[1].rgb[source == 1])
     # 8 bits become 16 so that white stays white.
     scale = 257 if is_deep else 1
@@ -211,9 +199,9 @@ def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
     mask[:, :30] = LayerMask.OUTSIDE
     large = samples.layer(mask)
     options = PLAIN.model_copy(update={"seams": "voronoi"})
-    (whole,) = preferences([large], options)
+    (whole,) = joining.preferences([large], options)
     monkeypatch.setattr(joining, "_BAND_CELLS", shape[0] * shape[1] // 8)
-    (reduced,) = preferences([large], options)
+    (reduced,) = joining.preferences([large], options)
     rows = slice(0, shape[0])
     # Every third cell: what is painted may end two cells beside.
     np.testing.assert_allclose(reduced(rows), whole(rows), atol=3.0)
@@ -407,7 +395,9 @@ def texture(spread_grey: float) -> NDArray[np.float64]:
 @pytest.mark.parametrize(("spread_grey", "n_found"), [(2.5, 0), (4.0, 1), (30.0, 1)])
 def test_flat_patches_tell_no_displacement(spread_grey: float, n_found: int) -> None:
     whole = np.rint(texture(spread_grey))
-    found = overlaps_of([plain_layer(grey=whole[:, k : k + 64]) for k in (0, 2)]).shifts_cells
+    found = agreement.overlaps_of(
+        [plain_layer(grey=whole[:, k : k + 64]) for k in (0, 2)]
+    ).shifts_cells
     assert len(found) == n_found
     if n_found:
         np.testing.assert_allclose(found, [[-2.0, 0.0]], atol=0.4)
@@ -422,7 +412,7 @@ def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
     for weight in np.linspace(0.5, 1.0, 41):
         mixed = np.rint((1.0 - weight) * one + weight * rng.integers(0, 256, one.shape))
         peak = cv2.phaseCorrelate(one.astype("f4"), mixed.astype("f4"), window)[1]
-        found = len(overlaps_of([plain_layer(grey=part) for part in (one, mixed)]).photos)
+        found = len(agreement.overlaps_of([plain_layer(grey=part) for part in (one, mixed)]).photos)
         if 0.16 < peak < 0.28:
             told["fifth"] = found
         elif 0.07 < peak < 0.14:
@@ -432,7 +422,7 @@ def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
 
 def test_two_hundred_patches_are_enough() -> None:
     row = np.tile(np.rint(texture(30.0)[:, :64]), (1, 240))
-    found = overlaps_of([plain_layer(grey=row, mask=(64, 64 * 240))] * 2).shifts_cells
+    found = agreement.overlaps_of([plain_layer(grey=row, mask=(64, 64 * 240))] * 2).shifts_cells
     assert len(found) == 200
     np.testing.assert_allclose(found, 0.0, atol=0.05)
 
@@ -453,15 +443,15 @@ def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
         found = np.array(agreement._before_seams(source, axis)).T
         np.testing.assert_array_equal(found[np.lexsort(found.T[::-1])], np.argwhere(before))
         seam |= before
-    np.testing.assert_array_equal(is_seam(source), seam)
+    np.testing.assert_array_equal(agreement.is_seam(source), seam)
     depth_m = rng.uniform(0.0, 0.06, source.shape).astype(np.float32)
     n_edges = np.count_nonzero(seam & depth_edges(depth_m))
-    assert count_seams(source, depth_m) == (seam.sum(), n_edges)
-    assert count_seams(source, None) == (seam.sum(), 0)
+    assert agreement.count_seams(source, depth_m) == (seam.sum(), n_edges)
+    assert agreement.count_seams(source, None) == (seam.sum(), 0)
 
 
 def test_black_and_white_are_a_hundred_apart() -> None:
     pair = [plain_layer(grey=value, mask=(1, 2)) for value in (0, 255)]
-    grey, delta_e = seam_steps(np.array([[0, 1]], dtype=np.int16), pair)
+    grey, delta_e = agreement.seam_steps(np.array([[0, 1]], dtype=np.int16), pair)
     assert grey.tolist() == pytest.approx([-255.0])
     assert delta_e.tolist() == pytest.approx([100.0], abs=1e-3)

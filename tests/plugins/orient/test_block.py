@@ -7,17 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.block import (
-    Block,
-    Observations,
-    Points,
-    block_covariance,
-    correlation_notes,
-    lens_statistics,
-    lenses_json,
-    pixel_covariances,
-    solve,
-)
+from orthoflow_plugins.orient import block as adjustment
 from orthoflow_plugins.orient.pose import Lens
 from scipy.optimize import least_squares
 
@@ -33,7 +23,7 @@ FREEDOM = LensFreedom(focal_sigma=0.02, k1_sigma=0.05)
 
 def block_of(
     *, freedoms: tuple[LensFreedom, ...] = (FREEDOM,), lens_of: tuple[int, ...] = (0, 0, 0)
-) -> Block:
+) -> adjustment.Block:
     """Three photos; of the points a third is seen once, a third is not in the scan."""
     rng = np.random.default_rng(0)
     cameras = bs.viewers()[:3]
@@ -45,15 +35,15 @@ def block_of(
     kept[np.unique(point, return_index=True)[1]] = True
     kept &= (point < 60) | (np.bincount(point)[point] > 1)
     photo, point, exact = photo[kept], point[kept], exact[kept]
-    return Block(
+    return adjustment.Block(
         cameras=cameras,
         lens_of=lens_of,
         lenses=tuple(
             Lens(prior=cameras[lens_of.index(k)], freedom=freedom, source="calibration")
             for k, freedom in enumerate(freedoms)
         ),
-        points=Points(now=points, known=known, sigma_m=sigma_m),
-        seen=Observations(
+        points=adjustment.Points(now=points, known=known, sigma_m=sigma_m),
+        seen=adjustment.Observations(
             photo=photo,
             point=point,
             pixels=exact + SIGMA_PX * rng.normal(size=exact.shape),
@@ -62,7 +52,7 @@ def block_of(
     )
 
 
-def predicted(block: Block, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+def predicted(block: adjustment.Block, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixels of all observations after a step of poses and lenses, and of all points."""
     places = np.where(block.is_joint[:, None], block.points.now, block.points.known)
     places = places + unknowns[block.lens_starts[-1] :].reshape(-1, 3)
@@ -75,7 +65,7 @@ def predicted(block: Block, unknowns: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def by_differences(
-    block: Block, soft_limit: float
+    block: adjustment.Block, soft_limit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Cofactors of poses and lenses, and residuals, from all unknowns at once, by differences.
 
@@ -108,7 +98,7 @@ def test_cofactors_and_sigma0_are_those_of_all_unknowns_at_once(soft_limit: floa
     counts = np.bincount(block.seen.point)
     assert set(counts[:30]) == {1 if soft_limit > 1.0 else 0}
     assert (counts[60:] > 1).sum() > 5
-    found = block_covariance(block, soft_limit=soft_limit)
+    found = adjustment.block_covariance(block, soft_limit=soft_limit)
     expected, residuals = by_differences(block, soft_limit)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found.cofactors / scale, expected / scale, atol=1e-5)
@@ -124,10 +114,10 @@ def test_cofactors_and_sigma0_are_those_of_all_unknowns_at_once(soft_limit: floa
     assert least.real.min() > 1.0 - 1e-6
 
 
-def minimised(block: Block, soft_limit: float) -> list[NDArray[np.float64]]:
+def minimised(block: adjustment.Block, soft_limit: float) -> list[NDArray[np.float64]]:
     """Centres of the cameras that SciPy finds for the same problem, written down anew."""
     joint = np.flatnonzero(block.is_joint)
-    whitening = np.linalg.inv(np.linalg.cholesky(pixel_covariances(block)))
+    whitening = np.linalg.inv(np.linalg.cholesky(adjustment.pixel_covariances(block)))
 
     def residuals(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         moves = np.zeros((len(block.points), 3))
@@ -158,8 +148,10 @@ def test_the_adjustment_finds_the_least_sum_of_huber_losses() -> None:
     # Few are joint: SciPy differentiates by each of their coordinates.
     few = ~block.is_joint[block.seen.point] | (block.seen.point % 6 == 0)
     block = replace(block, seen=block.seen.take(few))
-    solved = solve(block, soft_limit=1.5)
-    sigmas = np.sqrt(np.diag(block_covariance(solved, soft_limit=1.5).matrix)).reshape(3, 6)
+    solved = adjustment.solve(block, soft_limit=1.5)
+    sigmas = np.sqrt(np.diag(adjustment.block_covariance(solved, soft_limit=1.5).matrix)).reshape(
+        3, 6
+    )
     for camera, sigma, expected in zip(solved.cameras, sigmas, minimised(block, 1.5), strict=True):
         # It stops at a hundredth of a standard deviation.
         off = np.linalg.norm(camera.centre_world - expected)
@@ -170,7 +162,7 @@ def test_too_few_observations_determine_no_block() -> None:
     block = block_of()
     few = replace(block, seen=block.seen.take(np.arange(12)))
     with pytest.raises(GeometryError, match="do not determine the block"):
-        block_covariance(few, soft_limit=3.0)
+        adjustment.block_covariance(few, soft_limit=3.0)
 
 
 # --- what is said of lenses ---
@@ -183,7 +175,7 @@ def photos() -> list[Photo]:
 def test_lenses_are_told_with_their_photos_and_deviations() -> None:
     block = block_of(freedoms=(FREEDOM, LensFreedom()), lens_of=(0, 1, 0))
     covariance = np.diag(np.arange(1.0, 21.0) ** 2)
-    first, second = lenses_json(block, photos(), covariance)  # type: ignore[misc]
+    first, second = adjustment.lenses_json(block, photos(), covariance)  # type: ignore[misc]
     camera = block.cameras[0]
     assert first == {
         "photos": ["a.png", "c.png"],
@@ -202,7 +194,7 @@ def test_lenses_of_one_size_have_a_mean_and_a_spread() -> None:
     block = block_of(freedoms=(FREEDOM, FREEDOM), lens_of=(0, 1, 0))
     first, other, third = block.cameras
     block = replace(block, cameras=(first, replace(other, fx=first.fx + 30.0), third))
-    (entry,) = lens_statistics(block)  # type: ignore[misc]
+    (entry,) = adjustment.lens_statistics(block)  # type: ignore[misc]
     assert entry["n_lenses"] == 2
     assert entry["mean"]["focal"] == pytest.approx(first.fx + 15.0)
     assert entry["sd"]["focal"] == pytest.approx(30.0 / np.sqrt(2.0))
@@ -217,12 +209,12 @@ def test_lenses_that_all_photos_confuse_with_their_pose_are_named() -> None:
 
     for photo in range(2):
         correlate(photo, 5, 0, -0.97)
-    assert correlation_notes(block, photos(), cofactors) == []
+    assert adjustment.correlation_notes(block, photos(), cofactors) == []
     correlate(2, 5, 0, 0.94)
-    assert correlation_notes(block, photos(), cofactors) == []
+    assert adjustment.correlation_notes(block, photos(), cofactors) == []
     correlate(2, 5, 0, 0.96)
     scale = np.linspace(1.0, 3.0, 20)
-    ((photo, (spec, values)),) = correlation_notes(
+    ((photo, (spec, values)),) = adjustment.correlation_notes(
         block, photos(), cofactors * np.outer(scale, scale)
     )
     assert (photo, spec.code) == ("a.png", "lens-correlated-with-pose")
@@ -252,7 +244,7 @@ def freedom(*names: str, times: float = 1.0) -> LensFreedom:
 
 def lens_block(
     believed: dict[str, float], distortion: np.ndarray, free: LensFreedom, *, moved_m: float = 0.01
-) -> Block:
+) -> adjustment.Block:
     """Exact observations, by cameras of one lens that is believed to be another, stood aside."""
     true = true_cameras()
     points = np.random.default_rng(3).uniform([0.4, -0.6, 0.3], [2.6, 0.1, 1.7], (90, 3))
@@ -268,12 +260,12 @@ def lens_block(
         for camera in true
     )
     known = points[point]
-    return Block(
+    return adjustment.Block(
         cameras=cameras,
         lens_of=(0, 0, 0),
         lenses=(Lens(prior=cameras[0], freedom=free, source="exif"),),
-        points=Points(now=known, known=known, sigma_m=np.full(len(own), 1e-5)),
-        seen=Observations(
+        points=adjustment.Points(now=known, known=known, sigma_m=np.full(len(own), 1e-5)),
+        seen=adjustment.Observations(
             photo=photo,
             point=own,
             pixels=pixels,
@@ -301,7 +293,7 @@ def test_what_is_free_of_a_lens_is_found_and_the_rest_stays(
 ) -> None:
     believed = {name: off.get(name, 1.0) * value for name, value in TRUE.items()}
     distortion = DISTORTION + np.array([*distortion_off, 0.0])
-    solved = solve(lens_block(believed, distortion, freedom(*names)), soft_limit=3.0)
+    solved = adjustment.solve(lens_block(believed, distortion, freedom(*names)), soft_limit=3.0)
     for found, camera in zip(solved.cameras, true_cameras(), strict=True):
         for name, value in TRUE.items():
             assert getattr(found, name) == pytest.approx(value, abs=0.05), name
@@ -316,7 +308,7 @@ def test_what_is_known_of_a_lens_beforehand_holds_it() -> None:
     believed = {key: off[key] * value for key, value in TRUE.items()}
     distortion = DISTORTION + np.array([0.02, 0.02, 5e-4, 5e-4, 0.0])
     sure = freedom("focal", "centre_px", "k1", "k2", "tangential", times=1e-6)
-    found = solve(lens_block(believed, distortion, sure), soft_limit=3.0).cameras[0]
+    found = adjustment.solve(lens_block(believed, distortion, sure), soft_limit=3.0).cameras[0]
     for key, value in believed.items():
         assert getattr(found, key) == pytest.approx(value, abs=0.01), key
     np.testing.assert_allclose(found.distortion, distortion, atol=1e-5)
@@ -326,4 +318,4 @@ def test_a_lens_with_skew_is_refused() -> None:
     block = lens_block(TRUE, DISTORTION, LensFreedom())
     skewed = tuple(replace(camera, skew=2.0) for camera in block.cameras)
     with pytest.raises(MethodError, match=r"has a skew of 2\.0 px"):
-        solve(replace(block, cameras=skewed), soft_limit=3.0)
+        adjustment.solve(replace(block, cameras=skewed), soft_limit=3.0)

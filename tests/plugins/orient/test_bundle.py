@@ -13,12 +13,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import photo_ties
 from orthoflow_plugins.orient.bundle import OrientColmapBundle, adjust_block
-from orthoflow_plugins.orient.photo_ties import (
-    PhotoTies,
-    overlapping_pairs,
-    photo_features,
-    tie_photos,
-)
 from orthoflow_plugins.orient.photos import Trusted, by_itself, tied_photo
 from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.pose import estimate_pose, lens_groups
@@ -202,7 +196,7 @@ def test_the_noise_of_ties_between_photos_is_found() -> None:
     kept = np.flatnonzero(seen.sum(axis=0) >= n_seeing)
     photo, point = order[:, kept].ravel(), np.tile(np.arange(len(kept)), n_seeing)
     noise = rng.normal(0.0, 0.8, (len(photo), 2))
-    between = PhotoTies(
+    between = photo_ties.PhotoTies(
         photo=photo,
         point=point,
         pixels=pixels[photo, kept[point]] + noise,
@@ -260,7 +254,7 @@ def seen_in(
     return found
 
 
-def observed(ties: PhotoTies, points: NDArray[np.float64]) -> list[list[int]]:
+def observed(ties: photo_ties.PhotoTies, points: NDArray[np.float64]) -> list[list[int]]:
     """Which photos see each tied point, by the point's number in the scene."""
     found: list[list[int]] = [[] for _ in points]
     for photo, point in zip(ties.photo, ties.point, strict=True):
@@ -269,7 +263,7 @@ def observed(ties: PhotoTies, points: NDArray[np.float64]) -> list[list[int]]:
     return [sorted(photos) for photos in found]
 
 
-def residuals_px(ties: PhotoTies) -> NDArray[np.float64]:
+def residuals_px(ties: photo_ties.PhotoTies) -> NDArray[np.float64]:
     """How far observations are from where their photos see the points."""
     pairs = zip(ties.photo, ties.points_world[ties.point], strict=True)
     seen = [CAMERAS[photo].project(point[None])[0, :2] for photo, point in pairs]
@@ -278,7 +272,7 @@ def residuals_px(ties: PhotoTies) -> NDArray[np.float64]:
 
 def test_points_are_tied_in_all_photos_that_see_them_where_they_are() -> None:
     points = scene_points()
-    ties = tie_photos(CAMERAS, seen_in(points), PAIRS, 1000)
+    ties = photo_ties.tie_photos(CAMERAS, seen_in(points), PAIRS, 1000)
     assert observed(ties, points) == [[0, 1, 2, 3]] * 30
     apart = np.linalg.norm(points[:, None] - ties.points_world[None], axis=2).min(axis=0)
     np.testing.assert_allclose(apart, 0.0, atol=1e-7)
@@ -286,7 +280,7 @@ def test_points_are_tied_in_all_photos_that_see_them_where_they_are() -> None:
     # Key points of photos of 1000 px are found at full size, those of larger ones at 1600 px.
     assert set(ties.scale) == {1.0}
     large = [replace(view, width=3200, height=2560) for view in CAMERAS]
-    assert set(tie_photos(large, seen_in(points), PAIRS, 1000).scale) == {2.0}
+    assert set(photo_ties.tie_photos(large, seen_in(points), PAIRS, 1000).scale) == {2.0}
 
 
 def test_of_many_points_those_that_most_photos_see_are_kept() -> None:
@@ -296,7 +290,7 @@ def test_of_many_points_those_that_most_photos_see_are_kept() -> None:
     for photo in (2, 3):
         order = np.random.default_rng(photo).permutation(30)
         known_to[photo] = known_to[photo].take(order < 10)
-    ties = tie_photos(CAMERAS, known_to, PAIRS, 12)
+    ties = photo_ties.tie_photos(CAMERAS, known_to, PAIRS, 12)
     seen = observed(ties, points)
     assert seen[:10] == [[0, 1, 2, 3]] * 10
     assert sum(photos == [0, 1] for photos in seen[10:]) == 2
@@ -323,7 +317,7 @@ def test_matches_within_six_pixels_of_the_line_and_eight_of_the_point_are_tied(
     way = (across[1], -across[0]) if is_along else tuple(across)
     moved = {(1, 4): (off_px * way[0], off_px * way[1])}
     pairs = [(0, 1), (0, 2)][: 1 + is_along]
-    ties = tie_photos(CAMERAS[:n_photos], seen_in(points, moved)[:n_photos], pairs, 1000)
+    ties = photo_ties.tie_photos(CAMERAS[:n_photos], seen_in(points, moved)[:n_photos], pairs, 1000)
     assert residuals_px(ties).max() <= 8.0
     assert len(ties.points_world) == (30 if is_tied else 29)
 
@@ -334,7 +328,7 @@ def test_rays_must_meet_at_two_degrees(angle_deg: float, is_tied: bool) -> None:
     views = [camera(0.2 - half, 0.0, 0.3), camera(0.2 + half, 0.0, 0.3)]
     points = np.array([[0.2, 5.0, 0.3], [0.2, 5.0, 0.3]])
     found = [features(view.project(points)[:, :2], described(2)) for view in views]
-    ties = tie_photos(views, found, [(0, 1)], 10)
+    ties = photo_ties.tie_photos(views, found, [(0, 1)], 10)
     assert len(ties.points_world) == (2 if is_tied else 0)
 
 
@@ -345,9 +339,13 @@ def test_pairs_show_enough_of_each_others_walls(share: float, is_pair: bool) -> 
     behind = points.copy()
     behind[:6, 1] = -500.0
     views = [camera(-1.0, 0.0, 0.0), camera(1.0, 0.0, 0.0)]
-    assert overlapping_pairs(views, [behind, points], share) == ([(0, 1)] if is_pair else [])
-    assert overlapping_pairs(views, [points, behind], share) == ([(0, 1)] if is_pair else [])
-    assert overlapping_pairs(views, [points[:0], points], share) == []
+    assert photo_ties.overlapping_pairs(views, [behind, points], share) == (
+        [(0, 1)] if is_pair else []
+    )
+    assert photo_ties.overlapping_pairs(views, [points, behind], share) == (
+        [(0, 1)] if is_pair else []
+    )
+    assert photo_ties.overlapping_pairs(views, [points[:0], points], share) == []
 
 
 def test_key_points_are_in_pixels_of_the_photo_when_it_was_reduced() -> None:
@@ -360,7 +358,7 @@ def test_key_points_are_in_pixels_of_the_photo_when_it_was_reduced() -> None:
     soft = cv2.GaussianBlur(grey, (0, 0), 2.0).astype(np.uint8)
     photo = Photo(name="a.png", encoded=encode_png(soft), width=width, height=height)
     for n_most, limit_px in ((100, 0.5), (3, 20.0)):
-        found = photo_features(photo, n_most).pixels
+        found = photo_ties.photo_features(photo, n_most).pixels
         # The strongest are one of each part of the photo, before a second of any.
         assert np.linalg.norm(found[:, None] - centres, axis=2).min(axis=0).max() < limit_px
     assert len(found) == 3
@@ -375,7 +373,7 @@ def test_points_behind_a_camera_are_none() -> None:
             ways = np.array([[aside, 1.0, 0.05], [aside, 1.0, 0.1]])
             pixels = view.project(view.centre_world + 5.0 * ways)[:, :2]
             found.append(features(pixels, described(2)))
-        assert len(tie_photos(views, found, [(0, 1)], 10).points_world) == n_points
+        assert len(photo_ties.tie_photos(views, found, [(0, 1)], 10).points_world) == n_points
 
 
 def test_a_track_with_two_points_of_one_photo_is_none() -> None:

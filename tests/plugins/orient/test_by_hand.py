@@ -223,10 +223,7 @@ def oriented(camera: ViewingCamera = CAMERA) -> Cameras:
 
 
 def given(
-    folder: Path,
-    cameras: Cameras,
-    ties: Ties | None = None,
-    photos: Photos = PHOTOS,
+    folder: Path, cameras: Cameras, ties: Ties | None = None, photos: Photos = PHOTOS
 ) -> tuple[Cameras, list[str]]:
     ctx = context(folder)
     inputs = OrientGiven.In(cameras=cameras, photos=photos, walls=WALLS, ties=ties)

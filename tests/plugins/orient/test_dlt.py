@@ -9,13 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.dlt import (
-    Distortion,
-    OrientDlt,
-    direct_linear,
-    estimate_dlt,
-    relief,
-)
+from orthoflow_plugins.orient import dlt
 from orthoflow_plugins.orient.gates import known_walls, wall_error
 from orthoflow_plugins.orient.pose import Estimate
 
@@ -35,7 +29,7 @@ SIZE_PX = (4000, 3000)
 # A grey photo: what it shows is in the ties.
 ENCODED = encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
 CENTRE = np.array([0.15, -2.6, 0.1])
-orient = partial(tp.oriented, OrientDlt)
+orient = partial(tp.oriented, dlt.OrientDlt)
 
 
 def camera(*coefficients: float, skew: float = 0.0) -> ViewingCamera:
@@ -121,7 +115,7 @@ def test_with_distortion_the_corners_are_right_and_without_off_by_ten_pixels(
         remedies = {each.code: each.remedy or "" for each in ctx.diagnostics}
         # What it says to set can be set.
         value = remedies["dlt-without-distortion"].split('"')[1]
-        assert OrientDlt.Params.model_validate({"distortion": value})
+        assert dlt.OrientDlt.Params.model_validate({"distortion": value})
     else:
         assert errors.max() <= 4.0
         assert np.sqrt(np.mean(errors**2)) <= 0.7
@@ -129,13 +123,13 @@ def test_with_distortion_the_corners_are_right_and_without_off_by_ten_pixels(
 
 @pytest.mark.parametrize("distortion", ["none", "k1"])
 def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
-    distortion: Distortion,
+    distortion: dlt.Distortion,
 ) -> None:
     true, ratios = camera(-0.08, 0.02), []
     for seed in range(6):
         ties = ties_of(true, seed, noise_px=0.7)
         tied = tp.tied(photo(), tp.seen_of(ties), is_check=np.arange(300) % 5 == 0)
-        found = estimate_dlt(tied, OrientDlt.Params(distortion=distortion))
+        found = dlt.estimate_dlt(tied, dlt.OrientDlt.Params(distortion=distortion))
         assert isinstance(found, Estimate)
         stated = wall_error(found.resection, known_walls(ties, np.ones(300, np.bool_)))
         assert stated is not None
@@ -183,7 +177,7 @@ def estimated(
 ) -> Estimate | str:
     known = tp.photo(viewer, width=SIZE_PX[0], height=SIZE_PX[1])
     tied = tp.tied(known, seen, is_check=np.arange(len(seen)) < n_check)
-    return estimate_dlt(tied, OrientDlt.Params(**params))
+    return dlt.estimate_dlt(tied, dlt.OrientDlt.Params(**params))
 
 
 def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
@@ -197,7 +191,7 @@ def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
     matrix = lens @ np.column_stack([rotation, translation])
     pixels = (homogeneous := np.column_stack([points, np.ones(12)]) @ matrix.T)[:, :2]
     pixels /= homogeneous[:, 2:]
-    found = direct_linear(pixels, points, SIZE_PX)[0]
+    found = dlt.direct_linear(pixels, points, SIZE_PX)[0]
     np.testing.assert_allclose(found.rotation, rotation, atol=1e-7)
     np.testing.assert_allclose(found.translation, translation, atol=1e-6)
     assert (found.fx, found.fy) == pytest.approx((3000.0, 2800.0))
@@ -206,7 +200,7 @@ def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
     # Mirrored in the projection centre, the points have the same pixels, and lie behind it.
     behind = (-local - translation) @ rotation
     with pytest.raises(GeometryError, match="puts the points behind the camera"):
-        direct_linear(pixels, behind, SIZE_PX)
+        dlt.direct_linear(pixels, behind, SIZE_PX)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +210,9 @@ def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
         *(("k1 k2 p1 p2", False, 24), ("k1 k2 p1 p2", True, 25)),
     ],
 )
-def test_a_richer_lens_needs_more_control(distortion: Distortion, skew: bool, least: int) -> None:
+def test_a_richer_lens_needs_more_control(
+    distortion: dlt.Distortion, skew: bool, least: int
+) -> None:
     # Check points are no control points.
     for n, n_check, is_enough in ((least, 0, True), (least - 1, 0, False), (least, 1, False)):
         seen = seen_by(camera(), n)
@@ -228,7 +224,7 @@ def test_a_richer_lens_needs_more_control(distortion: Distortion, skew: bool, le
 def test_relief_must_be_ten_deviations_of_the_points(sigma_m: float, is_enough: bool) -> None:
     # Two planes 10 cm apart: 5 cm from the one between them, nearly.
     seen = seen_by(camera(), 80, relief_m=0.1, sigma_m=sigma_m)
-    assert relief(seen.points_world)[0] == pytest.approx(0.05, rel=0.02)
+    assert dlt.relief(seen.points_world)[0] == pytest.approx(0.05, rel=0.02)
     found = estimated(camera(), seen)
     assert isinstance(found, Estimate) == is_enough
     if isinstance(found, str):
@@ -246,8 +242,8 @@ def test_skew_is_given_whether_it_is_kept_or_not() -> None:
 
 def test_five_points_and_points_in_one_place_determine_no_camera() -> None:
     seen = seen_by(camera(), 6)
-    direct_linear(seen.pixels_photo, seen.points_world, SIZE_PX)
+    dlt.direct_linear(seen.pixels_photo, seen.points_world, SIZE_PX)
     with pytest.raises(GeometryError, match="needs six points, got 5"):
-        direct_linear(seen.pixels_photo[:5], seen.points_world[:5], SIZE_PX)
+        dlt.direct_linear(seen.pixels_photo[:5], seen.points_world[:5], SIZE_PX)
     with pytest.raises(GeometryError, match="coincide"):
-        direct_linear(seen.pixels_photo, np.ones((6, 3)), SIZE_PX)
+        dlt.direct_linear(seen.pixels_photo, np.ones((6, 3)), SIZE_PX)

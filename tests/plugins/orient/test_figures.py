@@ -11,13 +11,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import report
 from orthoflow_plugins.orient.gates import KnownWall
-from orthoflow_plugins.orient.report import (
-    Oriented,
-    draw_positions,
-    draw_residuals,
-    draw_ties,
-    draw_wall_errors,
-)
 
 from orthoflow.files.drawing import COLUMN_INCHES
 from orthoflow.files.images import decode_image, encode_png
@@ -26,14 +19,14 @@ from tests import samples
 from tests.tied_photos import context
 
 
-def residuals(name: str, n: int, seed: int, *, shift_px: float = 0.0) -> Oriented:
+def residuals(name: str, n: int, seed: int, *, shift_px: float = 0.0) -> report.Oriented:
     rng = np.random.default_rng(seed)
     role = np.where(np.arange(n) % 5 == 0, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
     role[-1] = TieRole.REJECTED
     values = rng.normal(shift_px, 0.5, (n, 2))
     values[-1] = 1e6
     camera = Camera(photo=name, status="ok")
-    return Oriented(camera=camera, chosen=np.arange(n), role=role, residuals_px=values)
+    return report.Oriented(camera=camera, chosen=np.arange(n), role=role, residuals_px=values)
 
 
 # --- ties on photos ---
@@ -50,7 +43,7 @@ def test_ties_are_marked_on_a_dimmed_photo_in_the_colour_of_their_role(
     image = np.full((round(300 / scale), round(900 / scale), 3), 200, dtype=np.uint8)
     at = np.array([[100.5, 50.5], [400.5, 100.5], [700.5, 250.5]])
     role = np.array([TieRole.CONTROL, TieRole.CHECK, TieRole.REJECTED], dtype=np.uint8)
-    draw_ties(context(tmp_path), photo_of(image), at / scale, role, "ok")
+    report.draw_ties(context(tmp_path), photo_of(image), at / scale, role, "ok")
     drawn = drawings["ties_west-a-b"]
     assert decode_image(drawn(), "ties").shape[1] == 1003
     shown, counts = drawn.args
@@ -71,7 +64,7 @@ def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
     ctx, image = context(tmp_path), np.zeros((4, 6, 3), dtype=np.uint8)
     names = ["a.jpg", "a.tif", "noending", *(f"{k}.jpg" for k in range(30))]
     for name in names:
-        draw_ties(ctx, photo_of(image, name), np.empty((0, 2)), np.empty(0, np.uint8), "ok")
+        report.draw_ties(ctx, photo_of(image, name), np.empty((0, 2)), np.empty(0, np.uint8), "ok")
     found = [figure.name for figure in ctx.figures]
     assert found[:3] == ["ties_a", "ties_a-1", "ties_noending"]
     assert len(found) == 24
@@ -109,7 +102,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     candidates: Any = [
         SimpleNamespace(known=(wall, hidden), estimate=SimpleNamespace(resection=k)) for k in (0, 1)
     ]
-    draw_wall_errors(context(tmp_path), candidates)
+    report.draw_wall_errors(context(tmp_path), candidates)
     # Nobody sees the other wall.
     assert list(drawings) == ["wall_8_predicted_error"]
     best = np.fmin(*np.where(np.isfinite(sigmas), sigmas, np.nan))
@@ -139,7 +132,7 @@ def test_photos_stand_before_the_wall_and_look_at_it(
         control=np.array([True, True, False]),
         photo=SimpleNamespace(name="a.jpg"),
     )
-    draw_positions(context(tmp_path), [candidate])
+    report.draw_positions(context(tmp_path), [candidate])
     above, facing = drawings["positions"].axes
     (name,) = facing.texts
     assert (name.get_text(), *name.xy) == ("a.jpg", pytest.approx(3.0), pytest.approx(0.5))
@@ -160,7 +153,7 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
     photos = [residuals(f"{k}.jpg", 300, k, shift_px=k - 1.0) for k in range(3)]
     # Unknown ones are left out.
     photos[0].residuals_px[1] = np.nan
-    draw_residuals(context(tmp_path), photos)
+    report.draw_residuals(context(tmp_path), photos)
     pooled = drawings["residuals"]
     assert pooled.get_size_inches()[0] == pytest.approx(COLUMN_INCHES)
     panels = np.array(pooled.axes).reshape(2, 2)
@@ -179,7 +172,7 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
 
 def test_the_density_of_residuals_shows_lobes(drawings: dict[str, Any], tmp_path: Path) -> None:
     photos = [residuals(f"{k}.jpg", 400, k, shift_px=3.0 * k) for k in range(2)]
-    draw_residuals(context(tmp_path), photos)
+    report.draw_residuals(context(tmp_path), photos)
     normal, density = drawings["residuals"].axes[0].lines
 
     def n_peaks(line: Any) -> int:

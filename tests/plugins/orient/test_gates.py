@@ -11,21 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.gates import (
-    CONTROL_GATES,
-    GATES_BEFORE_BLOCK,
-    Candidate,
-    Gate,
-    KnownWall,
-    WallError,
-    hull_area,
-    known_walls,
-    refusal,
-    sigmas_on_wall,
-    too_few,
-    wall_error,
-    warnings_for,
-)
+from orthoflow_plugins.orient import gates
 from orthoflow_plugins.orient.pose import OrientParams
 from scipy import optimize, stats
 
@@ -56,10 +42,10 @@ def camera(*, turn_deg: float = 0.0) -> ViewingCamera:
     )
 
 
-def wall(half_m: tuple[float, float] = (1.0, 0.5)) -> KnownWall:
+def wall(half_m: tuple[float, float] = (1.0, 0.5)) -> gates.KnownWall:
     across, up = half_m
     corners = [[-across, 0.0, up], [-across, 0.0, -up], [across, 0.0, -up], [across, 0.0, up]]
-    return KnownWall(
+    return gates.KnownWall(
         index=0,
         number=0,
         name="wall 0",
@@ -96,13 +82,13 @@ def grid(n: int = 10) -> np.ndarray:
     return pixels[np.random.default_rng(3).permutation(n * n)]
 
 
-def candidate(**changes: Any) -> Candidate:
+def candidate(**changes: Any) -> gates.Candidate:
     """A good orientation: 80 of 100 ties agree, of 20 withheld ones 16."""
     is_check = np.arange(N_TIES) % 5 == 0
     agreeing = np.arange(N_TIES) % 25 >= 5
     lengths = np.where(agreeing, 0.5, 8.0)
     footprint = grid(20)
-    error = WallError(
+    error = gates.WallError(
         rms_m=0.0008,
         worst_m=0.002,
         corners_m=np.full(4, 0.002),
@@ -143,19 +129,19 @@ def candidate(**changes: Any) -> Candidate:
         "error": error,
         "params": PARAMS,
     }
-    return Candidate(**{**usual, **changes})
+    return gates.Candidate(**{**usual, **changes})
 
 
-def gated(gates: Sequence[Gate] | None = None, /, **changes: Any) -> str | None:
+def gated(some: Sequence[gates.Gate] | None = None, /, **changes: Any) -> str | None:
     """Name of the gate that refuses a candidate."""
-    found = refusal(candidate(**changes), gates)
+    found = gates.refusal(candidate(**changes), some)
     return found and found[0]
 
 
 def test_a_good_orientation_is_ok_without_a_note() -> None:
     good = candidate()
-    assert gated() is gated(GATES_BEFORE_BLOCK) is None
-    assert warnings_for(good) == []
+    assert gated() is gated(gates.GATES_BEFORE_BLOCK) is None
+    assert gates.warnings_for(good) == []
     assert (good.control.sum(), good.checked.sum(), good.gsd_m) == (64, 16, 0.002)
     assert sum(good.quadrant_counts) == 80
     # 8 of 10 cells' distance in each direction of a grid, over 19 of 20.
@@ -206,7 +192,7 @@ def test_each_gate_refuses_what_is_beyond_its_bound(
     assert gated(**good) is None
     assert gated(**bad) == name
     # The reason can be stated.
-    assert refusal(candidate(**bad))[1]
+    assert gates.refusal(candidate(**bad))[1]
 
 
 @pytest.mark.parametrize(("n_agree", "refused_by"), [(8, None), (7, "check-share")])
@@ -217,7 +203,7 @@ def test_check_ties_must_agree_half_as_often_as_the_control(
     agrees = agreeing(64, n_agree)
     assert gated(agreeing=agrees, normalised=np.where(agrees, 0.5, 8.0)) == refused_by
     # Eight ties are needed to begin with.
-    assert (too_few(n_agree) == "") == (refused_by is None)
+    assert (gates.too_few(n_agree) == "") == (refused_by is None)
 
 
 @pytest.mark.parametrize(("factor", "refused_by"), [(1.95, None), (2.05, "check-rms")])
@@ -290,7 +276,7 @@ def test_quarters_without_ties_must_be_known_from_the_others(quarter: int) -> No
     unknown = (replace(WALL, gsd_m=None),)
     assert found(1, 0.0001, known=unknown) == "quarters"
     assert found(0, 0.0, known=unknown) is None
-    assert gated(GATES_BEFORE_BLOCK, agreeing=in_quarter(quarter, 0)) is None
+    assert gated(gates.GATES_BEFORE_BLOCK, agreeing=in_quarter(quarter, 0)) is None
 
 
 def test_the_side_of_a_wall_is_asked_where_it_is_known_and_tied() -> None:
@@ -305,12 +291,12 @@ def test_the_side_of_a_wall_is_asked_where_it_is_known_and_tied() -> None:
     assert gated(centre=behind, known=(other,), walls=walls) is None
     walls[control[:4]] = 1
     assert gated(centre=behind, known=(other,), walls=walls) == "side"
-    assert gated(GATES_BEFORE_BLOCK, centre=behind) == "side"
+    assert gated(gates.GATES_BEFORE_BLOCK, centre=behind) == "side"
 
 
 def test_limits_of_good_orientations_are_reported() -> None:
     def reported(**changes: Any) -> list[tuple[str, Any]]:
-        return [(spec.code, values) for spec, values in warnings_for(candidate(**changes))]
+        return [(spec.code, values) for spec, values in gates.warnings_for(candidate(**changes))]
 
     assert reported(source="none") == [("focal-length-estimated", {})]
     counts = candidate(agreeing=in_quarter(0, 2)).quadrant_counts
@@ -334,7 +320,7 @@ def test_one_tie_in_twenty_five_must_agree(n_agree: int, is_enough: bool) -> Non
     every = np.arange(1000)
     seen = candidate().seen.take(every % N_TIES)
     changes = {"seen": seen, "is_check": every % 5 == 0, "walls": np.zeros(1000, dtype=np.int32)}
-    found = gated(CONTROL_GATES[:2], agreeing=every < n_agree, **changes)
+    found = gated(gates.CONTROL_GATES[:2], agreeing=every < n_agree, **changes)
     assert (found != "share") == is_enough
 
 
@@ -347,7 +333,7 @@ def test_wrong_ties_gather_on_a_quarter_of_what_has_texture() -> None:
     scale = math.sqrt(4.0 * math.pi * radius_px**2 / BY_CHANCE / (900.0 * 720.0))
     for factor, is_fine in ((1.02, True), (0.98, False)):
         pixels = (500.0, 400.0) + factor * scale * (grid() - (500.0, 400.0))
-        found = gated(CONTROL_GATES[2:3], agreeing=agrees, normalised=lengths, pixels=pixels)
+        found = gated(gates.CONTROL_GATES[2:3], agreeing=agrees, normalised=lengths, pixels=pixels)
         assert (found is None) == is_fine
 
 
@@ -355,9 +341,9 @@ def test_the_area_of_a_hull_is_that_of_its_polygon() -> None:
     # Points within a triangle whose corners are among them.
     corners = np.array([[0.0, 0.0], [20.0, 5.0], [4.0, 30.0]])
     inside = np.random.default_rng(0).dirichlet(np.ones(3), 60) @ corners
-    assert hull_area(np.vstack([inside, corners])) == pytest.approx(0.5 * (20 * 30 - 5 * 4))
+    assert gates.hull_area(np.vstack([inside, corners])) == pytest.approx(0.5 * (20 * 30 - 5 * 4))
     for flat in (np.outer(np.arange(5.0), [2.0, 3.0]), corners[:2], np.empty((0, 2))):
-        assert hull_area(flat) == 0.0
+        assert gates.hull_area(flat) == 0.0
 
 
 def centres(shape: tuple[int, int], half_m: tuple[float, float]) -> NDArray[np.float64]:
@@ -369,8 +355,8 @@ def centres(shape: tuple[int, int], half_m: tuple[float, float]) -> NDArray[np.f
     return np.stack(np.meshgrid(right, down), axis=-1)
 
 
-def error_of(sigmas_m: tuple[float, float, float], half_m: tuple[float, float]) -> WallError:
-    found = wall_error(posed(sigmas_m), [wall(half_m)])
+def error_of(sigmas_m: tuple[float, float, float], half_m: tuple[float, float]) -> gates.WallError:
+    found = gates.wall_error(posed(sigmas_m), [wall(half_m)])
     assert found is not None
     return found
 
@@ -390,7 +376,7 @@ def test_a_camera_that_may_stand_aside_shows_the_wall_as_much_aside() -> None:
 
 def test_a_camera_that_may_stand_nearer_is_worst_far_from_the_middle() -> None:
     nearer = (0.0, 0.0, 0.006)
-    grid = sigmas_on_wall(posed(nearer), wall(), (4, 6))
+    grid = gates.sigmas_on_wall(posed(nearer), wall(), (4, 6))
     aside = np.linalg.norm(centres((4, 6), (1.0, 0.5)), axis=2)
     np.testing.assert_allclose(grid, 0.006 * aside / DISTANCE_M / math.sqrt(2.0), rtol=1e-6)
     # Corners of the photo count where they show a wall: 2 m and 1.5 m from the middle, but for
@@ -410,9 +396,9 @@ def test_a_camera_that_may_stand_nearer_is_worst_far_from_the_middle() -> None:
 
 def test_a_photo_that_shows_no_wall_has_no_error() -> None:
     resection = posed((0.001, 0.001, 0.001), camera(turn_deg=180.0))
-    assert wall_error(resection, [wall()]) is None
-    assert wall_error(resection, []) is None
-    assert np.isnan(sigmas_on_wall(resection, wall(), (3, 3))).all()
+    assert gates.wall_error(resection, [wall()]) is None
+    assert gates.wall_error(resection, []) is None
+    assert np.isnan(gates.sigmas_on_wall(resection, wall(), (3, 3))).all()
 
 
 @pytest.mark.parametrize(("aside_m", "is_shown"), [(29.0, True), (31.0, False)])
@@ -421,7 +407,7 @@ def test_places_seen_flatter_than_one_in_ten_are_not_shown(aside_m: float, is_sh
     corners = np.array([[0, 0, 0.1], [0, 0, -0.1], [0.2, 0, -0.1], [0.2, 0, 0.1]])
     strip = replace(wall(), corners_world=corners + np.array([aside_m - 0.1, 0, 0]))
     sideways = camera(turn_deg=84.0)
-    found = wall_error(posed((0.001, 0.001, 0.001), sideways), [strip])
+    found = gates.wall_error(posed((0.001, 0.001, 0.001), sideways), [strip])
     assert (found is not None) == is_shown
 
 
@@ -441,7 +427,7 @@ def test_walls_are_as_ties_describe_them_or_through_their_points() -> None:
         sigma_m=np.ones(40),
         walls=(described,),
     )
-    first, second = known_walls(ties, np.ones(40, dtype=np.bool_))
+    first, second = gates.known_walls(ties, np.ones(40, dtype=np.bool_))
     assert (first.index, first.number, first.gsd_m, first.has_side) == (0, 6, 0.004, True)
     np.testing.assert_array_equal(first.corners_world, wall().corners_world)
     np.testing.assert_array_equal(first.normal, [0.0, -1.0, 0.0])
@@ -457,4 +443,4 @@ def test_walls_are_as_ties_describe_them_or_through_their_points() -> None:
         [shares.min(axis=0), shares.max(axis=0)], [[0, 0], [1, 1]], atol=1e-9
     )
     # Only chosen ties count.
-    assert [item.index for item in known_walls(ties, number == 1)] == [1]
+    assert [item.index for item in gates.known_walls(ties, number == 1)] == [1]

@@ -11,17 +11,6 @@ from numpy.typing import NDArray
 from orthoflow_plugins.orient import photos
 from orthoflow_plugins.orient import pose as lenses
 from orthoflow_plugins.orient.pnp import estimate_by_opencv
-from orthoflow_plugins.orient.pose import (
-    Estimate,
-    OrientParams,
-    Sharing,
-    estimate_pose,
-    expected_px,
-    image_cells,
-    robust_start,
-    unit_deviation,
-    without_chance,
-)
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
@@ -37,7 +26,7 @@ from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
 from tests.tied_photos import SCENE, photo, seen_by, tied
 
-PARAMS = OrientParams()
+PARAMS = lenses.OrientParams()
 
 
 def camera() -> ViewingCamera:
@@ -55,12 +44,13 @@ def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone() -> None:
     scaled = replace(seen, sigma_px=2.5 * seen.sigma_px, sigma_m=2.5 * seen.sigma_m)
     check = np.arange(200) % 5 == 0
     # The same ties are sampled first.
-    params = OrientParams(threshold_px=4.0)
+    params = lenses.OrientParams(threshold_px=4.0)
     found, other = (
-        estimate_pose(tied(photo(viewer), each, is_check=check), params) for each in (seen, scaled)
+        lenses.estimate_pose(tied(photo(viewer), each, is_check=check), params)
+        for each in (seen, scaled)
     )
-    assert isinstance(found, Estimate)
-    assert isinstance(other, Estimate)
+    assert isinstance(found, lenses.Estimate)
+    assert isinstance(other, lenses.Estimate)
     np.testing.assert_array_equal(found.agreeing, other.agreeing)
     np.testing.assert_allclose(
         found.resection.camera.centre_world, other.resection.camera.centre_world, atol=1e-6
@@ -72,10 +62,10 @@ def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone() -> None:
 def test_the_unit_deviation_is_that_of_normal_vectors(scale: float) -> None:
     rng = np.random.default_rng(3)
     lengths = np.hypot(*rng.normal(0.0, scale, (2, 40_000)))
-    assert unit_deviation(lengths) == pytest.approx(scale, rel=0.02)
+    assert lenses.unit_deviation(lengths) == pytest.approx(scale, rel=0.02)
     lengths[:15_000] = 1e6
     # A good third of wrong ones leaves it within reason.
-    assert unit_deviation(lengths) <= 3.0
+    assert lenses.unit_deviation(lengths) <= 3.0
 
 
 def ring(inner: float, outer: float, count: int) -> NDArray[np.float64]:
@@ -87,18 +77,18 @@ def ring(inner: float, outer: float, count: int) -> NDArray[np.float64]:
 def test_a_limit_holds_where_hardly_any_tie_within_it_is_there_by_chance() -> None:
     right = np.full(100, 0.5)
     # Eighty wrong ones from one to three times the limit stand for ten within it: a tenth.
-    assert without_chance(np.append(right, ring(3.6, 10.4, 80)), 3.5) == 3.5
-    assert without_chance(np.append(right, ring(3.6, 10.4, 81)), 3.5) < 3.5
+    assert lenses.without_chance(np.append(right, ring(3.6, 10.4, 80)), 3.5) == 3.5
+    assert lenses.without_chance(np.append(right, ring(3.6, 10.4, 81)), 3.5) < 3.5
     # Farther off, or not known at all, they tell nothing.
     beyond = np.append(right, [10.6] * 500 + [np.nan] * 500 + [np.inf] * 500)
-    assert without_chance(beyond, 3.5) == 3.5
+    assert lenses.without_chance(beyond, 3.5) == 3.5
 
 
 @pytest.mark.parametrize("n_wrong", [1000, 4000])
 def test_a_limit_is_tightened_until_chance_is_a_tenth(n_wrong: int) -> None:
     right = np.hypot(*np.random.default_rng(4).normal(0.0, 0.3, (2, 300)))
     lengths = np.append(right, ring(0.0, 30.0, n_wrong))
-    found = without_chance(lengths, 3.5)
+    found = lenses.without_chance(lengths, 3.5)
 
     def share(limit: float) -> float:
         inside = np.count_nonzero(lengths <= limit)
@@ -125,8 +115,8 @@ def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
         sigma_m=np.full(4000, 0.002),
     )
     known = replace(seen, sigma_m=np.zeros(4000))
-    assert expected_px(known) == pytest.approx(0.6)
-    in_space = np.sqrt(expected_px(seen) ** 2 - 0.6**2)
+    assert lenses.expected_px(known) == pytest.approx(0.6)
+    in_space = np.sqrt(lenses.expected_px(seen) ** 2 - 0.6**2)
     # Half a metre lies in the middle of the places, seven tenths of it in that of the farther
     # coordinate: 500 px become 707.
     assert in_space == pytest.approx(0.002 * 500.0 * np.sqrt(2.0), rel=0.03)
@@ -135,7 +125,7 @@ def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
         ({"points_world": 2.0 * points + SURVEY_SHIFT_M}, 0.5),
         ({"sigma_m": 5.0 * seen.sigma_m}, 5.0),
     ):
-        moved = np.sqrt(expected_px(replace(seen, **change)) ** 2 - 0.6**2)
+        moved = np.sqrt(lenses.expected_px(replace(seen, **change)) ** 2 - 0.6**2)
         assert moved == pytest.approx(factor * in_space, rel=1e-6)
 
 
@@ -154,7 +144,7 @@ def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
     claimed = replace(true, fx=(1.0 + off) * true.fx, fy=(1.0 + off) * true.fy)
     # Wide enough that no tie is rejected for the wrong focal length.
     seen = seen_by(true, n_ties, sigma_px=6.0)
-    found = estimate_pose(tied(photo(claimed), seen), PARAMS)
+    found = lenses.estimate_pose(tied(photo(claimed), seen), PARAMS)
     assert isinstance(found, str) == is_contradicted
     if isinstance(found, str):
         # The reason states the focal length by the ties.
@@ -173,14 +163,14 @@ def test_withheld_ties_have_no_say_in_the_start_and_four_places_make_none() -> N
     seen = seen_by(true, 60)
     is_check = np.arange(60) % 2 == 0
     wrong = replace(seen, pixels_photo=np.where(is_check[:, None], 10.0, seen.pixels_photo))
-    start = robust_start(tied(photo(true), wrong, is_check=is_check), PARAMS)
+    start = lenses.robust_start(tied(photo(true), wrong, is_check=is_check), PARAMS)
     assert start is not None
     np.testing.assert_array_equal(start.agreeing, ~is_check)
     assert start.lens.source == "calibration"
     np.testing.assert_allclose(start.camera.centre_world, true.centre_world, atol=1e-3)
     for n_places in (4, 5):
         places = seen.take(np.arange(40) % n_places)
-        start = robust_start(tied(photo(true), places), PARAMS)
+        start = lenses.robust_start(tied(photo(true), places), PARAMS)
         assert (start is not None) == (n_places == 5)
 
 
@@ -193,8 +183,8 @@ def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: 
     pixels = seen.pixels_photo + wrong[:, None] * np.array([0.5 * times * 6.5, 0.0])
     is_check = np.arange(300) % 4 == 0
     spoilt = replace(seen, pixels_photo=pixels)
-    found = estimate_pose(tied(photo(true), spoilt, is_check=is_check), PARAMS)
-    assert isinstance(found, Estimate)
+    found = lenses.estimate_pose(tied(photo(true), spoilt, is_check=is_check), PARAMS)
+    assert isinstance(found, lenses.Estimate)
     assert found.limit == pytest.approx(3.5 * times, rel=0.2)
     assert found.agreeing[~wrong].mean() > 0.98
     assert found.agreeing[wrong].mean() < 0.2
@@ -252,7 +242,7 @@ def test_exif_is_believed_to_a_twentieth_and_without_it_lenses_from_wide_to_long
     ],
 )
 def test_photos_share_a_lens_by_size_and_known_focal_length(
-    sharing: Sharing, lens_of: tuple[int, ...], apart: tuple[int, ...]
+    sharing: lenses.Sharing, lens_of: tuple[int, ...], apart: tuple[int, ...]
 ) -> None:
     focals_px = (500.0, 500.0, 4.0, None, None, 500.0)
     photos = [
@@ -330,7 +320,7 @@ def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:
     by_hand[:40] = 1
     of = replace(ties(400), by_hand=by_hand)
     of.role[[0, 4]], of.role[2] = TieRole.REJECTED, TieRole.CHECK
-    params = OrientParams()
+    params = lenses.OrientParams()
     tied = photos.tied_photo(small_photo("a"), of, params, np.random.default_rng(1))
     # What matching rejected is not used; its check points are.
     np.testing.assert_array_equal(tied.chosen, [2, *range(6, 400, 2)])
@@ -352,7 +342,7 @@ def test_check_points_are_withheld_evenly(share: float, n_check: int) -> None:
     pixels = (100.0 * (corner + rng.random((36, 20, 2)))).reshape(-1, 2)
     chosen = photos.withheld(pixels, (600, 600), share, rng)
     assert chosen.sum() == n_check
-    counts = np.bincount(image_cells(pixels[chosen], (600, 600), 6), minlength=36)
+    counts = np.bincount(lenses.image_cells(pixels[chosen], (600, 600), 6), minlength=36)
     assert np.abs(counts - share * 20).max() <= 1.0
     # Which ones is left to chance.
     other = photos.withheld(pixels, (600, 600), share, rng)

@@ -22,7 +22,6 @@ from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
 
-from orthoflow.errors import MethodError
 from orthoflow.products import Layer, LayerMask
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes
@@ -103,14 +102,6 @@ def test_bands_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     banded, _ = thrown(coarse, tmp_path, fill_gap_cells=3)
     for name in ("rgb", "mask", "quality", "filled"):
         np.testing.assert_array_equal(getattr(banded, name), getattr(whole, name), err_msg=name)
-
-
-def test_a_camera_behind_the_wall_is_refused(tmp_path: Path) -> None:
-    where = scenes.frame()
-    viewer = scenes.camera(where)
-    moved = viewer.translation + viewer.rotation @ (4.0 * where.normal_world)
-    with pytest.raises(MethodError, match="no oriented photo sees a wall"):
-        thrown(scenes.inputs(viewers=[replace(viewer, translation=moved)]), tmp_path)
 
 
 TOLERANCE_M: Final = 0.008

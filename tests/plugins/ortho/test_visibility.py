@@ -11,24 +11,9 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho import surfaces
+from orthoflow_plugins.ortho import painting, surfaces
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.painting import (
-    CellFootprint,
-    footprint_of,
-    near_patches,
-    sample,
-    sample_bilinear,
-)
 from orthoflow_plugins.ortho.parameters import BackwardParams, VisibilityParams
-from orthoflow_plugins.ortho.surfaces import (
-    Surface,
-    cells_seen,
-    is_before,
-    relief_of,
-    surfaces_of,
-    view_of,
-)
 from orthoflow_plugins.ortho.visibility_kernels import (
     BLOCK_CELLS,
     FINE_CELLS,
@@ -68,19 +53,21 @@ def wall_of(depths: NDArray[np.floating]) -> Wall:
 
 def surface_of(
     depths: NDArray[np.floating], *, hides: bool = True, where: WallFrame | None = None
-) -> Surface:
+) -> surfaces.Surface:
     """The scene's wall with other depths, unless another frame is given."""
     where = where or scenes.frame()
-    relief = relief_of(samples.wall(where, depth_m=depths.astype(np.float32)), hides=hides)
-    return Surface(frame=where, relief=relief, front_m=scenes.BUFFER_M, tolerance_m=0.008)
+    relief = surfaces.relief_of(samples.wall(where, depth_m=depths.astype(np.float32)), hides=hides)
+    return surfaces.Surface(frame=where, relief=relief, front_m=scenes.BUFFER_M, tolerance_m=0.008)
 
 
 def seen_of(
-    surface: Surface, camera: ViewingCamera, buffer: DepthBuffer | None = None
+    surface: surfaces.Surface, camera: ViewingCamera, buffer: DepthBuffer | None = None
 ) -> TileVisibility:
-    view = view_of(camera, surface, PARAMS)
+    view = surfaces.view_of(camera, surface, PARAMS)
     rows, columns = (slice(0, size) for size in scenes.SHAPE)
-    return cells_seen(view, surface.relief, buffer or nothing_in_the_way(camera), rows, columns)
+    return surfaces.cells_seen(
+        view, surface.relief, buffer or nothing_in_the_way(camera), rows, columns
+    )
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 1.4])
@@ -146,7 +133,7 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
     visible = seen_of(surface, camera)
     asked = (visible.mask == PAINTED) | (visible.mask == OCCLUDED)
     # Each ray is followed to the camera, whatever bounds say.
-    view = view_of(camera, surface, PARAMS)
+    view = surfaces.view_of(camera, surface, PARAMS)
     followed = are_hidden(view, surface.relief, np.argwhere(asked))
     assert 200 < followed.sum() < 0.5 * len(followed)
     np.testing.assert_array_equal(visible.mask[asked] == OCCLUDED, followed)
@@ -190,7 +177,7 @@ def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full() -
     depth[70, 40] = 0.5
     edge_m = 0.015
     frame = samples.facing_south(edge_m / 5.0, 61, 77)
-    occluding = relief_of(samples.wall(frame, depth_m=depth)).occluding
+    occluding = surfaces.relief_of(samples.wall(frame, depth_m=depth)).occluding
 
     def of_windows(
         values: NDArray[np.float32], pick: np.ufunc, steps: range
@@ -230,11 +217,11 @@ def test_cells_at_the_border_of_a_photo_ask_the_last_pixel_of_the_buffer() -> No
         camera=flat, column=0.0, row=0.0, height_m=1.0, gsd_m=gsd_m, front_m=0.1,
         tolerance_m=0.001, cosine_least=0.1, border_px=1.0,
     )  # fmt: skip
-    relief = relief_of(samples.wall(samples.facing_south(gsd_m, 512, 1)), hides=False)
+    relief = surfaces.relief_of(samples.wall(samples.facing_south(gsd_m, 512, 1)), hides=False)
     # What lies behind the buffer in memory hides everything.
     memory = np.array([[np.inf, 0.0]], dtype=np.float32)
     buffer = DepthBuffer(nearest=memory[:, :1], reduction=float(size))
-    mask = cells_seen(view, relief, buffer, slice(0, 1), slice(0, 512)).mask
+    mask = surfaces.cells_seen(view, relief, buffer, slice(0, 1), slice(0, 512)).mask
     n_inside = np.count_nonzero(mask == PAINTED)
     assert 200 < n_inside < 300
     assert (mask[0, n_inside:] == LayerMask.OUTSIDE).all()
@@ -264,7 +251,10 @@ def test_bounds_of_blocks_are_those_of_their_cells(
     monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
 ) -> None:
     depths = rough(shape)
-    relief, clear = relief_of(wall_of(depths)), relief_of(wall_of(depths), hides=False)
+    relief, clear = (
+        surfaces.relief_of(wall_of(depths)),
+        surfaces.relief_of(wall_of(depths), hides=False),
+    )
     low = np.where(np.isnan(depths), np.inf, depths)
     for prepared in (relief, clear):
         np.testing.assert_array_equal(prepared.bottoms, of_blocks(low, BLOCK_CELLS, np.minimum))
@@ -282,14 +272,14 @@ def test_bounds_of_blocks_are_those_of_their_cells(
     assert clear.highest_m == clear.tops.max() == -np.inf
     # Bands of a large wall do not show.
     monkeypatch.setattr(surfaces, "_BAND_CELLS", 20 * shape[1])
-    np.testing.assert_array_equal(relief_of(wall_of(depths)).occluding, relief.occluding)
+    np.testing.assert_array_equal(surfaces.relief_of(wall_of(depths)).occluding, relief.occluding)
 
 
 def test_a_camera_is_the_same_in_the_axes_of_a_wall() -> None:
     where = scenes.frame(at_survey=True)
     camera = replace(scenes.camera(where, aside_m=0.4), skew=2.0)
     surface = surface_of(np.zeros(scenes.SHAPE), hides=False, where=where)
-    view = view_of(camera, surface, PARAMS)
+    view = surfaces.view_of(camera, surface, PARAMS)
     (foot,) = where.wall_from_world(camera.centre_world[None])
     # The centre of the first cell is 0.
     assert (view.column, view.row) == pytest.approx((foot[0] - 0.5, foot[1] - 0.5), abs=1e-6)
@@ -317,7 +307,7 @@ def test_a_camera_stands_before_a_wall_where_any_of_it_is_lower(
     surface, camera = surface_of(depths, hides=False, where=frame), scenes.camera(scenes.frame())
     centre = frame.world_from_wall(np.array([[20.0, 20.0]]), 2.0)[0]
     there = replace(camera, translation=-camera.rotation @ centre)
-    assert is_before(view_of(there, surface, PARAMS), surface) == is_seen
+    assert surfaces.is_before(surfaces.view_of(there, surface, PARAMS), surface) == is_seen
 
 
 def test_surfaces_tolerate_their_noise_and_what_cells_cannot_hold(tmp_path: Path) -> None:
@@ -325,14 +315,14 @@ def test_surfaces_tolerate_their_noise_and_what_cells_cannot_hold(tmp_path: Path
     wall = wall_of(depths)
     walls = samples.walls(wall, replace(wall, plane_index=0), buffer_m=0.15)
     ctx = context(tmp_path)
-    first, second = surfaces_of(walls, ctx)
+    first, second = surfaces.surfaces_of(walls, ctx)
     noise_m = depth_noise_m(wall.depth_m)
     assert noise_m == pytest.approx(0.002, rel=0.1)
     assert first.tolerance_m == pytest.approx(3.0 * noise_m + 0.5 * GSD_M)
     assert first.front_m == 0.15
     assert first.frame is wall.frame
     assert first.relief.occluding.size == second.relief.occluding.size == 3600
-    (clear, _) = surfaces_of(walls, ctx, hides=False)
+    (clear, _) = surfaces.surfaces_of(walls, ctx, hides=False)
     assert clear.relief.occluding.size == 0
     assert clear.tolerance_m == 0.5 * GSD_M  # nothing to tell from noise
 
@@ -350,7 +340,7 @@ def test_cells_near_hidden_patches_are_those_within_reach_of_two_by_two(reach: i
                 top, left = max(0, row - reach), max(0, column - reach)
                 near[top : row + 2 + reach, left : column + 2 + reach] = True
     inner = (slice(reach + 1, -reach - 1),) * 2
-    np.testing.assert_array_equal(near_patches(hidden, reach)[inner], near[inner])
+    np.testing.assert_array_equal(painting.near_patches(hidden, reach)[inner], near[inner])
 
 
 @pytest.mark.parametrize("aside_m", [0.0, 0.5])
@@ -362,7 +352,9 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
     painted = np.zeros((20, 40), dtype=np.bool_)
     painted[13 - 10 : 16 - 10, 30 - 18 : 33 - 18] = True
     tile, inner = (slice(12, 30), slice(20, 58)), (slice(2, 20), slice(2, 40))
-    found = footprint_of(view_of(camera, surface, PARAMS), surface, painted, tile, inner)
+    found = painting.footprint_of(
+        surfaces.view_of(camera, surface, PARAMS), surface, painted, tile, inner
+    )
     points = where.world_from_wall(np.array([[31.5, 14.5], [35.5, 14.5], [31.5, 18.5]]), 0.03)
     pixels = camera.project(points)
     # Over four cells.
@@ -398,7 +390,7 @@ def test_bilinear_colours_are_those_of_the_formula(depth: int, size: tuple[int, 
     expected = np.where(is_painted[..., None], above * (1 - d) + below * d, 0.0)
     visible = TileVisibility(u + 7.5, v + 3.5, is_painted.astype(np.uint8), np.ones_like(u))
     inner, colours = (slice(2, 29), slice(3, 40)), np.empty((27, 37, 3), dtype=photo.dtype)
-    sample_bilinear(photo, (7, 3), visible, inner, colours)
+    painting.sample_bilinear(photo, (7, 3), visible, inner, colours)
     # Positions are float32: a millionth of a pixel is a sixteenth of a level of 16 bits.
     tolerance = 0.5 + (1e-3 if depth == 8 else 0.5)
     assert np.abs(colours - expected[inner]).max() <= tolerance
@@ -415,14 +407,14 @@ def places_of(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np
 def sampled(photo: Any, pixels: tuple[float, float], resampling: Any) -> Any:
     u, v = places_of(np.random.default_rng(0))
     across, down = pixels
-    footprint = CellFootprint(
+    footprint = painting.CellFootprint(
         pixels_across=across, pixels_down=down, photo_gsd_m=0.001, obliquity_deg=0.0, n_cells=9
     )
     bounds = tuple(math.floor(value) for value in (u.min(), u.max(), v.min(), v.max()))
     visible = TileVisibility(u, v, np.ones(u.shape, dtype=np.uint8), np.ones_like(u))
     inner, colours = (slice(0, u.shape[0]), slice(0, u.shape[1])), np.empty((*u.shape, 3), np.uint8)
     params = BackwardParams(resampling=resampling)
-    sample(photo, visible, inner, bounds, footprint, params, into=colours)
+    painting.sample(photo, visible, inner, bounds, footprint, params, into=colours)
     return colours
 
 
