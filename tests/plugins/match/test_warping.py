@@ -148,10 +148,7 @@ def board_before(wall: Wall, camera: ViewingCamera) -> warping.Before:
 
 
 PHOTO = Photo(
-    name="a.png",
-    encoded=encode_png(np.full((800, 800), 90, dtype=np.uint8)),
-    width=800,
-    height=800,
+    name="a.png", encoded=encode_png(np.full((800, 800), 90, dtype=np.uint8)), width=800, height=800
 )
 
 

@@ -186,11 +186,7 @@ def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> No
 
 @pytest.mark.parametrize(
     "box",
-    [
-        (slice(0, 5), slice(0, 7)),
-        (slice(1, 4), slice(2, 6)),
-        (slice(4, 5), slice(6, 7)),
-    ],
+    [(slice(0, 5), slice(0, 7)), (slice(1, 4), slice(2, 6)), (slice(4, 5), slice(6, 7))],
     ids=["whole", "part", "block"],
 )
 def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slice, slice]) -> None:

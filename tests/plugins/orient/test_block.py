@@ -266,10 +266,7 @@ def lens_block(
         lenses=(Lens(prior=cameras[0], freedom=free, source="exif"),),
         points=adjustment.Points(now=known, known=known, sigma_m=np.full(len(own), 1e-5)),
         seen=adjustment.Observations(
-            photo=photo,
-            point=own,
-            pixels=pixels,
-            sigma_px=np.full(len(own), 0.1),
+            photo=photo, point=own, pixels=pixels, sigma_px=np.full(len(own), 0.1)
         ),
     )
 

@@ -14,12 +14,7 @@ from orthoflow_plugins.orient.pnp import estimate_by_opencv
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.resection import (
-    SeenPoints,
-    adjust,
-    misfit,
-    predicted_covariances,
-)
+from orthoflow.geometry.resection import SeenPoints, adjust, misfit, predicted_covariances
 from orthoflow.products import Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples

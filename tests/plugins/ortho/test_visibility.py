@@ -140,9 +140,7 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 1.4])
-def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(
-    aside_m: float,
-) -> None:
+def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(aside_m: float) -> None:
     where = scenes.frame()
     camera = scenes.camera(where, aside_m=aside_m)
     depths = noisy_depths()
