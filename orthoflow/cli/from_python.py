@@ -75,16 +75,19 @@ def run(
         flag = known[name].opts[-1]
         if isinstance(value, bool) and known[name].is_flag:
             words += [flag] if value else []
-        elif value is not None:
+        elif value not in (None, ""):
             words += [f"{flag}={one}" for one in _listed(value)]
     try:
-        chosen = command.make_context("orthoflow.run", [*words, "--", os.fspath(workflow)]).params
+        context = command.make_context("orthoflow run", [*words, "--", os.fspath(workflow)])
     except click.ClickException as error:
         raise ArgumentError(f"orthoflow.run: {error.format_message()}") from error
+    chosen = dict(context.params)
     if isinstance(datasets, Mapping):
         chosen["datasets"] = json.loads(_json("datasets", datasets))
     changes = Changes(**{item.name: chosen.pop(item.name) for item in fields(Changes)})
-    _, made = run_workflow(changes=changes, **chosen)
+    # The report of an interrupted run states the command of the context.
+    with context:
+        _, made = run_workflow(changes=changes, **chosen)
     from orthoflow.report.notebooks import open_run
 
     return open_run(made.path)

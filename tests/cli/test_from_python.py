@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from orthoflow.cli import from_python as module
-from orthoflow.errors import ArgumentError, WorkflowError
+from orthoflow.engine.journal import RunListener, RunStarted
+from orthoflow.errors import ArgumentError, CancelledStepError, WorkflowError
 from tests.studios import Studio, open_studio
 
 
@@ -63,3 +64,19 @@ def test_a_run_from_python_is_one_of_the_command(studio: Studio) -> None:
     assert [(cell.address, cell.status) for cell in record.cells] == [("survey", "ok")]
     assert [file.name for entry in record.inputs for file in entry.files] == ["n.txt"]
     assert (studio.folder / "r" / "run.h5").is_file()
+
+
+def test_an_interrupted_run_from_python_can_be_resumed(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, listen: RunListener, **_more: object) -> None:
+        (studio.folder / "r").mkdir()
+        listen(RunStarted(run_id="r1", n_cells=2, is_resumed=False))
+        raise CancelledStepError("stopped")
+
+    monkeypatch.setattr("orthoflow.cli.run.executed", interrupted)
+    again: list[str] = []
+    monkeypatch.setattr("orthoflow.report.write_page", lambda *_, go_on: again.append(go_on))
+    with pytest.raises(CancelledStepError):
+        module.run("studio.yaml", set={"paint.grey": 7}, output="r")
+    assert again == ["orthoflow run studio.yaml --set paint.grey=7 --store .orthoflow -o r"]
