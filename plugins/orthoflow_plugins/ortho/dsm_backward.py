@@ -46,6 +46,7 @@ class DsmBackward(Method):
 
     id: ClassVar[str] = "ortho.dsm-backward"
     determinism: ClassVar[Determinism] = "exact"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_layers", label="layers (one per photo and wall)"),
         MetricSpec("painted_share", label="covered cells"),
