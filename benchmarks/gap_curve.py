@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument("--photo-gsd-m", type=float, default=0.0025, help="pixel on the wall")
     parser.add_argument("--exif", action="store_true", help="without calibration")
     parser.add_argument(
-        "--structure", default="confirmed", help="never, confirmed or alone, as `match.sift` has it"
+        "--structure", default="confirmed", help="never or confirmed, as `match.sift` has it"
     )
     parser.add_argument("--share", type=float, help="the same gap in every room")
     parser.add_argument(

@@ -238,15 +238,9 @@ def _left_out(
             is_dark[part] = rgb[part].max(axis=1) < least
             if has_rgb is not None:
                 is_dark[part] |= ~np.asarray(has_rgb[part])
-    n_dark = int(counts[:least].sum())
-    if params.skip_below_grey:
-        ctx.log(
-            f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) have no channel that reaches "
-            f"skip_below_grey = {least}; they colour no cell"
-        )
-    elif least > 0:
-        ctx.report(SPECKS, subject="the cloud", n_points=n_dark, share=n_dark / n_points)
-    elif is_worth_words:
+    if least > 0 and params.skip_below_grey is None:
+        ctx.report(SPECKS, subject="the cloud", n_points=n_black, share=n_black / n_points)
+    elif least == 0 and is_worth_words:
         ctx.report(
             BLACK_POINTS,
             n_black=n_black,
