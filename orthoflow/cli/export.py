@@ -204,6 +204,12 @@ _HELP: Final = "\n\n".join(
     help="only points in the box between two corners, metres in scan coordinates.",
 )
 @_for(
+    _CLOUDS,
+    "--clean",
+    is_flag=True,
+    help="omit isolated points, with fewer than ten neighbours.",
+)
+@_for(
     "gltf",
     "--relief",
     is_flag=True,

@@ -34,6 +34,7 @@ class Choices:
         colour: source of the colours of points.
         wall: number of the only wall to export.
         box: corners of the part to export, as text.
+        clean: whether to remove isolated points.
         relief: whether to model walls from their depths.
         heights_m: heights of plans above the floor.
         through: lines of sections, `x,y,x,y`.
@@ -60,6 +61,7 @@ class Choices:
     colour: Colouring | None = None
     wall: int | None = None
     box: str | None = None
+    clean: bool = False
     relief: bool = False
     heights_m: tuple[float, ...] = ()
     through: tuple[str, ...] = ()

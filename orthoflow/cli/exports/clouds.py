@@ -101,6 +101,7 @@ def _export(
         wall=wall,
         wall_plane=wall_plane,
         box_world=_box(chosen.box),
+        is_cleaned=chosen.clean,
         crs_wkt=_crs_wkt(walls),
         name=digest,
     )

@@ -57,6 +57,7 @@ class AttributedCloud:
             deviations are measured from its plane.
         wall_plane: number of the plane of that wall.
         box_world: (2, 3) if given, only points between these corners are written.
+        is_cleaned: isolated points are omitted.
         crs_wkt: coordinate system of the world, as WKT; empty if unknown.
         name: name of the cloud in files.
     """
@@ -71,6 +72,7 @@ class AttributedCloud:
     wall: Slab | None = None
     wall_plane: int = -1
     box_world: NDArray[np.float64] | None = None
+    is_cleaned: bool = False
     crs_wkt: str = ""
     name: str = "cloud"
 
@@ -174,6 +176,9 @@ class AttributedCloud:
                 chosen &= (column >= 0) & (column <= frame.width)
                 chosen &= (row >= 0) & (row <= frame.height)
                 chosen &= (depth <= self.wall.front_m) & (depth >= -self.wall.behind_m)
+        if self.is_cleaned:
+            near = self.neighbourhoods
+            chosen &= ~near.alone[near.places(offsets_of(self.cloud, part))]
         return chosen
 
     def _attributed(self, part: slice, chosen: NDArray[np.bool_]) -> NDArray[np.void]:
@@ -403,6 +408,10 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
             f"cubes of {3.0 * attributed.neighbourhoods.side_m:.4g} m, towards the viewer; 0 0 "
             "0: no surface"
         ),
+        "cleaned": "points with fewer than 10 neighbours, in 3 x 3 x 3 cubes of "
+        f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, are left out"
+        if attributed.is_cleaned
+        else None,
         "wall": None
         if attributed.wall is None
         else {"plane_index": attributed.wall_plane, "deviation": "from the plane of this wall"},

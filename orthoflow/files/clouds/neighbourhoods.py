@@ -1,4 +1,4 @@
-"""Neighbourhoods of points in a cloud, and their surface normals.
+"""Neighbourhoods of points in a cloud: surface normal, and whether a point is isolated.
 
 The cloud is read in sections. Voxels accumulate count and moments of their points, so memory
 depends on the number of voxels, about a million at most.
@@ -19,6 +19,9 @@ from orthoflow.products import PointCloud
 # Side of a voxel in point spacings; a voxel and its 26 neighbours cover twelve spacings.
 _VOXEL_SPACINGS: Final = 4.0
 _VOXELS_MOST: Final = 1_000_000
+# For outliers, 3 x 3 x 3 voxels are merged, since sparse ends of a scan have few neighbours, too.
+_COARSER: Final = 3
+_ALONE_FEWER_THAN: Final = 10
 _POINTS_LEAST: Final = 6
 # Maximum ratio of the variances across the surface and along its narrower side (spreads: 1/2).
 _FLAT: Final = 0.25
@@ -37,12 +40,14 @@ class Neighbourhoods:
         side_m: side of a voxel.
         keys: (v,) int64 keys of the voxels, sorted.
         normals: (v, 3) float32 unit vectors of arbitrary sign, 0 0 0 where there is no surface.
+        alone: (v,) True if there are fewer than 10 points within about 18 spacings.
     """
 
     low: NDArray[np.float64]
     side_m: float
     keys: NDArray[np.int64]
     normals: NDArray[np.float32]
+    alone: NDArray[np.bool_]
 
     def places(self, offsets: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the voxel (n,) of each point (n, 3), given in metres from the cloud's origin."""
@@ -56,8 +61,13 @@ def neighbourhoods_of(cloud: PointCloud) -> Neighbourhoods:
     side_m = spacing_m * float(np.sqrt(per_voxel))
     low = np.array([float(axis.min()) for axis in (cloud.x, cloud.y, cloud.z)]) - 4.0 * side_m
     keys, moments = _moments(cloud, low, side_m)
-    normals = _normals(keys, moments)
-    return Neighbourhoods(low=low, side_m=side_m, keys=keys, normals=normals)
+    return Neighbourhoods(
+        low=low,
+        side_m=side_m,
+        keys=keys,
+        normals=_normals(keys, moments),
+        alone=_alone(keys, moments[:, 0]),
+    )
 
 
 def offsets_of(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
@@ -118,3 +128,11 @@ def _normals(keys: NDArray[np.int64], moments: NDArray[np.float64]) -> NDArray[n
     is_surface = (count[:, 0] >= _POINTS_LEAST) & (values[:, 0] < _FLAT * values[:, 1])
     normals[is_surface] = vectors[is_surface, :, 0]
     return normals
+
+
+def _alone(keys: NDArray[np.int64], counts: NDArray[np.float64]) -> NDArray[np.bool_]:
+    mask = (1 << 21) - 1
+    parts = [(keys >> 42) // _COARSER, ((keys >> 21) & mask) // _COARSER, (keys & mask) // _COARSER]
+    coarse, inverse = np.unique((parts[0] << 42) | (parts[1] << 21) | parts[2], return_inverse=True)
+    about = _neighbour_sums(coarse, np.bincount(inverse, counts, len(coarse)).astype(np.float64))
+    return (about < _ALONE_FEWER_THAN)[inverse]

@@ -115,3 +115,4 @@ def test_normals_take_the_voxels_about_them_together() -> None:
     known = found.any(axis=1)
     assert known.mean() > 0.99
     np.testing.assert_allclose(np.abs(found[known] @ truth), 1.0, atol=1e-4)
+    assert not near.alone.any()

@@ -26,6 +26,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, PointLabels
 from tests import cloud_scenes
 from tests.cloud_scenes import ORIGIN, planes
+from tests.long_loops import seeds
 
 N_SIDE = 60
 STATIONS = ORIGIN + np.array([[2.0, 1.0, 1.5], [1.0, 2.0, 1.0]])
@@ -311,6 +312,29 @@ def test_only_what_is_asked_for_is_written(tmp_path: Path) -> None:
     expected = np.all((cloud.points_world() >= box[0]) & (cloud.points_world() <= box[1]), axis=1)
     assert len(inside) == np.count_nonzero(expected)
     assert write_laz(tmp_path / "none.laz", with_attributes(box_world=box + 100.0)) == 0
+
+
+@pytest.mark.parametrize("seed", seeds(3))
+def test_cleaning_takes_the_outliers_and_nothing_else(tmp_path: Path, seed: int) -> None:
+    cloud = corner()
+    random = np.random.default_rng(seed)
+    far = random.uniform([0.6, 0.6, 0.6], [3.0, 3.0, 3.0], (12, 3)).astype(np.float32)
+    far[0] = 4000.0
+    spoilt = PointCloud(
+        origin=ORIGIN,
+        x=np.append(cloud.x, far[:, 0]),
+        y=np.append(cloud.y, far[:, 1]),
+        z=np.append(cloud.z, far[:, 2]),
+        up=cloud.up,
+        intensity=np.ones(len(cloud) + 12, np.float32),
+    )
+    plain = with_attributes(cloud=spoilt, colouring="intensity", planes=None)
+    assert write_laz(tmp_path / "a.laz", plain) == len(spoilt)
+    clean = dataclasses.replace(plain, is_cleaned=True)
+    assert write_laz(tmp_path / "b.laz", clean) == len(cloud)
+    np.testing.assert_allclose(
+        read_laz(tmp_path / "b.laz").world, cloud.points_world(), atol=0.51e-4
+    )
 
 
 # The header of LAZ, and the scale of its coordinates
