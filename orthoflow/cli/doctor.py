@@ -31,6 +31,8 @@ from orthoflow.geometry.threads import usable_cores
 from orthoflow.version import DISTRIBUTION, __version__
 
 _IMPORT_TIMEOUT_S: Final = 120
+_MIN_DISK_BYTES: Final = 5 * 1024**3
+_MIN_MEMORY_BYTES: Final = 2 * 1024**3
 
 # Distributions without which no command works.
 _CORE: Final = frozenset(
@@ -161,12 +163,23 @@ def _machine() -> Iterator[Finding]:
     with contextlib.suppress(ImportError):  # reported with the libraries
         import psutil
 
-        yield Finding("memory", "ok", f"{size(psutil.virtual_memory().available)} available")
+        cost = "scans with many millions of points will not fit"
+        yield _enough("memory", psutil.virtual_memory().available, _MIN_MEMORY_BYTES, cost)
+
+
+def _enough(name: str, n_bytes: int, min_bytes: int, cost: str) -> Finding:
+    """Return the finding on whether there is enough of a resource."""
+    is_enough = n_bytes >= min_bytes
+    verdict: Literal["ok", "limited"] = "ok" if is_enough else "limited"
+    return Finding(name, verdict, f"{size(n_bytes)} free", "" if is_enough else cost)
 
 
 def _store(store: Path) -> Iterator[Finding]:
     places = (store.absolute(), *store.absolute().parents)
     folder = next(place for place in places if place.is_dir())
+    free = shutil.disk_usage(folder).free
+    cost = "long runs may fill it (orthoflow cache gc, or --store DIR)"
+    yield _enough("disk of the store", free, _MIN_DISK_BYTES, cost)
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")
@@ -175,8 +188,7 @@ def _store(store: Path) -> Iterator[Finding]:
         cost = "no run can start here (choose another folder with --store DIR)"
         yield Finding("store", "missing", problem, cost, core=True)
     else:
-        free = size(shutil.disk_usage(folder).free)
-        yield Finding("store", "ok", f"{store} is writable, {free} free", core=True)
+        yield Finding("store", "ok", f"{store} is writable", core=True)
 
 
 def _plugins() -> Iterator[Finding]:

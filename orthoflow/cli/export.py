@@ -24,6 +24,15 @@ _Command = TypeVar("_Command", bound=Callable[..., Any] | click.Command)
 _EXPORT_FOLDER: Final = "export"
 
 
+class _Scale(click.IntRange):
+    """The N of a scale 1:N, entered as N or as 1:N."""
+
+    # Any: as declared by click.
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        text: Any = value.replace(" ", "").removeprefix("1:") if isinstance(value, str) else value
+        return int(super().convert(text, param, ctx))
+
+
 _CLOUDS: Final = "laz copc ply e57"
 _DRAWN: Final = "plan section elevation sheet"
 _STEPWISE: Final = (
@@ -96,9 +105,10 @@ _HELP: Final = "\n\n".join(
 @_for(
     _DRAWN,
     "--scale",
-    type=click.IntRange(min=1, max=100_000),
+    type=_Scale(min=1, max=100_000),
     metavar="N",
-    help="scale 1:N; by default the largest common scale at which each drawing fits on one sheet.",
+    help="scale 1:N (50 or 1:50); by default the largest common scale at which each drawing fits "
+    "on one sheet.",
 )
 @_for(
     _DRAWN,

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
     from orthoflow.engine.plan import PlannedCell
 
+# Below these limits, the progress of a step is too small to predict its remaining time.
+_MIN_FRACTION: Final = 0.05
+_MIN_ELAPSED_S: Final = 2.0
 _REFRESH_PER_S: Final = 4
 # Maximum time between lines in a log file.
 _EVERY_S: Final = 10.0
@@ -55,6 +58,7 @@ class CellState:
         text: current activity, or the reason for its outcome.
         started: clock time in seconds.
         wall_s: duration.
+        took_s: previous duration of this or a similar cell; None if unknown.
     """
 
     state: str = "waiting"
@@ -62,6 +66,58 @@ class CellState:
     text: str = ""
     started: float = 0.0
     wall_s: float = 0.0
+    took_s: float | None = None
+
+    def left_s(self, now_s: float) -> float | None:
+        """Return the remaining time in seconds, from its earlier duration or else its progress."""
+        if self.state == "waiting":
+            return self.took_s
+        if self.state != "running":
+            return 0.0
+        elapsed_s = now_s - self.started
+        if self.took_s is not None and elapsed_s < self.took_s:
+            return self.took_s - elapsed_s
+        if self.fraction < _MIN_FRACTION or elapsed_s < _MIN_ELAPSED_S:
+            return None
+        return elapsed_s * (1 - self.fraction) / self.fraction
+
+
+def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> str:
+    """Estimate the remaining time of a run; empty if nothing remains.
+
+    Args:
+        cells: all cells.
+        now_s: time of the clock that gave `started`.
+        jobs: number of cells that run at the same time.
+    """
+    left = [
+        cell.left_s(now_s)
+        for cell in cells
+        # Stored and skipped steps take no time, and do not help to predict others.
+        if cell.state == "running" or (cell.state == "waiting" and cell.took_s != 0.0)
+    ]
+    known = [seconds for seconds in left if seconds is not None]
+    n_unknown = len(left) - len(known)
+    if not left:
+        return ""
+    # Otherwise a few short steps would suggest that a run of minutes is nearly finished.
+    if not known or n_unknown > len(known):
+        return "remaining time still unknown"
+    seconds = about(max(*known, sum(known) / jobs, 0.0))
+    if n_unknown:
+        return f"at least {seconds} left; {counted(n_unknown, 'step')} not estimated"
+    return f"about {seconds} left"
+
+
+def about(seconds: float) -> str:
+    """Format an estimated duration, rounded up.
+
+    >>> [about(seconds) for seconds in (0.3, 7, 42, 130, 4000)]
+    ['5 s', '10 s', '45 s', '2 min 10 s', '1 h 07 min']
+    """
+    step = 5 if seconds <= 60 else 10 if seconds <= 600 else 60
+    rounded = max(step, step * -(-round(seconds) // step))
+    return f"{rounded} s" if rounded < 60 else duration(rounded)
 
 
 class Progress:
@@ -72,9 +128,10 @@ class Progress:
         console: console of the terminal; None if there is no terminal.
     """
 
-    def __init__(self, cells: Sequence[PlannedCell] = ()) -> None:
+    def __init__(self, cells: Sequence[PlannedCell] = (), *, jobs: int = 1) -> None:
+        self._jobs = jobs
         self._lock = threading.Lock()
-        self._cells = {item.cell.address: CellState() for item in cells}
+        self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
         self._n_cells = len(cells)
         self._reported: set[tuple[str, str]] = set()
         self._n_similar: Counter[str] = Counter()
@@ -103,6 +160,8 @@ class Progress:
         line = self._applied(event)
         if isinstance(event, RunStarted):
             self._n_cells = event.n_cells
+            left = "" if self.console else self.left()
+            line += f", {left}" if left else ""
         if not line:
             return
         if self.console:
@@ -171,6 +230,10 @@ class Progress:
         with self._lock:
             return dict(self._cells)
 
+    def left(self) -> str:
+        """Estimate the remaining time of the run; empty if nothing remains."""
+        return left_of_run(self.cells().values(), time.monotonic(), jobs=self._jobs)
+
     @property
     def n_ended(self) -> int:
         """Return the number of cells that have ended."""
@@ -182,9 +245,14 @@ class Progress:
         running = []
         for address, cell in self.cells().items():
             if cell.state == "running":
-                text = f"{cell.text}, " if cell.text else ""
-                so_far = f"{duration(now_s - cell.started)} so far"
-                running.append(f"{address}: {100 * cell.fraction:.0f} %, {text}{so_far}")
+                left_s = cell.left_s(now_s)
+                parts = [
+                    f"{100 * cell.fraction:.0f} %",
+                    cell.text,
+                    f"{duration(now_s - cell.started)} so far",
+                    f"about {about(left_s)} left" if left_s is not None else "",
+                ]
+                running.append(f"{address}: {', '.join(part for part in parts if part)}")
         if running:
             echo_error(*running)
 
@@ -194,7 +262,8 @@ class Progress:
         from rich.text import Text
 
         ended = f"{self.n_ended} of {counted(len(self.cells()), 'step')} ended"
-        return Group(self.table(), Text(ended, style="dim"))
+        left = self.left()
+        return Group(self.table(), Text(f"{ended}, {left}" if left else ended, style="dim"))
 
     def table(self) -> Table:
         """Return the table; if too long, only running, failed and waiting cells."""
@@ -203,7 +272,7 @@ class Progress:
 
         now_s = time.monotonic()
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("step", "state", "time", ""):
+        for title in ("step", "state", "time", "left", ""):
             table.add_column(title, no_wrap=True, overflow="ellipsis")
         cells = self.cells()
         most = (self.console.height if self.console else len(cells) + 4) - 4
@@ -216,10 +285,12 @@ class Progress:
             running = cell.state == "running"
             state = f"{100 * cell.fraction:3.0f} %" if running else cell.state
             seconds = now_s - cell.started if running else cell.wall_s
+            left_s = cell.left_s(now_s) if running else None
             table.add_row(
                 Text(shown(address)),
                 Text(state, style=_STYLES.get(cell.state, "dim")),
                 Text(duration(seconds) if seconds else ""),
+                Text(about(left_s) if left_s is not None else ""),
                 Text(shown(cell.text)),
             )
         return table

@@ -211,7 +211,7 @@ def executed(  # noqa: PLR0913 - parts of a run
     )
 
     def run() -> RunOutcome:
-        with Progress(plan.cells) as progress:
+        with Progress(plan.cells, jobs=plan.options.jobs) as progress:
 
             def take(event: RunEvent) -> None:
                 listen(event)

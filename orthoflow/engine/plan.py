@@ -44,6 +44,8 @@ _ABSENT: Final = "absent"
 _FORCED: Final = "forced"
 # Files with camera parameters or positions of images, which may be the same for several images.
 _SIDECARS: Final = frozenset({".aae", ".jgw", ".pgw", ".prj", ".tfw", ".wld", ".xmp"})
+# Time to start a process and to read and store its products.
+_START_S: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +89,8 @@ class PlannedCell:
         key: cache key; None if its inputs are not known.
         inputs: port -> product, as far as known.
         result: stored result of a cached cell.
+        took_s: expected duration, from the earlier call with the most similar parameters; 0 for
+            cells that do not run, None if unknown.
     """
 
     cell: Cell
@@ -95,6 +99,7 @@ class PlannedCell:
     key: CellKey | None = None
     inputs: Mapping[str, ProductRef] | None = None
     result: CellResult | None = None
+    took_s: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,13 +239,15 @@ class _Planner:
     def add(self, cell: Cell) -> None:
         """Add the plan of one more cell."""
         planned = self._without_inputs(cell) or self._with_inputs(cell)
+        is_run = planned.status in ("will run", "unknown yet")
+        took_s = self._took_s(cell) if is_run else 0.0
         if planned.status == "unknown yet" and cell.step in self.force:
             planned = replace(planned, status="will run", reason=_FORCED)
-        elif planned.status == "unknown yet" and not self._before(cell.method):
+        elif planned.status == "unknown yet" and took_s is None:
             # If a method has no results in the store, none can be found whatever its inputs are.
             reason = "no result of this method is stored"
             planned = replace(planned, status="will run", reason=reason)
-        self.planned[cell.address] = planned
+        self.planned[cell.address] = replace(planned, took_s=took_s)
 
     def _without_inputs(self, cell: Cell) -> PlannedCell | None:
         if cell.skip_reason:
@@ -266,6 +273,21 @@ class _Planner:
         return PlannedCell(
             cell=cell, status="cached", reason=reason, key=key, inputs=refs, result=result
         )
+
+    def _took_s(self, cell: Cell) -> float | None:
+        """Return the duration of the most similar call; None if there is none."""
+        params = {
+            f"params.{name}": json.dumps(value, ensure_ascii=False, sort_keys=True)
+            for name, value in cell.params.items()
+        }
+
+        def n_changed(earlier: CellResult) -> int:
+            before = _ingredients(earlier.key_preimage)
+            return sum(before.get(name) != value for name, value in params.items())
+
+        # If several are equally similar, the most recent one is used.
+        nearest = min(self._before(cell.method), key=n_changed, default=None)
+        return None if nearest is None else nearest.wall_s + _START_S
 
     def _before(self, method: str) -> tuple[CellResult, ...]:
         if method not in self._earlier:

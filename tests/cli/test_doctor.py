@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 from click.testing import CliRunner
 
 from orthoflow.cli import program
 from orthoflow.cli.doctor import _libraries
+
+GIB = 1 << 30
 
 
 @pytest.fixture
@@ -23,6 +28,9 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture(autouse=True)
 def _here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A machine with nothing to find fault with."""
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=8 * GIB))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=99 * GIB))
     monkeypatch.chdir(tmp_path)
 
 
@@ -41,7 +49,7 @@ def test_where_all_is_there_nothing_is_restricted() -> None:
     lines = result.stdout.splitlines()
     assert lines[-1] == "orthoflow works, with 0 restrictions"
     assert [line.split()[0] for line in lines if "  ok  " in line] == [
-        *("platform", "cores", "memory", "store", "click", "plugins"),
+        *("platform", "cores", "memory", "disk", "store", "click", "plugins"),
     ]
     assert not Path("new").exists()
 

@@ -12,7 +12,9 @@ import pytest
 from rich.console import Console
 
 from orthoflow.cli.progress import (
+    CellState,
     Progress,
+    left_of_run,
     working_on,
 )
 from orthoflow.diagnostics import PLAIN_WARNING, Diagnostic, DiagnosticSpec
@@ -67,15 +69,20 @@ EVENTS: list[RunEvent] = [
 ]
 
 
-def planned(*addresses: str) -> tuple[PlannedCell, ...]:
+def planned(*addresses: str, took_s: float | None = None) -> tuple[PlannedCell, ...]:
     return tuple(
         PlannedCell(
             cell=Cell(address=address, step=address, method="toy.toy"),
             status="will run",
             reason="",
+            took_s=took_s,
         )
         for address in addresses
     )
+
+
+def running(*, fraction: float = 0.0, took_s: float | None = None) -> CellState:
+    return CellState(state="running", fraction=fraction, started=100.0, took_s=took_s)
 
 
 # Lines --------------------------------------------------------------------------------------------
@@ -110,7 +117,7 @@ def test_a_log_has_a_line_per_start_end_and_code(
 def test_a_log_shows_a_long_step_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    progress = Progress(planned("plane", "wall"))
+    progress = Progress(planned("plane", "wall", took_s=60.0))
     progress.every_s = 0.2
     with progress:
         progress.take(RunStarted(run_id="r1", n_cells=2, is_resumed=False))
@@ -118,10 +125,10 @@ def test_a_log_shows_a_long_step_again(
         progress.take(progressed("plane", 0.25, "peeling"))
         time.sleep(0.7)
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["run r1: 2 steps", "plane: started"]
+    assert lines[:2] == ["run r1: 2 steps, about 2 min 00 s left", "plane: started"]
     assert 1 <= len(lines[2:]) <= 3
     for line in lines[2:]:
-        assert re.fullmatch(r"plane: 25 %, peeling, \d\.\d+ s so far", line)
+        assert re.fullmatch(r"plane: 25 %, peeling, \d\.\d+ s so far, about 1 min 00 s left", line)
 
 
 # The table ----------------------------------------------------------------------------------------
@@ -137,8 +144,9 @@ def test_the_live_table_shows_every_state_and_keeps_warnings(
         columns = [[str(cell) for cell in column.cells] for column in progress.table().columns]
         assert columns[0] == ["cloud", "plane", "wall", "other"]
         assert columns[1] == ["cached", " 50 %", "waiting", "waiting"]
-        assert columns[3] == ["", "peeling", "", ""]
-        assert str(progress.drawn().renderables[1]) == "1 of 4 steps ended"
+        assert columns[4] == ["", "peeling", "", ""]
+        whole = "1 of 4 steps ended, remaining time still unknown"
+        assert str(progress.drawn().renderables[1]) == whole
         progress.take(CellStarted(address="plane"))
         assert str(list(progress.table().columns[1].cells)[1]) == "  0 %"
         for address in ("plane", "wall", "other"):
@@ -170,6 +178,56 @@ def test_long_work_outside_of_cells_is_shown(capsys: pytest.CaptureFixture[str])
         pass
     lines = set(re.sub(r"\d\.\d+ s", "T", capsys.readouterr().err).splitlines())
     assert lines == {"writing the record, T so far"}
+
+
+# Forecasts ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cell", "now_s", "left_s"),
+    [
+        (CellState(took_s=30.0), 0.0, 30.0),
+        (CellState(state="ok", took_s=30.0), 0.0, 0.0),
+        # Its earlier duration counts until that is over, then its progress.
+        (running(took_s=30.0, fraction=0.9), 110.0, 20.0),
+        (running(took_s=30.0), 150.0, None),
+        # Where it never ran before, a quarter in ten seconds leaves thirty.
+        (running(fraction=0.25), 110.0, 30.0),
+        (running(fraction=0.049), 110.0, None),
+        (running(fraction=0.25), 101.9, None),
+    ],
+)
+def test_a_cell_is_predicted_by_its_last_run_then_by_its_progress(
+    cell: CellState, now_s: float, left_s: float | None
+) -> None:
+    assert cell.left_s(now_s) == (None if left_s is None else pytest.approx(left_s))
+
+
+LEFT = [running(took_s=50.0), CellState(took_s=40.0), CellState(took_s=40.0)]
+UNKNOWN = [CellState(), CellState()]
+
+
+@pytest.mark.parametrize(
+    ("cells", "jobs", "text"),
+    [
+        # 50 + 40 + 40 one after the other, or two at a time; three at a time end with the longest.
+        ([*LEFT, CellState(state="ok", took_s=1000.0)], 1, "about 2 min 10 s left"),
+        (LEFT, 2, "about 1 min 10 s left"),
+        (LEFT, 3, "about 50 s left"),
+        ([*LEFT[1:], *UNKNOWN], 1, "at least 1 min 20 s left; 2 steps not estimated"),
+        # A few seconds of one cell would make a run of minutes look short; stored ones say nothing.
+        (
+            [CellState(took_s=0.0), CellState(took_s=4.0), *UNKNOWN],
+            1,
+            "remaining time still unknown",
+        ),
+        ([CellState(took_s=0.0), CellState(state="ok")], 1, ""),
+    ],
+)
+def test_a_run_takes_as_long_as_its_longest_cell_or_its_share_of_all(
+    cells: list[CellState], jobs: int, text: str
+) -> None:
+    assert left_of_run(cells, 100.0, jobs=jobs) == text
 
 
 # Untrusted text -----------------------------------------------------------------------------------

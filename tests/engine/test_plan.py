@@ -228,3 +228,24 @@ def test_a_raised_result_version_counts(world: World) -> None:
     )
     forget_toys()
     assert world.status(CHAIN)["first"] == ("will run", "code changed, result_version 1 -> 2")
+
+
+# How long it takes --------------------------------------------------------------------------------
+
+
+def test_of_what_a_method_took_the_nearest_counts(world: World) -> None:
+    steps = """
+steps:
+  first: {use: make.range}
+  second: {use: work.slow, in: {numbers: first.numbers}, params: {steps: 1}}
+"""
+    run(world, steps, into="short")
+    run(world, steps.replace("steps: 1", "steps: 8"), into="long")
+
+    def took_s(n_steps: int) -> float:
+        plan = world.plan(steps, sets=[f"second.steps={n_steps}"], force=("second",))
+        return plan.cells[1].took_s or 0.0
+
+    # Seven steps more, of a twentieth of a second each.
+    assert took_s(8) - took_s(1) > 0.3
+    assert took_s(1) > 1.0

@@ -333,7 +333,7 @@ def test_cleaning_takes_the_outliers_and_nothing_else(tmp_path: Path, seed: int)
     clean = dataclasses.replace(plain, is_cleaned=True)
     assert write_laz(tmp_path / "b.laz", clean) == len(cloud)
     np.testing.assert_allclose(
-        read_laz(tmp_path / "b.laz").world, cloud.points_world(), atol=0.51e-4
+        read_laz(tmp_path / "b.laz")["world"], cloud.points_world(), atol=0.51e-4
     )
 
 

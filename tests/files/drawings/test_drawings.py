@@ -12,10 +12,12 @@ import ezdxf
 import numpy as np
 import pdfplumber
 import pytest
+from click import BadParameter
 from click.testing import CliRunner, Result
 from orthoflow_provenance.document import PublishedFile
 from PIL import Image
 
+from orthoflow.cli.export import export as command
 from orthoflow.cli.program import program
 from orthoflow.errors import RecordError
 from orthoflow.records.open import open_run
@@ -163,6 +165,14 @@ def test_the_accuracy_of_a_wall_is_by_evidence_on_that_wall(
     # What is stated is not said to be unknown; numbers of the photos are of all walls together.
     assert sum("not checked" in text for text in texts) == int(not has_ties)
     assert not any("worst photo" in text for text in texts)
+
+
+@pytest.mark.parametrize("text", ["50", "1:50", "1 : 50"])
+def test_a_scale_may_be_written_whole(text: str) -> None:
+    (option,) = (one for one in command.params if one.name == "scale")
+    assert option.type.convert(text, option, None) == 50
+    with pytest.raises(BadParameter):
+        option.type.convert("2:50", option, None)
 
 
 def test_a_record_alone_is_drawn_as_its_run_is(run: Path, tmp_path: Path) -> None:
