@@ -47,11 +47,6 @@ class KindPorts:
     imports: Mapping[str, tuple[str, ...]]
     needs: tuple[str, ...] = ()
 
-    @property
-    def hands_on(self) -> bool:
-        """Whether each output can be an input returned unchanged."""
-        return all(port.same_as for port in self.outputs)
-
 
 def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
     """Derive the ports of a new method from a kind and its first installed method that loads.

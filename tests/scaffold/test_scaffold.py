@@ -22,6 +22,7 @@ from tests.author_environments import install, new_environment, succeed
 from tests.long_loops import long_only
 
 KINDS = sorted(discover_catalog().kinds)
+ALL_BUT_TRUTH = ",".join(sorted({*discover_catalog().products} - {"truth"}))
 COMPARED = {"plane", "raster", "ortho", "mosaic", "inspect", "match", "orient"}
 
 
@@ -55,10 +56,11 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
         assert f"`{kind}: {{use: {project.method_id}" in told
 
 
+@pytest.mark.parametrize("kind", ["simulate", "face", "dense"])
 def test_a_new_plugin_passes_the_suite_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    project = Project(name="fresh-simulate", kind="simulate")
+    project = Project(name=f"fresh-{kind}", kind=kind)
     write_installed(project, tmp_path, monkeypatch)
     golden = tmp_path / "golden.json"
     problems = [case.problem() for case in conformance_cases(project.method_id, golden=golden)]
@@ -74,6 +76,9 @@ def test_a_new_plugin_passes_the_suite_as_it_is(
         # A filter; one that also gives a product of its own.
         ("cloud", "cloud"),
         ("cloud,labels", "labels,scores"),
+        # Every product that a method can make from nothing.
+        ("truth", ALL_BUT_TRUTH),
+        ("cloud", "labels,planes,sums"),
     ],
 )
 def test_a_new_kind_takes_and_gives_what_is_asked_and_passes_the_suite(
@@ -97,7 +102,7 @@ def test_a_new_kind_takes_and_gives_what_is_asked_and_passes_the_suite(
     assert comparison.exists() == bool(set(gives.split(",")) - known)
     if not comparison.exists():
         readme = (folder / "README.md").read_text(encoding="utf-8")
-        assert f"{name}, in: {{cloud: STEP.cloud}}}}`" in readme
+        assert f"{name}, in: {{{takes}: STEP.{takes}}}}}`" in readme
         return
     workflow = load_workflow(folder / "compare.yaml", catalog)
     cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == kind]
@@ -184,7 +189,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("dense", "face")])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_new_plugin_installs_and_passes_its_tests_at_once(
     kind: str, environment: Path, tmp_path: Path
 ) -> None:
