@@ -184,7 +184,7 @@ def _store(store: Path) -> Iterator[Finding]:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")
     except OSError as error:
-        problem = f"{folder} cannot be written: {(error.strerror or str(error)).lower()}"
+        problem = f"cannot write to {folder}: {(error.strerror or str(error)).lower()}"
         cost = "no run can start here (choose another folder with --store DIR)"
         yield Finding("store", "missing", problem, cost, core=True)
     else:

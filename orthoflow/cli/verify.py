@@ -33,11 +33,12 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     """Check that the record of RUN, a run folder or its run.h5, is complete and unchanged.
 
     Recomputes the seal of the file, the digest of every product and input file in the record, and
-    every cache key; compares redundant entries of the record, and the published files and report
-    pages next to it with their digests. Missing files, files unknown to the record, and a changed
-    report are only noted; with --strict they are errors. Figures next to the report and other files
-    in the folder, such as logs, are not checked. With --signer, the record must be signed with that
-    key. The exit code is 3 if something differs, or if RUN is not a record or has another version.
+    every cache key; checks that redundant entries of the record agree, and that the published files
+    and report pages next to it match their digests. Missing files, files unknown to the record, and
+    a changed report are only noted; with --strict they are errors. Figures next to the report and
+    other files in the folder, such as logs, are not checked. With --signer, the record must be
+    signed with that key. The exit code is 3 if something differs, or if RUN is not a record or has
+    another version.
     """
     from orthoflow.records.verify import verify_run
 

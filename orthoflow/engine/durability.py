@@ -71,7 +71,7 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write a temporary file and rename it, so that readers see either the old or the new file.
 
     Raises:
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     aside = path.with_name(f".{path.name[:40]}-{uuid.uuid4().hex}")
     with writing_to(path.parent):
@@ -94,7 +94,7 @@ def place_folder(aside: Path, final: Path) -> bool:
         False if another process was first; the new folder then keeps its temporary name.
 
     Raises:
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     with writing_to(final.parent):
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -114,7 +114,7 @@ def whole_folder(final: Path) -> Iterator[Path]:
     """Yield the path of a folder to create and fill; it is renamed if the block succeeds.
 
     Raises:
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     aside = final.with_name(f".{final.name}.unfinished")
     remove_tree(aside)

@@ -111,7 +111,7 @@ class FileDigests:
         """Save new digests for the next run.
 
         Raises:
-            StoreError: the disk cannot be written.
+            StoreError: the disk cannot be written to.
         """
         if self._is_dirty:
             text = json.dumps({"files": self._known, "places": self._places}, sort_keys=True)

@@ -145,7 +145,7 @@ class Journal:
         Raises:
             ArgumentError: the folder is in use by another run, or contains a finished run, a run of
                 another workflow, or other files.
-            StoreError: the disk cannot be written.
+            StoreError: the disk cannot be written to.
         """
         self._folder = folder
         self._path = folder / JOURNAL
@@ -173,7 +173,7 @@ class Journal:
             facts: other fields, see `JournalLine`; `time` is the current time unless given.
 
         Raises:
-            StoreError: the disk cannot be written.
+            StoreError: the disk cannot be written to.
         """
         line = {"event": event, "time": now(), **facts}
         text = json.dumps(line, ensure_ascii=False).encode() + b"\n"

@@ -133,7 +133,7 @@ def execute(
 
     Raises:
         ArgumentError: the run folder contains a finished run or other files, or a path is not text.
-        StoreError: the disk cannot be written, or the run folder is in use.
+        StoreError: the disk cannot be written to, or the run folder is in use.
         DamageError: an input of a step was damaged in the store and has been removed; the same call
             recomputes it.
         CancelledStepError: the run was interrupted by Ctrl-C or SIGTERM.

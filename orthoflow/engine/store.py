@@ -275,7 +275,7 @@ class Store:
         """Store bytes and return their SHA-256 as hexadecimal digits.
 
         Raises:
-            StoreError: the disk cannot be written.
+            StoreError: the disk cannot be written to.
         """
         sha256 = hashlib.sha256(content).hexdigest()
         folder = self.objects / sha256
@@ -389,7 +389,7 @@ class Store:
         """Store the result of a cell; its objects must be in the store already.
 
         Raises:
-            StoreError: the disk cannot be written.
+            StoreError: the disk cannot be written to.
         """
         with writing_to(self.folder):
             self.results.mkdir(parents=True, exist_ok=True)

@@ -136,8 +136,8 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
         return list(of_photos.pop())
     counts = ", ".join(f"{name} ({len(names)} lines)" for name, names in lists.items())
     raise InputError(
-        f"{path.name} has {n_cameras} cameras without names: use the folder with it and a "
-        f"list (.txt) of as many photos, one per line; found {counts or 'no such file'}"
+        f"{path.name} has {n_cameras} cameras without names: pass its folder, in which a list "
+        f"(.txt) names the same number of photos, one per line; found {counts or 'no such file'}"
     )
 
 

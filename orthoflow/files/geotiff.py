@@ -354,7 +354,7 @@ def read_raster(path: Path) -> RasterFile:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Convert errors of GDAL while reading a file into an error about the file.
+    """Convert GDAL errors that occur while a file is read into errors that name the file.
 
     Raises:
         InputError: the file cannot be read.

@@ -137,7 +137,9 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
             if number.is_integer() and 0 <= number <= MOST_WALLS:
                 wall = int(number)
             elif math.isfinite(number):
-                table.add(line, f"wall must be the number of a wall, from 0, got {cells['wall']}")
+                table.add(
+                    line, f"wall must be a wall number from 0 to {MOST_WALLS}, got {cells['wall']}"
+                )
         point = SurveyPoint(
             name=name,
             position=(x, y, z),

@@ -98,7 +98,7 @@ def write_crate(
         The files; the metadata file is first.
 
     Raises:
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
         RecordError: a name in the record cannot be a file name, a link replaces a file, or a cell
             uses a product that no cell produced.
     """

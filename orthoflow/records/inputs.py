@@ -174,7 +174,7 @@ class PlacedInputs:
         """The folder, created on first use.
 
         Raises:
-            StoreError: the disk cannot be written.
+            StoreError: the disk cannot be written to.
         """
         with writing_to(self._beside):
             self._beside.mkdir(parents=True, exist_ok=True)
@@ -185,7 +185,7 @@ class PlacedInputs:
         """Return the files found for an input, under their recorded names and in recorded order.
 
         Raises:
-            StoreError: the disk cannot be written.
+            StoreError: the disk cannot be written to.
         """
         names = [file.name for file in entry.files]
         # Files with the same name are sorted by folder, so they need new folders to keep their
@@ -211,7 +211,7 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[PlacedInputs]:
 
     Raises:
         RecordError: the record is damaged.
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     with ExitStack() as stack:
         placed = PlacedInputs(beside, stack)

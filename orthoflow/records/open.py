@@ -65,8 +65,9 @@ def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
             written next to the temporary record, unless the run folder already contains them.
 
     Raises:
-        ArgumentError: its outline or its store is missing or unreadable, or the run is running.
-        StoreError: the disk cannot be written.
+        ArgumentError: its outline or its store is missing or unreadable, or the run is still in
+            progress.
+        StoreError: the disk cannot be written to.
     """
     from orthoflow.engine.store import Store  # noqa: PLC0415 - only who looks at such a run
 

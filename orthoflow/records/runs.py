@@ -568,7 +568,7 @@ def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]
         The number of files written.
 
     Raises:
-        StoreError: the disk cannot be written, or a link is in the path.
+        StoreError: the disk cannot be written to, or a link is in the path.
     """
     with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -601,7 +601,7 @@ def copy_files(
 
     Raises:
         RecordError: a file is a link or a device, or differs from the record.
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     copied: list[str] = []
     known = {file.path: file for file in published}
@@ -612,7 +612,7 @@ def copy_files(
             with open_below(source, path) as stream:
                 n_bytes = os.fstat(stream.fileno()).st_size
                 if path not in known and n_bytes > LARGEST_PAGE_BYTES:
-                    raise RecordError(f"{source / path} has {n_bytes} bytes: no report is so large")
+                    raise RecordError(f"{source / path} is too large for a report: {n_bytes} bytes")
                 with creating(target, path) as copy:
                     shutil.copyfileobj(stream, copy, 1 << 20)
         except (FileNotFoundError, NotADirectoryError):
@@ -628,7 +628,7 @@ def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
     """Write a file into a folder; it gets its final name when it is complete.
 
     Raises:
-        StoreError: the disk cannot be written, or a link is in the path.
+        StoreError: the disk cannot be written to, or a link is in the path.
     """
     try:
         with writing_to(folder), create_below(folder, path) as stream:

@@ -69,7 +69,7 @@ def write_stac(run: Run, folder: Path) -> int:
     Raises:
         ArgumentError: the run published no orthoimage, or the files are missing.
         RecordError: a published file was changed.
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     inside = {
         f"{PRODUCTS_FOLDER}/{path.parent.name}/{path.name}": address

@@ -82,7 +82,7 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
         InputError: the file is not such a key, or the password is wrong.
         ArgumentError: there is already a signature with another key.
         RecordError: the record is damaged.
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
         PluginError: the library cryptography is not installed.
     """
     key = _read_key(key_file, password)
@@ -395,8 +395,8 @@ def _is_own_page(folder: Path, name: str, content_sha256: str) -> bool:
 
 def _page_note(folder: Path, name: str) -> Note:
     text = (
-        f"{name} does not show this record, or was changed since it was written; `orthoflow report "
-        f"{shlex.quote(str(folder))}` recreates it"
+        f"{name} does not show this record, or has been changed since it was written; "
+        f"`orthoflow report {shlex.quote(str(folder))}` recreates it"
     )
     return Note(code="page", text=text)
 
@@ -450,7 +450,7 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
     # A record that was passed on alone may be next to unrelated files.
     is_alone = bool(missing) and len(missing) == n_published
     if not is_alone and (unnamed := _unnamed(path, record)):
-        text = f"the record does not list {first_few(unnamed)}, found among its published files"
+        text = f"the record does not list these files of {PRODUCTS_FOLDER}/: {first_few(unnamed)}"
         yield Note(code="foreign", text=text)
 
 

@@ -286,7 +286,7 @@ def write_run(
     Raises:
         DamageError: an object that the record needs was damaged in the store and has been removed;
             resuming the run recomputes it.
-        StoreError: the disk cannot be written, or a step could not read or write it.
+        StoreError: the disk cannot be written to, or a step could not read or write it.
         InputError: an input file to embed was changed during the run.
         ArgumentError: another run is using the folder.
     """
@@ -375,7 +375,7 @@ def begin_run(
     It is used to show the run before it is finished, see `open.open_unfinished`.
 
     Raises:
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     from orthoflow.engine.environment import now  # noqa: PLC0415 - runs alone begin
     from orthoflow.engine.scheduler import RunOutcome  # noqa: PLC0415
@@ -500,7 +500,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         InputError: an input file is missing.
         RefusedRunError: an input file was changed.
         ArgumentError: a product is neither in the record nor in the store.
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
         InvalidArgumentsError: `inputs` contains a name that is not an input of the workflow.
     """
     missing = [
@@ -593,7 +593,7 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
 
     Raises:
         RecordError: the run is damaged.
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     with writing_to(folder):
         folder.mkdir(parents=True)
@@ -630,7 +630,7 @@ def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iter
 
     Raises:
         RecordError: the record is damaged.
-        StoreError: the disk cannot be written.
+        StoreError: the disk cannot be written to.
     """
     published = run.record.published
     if not published or any((run.folder / file.path).exists() for file in published):

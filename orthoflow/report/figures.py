@@ -225,7 +225,7 @@ def write_figures(
 
     Raises:
         RecordError: the name or type of a figure is not valid for a file; nothing is written.
-        StoreError: the folder cannot be written.
+        StoreError: the folder cannot be written to.
     """
     named = figure_files(run, addresses)
     contents: dict[str, Callable[[], bytes | None]] = {GRAPH_FILE: partial(graph_file, run)}

@@ -245,7 +245,7 @@ def photo_of(
 # Takes half a second per image, and most tests of a method use the same few.
 @lru_cache(maxsize=32)
 def _picture(pickled: bytes) -> bytes:
-    """Return the image of a scene and a camera, pickled so that equal ones share an entry."""
+    """Return the image of a pickled scene and camera; equal ones share an entry of the cache."""
     scene: TexturedWall
     camera: ViewingCamera
     scene, camera = pickle.loads(pickled)

@@ -162,7 +162,7 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
         try:
             TopologicalSorter(sources).prepare()
         except CycleError as error:
-            # Each step of this list is the source of the next; the last one is the first again.
+            # Each step of this list is the source of the next; the last is the same as the first.
             names_in_cycle: list[str] = error.args[1]
         else:
             return

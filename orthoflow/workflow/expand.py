@@ -579,7 +579,7 @@ class _Expansion:
 
 
 def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> set[str]:
-    """Return the steps that the workflow compares; repeats of upstream steps extend to these.
+    """Return the steps that the workflow compares; they run once per repeat of an upstream step.
 
     They are the steps in `compare.metrics` and all inspections that match its wildcards; without
     `metrics`, all inspections.

@@ -233,11 +233,12 @@ class ResourcesSection(FileSection):
 
 class SweepSection(FileSection):
     """A parameter can have several values: `tolerance_m: {sweep: [0.02, 0.05]}` makes the variants
-    `tolerance_m-0_02` and `tolerance_m-0_05` of the step. If a variant contains the sweep, their
-    names begin with its name, which `baseline` and `exclude` accept. If values cannot be part of a
-    name, variants are numbered (`sweep-1`); `orthoflow plan` lists them. Sweeps of several
-    parameters make all combinations. The report plots the metrics against the parameter.
-    `--set STEP.PARAM=VALUE` replaces a sweep, `--set 'STEP.PARAM={sweep: [...]}'` makes one.
+    `tolerance_m-0_02` and `tolerance_m-0_05` of the step. A sweep inside a variant adds the name of
+    that variant (`ransac-tolerance_m-0_02`); `baseline` and `exclude` accept `ransac` for all of
+    them. If values cannot be part of a name, variants are numbered (`sweep-1`); `orthoflow plan`
+    lists them. Sweeps of several parameters make all combinations. The report plots the metrics
+    against the parameter. `--set STEP.PARAM=VALUE` replaces a sweep;
+    `--set 'STEP.PARAM={sweep: [...]}'` makes one.
     """  # noqa: D205
 
     sweep: Annotated[list[Any], Field(min_length=2, max_length=MOST_SWEPT)] = Field(
@@ -315,7 +316,7 @@ class DatasetSection(BaseModel):
     `data=<name>`; all others run once. Inputs that a dataset does not list are those of the
     workflow. You can list the datasets in a CSV file instead, one per line: a column `name`, one
     per input, and columns such as `room.noise_m` for parameters. An empty field leaves the
-    parameter unchanged; paths are relative to the file. `--datasets FILE` replaces the section,
+    parameter unchanged; paths are relative to the file. `--datasets FILE` replaces the section;
     `--only-data A,B` selects datasets.
     """  # noqa: D205
 
@@ -390,7 +391,7 @@ class SeedSection(FileSection):
 
 class WorkflowFile(FileSection):
     """A workflow file is YAML 1.2 and contains only data: no templates, expressions, environment
-    variables or tags. Every key and every name occurs only once.
+    variables or tags. Duplicate keys and names are errors.
     """  # noqa: D205
 
     orthoflow: Annotated[
@@ -400,8 +401,8 @@ class WorkflowFile(FileSection):
     ] = Field(FORMAT, description="Version of this format.", examples=[FORMAT])
     name: _Name | None = Field(
         None,
-        description="Name of the workflow, with which the names of run folders begin; by default "
-        "the file name.",
+        description="Name of the workflow, which is the prefix of the names of run folders; by "
+        "default the file name.",
         examples=["palace-room"],
     )
     seed: _Seed | SeedSweep = Field(

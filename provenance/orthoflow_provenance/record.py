@@ -479,7 +479,7 @@ def _embed_file(files: h5py.Group, input_name: str, file: RecordedFile, path: Pa
         )
     another = InputFileError(
         f"the input file {path.name} must have {file.size_bytes} bytes with the SHA-256 "
-        f"{file.sha256[:12]}..., but was changed since it was read"
+        f"{file.sha256[:12]}..., but has been changed since it was read"
     )
     if not path.is_file():
         # Do not open it: reading from a pipe would block.

@@ -111,7 +111,7 @@ def test_what_an_installation_brings_is_looked_at() -> None:
 def test_a_store_where_nothing_can_be_written_is_named() -> None:
     # /proc takes no files, not even from root.
     store = findings("--store", "/proc/none", code=4)["store"]
-    assert store["found"].startswith("/proc cannot be written: ")
+    assert store["found"].startswith("cannot write to /proc: ")
     assert store["cost"] == "no run can start here (choose another folder with --store DIR)"
 
 

@@ -139,8 +139,8 @@ KNOWN: Final = {
     "deep JSON": ("SIDECAR", "wall.json", "[" * 50_000, "not valid JSON, it is nested"),
     "a number of 5,000 digits": ("SIDECAR", "wall.json", f'{{"wall": {"9" * 5000}}}',
         r"wall\.json: not valid JSON"),
-    "wall: true": ("SIDECAR", "wall.json", _sidecar(wall=True), "from 0, got True"),
-    "a wall beyond 16 bits": ("SIDECAR", "wall.json", _sidecar(wall=10**30), "from 0, got 1000"),
+    "wall: true": ("SIDECAR", "wall.json", _sidecar(wall=True), "from 0 to 32000, got True"),
+    "a wall beyond 16 bits": ("SIDECAR", "wall.json", _sidecar(wall=10**30), "to 32000, got 1000"),
     # Pictures.
     "30,000 x 30,000 pixels": ("PNG", "a.png", _large_png, "a.png is too large: 30000 x"),
     "another format": ("FIGURE", "a.bmp", b"BM" + bytes(200), "BMP, which is not supported:"),

@@ -356,7 +356,7 @@ def test_a_file_that_changed_or_is_gone_is_not_embedded(tmp_path: Path) -> None:
     changed.write_bytes(b"newer photo")
     os.mkfifo(pipe)
     for place in (pipe, tmp_path / "gone", changed, None):
-        sentence = "was changed since it was read" if place else "no file has its SHA-256"
+        sentence = "has been changed since it was read" if place else "no file has its SHA-256"
         find = {with_photos(b"older photo").inputs[0].files[0].sha256: place}.get
         with pytest.raises(InputFileError, match=sentence):
             write_record(

@@ -43,7 +43,7 @@ class KeyPlan:
         numbers: numbers of these walls, as in files and reports.
         outlines: outlines of the room, (n, 2) each; closed ones end where they begin.
         marked: (n, 2) the marked wall: two ends, or the four corners of a level plane.
-        arrow: (2, 2) from the viewer to the wall; None for level planes.
+        arrow: (2, 2) from the viewer to the wall; None for horizontal planes.
         up_label: label of the upwards direction of the plan: `N` in a map, else an axis.
         number: number of the marked wall, -1 if none.
     """
@@ -129,7 +129,7 @@ def marked_plan(
     Args:
         planes: planes of the room.
         marked_world: (2 or 4, 3) the marked ends or corners.
-        towards_world: (3,) direction from it to the viewer; None for level planes.
+        towards_world: (3,) direction from it to the viewer; None for horizontal planes.
         number: number of the marked wall, -1 if none.
         is_map: whether world x and y are easting and northing.
     """

@@ -83,7 +83,7 @@ def write_viewer(folder: Path, images: Mapping[str, OrthoFile]) -> None:
 
     Args:
         folder: existing folder.
-        images: orthoimages by name of their tiles.
+        images: orthoimages by the name of their tile set.
 
     Raises:
         StoreError: the file cannot be written.

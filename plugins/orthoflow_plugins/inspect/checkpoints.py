@@ -70,8 +70,8 @@ MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
     severity="warning",
     text="{n_missed} of {n_points} check points are not used: {reasons}",
-    remedy="measure them in an orthoimage, or include them by {step[raster.grid]}.margin_m or "
-    "{step[raster.grid]}.buffer_m",
+    remedy="measure them in an orthoimage, or increase {step[raster.grid]}.margin_m or "
+    "{step[raster.grid]}.buffer_m to include them",
     rank_by="n_missed",
 )
 CAPPED_RULE: Final = DiagnosticSpec(

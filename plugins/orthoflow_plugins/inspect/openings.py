@@ -126,7 +126,7 @@ class InspectOpenings(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _TrueWall:
-    """The truth of a wall.
+    """Ground truth for the openings of a wall.
 
     Attributes:
         slab: raster and depth range of the wall.

@@ -61,7 +61,7 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
 LEAST: Final = 16
 # With this many matches, no other mixture is tried, nor matching by structure.
 CLEARLY: Final = 24
-# Mixtures only need to find the approximate position, so a reduced resolution is enough.
+# Mixtures are only used to find the approximate position, so a reduced resolution is enough.
 _LONGEST_SIDE_PX: Final = 2000
 # Mixtures with a smaller contrast, as of photos without colours, are not tried.
 _MIN_GREY_LEVELS: Final = 8.0

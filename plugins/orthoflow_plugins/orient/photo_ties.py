@@ -29,7 +29,7 @@ _MIN_ANGLE: Final = np.radians(2.0)
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoTies:
-    """Points seen by several photos that are not in the scan.
+    """Points that are not in the scan but visible in several photos.
 
     Attributes:
         photo: (m,) index of the photo of each observation.

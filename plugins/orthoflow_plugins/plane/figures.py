@@ -109,7 +109,7 @@ def draw_planes(
     plane_of_point: NDArray[np.int64],
     cloud: PointCloud,
 ) -> None:
-    """Draw the points coloured by plane and, below, the rectangles of the planes' parts.
+    """Draw the points coloured by plane and, below, the rectangles of the parts of the planes.
 
     Args:
         ctx: receives the figure.
@@ -435,7 +435,7 @@ def _show_votes(
 
 @in_column_style()
 def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m: float) -> None:
-    """Draw the points per voxel in three sections through the middle of the planes' parts.
+    """Draw the points per voxel in three sections through the middle of the planes.
 
     Args:
         ctx: receives the figure.
@@ -480,8 +480,8 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     ctx.figure(
         "voxels",
         figure,
-        f"Points per voxel of {100.0 * cell_m:.3g} cm (darker is more, logarithmic) in three "
-        "sections through the middle of the planes' parts: walls are thin dark lines; where they "
+        f"Points per voxel of {100.0 * cell_m:.3g} cm (darker is more, on a logarithmic scale) "
+        "in three sections through the middle of the planes: walls are thin dark lines; where they "
         "are wide or double, the scans disagree or the cloud is noisy.",
     )
 

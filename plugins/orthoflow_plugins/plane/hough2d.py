@@ -52,11 +52,10 @@ class Hough2d(Method):
     tolerance that decreases from `tolerance_m` to `fit_tolerance_m`. It is bounded by a rectangle
     and its points are removed; their share of each cell is estimated from the sample. When all
     planes are found, they are fitted to all points in one pass (total least squares of cell means;
-    for clouds above 24 million points, a random part is used), and all points are labelled in
-    another.
+    for clouds above 24 million points, a random sample is used); a second pass labels all points.
 
-    Floors, ceilings and other level planes are found in the histogram of heights. They compete with
-    walls by number of votes and are refitted in 3D.
+    Floors, ceilings and other horizontal planes are found in the histogram of heights. They compete
+    with walls by number of votes and are refitted in 3D.
 
     The covariance of (normal, offset) accounts for errors common to neighbouring points. It is
     estimated from the scatter of tiles of 10 to 80 cm; the size with the largest variance is used.
@@ -127,15 +126,15 @@ class Hough2d(Method):
 
 
 class PlanProposer:
-    """Proposes walls at maxima of the accumulator and level planes at maxima of the heights.
+    """Proposes walls at maxima of the accumulator, horizontal planes at maxima of the heights.
 
     Attributes:
         grid: the plan and the height bins.
         plan: (e1, e2) number of points per cell, for the whole cloud.
         centre_m: (2,) centre of the plan in the (e1, e2) frame of the cloud's offsets.
         reach_m: maximum distance of lines from the centre, on each side.
-        first: (angles, bins) votes of the whole cloud, VOTE_SHARES each; None if only level planes
-            are searched for.
+        first: (angles, bins) votes of the whole cloud, VOTE_SHARES each; None if only
+            horizontal planes are searched for.
     """
 
     def __init__(self, search: Search, params: Hough2d.Params) -> None:

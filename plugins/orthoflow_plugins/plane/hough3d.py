@@ -310,7 +310,7 @@ class SpaceProposer:
         return within
 
 
-# Any, because the type of a share of work differs between passes.
+# `...`, because each pass divides its work into shares of another type.
 def _in_shares(task: Callable[..., None], shares: Sequence[object]) -> None:
     in_threads([partial(task, share) for share in shares])
 
@@ -381,10 +381,10 @@ def sections_of(
         bin_m: width of a distance bin.
 
     Returns:
-        The best scores (o, p) of any distance over omega 0..180 and phi -90..90 degrees, NaN if
-        there is no direction with that phi; for angles in degrees, the votes over omega and
-        distance at that phi, and over phi and distance at that omega, NaN if there is no direction;
-        and the maximum distance, on each side.
+        The best score (o, p) of all distances for each omega (0..180 degrees) and phi (-90..90
+        degrees); for each angle of a section in degrees, the votes by omega and distance at this
+        phi; the same by phi and distance at this omega; and the maximum distance on each side.
+        Values for which there is no direction are NaN.
     """
     n_turns = len(directions.starts) - 1
     best = np.full((n_turns, n_turns + 1), np.nan)

@@ -86,8 +86,8 @@ class Ransac(Method):
     Planes through random points are scored with a sample of the cloud. The best is refined with a
     tolerance that decreases from `tolerance_m` to `fit_tolerance_m`, and enough points must
     concentrate on it. When all planes are found in the sample, they are fitted to all points in one
-    pass (for clouds above 24 million points, a random part is used), and all points are labelled in
-    another.
+    pass (for clouds above 24 million points, a random sample is used); a second pass labels all
+    points.
 
     `model: 2d` draws vertical planes through two points of the plan, as in markiewicz2015, and
     finds only walls. `scoring: a-contrario` estimates a tolerance up to `tolerance_m`: the one at

@@ -43,8 +43,8 @@ class Emptiness:
 
     Attributes:
         shares: share of the cells by cause. `behind`: their points are behind the buffer; `before`:
-            objects are directly in front of the wall, beyond the buffer; `hidden`: objects are
-            between them and every scanner; `sparse`: close to points of the wall (gaps, shadows of
+            objects are directly in front of the wall, beyond the buffer; `hidden`: objects hide
+            them from every station; `sparse`: close to points of the wall (gaps, shadows of
             relief, borders); `unseen`: nothing was scanned there.
         behind_m: median depth behind the plane of the points behind the buffer; NaN if there are
             none.

@@ -288,7 +288,7 @@ class ScanGrid(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """Limits for neighbours on one surface.
+    """Limits within which neighbouring points of a scan are assumed to be on the same surface.
 
     Attributes:
         step: number of rows and columns of the scan between them.

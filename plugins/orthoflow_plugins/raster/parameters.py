@@ -120,9 +120,9 @@ class RasterParams(MethodParams):
     crs: str | None = Field(
         default=None,
         pattern=r"^(EPSG:[0-9]{4,6}|site)$",
-        description="Coordinate system of the cloud, EPSG:nnnn, or site for an unnamed system: "
-        "rasters of level planes seen from above are maps in it, with x as easting and y as "
-        "northing.",
+        description="Coordinate system of the cloud: EPSG:nnnn, or site for a local system. "
+        "Rasters of horizontal planes seen from above are then maps in this system, with x as "
+        "easting and y as northing.",
     )
 
     @model_validator(mode="after")

@@ -57,8 +57,8 @@ BEHIND_BUFFER: Final = DiagnosticSpec(
 HIDDEN: Final = DiagnosticSpec(
     code="wall-hidden",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty: objects "
-    "are between them and every scanner",
+    text="{subject}: {share:.1%} of its cells are empty because objects "
+    "hide them from every station",
     remedy="scan from another station",
     rank_by="share",
 )

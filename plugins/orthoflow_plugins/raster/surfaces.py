@@ -342,8 +342,8 @@ def _averaged_values(
     cloud: PointCloud, slab: Slab, few: kernels.FewPoints, *, threads: int
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
     """Return means of intensity (cells,) and colour (cells, 3), and a mask (cells,) of colours."""
-    # Values of points, a mask of points that have one (empty if all have, or if NaN marks the
-    # others), and sums.
+    # For each channel: the values of the points, a mask of the points with a value (empty if all
+    # have one, or if the others are NaN), and the sums per cell.
     of_all = np.empty(0, dtype=np.bool_)
     of_intensity, of_colour = np.empty((0, 2)), np.empty((0, 4), dtype=np.uint32)
     channels: list[tuple[NDArray[np.generic], NDArray[np.bool_], NDArray[np.generic]]] = []

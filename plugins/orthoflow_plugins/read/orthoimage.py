@@ -103,7 +103,7 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
     number = place.get("wall", wall)
     if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= MOST_WALLS:
         raise InputError(
-            f"{path.stem}.json: wall must be the number of a wall, from 0, got "
+            f"{path.stem}.json: wall must be a wall number from 0 to {MOST_WALLS}, got "
             f"{shown_value(number)}"
         )
     rgb = _rgb(path, raster)

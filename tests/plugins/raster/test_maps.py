@@ -1,4 +1,4 @@
-"""Rasters of level planes as maps: which are, where they lie, and what is refused."""
+"""Rasters of horizontal planes as maps: which are, where they lie, and what is refused."""
 
 from __future__ import annotations
 
