@@ -43,6 +43,7 @@ class DifferenceTable:
         n_different: number of those that differ.
         rows: values that differ, and values that only one run has; equal rows are grouped.
         n_alone: number of values that only one run has.
+        n_rounded: number of values that differ by rounding only; they have no row.
         whose: steps to which the table is restricted; empty for all.
     """
 
@@ -51,6 +52,7 @@ class DifferenceTable:
     n_different: int
     rows: tuple[Difference, ...]
     n_alone: int = 0
+    n_rounded: int = 0
     whose: str = ""
 
 
@@ -108,6 +110,7 @@ def _table(
         n_compared=len(shared),
         n_different=sum(pair.is_moved for pair in shared),
         n_alone=sum((pair.left is None) != (pair.right is None) for pair in pairs),
+        n_rounded=sum(pair.is_rounded for pair in shared),
         whose=whose,
         rows=tuple(
             Difference(
