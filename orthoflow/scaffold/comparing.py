@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 from ruamel.yaml import YAML
@@ -26,7 +26,12 @@ _NAME_MOST: Final = 32
 # Metrics to compare. The RMS reported by a detector is no criterion: it is low if only easy planes
 # are found.
 _JUDGED: Final = {
-    "plane": ("true_planes_found", "label_iou_mean", "plane_angle_deg", "plane_offset_mm")
+    "plane": [
+        "check.true_planes_found",
+        "check.label_iou_mean",
+        "check.plane_angle_deg",
+        "check.plane_offset_mm",
+    ]
 }
 
 
@@ -48,24 +53,12 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         steps: dict[str, dict[str, Any]] = document["steps"]
         of_kind = [node for node in steps.values() if node["use"].startswith(f"{kind}.")]
         if of_kind and not catalog.kinds[kind].spec.is_source:
-            judged = _judged(kind, steps, catalog)
             node = of_kind[-1]
             ours = {key: node.pop(key) for key in ("use", "params") if key in node}
             sibling = ours["use"].partition(".")[2]
             node["variants"] = {sibling: ours, name: {"use": method_id}}
-            return _dumped(document, name, judged)
+            return _dumped(document, name, _JUDGED.get(kind, []))
     return ""
-
-
-def _judged(kind: str, steps: Mapping[str, Mapping[str, Any]], catalog: Catalog) -> list[str]:
-    """Return the metrics in a recipe that show which method is better."""
-    wanted = _JUDGED.get(kind, ())
-    measured = {
-        metric.name: f"{name}.{metric.name}"
-        for name, node in steps.items()
-        for metric in catalog.method(node["use"]).load().metric_specs()
-    }
-    return [measured[metric] for metric in wanted if metric in measured]
 
 
 def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) -> str:

@@ -12,7 +12,6 @@ from typing import Final
 
 import jinja2
 
-from orthoflow import products, sdk
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import ArgumentError, did_you_mean
@@ -21,8 +20,6 @@ from orthoflow.scaffold.kinds import KindPorts, kind_ports, new_kind_ports
 from orthoflow.version import __version__
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
-# Names that a written module may import.
-_IMPORTED: Final = frozenset({*products.__all__, *sdk.__all__})
 _NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")
 
 
@@ -61,17 +58,13 @@ class Project:
 
     @property
     def class_name(self) -> str:
-        """Name of the method's class, different from other class names in its module."""
-        name = _class_name(self.name)
-        named = map(_class_name, (*self.takes, *self.gives))
-        others = {self.product_class, *named, *_IMPORTED}
-        return f"{name}Method" if name in others else name
+        """Name of the method's class."""
+        return f"{_class_name(self.name)}Method"
 
     @property
     def product_class(self) -> str:
-        """Name of the class of its own product, different from other class names in its module."""
-        name = _class_name(self.product)
-        return f"{name}Product" if name in _IMPORTED else name
+        """Name of the class of its own product."""
+        return f"{_class_name(self.product)}Product"
 
 
 def _class_name(name: str) -> str:

@@ -7,9 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
-
-from pydantic import ValidationError
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import package_path
@@ -19,8 +16,8 @@ from orthoflow.sdk import Method
 from orthoflow.sdk.lines import describe_error
 from orthoflow.testing.checks import CHECKS, Check
 from orthoflow.testing.examples import ExampleError, example_inputs
+from orthoflow.testing.subjects import Subject
 from orthoflow.testing.trials import Trial
-from orthoflow.testing.witnesses import Subject, Witness
 
 Inputs = Mapping[str, Product | InputFiles]
 
@@ -36,16 +33,14 @@ class ConformanceCase:
     Attributes:
         method_id: id of the method.
         check: the check.
-        witness: returns the runs of the method, which are shared by its cases.
+        subject: returns the method with its runs, which are shared by its cases.
         expected_failure: why the check is expected to fail; empty if it must pass.
-        golden: file with golden results; None if there is none.
     """
 
     method_id: str
     check: Check
-    witness: Callable[[], Witness]
+    subject: Callable[[], Subject]
     expected_failure: str = ""
-    golden: Path | None = None
 
     def __str__(self) -> str:
         return f"{self.method_id}-{self.check.name}"
@@ -67,44 +62,22 @@ class ConformanceCase:
 
     def problem(self) -> str:
         """Run the check and return the problem in one sentence; empty if there is none."""
-        with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
-            try:
-                subject = Subject(witness=self.witness(), folder=Path(folder), golden=self.golden)
-                self.check.run(subject)
-            except AssertionError as error:
-                # If the example inputs already make it fail, the reason is not the rule about
-                # unusual inputs.
-                return (error.__cause__ is not None and self._what_stops()) or str(error)
-            except Exception as error:  # noqa: BLE001 - a third-party method may raise anything
-                return _failure(error, self.witness)
-        return ""
-
-    def _what_stops(self) -> str:
-        """Return the error of a run on the example inputs; empty if it succeeds."""
         try:
-            _ = self.witness().first
-        except Exception as error:  # noqa: BLE001 - as above
-            return _failure(error, self.witness)
+            self.check.run(self.subject())
+        except (AssertionError, ExampleError) as error:
+            return str(error)
+        except Exception as error:  # noqa: BLE001 - a third-party method may raise anything
+            return f"on the suite's inputs the method raised {_described(error, self.subject())}"
         return ""
 
 
-def _failure(error: Exception, witness: Callable[[], Witness]) -> str:
-    """Return a sentence with the error of a run and the line where it was raised."""
-    if isinstance(error, ExampleError):
-        return str(error)
-    trial = witness().trial
-    if isinstance(error, ValidationError) and error.title == trial.method.Params.__name__:
-        return "; ".join(
-            f"parameter {'.'.join(map(str, one['loc']))} "
-            + ("has no default" if one["type"] == "missing" else f"cannot be: {one['msg']}")
-            for one in error.errors(include_url=False)
-        )
-    own = package_path(trial.method.__module__)
+def _described(error: Exception, subject: Subject) -> str:
+    """Return an error of a run and the line of the method where it was raised."""
+    own = package_path(subject.method.__module__)
     frames = traceback.extract_tb(error.__traceback__)
     within = [one for one in frames if own and Path(one.filename).resolve().is_relative_to(own)]
     where = f" ({Path(within[-1].filename).name}:{within[-1].lineno})" if within else ""
-    where = "" if str(error).endswith(where) else where
-    return f"on the suite's inputs the method raised {describe_error(error)}{where}"
+    return f"{describe_error(error)}{where}"
 
 
 def conformance_cases(
@@ -142,18 +115,18 @@ def conformance_cases(
             )
 
     @cache
-    def witness() -> Witness:
+    def subject() -> Subject:
         given = inputs() if callable(inputs) else inputs or {}
         filled = {**example_inputs(method, besides=given), **given}
-        return Witness(Trial(method=method, inputs=filled, params=dict(params or {})))
+        trial = Trial(method=method, inputs=filled, params=dict(params or {}))
+        return Subject(trial, golden)
 
     return tuple(
         ConformanceCase(
             method_id=method_id,
             check=check,
-            witness=witness,
+            subject=subject,
             expected_failure=expected.get(check.name, ""),
-            golden=golden,
         )
         for check in CHECKS
         if check.applies(method) and (golden is not None or check.name != "golden-digest-holds")

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.errors import OrthoflowError, PluginError
+from orthoflow.errors import OrthoflowError
 from orthoflow.geometry import up_vector, wall_axes
+from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import InputFiles, Planes, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.photographed import PHOTOGRAPHED
@@ -76,36 +77,24 @@ def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
     make = SURVEYED.get(type_name) or PHOTOGRAPHED.get(type_name)
     if make is not None:
         return make()
-    if type_name not in within:
-        for method, port in _givers(discover_catalog(), type_name):
-            try:
-                inputs = _example_inputs(method, (), within=(*within, type_name))
-                with TemporaryDirectory(prefix="orthoflow-example-") as folder:
-                    trial = Trial(method=method, inputs=inputs)
-                    return run_trial(trial, Path(folder), draws=False).outputs[port]
-            except Exception:  # noqa: BLE001 - a third-party method may raise anything
-                continue
-    raise ExampleError(
-        f"there is no example of a {type_name} product, and no installed method makes one of the "
-        "suite's examples: give one in `inputs` of conformance_cases"
-    )
-
-
-def _givers(catalog: Catalog, type_name: str) -> Iterator[tuple[type[Method], str]]:
-    """Yield installed methods that output a type, each with its output port."""
-    if type_name not in catalog.products:
-        return
-    for entry in catalog.methods.values():
+    for entry in discover_catalog().methods.values() if type_name not in within else ():
         kind = entry.kind
         if kind is None or not (kind.is_source or type_name in kind.outputs.values()):
             continue
         try:
             method = entry.load()
-        except PluginError:
+            ports = port_specs(method.Out).values()
+            name = next(port.name for port in ports if port.type_name == type_name)
+            inputs = _example_inputs(method, (), within=(*within, type_name))
+            with TemporaryDirectory(prefix="orthoflow-example-") as folder:
+                trial = Trial(method=method, inputs=inputs)
+                return run_trial(trial, Path(folder), draws=False).outputs[name]
+        except Exception:  # noqa: BLE001 - a third-party method may raise anything
             continue
-        for port in port_specs(method.Out).values():
-            if port.type_name == type_name:
-                yield method, port.name
+    raise ExampleError(
+        f"there is no example of a {type_name} product, and no installed method makes one of the "
+        "suite's examples: give one in `inputs` of conformance_cases"
+    )
 
 
 def example_room(
@@ -135,7 +124,7 @@ def example_room(
     spans = np.array([[0, 2], [0, 2], [1, 2], [1, 2], [0, 1], [0, 1]])
     areas = size[spans].prod(axis=1)
     per_side = np.floor(n_points * areas / areas.sum()).astype(int)
-    turn = _turn_about_up(turned_deg)
+    turn = rotation_from_vector(np.array([0.0, 0.0, math.radians(turned_deg)]))
     origin = np.zeros(3) if shift_m is None else np.asarray(shift_m, dtype=np.float64)
     points, offsets, corners = [], [], []
     for normal, span, count in zip(normals, spans, per_side, strict=True):
@@ -146,8 +135,8 @@ def example_room(
         points.append(local @ turn.T)
         offsets.append(distance + float(turn @ normal @ origin))
         corners.append(_corners(normal, distance, size[span]) @ turn.T + origin)
-    offsets_m = np.concatenate(points).astype(np.float32)
-    grey = rng.integers(60, 200, (len(offsets_m), 1)).astype(np.uint8)
+    grey = rng.integers(60, 200, per_side.sum()).astype(np.uint8)
+    cloud = few_points(np.concatenate(points), grey)
     planes = Planes(
         normal=normals @ turn.T,
         offset=np.array(offsets),
@@ -159,35 +148,24 @@ def example_room(
         names=("wall 0", "wall 1", "wall 2", "wall 3", "floor 4", "ceiling 5"),
         viewpoint="stations",
     )
-    return _grey_cloud(offsets_m, grey, origin), planes
+    return replace(cloud, origin=origin, stations=origin[np.newaxis]), planes
 
 
-def _grey_cloud(
-    offsets_m: NDArray[np.float32], grey: NDArray[np.uint8], origin: NDArray[np.float64]
-) -> PointCloud:
-    x, y, z = (np.ascontiguousarray(column) for column in offsets_m.T)
+def few_points(offsets_m: NDArray[np.floating], grey: int | NDArray[np.uint8] = 128) -> PointCloud:
+    """Return a grey cloud of points at offsets (n, 3) from the origin, where its station is."""
+    x, y, z = np.ascontiguousarray(offsets_m.T, dtype=np.float32)
+    greys = np.broadcast_to(np.uint8(grey), x.shape)
     return PointCloud(
-        origin=origin,
+        origin=np.zeros(3),
         x=x,
         y=y,
         z=z,
         up=up_vector("z"),
-        intensity=(grey[:, 0] / 255.0).astype(np.float32),
-        rgb=np.repeat(grey, 3, axis=1),
-        stations=origin[None, :].copy(),
+        intensity=(greys / 255.0).astype(np.float32),
+        rgb=np.repeat(greys[:, np.newaxis], 3, axis=1),
+        stations=np.zeros((1, 3)),
         stations_source="file",
     )
-
-
-def few_points(coordinates: NDArray[np.float64]) -> PointCloud:
-    """Return a cloud of points with given offsets (n, 3) and all optional arrays."""
-    offsets_m = coordinates.astype(np.float32).reshape(-1, 3)
-    return _grey_cloud(offsets_m, np.full((len(offsets_m), 1), 128, np.uint8), np.zeros(3))
-
-
-def _turn_about_up(angle_deg: float) -> NDArray[np.float64]:
-    cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _corners(

@@ -102,19 +102,17 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
         inputs={port: sample_of(product) for port, product in inputs.items()},
         outputs={port: sample_of(product) for port, product in outputs.items()},
     )
-    before = _read(file).get(trial.method.id)
-    is_of_the_same = (
-        before is not None
-        and replace(before, inputs={}, outputs={}) == replace(now, inputs={}, outputs={})
-        and before.inputs.keys() == now.inputs.keys()
-        and not any(
-            sample_problem(before.inputs[port], now.inputs[port], product.tolerances)
-            for port, product in inputs.items()
-        )
-    )
-    if before is None or not is_of_the_same:
-        _record(file, trial.method.id, now)
-        return ""
+    # Processes that test other methods use the same file.
+    with file.open("a+", encoding="utf-8") as stream:
+        lock_file(file, stream.fileno(), waits=True)
+        stream.seek(0)
+        known = _parsed(stream.read(), file)
+        if (before := known.get(trial.method.id)) is None or not _is_of_the_same(
+            before, now, inputs
+        ):
+            stream.truncate(0)
+            stream.write(_text({**known, trial.method.id: now}))
+            return ""
     for port in sorted({*before.outputs, *now.outputs}):
         moved = "one of them has none"
         if port in before.outputs and port in outputs:
@@ -132,22 +130,16 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
     return ""
 
 
-def _read(file: Path) -> dict[str, Golden]:
-    if not file.is_file():
-        return {}
-    with file.open(encoding="utf-8") as stream:
-        lock_file(file, stream.fileno(), is_shared=True, waits=True)
-        return _parsed(stream.read(), file)
-
-
-def _record(file: Path, method_id: str, golden: Golden) -> None:
-    """Write a result to the file, which processes testing other methods may change meanwhile."""
-    with file.open("a+", encoding="utf-8") as stream:
-        lock_file(file, stream.fileno(), waits=True)
-        stream.seek(0)
-        known = _parsed(stream.read(), file)
-        stream.truncate(0)
-        stream.write(_text({**known, method_id: golden}))
+def _is_of_the_same(before: Golden, now: Golden, inputs: Mapping[str, Product]) -> bool:
+    """Return whether two results are of the same method, parameters and inputs."""
+    return (
+        replace(before, inputs={}, outputs={}) == replace(now, inputs={}, outputs={})
+        and before.inputs.keys() == now.inputs.keys()
+        and not any(
+            sample_problem(before.inputs[port], now.inputs[port], product.tolerances)
+            for port, product in inputs.items()
+        )
+    )
 
 
 def _parsed(text: str, file: Path) -> dict[str, Golden]:

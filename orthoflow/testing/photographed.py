@@ -211,10 +211,7 @@ def camera_before(
     rotation = looking_at(
         corner + np.array(centre), corner + np.array(towards), np.array([0.0, 0.0, 1.0])
     )
-    turn = np.array(
-        [[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]]
-    )
-    rotation = turn @ rotation
+    rotation = rotation_from_vector(np.array([0.0, 0.0, roll])) @ rotation
     return ViewingCamera(
         width=900,
         height=640,
@@ -307,13 +304,8 @@ def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera)
         normal, offset = scene.frame.normal_world, scene.frame.plane.offset_m
         reach = (offset - camera.centre_world @ normal) / (rays @ normal)
         landed.append(camera.centre_world + reach[:, None] * rays)
-    cells = scene.frame.wall_from_world(landed[1])
-    inside = (
-        (cells[:, 0] > 0)
-        & (cells[:, 0] < scene.frame.width)
-        & (cells[:, 1] > 0)
-        & (cells[:, 1] < scene.frame.height)
-    )
+    cells = scene.frame.wall_from_world(landed[1])[:, :2]
+    inside = ((cells > 0) & (cells < [scene.frame.width, scene.frame.height])).all(axis=1)
     difference = (landed[0] - landed[1])[inside]
     return float(np.sqrt((difference**2).sum(axis=1).mean() / 2.0))
 
@@ -347,25 +339,16 @@ def _photos() -> Photos:
 def _cameras() -> Cameras:
     return Cameras(
         cameras=tuple(
-            settled_camera(oriented(camera, name=name))
+            oriented(settled_camera(camera), name=name)
             for name, camera in photographing_cameras().items()
         )
     )
 
 
-def settled_camera(camera: Camera) -> Camera:
-    """Return an orientation with rounded values, which has the same bits on every processor."""
-    rotation, translation = (
-        camera.rotation_camera_from_world,
-        camera.translation_camera_from_world,
-    )
-    assert rotation is not None  # noqa: S101 - both are oriented
-    assert translation is not None  # noqa: S101
-    return replace(
-        camera,
-        rotation_camera_from_world=settled(rotation),
-        translation_camera_from_world=settled(translation),
-    )
+def settled_camera(camera: ViewingCamera) -> ViewingCamera:
+    """Return a camera with a rounded pose, which has the same bits on every processor."""
+    rotation, translation = settled(camera.rotation), settled(camera.translation)
+    return replace(camera, rotation=rotation, translation=translation)
 
 
 @cache
@@ -402,10 +385,15 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
         noise_m: standard deviation of the coordinates of points; by default, the one in the ties.
     """
     rng = np.random.default_rng(seed)
+    scene = photographed_scene()
     views = list(photographing_cameras().values())
     columns: list[tuple[NDArray[np.float64], ...]] = []
     for index, camera in enumerate(views):
-        points, wall = _tie_points(rng)
+        places = rng.random((320, 2)) * SIZE_M
+        on_board = np.arange(len(places)) >= 220
+        depths = np.where(on_board, _BOARD_M, scene.depth_m(places[:, 0], places[:, 1]))
+        points = scene.frame.world_from_wall(places / scene.frame.gsd_m, depths)
+        wall = on_board.astype(np.float64)
         pixels = camera.project(points)[:, :2]
         inside = (pixels > 10.0).all(axis=1)
         inside &= (pixels < [camera.width - 10.0, camera.height - 10.0]).all(axis=1)
@@ -430,15 +418,6 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
         role=np.full(count, TieRole.CONTROL, dtype=np.uint8),
         residual_px=np.full((count, 2), np.nan),
     )
-
-
-def _tie_points(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    scene = photographed_scene()
-    places = rng.random((320, 2)) * SIZE_M
-    on_board = np.arange(len(places)) >= 220
-    depths = np.where(on_board, _BOARD_M, scene.depth_m(places[:, 0], places[:, 1]))
-    points = scene.frame.world_from_wall(places / scene.frame.gsd_m, depths)
-    return points, on_board.astype(np.float64)
 
 
 PHOTOGRAPHED: Final[Mapping[str, Callable[[], Product]]] = {

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from functools import partial
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +16,10 @@ from orthoflow.products import (
     Orthoimage,
     Orthoimages,
     Planes,
-    Product,
     is_painted,
 )
-from orthoflow.sdk import port_specs
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.photographed import (
-    PHOTOGRAPHED,
     TexturedWall,
     cloud_of,
     drawn_ties,
@@ -35,7 +30,7 @@ from orthoflow.testing.photographed import (
     wall_error_m,
     walls_of,
 )
-from orthoflow.testing.witnesses import Subject, output_of, require
+from orthoflow.testing.subjects import Subject, output_of, require
 
 # Ties with 0.3 px and 1 mm at 2.5 m: a single tie is off by 1.3 mm on the wall, the mean of a
 # hundred by a tenth of that. A half-pixel error from a wrong pixel convention is 1.5 mm.
@@ -56,8 +51,6 @@ _NO_VARIANCE: Final = 1e-30
 # 0.93.
 _STATED_LIMITS: Final = (0.1, 2.0)
 
-_Kinds: TypeAlias = Mapping[str, Callable[[], Product]]
-
 
 def planes_follow_a_rigid_motion(subject: Subject) -> None:
     """Planes found in a room that is rotated about the vertical and shifted move with it.
@@ -68,7 +61,7 @@ def planes_follow_a_rigid_motion(subject: Subject) -> None:
     shift = np.array([634512.347, 486215.781, 112.193])
     for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
         cloud, truth = example_room(n_points=_ROOM_POINTS, turned_deg=turned_deg, shift_m=moved_by)
-        run = subject.run_on(f"turned{turned_deg}{moved_by[0]}", cloud=cloud)
+        run = subject.run_on(cloud=cloud)
         planes = output_of(run, "planes", Planes)
         require(len(planes) > 0, "no plane was found")
         _match_planes(planes, truth)
@@ -93,7 +86,7 @@ def stated_errors_of_planes_hold(subject: Subject) -> None:
     ratios: list[float] = []
     for seed in _DRAWS:
         cloud, truth = example_room(seed=seed, n_points=_ROOM_POINTS)
-        run = subject.run_on(f"stated{seed}", cloud=cloud)
+        run = subject.run_on(cloud=cloud)
         ratios += _plane_ratios(output_of(run, "planes", Planes), truth)
     _check_ratios(ratios, "distances of true corners from planes")
 
@@ -118,7 +111,7 @@ def stated_errors_of_poses_hold(subject: Subject) -> None:
     """The errors of poses from random ties are 0.1 to 2 times those predicted by covariances."""
     ratios: list[float] = []
     for seed in _DRAWS:
-        run = subject.run_on_photographs(f"stated{seed}", ties=drawn_ties(seed))
+        run = subject.run_on_photographs(ties=drawn_ties(seed))
         for camera in output_of(run, "cameras", Cameras).cameras:
             if camera.status == "ok" and camera.covariance is not None:
                 found, true = camera.viewing(), photographing_cameras()[camera.photo]
@@ -163,12 +156,7 @@ def cells_show_their_own_place(subject: Subject) -> None:
     """With two cell sizes, each painted cell has the colour of its own position, to 0.2 cells."""
     for gsd_m in _CELL_SIZES_M:
         scene = photographed_scene(gsd_m)
-        kinds: _Kinds = {
-            **PHOTOGRAPHED,
-            "walls": partial(walls_of, scene),
-            "cloud": partial(cloud_of, scene),
-        }
-        run = subject.run_on(f"cells{gsd_m}", **_inputs(subject, kinds))
+        run = subject.run_on_photographs(walls=walls_of(scene), cloud=cloud_of(scene))
         layers = output_of(run, "layers", Layers).layers
         require(layers, "no layer was made")
         for layer in layers:
@@ -179,8 +167,7 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
     """Two overlapping layers become an orthoimage whose cells have the colour of their position."""
     for gsd_m in _CELL_SIZES_M:
         scene = photographed_scene(gsd_m)
-        kinds: _Kinds = {"layers": partial(two_halves, scene), "walls": partial(walls_of, scene)}
-        run = subject.run_on(f"mosaic{gsd_m}", **_inputs(subject, kinds))
+        run = subject.run_on_photographs(layers=two_halves(scene), walls=walls_of(scene))
         images = output_of(run, "orthoimages", Orthoimages).images
         require(images, "no orthoimage was made")
         for image in images:
@@ -191,12 +178,6 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
                 f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are covered, "
                 "although the layers show all",
             )
-
-
-def _inputs(subject: Subject, kinds: _Kinds) -> dict[str, Product]:
-    """Return inputs of a method by port, for its ports of these types."""
-    ports = port_specs(subject.method.In).items()
-    return {name: kinds[port.type_name]() for name, port in ports if port.type_name in kinds}
 
 
 def _check_cells(

@@ -41,6 +41,8 @@ class TrialRun:
     Attributes:
         outputs: port -> product.
         digests: port -> digest of the product.
+        changed_inputs: ports whose input was changed.
+        drew_globally: whether numpy's global random generator was used.
         metrics: metrics reported by the method.
         figures: figures, in the scratch folder.
         events: progress, log lines and warnings, in order.
@@ -49,6 +51,8 @@ class TrialRun:
 
     outputs: Mapping[str, Product]
     digests: Mapping[str, str]
+    changed_inputs: tuple[str, ...]
+    drew_globally: bool
     metrics: tuple[Metric, ...]
     figures: tuple[DrawnFigure, ...]
     events: tuple[StepEvent, ...]
@@ -99,6 +103,8 @@ def run_trial(
         draws=draws,
     )
     method = trial.method
+    inputs = {name: one for name, one in trial.inputs.items() if isinstance(one, Product)}
+    before, state = {name: digest_of(one) for name, one in inputs.items()}, _global_state()
     # `Any`: the type of the returned value is checked here.
     returned: Any = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     if not isinstance(returned, method.Out):
@@ -108,8 +114,14 @@ def run_trial(
     return TrialRun(
         outputs=outputs,
         digests={name: digest_of(product) for name, product in outputs.items()},
+        changed_inputs=tuple(name for name in inputs if digest_of(inputs[name]) != before[name]),
+        drew_globally=state != _global_state(),
         metrics=tuple(ctx.metrics),
         figures=tuple(ctx.figures),
         events=tuple(events),
         fractions=tuple(ctx.fractions),
     )
+
+
+def _global_state() -> str:
+    return repr(np.random.get_state())  # noqa: NPY002 - it is the global one that is watched

@@ -125,31 +125,11 @@ def test_a_new_plugin_on_another_ones_product_requires_it_and_has_an_example(
     method = discover_catalog().method("then.then-own").load()
     inputs = example_inputs(method)
     assert {name: type(given).__name__ for name, given in inputs.items()} == {
-        "firsts": "Firsts",
+        "firsts": "FirstsProduct",
         "cloud": "PointCloud",
     }
     made = run_trial(Trial(method=method, inputs=inputs), tmp_path / "scratch", draws=False)
     assert made.metrics[0].value > 0
-
-
-@pytest.mark.parametrize(
-    ("project", "names"),
-    [
-        (Project(name="planes", kind="plane"), ("PlanesMethod", "")),
-        (
-            Project(name="parts", kind="part", product="parts", takes=("cloud",)),
-            ("PartsMethod", "Parts"),
-        ),
-        (
-            Project(name="damp-map", kind="leak", product="point_cloud", takes=("damp_map",)),
-            ("DampMapMethod", "PointCloudProduct"),
-        ),
-    ],
-)
-def test_no_class_has_the_name_of_another_one_beside_it(
-    project: Project, names: tuple[str, str]
-) -> None:
-    assert (project.class_name, project.product_class) == names
 
 
 PARTS = {"kind": "part", "product": "parts", "takes": ("cloud",)}

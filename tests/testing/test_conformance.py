@@ -92,11 +92,11 @@ def camera_file() -> bytes:
 def coloured_wall() -> Mapping[str, Product | InputFiles]:
     """A wall and a board before it as bare points, and a photo of them."""
     where = ortho_scenes.frame()
-    oriented = ortho_scenes.cameras(ortho_scenes.camera(where))
+    oriented = ortho_scenes.cameras(settled_camera(ortho_scenes.camera(where)))
     return {
         "cloud": ortho_scenes.cloud(where, spacing_cells=2.0),
         "photos": ortho_scenes.photos(ortho_scenes.rendered()),
-        "cameras": Cameras(cameras=tuple(map(settled_camera, oriented.cameras))),
+        "cameras": oriented,
     }
 
 

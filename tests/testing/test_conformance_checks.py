@@ -21,7 +21,7 @@ from orthoflow.testing import (
     TrialRun,
     conformance_cases,
     run_trial,
-    witnesses,
+    subjects,
 )
 from orthoflow.testing.examples import example_room
 from tests.laboratories import write_distribution
@@ -384,7 +384,7 @@ def test_quick_checks_take_two_runs_and_say_what_they_leave_out(
         runs.append(trial.cores)
         return run_trial(trial, *_, **__)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(witnesses, "run_trial", run)
+    monkeypatch.setattr(subjects, "run_trial", run)
     code, states = quickly_checked("plane.floor")
     # The example on one core and on two; clouds that are refused, and a step that was cancelled.
     assert runs == [1, 2, 1, 1, 1]

@@ -118,19 +118,15 @@ def test_cells_that_show_another_place_are_reported(image: dict[str, Any], messa
 
 @pytest.mark.parametrize(("hidden", "passes"), [(0.02, True), (0.05, False)])
 def test_a_mosaic_paints_what_its_layers_show(hidden: float, passes: bool) -> None:
-    def run_on(name: str, **inputs: object) -> object:
-        gsd_m = float(name.removeprefix("mosaic"))
+    def run_on(**inputs: object) -> object:
         (left, right) = inputs["layers"].layers  # type: ignore[attr-defined]
         rgb = np.where(left.mask[..., None] == LayerMask.PAINTED, left.rgb, right.rgb)
         mask = np.full(left.frame.shape, OrthoMask.PAINTED, dtype=np.uint8)
         mask[: round(hidden * len(mask))] = OrthoMask.OCCLUDED
-        assert left.frame.gsd_m == gsd_m
         image = samples.orthoimage(left.frame, rgb=rgb, mask=mask, sources=("left", "right"))
         return SimpleNamespace(outputs={"orthoimages": Orthoimages(images=(image,))})
 
-    from orthoflow_plugins.mosaic.seams import MosaicSeams
-
-    subject: Any = SimpleNamespace(method=MosaicSeams, run_on=run_on)
+    subject: Any = SimpleNamespace(run_on_photographs=run_on)
     if passes:
         physics.mosaics_show_cells_in_place(subject)
         return
