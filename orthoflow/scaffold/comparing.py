@@ -50,8 +50,7 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
     kind = method_id.partition(".")[0]
     for recipe in _RECIPES:
         document = _coarse_document(recipe)
-        steps: dict[str, dict[str, Any]] = document["steps"]
-        of_kind = [node for node in steps.values() if node["use"].startswith(f"{kind}.")]
+        of_kind = [one for one in document["steps"].values() if one["use"].startswith(f"{kind}.")]
         if of_kind and not catalog.kinds[kind].spec.is_source:
             node = of_kind[-1]
             ours = {key: node.pop(key) for key in ("use", "params") if key in node}
@@ -75,16 +74,16 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
     kind = method_id.partition(".")[0]
     for recipe in _RECIPES:
         document = _coarse_document(recipe)
-        steps: dict[str, dict[str, Any]] = document["steps"]
         given: dict[str, list[str]] = {}
-        for name, node in steps.items():
+        for name, node in document["steps"].items():
             for port in port_specs(catalog.method(node["use"]).load().Out).values():
                 given.setdefault(port.type_name, []).append(f"{name}.{port.name}")
-        if kind not in steps and given.keys() >= set(takes):
+        if kind not in document["steps"] and given.keys() >= set(takes):
             # A cloud is read or simulated, whichever is there.
             wires = {name: given[name] if name == "cloud" else given[name][-1] for name in takes}
             double = {"use": method_id, "params": {"factor": 2.0}}
-            steps[kind] = {"in": wires, "variants": {"plain": {"use": method_id}, "double": double}}
+            variants = {"plain": {"use": method_id}, "double": double}
+            document["steps"][kind] = {"in": wires, "variants": variants}
             return _dumped(document, kind, [f"{kind}.n_items"])
     return ""
 

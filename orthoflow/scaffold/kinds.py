@@ -9,7 +9,7 @@ from orthoflow import products
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.errors import PluginError
-from orthoflow.sdk import PortSpec, port_specs
+from orthoflow.sdk import port_specs
 from orthoflow.sdk.hooks import FILES
 from orthoflow.version import DISTRIBUTION
 
@@ -21,13 +21,11 @@ class Port:
     Attributes:
         name: name of the port.
         class_name: product class.
-        required: whether it must be connected.
-        same_as: for an output, the required input of the same type that can be returned unchanged.
+        same_as: for an output, the input of the same type that can be returned unchanged.
     """
 
     name: str
     class_name: str
-    required: bool = True
     same_as: str = ""
 
 
@@ -57,53 +55,49 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
     entry = catalog.kinds[kind]
     if entry.state != "fine":
         raise PluginError(entry.problem)
-    taken: Mapping[str, PortSpec] = {}
-    given: Mapping[str, PortSpec] = {}
+    taken, given = entry.spec.inputs, entry.spec.outputs
     for other in catalog.methods.values():
         if other.spec.kind == kind:
             try:
                 method = other.load()
             except PluginError:
                 continue
-            taken, given = port_specs(method.In), port_specs(method.Out)
+            ports = port_specs(method.In).values()
+            required = {port.name: port.type_name for port in ports if port.required}
+            if entry.spec.is_source:
+                outputs = port_specs(method.Out).values()
+                taken, given = required, {port.name: port.type_name for port in outputs}
+            elif required:
+                taken = {name: type_name for name, type_name in taken.items() if name in required}
             break
-    if not entry.spec.is_source:
-        required = {name: name not in taken or taken[name].required for name in entry.spec.inputs}
-        wanted = {name for name in taken if taken[name].required} or set(entry.spec.inputs)
-        taken = {
-            name: PortSpec(name=name, type_name=type_name, required=required[name])
-            for name, type_name in entry.spec.inputs.items()
-            if name in wanted
-        }
-        given = {
-            name: PortSpec(name=name, type_name=type_name, required=True)
-            for name, type_name in entry.spec.outputs.items()
-        }
     return _kind_ports(catalog, taken, given, [entry.distribution])
 
 
 def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> KindPorts:
-    """Return the ports for a method of a new kind: one per product type, all required."""
-    taken, given = (
-        {name: PortSpec(name=name, type_name=name, required=True) for name in names}
-        for names in (takes, gives)
-    )
-    return _kind_ports(catalog, taken, given, [])
+    """Return the ports for a method of a new kind: one per product type."""
+    return _kind_ports(catalog, {name: name for name in takes}, {name: name for name in gives}, [])
 
 
 def _kind_ports(
     catalog: Catalog,
-    taken: Mapping[str, PortSpec],
-    given: Mapping[str, PortSpec],
+    taken: Mapping[str, str],
+    given: Mapping[str, str],
     besides: Sequence[DistributionInfo],
 ) -> KindPorts:
-    """Return the ports of a new method; `besides` are required distributions but for products."""
-    types = dict.fromkeys(port.type_name for port in (*taken.values(), *given.values()))
+    """Return the ports of a new method.
+
+    Args:
+        catalog: the installed plugins.
+        taken: product types of the inputs by port name.
+        given: product types of the outputs by port name.
+        besides: required distributions in addition to those of the product types.
+    """
+    types = dict.fromkeys((*taken.values(), *given.values()))
     classes = {type_name: _class_of(catalog, type_name) for type_name in types}
     imports: dict[str, set[str]] = {}
     for module, name in classes.values():
         imports.setdefault(module, set()).add(name)
-    handed_on = {port.type_name: port.name for port in taken.values() if port.required}
+    handed_on = {type_name: name for name, type_name in taken.items()}
     of_types = [catalog.products[name].distribution for name in types if name != FILES]
     # A version after `>=` cannot contain a local part.
     needs = {
@@ -111,17 +105,12 @@ def _kind_ports(
         for one in (*of_types, *besides)
         if one.name != DISTRIBUTION
     }
-    inputs, outputs = (
-        tuple(
-            Port(
-                name=port.name,
-                class_name=classes[port.type_name][1],
-                required=port.required,
-                same_as=handed_on.get(port.type_name, "") if ports is given else "",
-            )
-            for port in ports.values()
-        )
-        for ports in (taken, given)
+    inputs = tuple(
+        Port(name=name, class_name=classes[type_name][1]) for name, type_name in taken.items()
+    )
+    outputs = tuple(
+        Port(name=name, class_name=classes[type_name][1], same_as=handed_on.get(type_name, ""))
+        for name, type_name in given.items()
     )
     return KindPorts(
         inputs=inputs,
