@@ -97,7 +97,7 @@ def test_the_report_states_what_was_read(plan: Path) -> None:
     inputs = page.partition("Inputs and environment</h2>")[2].partition("</p>")[0]
     (scan,) = json.loads((plan / "products" / "cloud" / "scans.json").read_text())["scans"]
     assert f"LAS/LAZ: 1 scan, {scan['n_points']:,} points; fields used: X, Y, Z" in inputs
-    assert "unit m (assumed); up z; extent" in inputs
+    assert "unit: m (assumed); up: z; extent" in inputs
 
 
 def test_the_map_lies_where_the_site_does(plan: Path) -> None:
