@@ -160,18 +160,14 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         keep_trailing_newline=True,
         undefined=jinja2.StrictUndefined,
     )
-    method = f"kinds/{project.kind}.py.jinja"
+    comparison, method = "", "method.py.jinja"
     if project.product:
         method = "own_method.py.jinja"
-    elif project.is_new_kind or not (_TEMPLATES / method).is_file():
-        method = "method.py.jinja"
-    comparison = (
-        own_comparison_text(project.method_id, project.takes, catalog)
-        if project.product
-        else ""
-        if project.is_new_kind
-        else comparison_text(project.method_id, project.name, catalog)
-    )
+        comparison = own_comparison_text(project.method_id, project.takes, catalog)
+    elif not project.is_new_kind:
+        if (_TEMPLATES / (written := f"kinds/{project.kind}.py.jinja")).is_file():
+            method = written
+        comparison = comparison_text(project.method_id, project.name, catalog)
     known = {
         "project": project,
         "ports": ports,

@@ -197,9 +197,9 @@ def sample_problem(
         if name == _METADATA and not numbers_stated:
             continue
         amount, share = _limit(name, tolerances)
-        n_apart = sum(
-            _is_apart(a, b, amount, share) for a, b in zip(old.values, new.values, strict=True)
-        )
+        a, b = (np.array(sample.values, dtype=np.float64) for sample in (old, new))
+        is_close = np.isclose(a, b, atol=amount, rtol=share + _ROUNDING, equal_nan=True)
+        n_apart = np.count_nonzero(~is_close)
         if n_apart > _STRAY_SHARE * len(old.values):
             return f"{n_apart} of {len(old.values)} sampled values of {name} changed"
     return ""
@@ -207,10 +207,9 @@ def sample_problem(
 
 def _sample(array: NDArray[np.generic]) -> Sample:
     flat = array.reshape(-1)
-    places: Sequence[int] = range(flat.size)
     if flat.size > _AT_MOST:
-        places = [(index * _STRIDE) % flat.size for index in range(1, _AT_MOST + 1)]
-    values = [float(flat[place]) for place in places]
+        flat = flat[np.arange(1, _AT_MOST + 1) * _STRIDE % flat.size]
+    values = [float(value) for value in flat]
     return Sample(
         shape=list(array.shape),
         values=[float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None for value in values],
@@ -223,13 +222,6 @@ def _limit(name: str, tolerances: Mapping[str, Tolerance]) -> tuple[float, float
         return _UNSTATED, _METADATA_SHARE
     tolerance = tolerances.get(name.rpartition("/")[2])
     return (_UNSTATED, _UNSTATED) if tolerance is None else (tolerance.limit, 0.0)
-
-
-def _is_apart(before: float | None, after: float | None, amount: float, share: float) -> bool:
-    if before is None or after is None:
-        return before is not after
-    largest = max(abs(before), abs(after))
-    return abs(after - before) > amount + (share + _ROUNDING) * largest
 
 
 def _is_bytes(payload: Payload, name: str) -> bool:

@@ -327,22 +327,14 @@ def photographing_cameras() -> Mapping[str, ViewingCamera]:
 
 @cache
 def _photos() -> Photos:
-    scene = photographed_scene()
-    return Photos(
-        photos=tuple(
-            photo_of(scene, camera, name=name) for name, camera in photographing_cameras().items()
-        )
-    )
+    scene, views = photographed_scene(), photographing_cameras()
+    return photos(*(photo_of(scene, camera, name=name) for name, camera in views.items()))
 
 
 @cache
 def _cameras() -> Cameras:
-    return Cameras(
-        cameras=tuple(
-            oriented(settled_camera(camera), name=name)
-            for name, camera in photographing_cameras().items()
-        )
-    )
+    views = photographing_cameras()
+    return cameras(*(oriented(settled_camera(view), name=name) for name, view in views.items()))
 
 
 def settled_camera(camera: ViewingCamera) -> ViewingCamera:
