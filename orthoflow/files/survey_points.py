@@ -27,6 +27,11 @@ MOST_POINTS: Final = 100_000
 _MAX_PROBLEMS: Final = 20
 #: characters of a line of a file of check points
 MOST_LINE: Final = 10_000
+# Columns of ties.csv, as written by orthoflow, besides those of measured ties.
+_OF_WRITTEN_TIES: Final = (
+    *("wall", "role", "residual_u_px", "residual_v_px"),
+    "opencv_pixel_convention",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +79,19 @@ class MeasuredTie:
 def read_measured_ties(path: Path) -> tuple[MeasuredTie, ...]:
     """Read a tie file: `photo,u_px,v_px,x,y,z[,sigma_px]`, in the form of `read_survey_points`.
 
+    In a `ties.csv` of orthoflow, the other columns are ignored and rejected ties are left out.
+
     Raises:
         InputError: the file is invalid; one line per problem, `file:line: ...`.
     """
     required = ("photo", *_IN_IMAGE, *_POSITION)
-    table = _Table(path, content="ties", required=required, single=("sigma_px",))
+    table = _Table(
+        path, content="ties", required=required, single=("sigma_px",), ignored=_OF_WRITTEN_TIES
+    )
     ties = []
     for line, cells in table.rows():
+        if cells.get("role") == "rejected":
+            continue
         if not cells["photo"]:
             table.add(line, "the name of the photo is missing")
         u, v, x, y, z = table.numbers(line, cells, required[1:])
@@ -164,6 +175,7 @@ class _Table:
         required: columns that must be present.
         single: optional columns, also possible without a header.
         measured: further optional columns, some of which belong together.
+        ignored: columns that may be present and are not read.
     """
 
     path: Path = field(kw_only=False)
@@ -171,6 +183,7 @@ class _Table:
     required: tuple[str, ...]
     single: tuple[str, ...]
     measured: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()
     problems: list[str] = field(default_factory=list)
 
     def add(self, line: int, message: str) -> None:
@@ -288,7 +301,7 @@ class _Table:
             return ()
         n_before = len(self.problems)
         for name in names:
-            if name not in known:
+            if name not in (*known, *self.ignored):
                 near = difflib.get_close_matches(name, known, n=1)
                 hint = f" (did you mean {near[0]}?)" if near else ""
                 self.add(line, f"unknown column {name}{hint}; known are {', '.join(known)}")

@@ -5,14 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from orthoflow.files.publishing import publish_ties
 from orthoflow.files.survey_points import (
     MeasuredTie,
     SurveyPoint,
     read_measured_ties,
     read_survey_points,
 )
+from orthoflow.products import TieRole
+from orthoflow.testing.photographed import example_ties
+from tests import samples
 
 
 def read(folder: Path, text: str | bytes) -> tuple[SurveyPoint, ...]:
@@ -71,3 +76,13 @@ def test_ties_know_how_exactly_they_were_measured_where_somebody_says_so(tmp_pat
         where="t.csv:2", photo="a.jpg", pixel=(1.5, 2.0), position=(3.0, 4.0, 5.0), sigma_px=0.4
     )
     assert (second.photo, second.sigma_px) == ("b c.jpg", None)
+
+
+def test_ties_that_orthoflow_wrote_are_read_without_the_rejected(tmp_path: Path) -> None:
+    roles = [TieRole.CONTROL, TieRole.REJECTED, TieRole.CHECK]
+    ties = samples.taken(example_ties(), slice(3))
+    publish_ties(replace(ties, role=np.array(roles, dtype=np.uint8)), tmp_path, "")
+    first, last = read_measured_ties(tmp_path / "ties.csv")
+    np.testing.assert_allclose(
+        [first.position, last.position], ties.points_world[[0, 2]], atol=1e-6
+    )

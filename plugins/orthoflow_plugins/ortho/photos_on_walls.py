@@ -37,7 +37,7 @@ NO_CLOUD: Final = DiagnosticSpec(
 )
 UPSIDE_DOWN: Final = DiagnosticSpec(
     code="photos-upside-down",
-    severity="warning",
+    severity="error",
     text="{n_down} of {n_photos} photos are upside down: if the vertical axis of the scan points "
     "down, walls and orthoimages are upside down and floor and ceiling are swapped",
     remedy="set `up` of read.scan to {opposite}",

@@ -303,12 +303,12 @@ def test_a_scan_whose_up_is_down_is_told_by_its_photos(
     walls = scenes.walls(scenes.frame())
     given = scenes.inputs(*pictures, viewers=turned, walls=replace(walls, up=sign * walls.up))
     _, ctx = laid(tmp_path, given)
-    told = [one.values for one in ctx.diagnostics if one.code == "photos-upside-down"]
-    assert len(told) == (opposite is not None)
+    found = [one for one in ctx.diagnostics if one.code == "photos-upside-down"]
+    assert [one.severity for one in found] == ["error"] * (opposite is not None)
     if opposite:
         n_photos = len(turns_deg)
         expected = {"n_down": max(1, n_photos - 1), "n_photos": n_photos, "opposite": opposite}
-        assert {name: told[0][name] for name in expected} == expected
+        assert {name: found[0].values[name] for name in expected} == expected
 
 
 # --- layers, joined by wall ---
