@@ -587,9 +587,13 @@ class FocalLength:
 
 
 def read_exif(encoded: bytes) -> Exif:
-    """Read the EXIF data of a photo; all fields are empty if there are none."""
+    """Read the EXIF data of a photo; all fields are empty if there are none.
+
+    They are not read from photos of more than `MOST_PIXELS` pixels, which are refused: Pillow
+    decodes a PNG file to find data after its pixels.
+    """
     with opened(encoded) as image:
-        if image is None:
+        if image is None or image.width * image.height > MOST_PIXELS:
             return Exif()
         found, is_damaged = _tags(image)
     orientation = _positive(found.get(_ORIENTATION)) or 1.0
