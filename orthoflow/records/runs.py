@@ -194,11 +194,10 @@ def require_unchanged(run: Run, *paths: Path) -> None:
             raise RecordError(
                 f"{path} is not listed in the record of the run, so it cannot be checked"
             )
-        _require_same(run.folder, expected)
+        _require_same(run.folder, expected, published_state(run.folder, expected))
 
 
-def _require_same(folder: Path, file: PublishedFile) -> None:
-    state = published_state(folder, file)
+def _require_same(folder: Path, file: PublishedFile, state: PublishedState) -> None:
     if state == "changed":
         raise RecordError(
             f"{folder / file.path} was changed after the run: the record states the digest "
@@ -606,8 +605,12 @@ def copy_files(
     copied: list[str] = []
     known = {file.path: file for file in published}
     for path in paths:
-        if path in known and published_state(source, known[path]) != "missing":
-            _require_same(source, known[path])
+        if path in known:
+            # Each file is hashed once; published files may have gigabytes.
+            state = published_state(source, known[path])
+            if state == "missing":
+                continue
+            _require_same(source, known[path], state)
         try:
             with open_below(source, path) as stream:
                 n_bytes = os.fstat(stream.fileno()).st_size
