@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ from orthoflow_plugins.plane.kernels import (
     each_part,
     piece_of,
 )
+
+_Label = TypeVar("_Label", np.int8, np.int16)
 
 SAMPLE_POINTS: Final = 200_000
 # Maximum number of plan cells; larger plans have larger cells.
@@ -115,12 +117,23 @@ class PreparedCloud:
 
         each_part(len(self.claims), self.parts, claim)
 
-    def write_labels(self, names: NDArray[np.int16], labels: NDArray[np.int16]) -> None:
-        """Write labels (n,) of points from (k + 1,) names; the last is for points on no plane."""
+    def write_labels(self, names: NDArray[_Label], labels: NDArray[_Label]) -> None:
+        """Write labels (n,) of points from (k + 1,) names; the last is for points on no plane.
+
+        Args:
+            names: names of the planes, in the type of the labels.
+            labels: output; may be the claims themselves.
+        """
+        import cv2
+
+        # Indexing would convert all claims to 64 bits; a table has an entry for each byte, -1
+        # included.
+        table = np.full(256, names[-1], dtype=names.dtype)
+        table[: len(names) - 1] = names[:-1]
 
         def write(_part: int, piece: slice) -> None:
-            # A claim of -1 wraps to the last name.
-            np.take(names, self.claims[piece], out=labels[piece], mode="wrap")
+            if piece.stop > piece.start:
+                cv2.LUT(self.claims[piece].view(np.uint8), table, np.asarray(labels[piece]))
 
         each_part(len(labels), self.parts, write)
 

@@ -624,7 +624,7 @@ def label(found: list[FoundPlane], cloud: PreparedCloud, tolerance_m: float) -> 
     cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]))
     if len(slabs) > len(found):
         # The last entry is for a claim of -1.
-        cloud.claims[:] = np.append(plane_of_slab, -1).astype(np.int8)[cloud.claims]
+        cloud.write_labels(np.append(plane_of_slab, -1).astype(np.int8), cloud.claims)
 
 
 def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
