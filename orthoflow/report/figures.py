@@ -209,9 +209,9 @@ def figure_groups(
 def write_figures(
     run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "", as_pdf: bool = False
 ) -> int:
-    """Write the figures of cells to `folder/<cell>/` as PNG or SVG files, and the run's graph.
+    """Write the figures of cells to `folder/<cell>/` as PNG or JPEG files, and the run's graph.
 
-    Damaged pictures are omitted, and SVG files with scripts or external references.
+    Damaged pictures are omitted, and SVG files, which may contain scripts.
 
     Args:
         run: the run.
@@ -230,16 +230,15 @@ def write_figures(
     named = figure_files(run, addresses)
     contents: dict[str, Callable[[], bytes | None]] = {GRAPH_FILE: partial(graph_file, run)}
     for path, figure in named.items():
-        is_pdf = as_pdf and figure.media_type != "image/svg+xml"
-        name = f"{path.rpartition('.')[0]}.pdf" if is_pdf else path
-        contents[name] = partial(_content, figure, as_pdf=is_pdf)
+        name = f"{path.rpartition('.')[0]}.pdf" if as_pdf else path
+        contents[name] = partial(_content, figure, as_pdf=as_pdf)
     way = f"{inside}/" if inside else ""
     written = write_files(folder, {f"{way}{path}": content for path, content in contents.items()})
     return written - 1
 
 
 def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
-    """Return the content of a figure's file; None if it is damaged, or an SVG with its scripts."""
+    """Return the content of a figure's file; None if it is damaged or an SVG file."""
     if figure.media_type == "image/svg+xml":
         return None
     try:
