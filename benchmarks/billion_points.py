@@ -129,10 +129,10 @@ def print_steps(table: Path) -> None:
     with table.open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["metric"] in wanted]
     for step in dict.fromkeys(row["step"] for row in rows):
-        told = ", ".join(
+        summary = ", ".join(
             f"{row['metric']} {float(row['value']):.6g}" for row in rows if row["step"] == step
         )
-        print(f"  {step:7} {told}", flush=True)
+        print(f"  {step:7} {summary}", flush=True)
 
 
 if __name__ == "__main__":

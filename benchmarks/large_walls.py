@@ -65,8 +65,8 @@ def main() -> None:
         return
     for name in wanted.only:
         with TemporaryDirectory(dir=wanted.folder) as folder:
-            told = [folder, "--side", str(wanted.side), "--run", name]
-            cost = measured([sys.executable, __file__, *told])
+            arguments = [folder, "--side", str(wanted.side), "--run", name]
+            cost = measured([sys.executable, __file__, *arguments])
         print(
             f"{name}, {wanted.side} x {wanted.side} cells: {cost.wall_s:.0f} s, processor "
             f"{cost.cpu_s:.0f} s, anonymous {cost.anonymous_mib:.0f} MiB",
@@ -87,7 +87,8 @@ def run_surf(folder: Path, side: int) -> None:
     )
     off = metrics["mean_x_mm"] - 1e3 * GSD_M * SHIFT_CELLS
     expect(
-        f"the displacement is told within 0.05 cells, not {off:.3f}", is_met=bool(abs(off) < 0.05)
+        f"the displacement is measured within 0.05 cells, not {off:.3f}",
+        is_met=bool(abs(off) < 0.05),
     )
 
 

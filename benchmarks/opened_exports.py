@@ -130,8 +130,12 @@ class Walk:
     def frames(self) -> Iterator[tuple[int, float, float]]:
         """Return number, width and height in metres of the walls with orthoimages."""
         for path in sorted((self.run / "products").glob("*/wall_*_ortho.json")):
-            told = json.loads(path.read_text())
-            yield told["wall"], told["gsd_m"] * told["width"], told["gsd_m"] * told["height"]
+            content = json.loads(path.read_text())
+            yield (
+                content["wall"],
+                content["gsd_m"] * content["width"],
+                content["gsd_m"] * content["height"],
+            )
 
 
 def walk_sheets(walk: Walk) -> None:
@@ -246,10 +250,10 @@ def walk_clouds(walk: Walk) -> None:
             if folder is None:
                 break
             xyz, rgb = read(folder / name)
-            told = json.loads((folder / "cloud.json").read_text())
+            content = json.loads((folder / "cloud.json").read_text())
             facts = (xyz.min(0), xyz.max(0), rgb.astype(float).mean(0), rgb.astype(float).std(0))
             seen.append(facts)
-            is_same = len(xyz) == told["points"] and all(
+            is_same = len(xyz) == content["points"] and all(
                 np.abs(mine - first).max() < limit
                 for mine, first, limit in zip(facts, seen[0], (1e-3, 1e-3, 0.6, 0.6), strict=True)
             )
@@ -260,7 +264,9 @@ def walk_clouds(walk: Walk) -> None:
                 is_right=is_same,
             )
             if target == "laz":
-                draw_points(xyz, rgb, np.array(told["up"]), walk.pictures / f"cloud_{colour}.png")
+                draw_points(
+                    xyz, rgb, np.array(content["up"]), walk.pictures / f"cloud_{colour}.png"
+                )
 
 
 def draw_points(xyz: np.ndarray, rgb: np.ndarray, up: np.ndarray, path: Path) -> None:
@@ -349,12 +355,12 @@ def walk_records(walk: Walk) -> None:
     if folder := walk.export("stac"):
         core = RegisteredValidator.get_validator()
         collection = pystac.Collection.from_file(str(folder / "collection.json"))
-        told = json.loads((folder / "collection.json").read_text())
-        core.validate_core(told, pystac.STACObjectType.COLLECTION, "1.1.0")
+        content = json.loads((folder / "collection.json").read_text())
+        core.validate_core(content, pystac.STACObjectType.COLLECTION, "1.1.0")
         items = list(collection.get_items())
         for item in items:
-            told = json.loads(Path(item.self_href).read_text())
-            core.validate_core(told, pystac.STACObjectType.ITEM, "1.1.0")
+            content = json.loads(Path(item.self_href).read_text())
+            core.validate_core(content, pystac.STACObjectType.ITEM, "1.1.0")
             with rasterio.open(item.assets["image"].get_absolute_href()) as raster:
                 is_right = item.properties["proj:shape"] == list(raster.shape)
             walk.say(Path(item.self_href), "pystac and rasterio: valid", is_right=is_right)

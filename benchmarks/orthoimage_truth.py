@@ -117,8 +117,8 @@ class Bench:
 
 def numbers(inspection: Inspection) -> dict[str, float]:
     """Return the findings for the first wall, and those that belong to no wall."""
-    told = {finding.name: finding.value for finding in inspection.findings if finding.wall < 0}
-    return told | {
+    measured = {finding.name: finding.value for finding in inspection.findings if finding.wall < 0}
+    return measured | {
         finding.name: finding.value for finding in inspection.findings if finding.wall == 0
     }
 
@@ -148,8 +148,8 @@ def main() -> None:
     for surface, wall in walls.items():
         for poses, cameras in (("true", true), ("estimated", found)):
             images = bench.orthoimages(wall, cameras)
-            told, surf = bench.truth(wall, cameras, images), bench.surf(wall, images)
-            values = [factor * told.get(key, np.nan) for _, key, factor in COLUMNS]
+            measured, surf = bench.truth(wall, cameras, images), bench.surf(wall, images)
+            values = [factor * measured.get(key, np.nan) for _, key, factor in COLUMNS]
             values += [surf.get(key, np.nan) for _, key in SURF_COLUMNS]
             row = " ".join(f"{value:8.3f}" for value in values)
             print(f"{surface:10s} {poses:10s} {raster_s[surface]:9.1f} {row}", flush=True)

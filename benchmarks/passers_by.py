@@ -51,8 +51,8 @@ def main() -> None:
                 shown(joined(crowded, walls, Path(folder), robust=robust), crowded, people)
                 for robust in (False, True)
             ]
-        told = [f"{only:.3%} {avoidable:.3%}" for only, avoidable in row]
-        print(f"{seed}: not robust {told[0]}, robust {told[1]}", flush=True)
+        shares = [f"{only:.3%} {avoidable:.3%}" for only, avoidable in row]
+        print(f"{seed}: not robust {shares[0]}, robust {shares[1]}", flush=True)
 
 
 def context(seed: int, folder: Path) -> StepContext:

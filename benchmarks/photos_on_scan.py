@@ -32,7 +32,7 @@ from orthoflow.records.open import open_run
 
 RECIPE = "photos-on-scan.yaml"
 INPUTS = {"scan": "scan.e57", "photos": "photos", "calibration": "calibration.yaml"}
-# Of a scan this coarse the number of points is told; it goes with the square of the step.
+# The number of points is predicted from a scan with this step: it grows with the inverse square.
 _COARSE_M = 0.05
 
 

@@ -197,8 +197,8 @@ def main() -> None:
         nth = room.truth.planes.names.index("main wall")
         step = measured_step(room.truth, room.cloud, nth)
         if step is not None:
-            told = f"{1e3 * step[0]:.1f} mm apart (p90 {1e3 * step[1]:.1f})"
-            print(f"{seed} {len(room.cloud) / 1e6:.1f} M points, {told}", flush=True)
+            spacing = f"{1e3 * step[0]:.1f} mm apart (p90 {1e3 * step[1]:.1f})"
+            print(f"{seed} {len(room.cloud) / 1e6:.1f} M points, {spacing}", flush=True)
         with tempfile.TemporaryDirectory() as folder:
             for name, path in written(room, Path(folder)):
                 if name not in chosen.formats:

@@ -107,7 +107,7 @@ def record(command: list[str], frames: Path | None) -> tuple[dict[str, Stillness
         env={**os.environ, "TERM": "xterm", "COLUMNS": str(_COLUMNS), "LINES": str(_ROWS)},
     )
     os.close(terminal)
-    screen, watched, told = Screen(), {}, ()
+    screen, watched, earlier = Screen(), {}, ()
     out = frames.open("w", encoding="utf-8") if frames else None
     while True:
         ready, _, _ = select.select([controlling], [], [], 0.1)
@@ -122,9 +122,9 @@ def record(command: list[str], frames: Path | None) -> tuple[dict[str, Stillness
             screen.feed(block.decode("utf-8", errors="replace"))
         shown = screen.text()
         _watch(watched, shown, now_s)
-        if out and shown != told:
+        if out and shown != earlier:
             print(f"--- {now_s:.2f} s", *shown, sep="\n", file=out)
-        told = shown
+        earlier = shown
     code = process.wait()
     if out:
         out.close()

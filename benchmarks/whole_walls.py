@@ -117,12 +117,12 @@ def row(seed: int, truth: Truth, walls: Walls, image: Orthoimage) -> tuple[float
     }
     front_m, behind_m = wall.reach_m()
     shares = float(scanned.mean()), float(painted[asked].mean())
-    told = " ".join(
+    summary = " ".join(
         f"{name} {100 * cause.sum() / asked.sum():4.1f}" for name, cause in causes.items()
     )
     print(
         f"{seed:5d} {own:13s} {shares[0]:8.3f} {shares[1]:8.3f} "
-        f"{slab.front_m:6.2f} /{front_m:5.2f} {slab.behind_m:6.2f} /{behind_m:5.2f}  {told}",
+        f"{slab.front_m:6.2f} /{front_m:5.2f} {slab.behind_m:6.2f} /{behind_m:5.2f}  {summary}",
         flush=True,
     )
     return shares

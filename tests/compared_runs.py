@@ -16,7 +16,7 @@ def number(value: float, *, is_cost: bool = False, unit: str = "mm") -> Compared
 
 def compared(*metrics: Pair[ComparedMetric], alone: tuple[str, ...] = ()) -> RunComparison:
     """Two runs of the cells of these numbers, some of which only the first has."""
-    told = record([])
+    empty = record([])
     facts = CellFacts(
         status="ok", method="a.b", distribution="d 1", result_version=1, determinism="exact",
         seed=None, code={}, tools={}, error="",
@@ -26,8 +26,8 @@ def compared(*metrics: Pair[ComparedMetric], alone: tuple[str, ...] = ()) -> Run
         for cell in dict.fromkeys(row.cell for row in metrics)
     )
     return RunComparison(
-        left=told,
-        right=replace(told, run_id="r2"),
+        left=empty,
+        right=replace(empty, run_id="r2"),
         workflow=(),
         overrides=Pair(name="overrides", left=(), right=()),
         inputs=(Pair(name="scan", left=(), right=None),),

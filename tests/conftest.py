@@ -39,7 +39,7 @@ gc.set_threshold(50_000, *gc.get_threshold()[1:])
 # tests and for the steps that they run.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(private_folder("numba")))
 
-# What steps are told, for the processes of the tests, too: libraries read it when they are loaded.
+# The same settings as for steps, for the test processes, too: libraries read them when loaded.
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "20")
 
 # There is a process of tests for each core. With as many threads each, products of small matrices

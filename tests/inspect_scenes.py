@@ -205,7 +205,7 @@ def true_orthoimage(*, right_cells: float = 0.0, down_cells: float = 0.0) -> Tru
 
 
 def truth_inputs() -> Mapping[str, Product]:
-    """What `inspect.truth` takes: every error is put in, and large enough to be told from noise.
+    """What `inspect.truth` takes: all errors are introduced, and are larger than the noise.
 
     Displaced by 0.5 and -0.25 cells; 2 mm too near, and 8 mm on the left, four times what is
     stated; two white spots, one behind the chair; a part that is filled and one that nothing

@@ -1,4 +1,4 @@
-"""What processes of tests are told of memory: to keep that of arrays for the next ones.
+"""Memory settings of test processes: memory of arrays is kept for the next ones.
 
 Asking the system for each anew took 6 % of the processor time of tests of methods. The C library
 reads it when a process starts: it stands in the environment of who is to have it, nowhere else.

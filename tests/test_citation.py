@@ -14,10 +14,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_the_citation_is_of_this_version_and_has_what_its_format_wants() -> None:
-    told = YAML(typ="safe").load(ROOT / "CITATION.cff")
-    assert told["version"] == orthoflow.__version__
-    assert {"cff-version", "message", "title", "authors", "license"} <= set(told)
-    dois = [entry["doi"] for entry in told["references"] if "doi" in entry]
+    citation = YAML(typ="safe").load(ROOT / "CITATION.cff")
+    assert citation["version"] == orthoflow.__version__
+    assert {"cff-version", "message", "title", "authors", "license"} <= set(citation)
+    dois = [entry["doi"] for entry in citation["references"] if "doi" in entry]
     # As the methods themselves ask for it.
     source = (ROOT / "plugins/orthoflow_plugins/inspect/surf.py").read_text()
     assert dois

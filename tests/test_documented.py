@@ -179,8 +179,8 @@ def test_authors_of_plugins_are_told_every_unit() -> None:
     from orthoflow.testing.checks import UNIT_SUFFIXES
 
     text = (ROOT / "docs" / "plugin-authors.md").read_text(encoding="utf-8")
-    (told,) = re.findall(r"its unit in its name: (.*?)\. Counts", text, re.DOTALL)
-    assert set(re.findall(r"`_(\w+)`", told)) == set(UNIT_SUFFIXES)
+    (units,) = re.findall(r"its unit in its name: (.*?)\. Counts", text, re.DOTALL)
+    assert set(re.findall(r"`_(\w+)`", units)) == set(UNIT_SUFFIXES)
 
 
 def test_what_authors_of_plugins_are_shown_works(tmp_path: Path) -> None:

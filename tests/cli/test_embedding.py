@@ -142,12 +142,12 @@ def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
 
 
 def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:
-    told = studio.json("verify", "first", "--strict")
-    assert (told["ok"], told["notes"], told["pages"]) == (True, [], 1)
+    verdict = studio.json("verify", "first", "--strict")
+    assert (verdict["ok"], verdict["notes"], verdict["pages"]) == (True, [], 1)
     report = studio.folder / "first" / "report.html"
     page, products = report.read_text(), studio.folder / "first" / "products"
     table = products / "metrics.csv"
-    assert told["published"] == sum(path.is_file() for path in products.rglob("*"))
+    assert verdict["published"] == sum(path.is_file() for path in products.rglob("*"))
     written = table.read_text()
     table.write_text(written.replace("cell", "sell"))
     refused = studio("verify", "first")

@@ -34,7 +34,7 @@ COMMANDS = [
 
 
 def invoke_failing(error: BaseException | Callable[[], int], *arguments: str) -> Result:
-    """Run a program whose only command raises the error, or does what it is told."""
+    """Run a program whose only command raises the error or calls the function."""
 
     def fail() -> int:
         if callable(error):

@@ -130,7 +130,7 @@ def test_a_failed_cell_leaves_a_record_a_report_and_its_exit_code(
         assert run.cells["paint"].error_message == "needs survey, which failed"
         return
     assert [cell.status for cell in run.record.cells] == ["ok", "failed"]
-    # What the method itself got wrong is told where it can be read, here and in the record.
+    # An error of the method itself is reported here and in the record.
     has_trace = method == "paint.lacking"
     log = (tmp_path / "r" / "logs" / "paint.log").read_text()
     assert ("traceback: r/logs/paint.log" in done.stderr) == has_trace

@@ -16,8 +16,8 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
     path, _, _ = write_sample(tmp_path)
     with open_record(path) as opened:
         seal = opened.content_sha256
-    told = said("verify", path)
-    assert told.startswith(f"seal: sha256:{seal}\nverified: seal ok, 1 product (1 more by ")
+    verified = said("verify", path)
+    assert verified.startswith(f"seal: sha256:{seal}\nverified: seal ok, 1 product (1 more by ")
     assert json.loads(said("verify", path, "--json")) == {
         "record": str(path),
         "ok": True,
@@ -32,8 +32,8 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
     }
     path.write_bytes(path.read_bytes()[:-1])
     assert "was changed after it was written (see above)\n" in said("verify", path, code=3)
-    told = json.loads(said("verify", path, "--json", code=3))
-    assert (told["ok"], len(told["findings"])) == (False, 1)
+    verified = json.loads(said("verify", path, "--json", code=3))
+    assert (verified["ok"], len(verified["findings"])) == (False, 1)
 
 
 def test_who_shows_a_record_that_was_changed_says_so(tmp_path: Path) -> None:

@@ -176,16 +176,16 @@ def test_a_disk_that_cannot_be_read_is_no_damage(
     ref = store.put_product(heights("low"))
     assert store.get_product(ref.digest, Heights).note == "low"
 
-    for error, told in (
+    for error, error_class in (
         (OSError(errno.EMFILE, "Too many open files"), StoreError),
         (OSError(errno.EIO, "Input/output error"), DamageError),
         (KeyError("metadata"), DamageError),
     ):
         read = Mock(side_effect=error)
         monkeypatch.setattr("orthoflow_provenance.arrays.read_product_file", read)
-        with pytest.raises(told) as caught:
+        with pytest.raises(error_class) as caught:
             store.get_product(ref.digest, Heights)
-        assert isinstance(caught.value, DamageError) is (told is DamageError)
+        assert isinstance(caught.value, DamageError) is (error_class is DamageError)
 
 
 # Garbage ------------------------------------------------------------------------------------------
@@ -244,8 +244,8 @@ def test_a_store_is_listed_and_checked(store: Store) -> None:
     (item,) = list_results(store)
     folder = object_folder(store, result.outputs["p0"])
     size = sum(path.stat().st_size for path in folder.iterdir())
-    told = (item.key, item.method, item.run_id, item.size_bytes, item.is_complete)
-    assert told == (KEY, "toy.make", "r1", size, True)
+    listed = (item.key, item.method, item.run_id, item.size_bytes, item.is_complete)
+    assert listed == (KEY, "toy.make", "r1", size, True)
     # What others put there is not ours.
     (store.objects / "notes").mkdir()
     (store.results / "notes.txt").touch()

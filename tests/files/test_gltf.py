@@ -73,8 +73,8 @@ def test_relief_stands_out_towards_the_viewer(written: Path, carved: Path) -> No
 
 
 def test_another_program_finds_the_walls_where_they_are(written: Path) -> None:
-    told, _ = parts(written)
-    root = told["nodes"][0]
+    document, _ = parts(written)
+    root = document["nodes"][0]
     offset = np.array(root["extras"]["offset_world"])
     scene = trimesh.load(written)
     assert set(scene.geometry) == {"wall </script> 0", "floor 1"}
@@ -116,13 +116,13 @@ def test_textures_show_the_orthoimage_at_its_place(written: Path) -> None:
 def test_walls_are_painted_with_colours_that_have_their_light_already(
     written: Path, snapshot: SnapshotAssertion
 ) -> None:
-    told, _ = parts(written)
+    document, _ = parts(written)
     named = ("extensionsUsed", "materials", "textures", "samplers", "scene", "scenes")
-    assert {name: told[name] for name in named} == snapshot
-    assert [image["mimeType"] for image in told["images"]] == ["image/png", "image/jpeg"]
-    assert told["nodes"][0]["children"] == [1, 2]
-    assert [node["mesh"] for node in told["nodes"][1:]] == [0, 1]
-    assert {node["extras"]["surface"] for node in told["nodes"][1:]} == {"plane"}
+    assert {name: document[name] for name in named} == snapshot
+    assert [image["mimeType"] for image in document["images"]] == ["image/png", "image/jpeg"]
+    assert document["nodes"][0]["children"] == [1, 2]
+    assert [node["mesh"] for node in document["nodes"][1:]] == [0, 1]
+    assert {node["extras"]["surface"] for node in document["nodes"][1:]} == {"plane"}
 
 
 # Walls as triangles

@@ -64,9 +64,9 @@ def test_what_is_written_lies_where_rasters_lie(tmp_path: Path, crs: str) -> Non
     ring: Any = [[[0.5, -0.5], [1.0, -0.5], [1.0, -1.0], [0.5, -0.5]]]
     area = feature(ring)
     write_features(tmp_path / "a.geojson", [area], crs, digest="ab12")
-    told = json.loads((tmp_path / "a.geojson").read_text())
-    name = told.pop("crs")["properties"]["name"]
-    assert told == {
+    document = json.loads((tmp_path / "a.geojson").read_text())
+    name = document.pop("crs")["properties"]["name"]
+    assert document == {
         "type": "FeatureCollection",
         "name": "a",
         "product_digest": "ab12",

@@ -62,12 +62,12 @@ def test_planes_are_told_completely(tmp_path: Path, snapshot: SnapshotAssertion)
         part_plane=np.array([0, 1, 0], np.int32),
     )
     publishing.publish_planes(product, tmp_path, DIGEST)
-    told = json_of(tmp_path / "planes.json")
+    document = json_of(tmp_path / "planes.json")
     # In the middle of the corners, (3, 2, 1): 4 mm^2 times 2^2, 1 times 1^2, and 9.
-    first = told["planes"][0]
+    first = document["planes"][0]
     assert first.pop("sigma_offset_mm") == pytest.approx(np.sqrt(26.0), rel=1e-12)
     assert first.pop("sigma_angle_deg") == pytest.approx(np.degrees(2e-3), rel=1e-12)
-    assert told == snapshot
+    assert document == snapshot
     without = replace(product, part_corners=None, part_plane=None)
     publishing.publish_planes(without, tmp_path, DIGEST)
     assert "part_corners_world" not in (tmp_path / "planes.json").read_text()

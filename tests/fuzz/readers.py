@@ -185,8 +185,8 @@ def _photo_files(kind: str, folder: Path) -> None:
 def _read_photo(path: Path) -> object:
     encoded = path.read_bytes()
     exif = read_exif(encoded)
-    told = exif.camera, focal_length(exif, 64, 48), icc_profile(encoded), damage(encoded)
-    return told, _read_with(ReadPhotos, _files(path))
+    values = exif.camera, focal_length(exif, 64, 48), icc_profile(encoded), damage(encoded)
+    return values, _read_with(ReadPhotos, _files(path))
 
 
 def _figure_files(folder: Path) -> None:

@@ -121,17 +121,19 @@ def check_command(
     before = time.process_time()
     done = studio(command[0], run, *words)
     took_s = time.process_time() - before
-    told = f"{' '.join(command)}: {done.output[-2000:]}"
+    description = f"{' '.join(command)}: {done.output[-2000:]}"
     if done.exception and not isinstance(done.exception, SystemExit):
-        raise AssertionError(told) from done.exception
+        raise AssertionError(description) from done.exception
     # 4: a record may name methods that are not there.
-    assert done.exit_code in ({0, 1, 2, 3, 4} if command[0] == "replay" else {0, 1, 2, 3}), told
-    assert "itself failed" not in done.output, told
-    assert "Traceback" not in done.output, told
+    assert done.exit_code in ({0, 1, 2, 3, 4} if command[0] == "replay" else {0, 1, 2, 3}), (
+        description
+    )
+    assert "itself failed" not in done.output, description
+    assert "Traceback" not in done.output, description
     if done.exit_code and "--json" not in command:
-        assert "error: " in done.stderr, told
-    assert not {"\x1b", "\x9b", "\u202e"} & set(done.output), told
-    assert took_s < max_cpu_s, f"{told}: {took_s} s"
+        assert "error: " in done.stderr, description
+    assert not {"\x1b", "\x9b", "\u202e"} & set(done.output), description
+    assert took_s < max_cpu_s, f"{description}: {took_s} s"
     return done.exit_code
 
 

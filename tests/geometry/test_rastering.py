@@ -197,6 +197,6 @@ def test_places_are_told_of_points_up_to_two_cells_beside_a_gap() -> None:
     is_near = np.zeros(wall.shape, dtype=np.bool_)
     for row, column in np.argwhere(is_gap):
         is_near[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3] = True
-    told = is_near & ~is_gap
-    np.testing.assert_allclose(places[told], offsets[told], atol=2e-3)
+    is_known = is_near & ~is_gap
+    np.testing.assert_allclose(places[is_known], offsets[is_known], atol=2e-3)
     assert (places[~is_near] == 0.0).all()

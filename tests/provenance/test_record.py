@@ -110,14 +110,14 @@ def test_folders_stay_out_of_the_record(tmp_path: Path) -> None:
         log='File "/opt/python/numpy.py", see https://example.org/a/b; 3 m/s, ../a/b, and/or',
         warnings=(f"{Path.home()}/My Scans/x.las",),
     )
-    told = replace(
+    altered = replace(
         record,
         cells=(cell,),
         overrides=("--input scan=/home/jane/scans/hall.e57",),
         workflow_resolved='{"files":["/home/jane/scans/hall.e57"]}',
     )
     path = tmp_path / "run.h5"
-    write_record(path, told, shelf.find)
+    write_record(path, altered, shelf.find)
     read = read_record(path)
     assert read.cells[0].error_message == "cannot read hall.e57: it is cut off"
     assert read.cells[0].log == (

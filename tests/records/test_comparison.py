@@ -78,15 +78,15 @@ def test_the_same_workflow_computed_twice_is_the_same(studio: Studio) -> None:
 
 def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Studio) -> None:
     plain, variants = open_run("first"), open_run("swept")
-    told = compare_runs(plain, variants)
-    assert told.readdressed == {"paint@paint=grey-128": "paint"}
+    pairing = compare_runs(plain, variants)
+    assert pairing.readdressed == {"paint@paint=grey-128": "paint"}
     # Products are read under the name that each run gives them.
-    assert [(item.cell, item.verdict) for item in told.products] == [
+    assert [(item.cell, item.verdict) for item in pairing.products] == [
         ("survey", "identical"),
         ("paint", "identical"),
     ]
-    assert {row.cell for row in told.shared(told.parameters)} == {"survey", "paint"}
-    assert repr(told).endswith(", 2 steps only in one run>")
+    assert {row.cell for row in pairing.shared(pairing.parameters)} == {"survey", "paint"}
+    assert repr(pairing).endswith(", 2 steps only in one run>")
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
 
 

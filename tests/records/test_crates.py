@@ -157,10 +157,10 @@ def test_who_made_it_is_told_where_it_is_given(
     assert "author" not in entities(crate, "Dataset")[0]
     assert entities(crate, "Person") == []
     record = open_run(studio.folder / "first").record
-    told: dict[str, Any] = crate_metadata(record, [], license_text="CC0", author=f" {author} ")
-    assert entities(told, "Dataset")[0]["license"] == "CC0"
-    assert entities(told, "Person") == [{"@id": identifier, "@type": "Person", "name": name}]
-    assert entities(told, "Dataset")[0]["author"] == {"@id": identifier}
+    metadata: dict[str, Any] = crate_metadata(record, [], license_text="CC0", author=f" {author} ")
+    assert entities(metadata, "Dataset")[0]["license"] == "CC0"
+    assert entities(metadata, "Person") == [{"@id": identifier, "@type": "Person", "name": name}]
+    assert entities(metadata, "Dataset")[0]["author"] == {"@id": identifier}
 
 
 def test_products_that_the_record_holds_are_part_of_it(studio: Studio) -> None:
@@ -190,8 +190,8 @@ def test_what_the_report_links_to_is_in_the_crate(studio: Studio, tmp_path: Path
     links = {unquote(link) for link in re.findall(r'href="([^"#:]+)"', page)}
     assert any(link.startswith("figures/") for link in links)
     assert [link for link in sorted(links) if not (folder / link).is_file()] == []
-    told = json.loads((folder / "ro-crate-metadata.json").read_text(encoding="utf-8"))
-    assert links <= {entity["@id"] for entity in entities(told, "File")}
+    metadata = json.loads((folder / "ro-crate-metadata.json").read_text(encoding="utf-8"))
+    assert links <= {entity["@id"] for entity in entities(metadata, "File")}
 
 
 def test_tables_hold_what_the_record_says(studio: Studio) -> None:

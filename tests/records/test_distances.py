@@ -46,8 +46,8 @@ def compared(left: Payload, right: Payload | None, *, kind: str = "toy") -> Prod
     for one in (left, right):
         out = replace(given("", "0", kind), digest=f"{id(one)}", embedded=one is not None)
         held: Any = {("cell", "out"): SimpleNamespace(to_payload=partial(copy, one))}
-        told = record([cell("cell", outputs={"out": out})])
-        sides.append(RunProducts(run=HeldRun(path=Path("run.h5"), record=told, products=held)))
+        made = record([cell("cell", outputs={"out": out})])
+        sides.append(RunProducts(run=HeldRun(path=Path("run.h5"), record=made, products=held)))
     (found,) = product_distances(*sides, ["cell"], Catalog())  # type: ignore[arg-type]
     return found
 

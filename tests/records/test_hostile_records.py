@@ -192,8 +192,8 @@ def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Pa
 
     def write(record: hostile.Record) -> None:
         record.document["name"] = f"name {evil}"
-        told = PLAIN_WARNING.of("", {"text": ""})
-        row = {**dataclasses.asdict(told), "text": f"warnings {evil}", "settled_by": []}
+        warning = PLAIN_WARNING.of("", {"text": ""})
+        row = {**dataclasses.asdict(warning), "text": f"warnings {evil}", "settled_by": []}
         record.cell("paint").update(log=evil, diagnostics=[row], citations=[f"citations {evil}"])
         record.add_figure("paint", f"figure {evil}")
 

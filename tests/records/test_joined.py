@@ -53,7 +53,7 @@ def test_the_same_cell_of_two_records_is_one_whatever_it_is_called() -> None:
         ("wide", 2.0, 2, 2),
         ("coarse", 3.0, 1, 1),
     ]
-    # Names that two records share for other parameters are told apart.
+    # Names that two records use for different parameters are distinguished.
     found = rms(join_runs([ours, run_of("b", plane("fine", 0.2, 2.0))]))
     assert found[0][0] == "fine (tolerance_m=0.01)"
     assert found[2][0] == "fine (tolerance_m=0.2)"
@@ -120,8 +120,8 @@ def test_the_command_and_the_library_give_one_table(
     assert list(table.columns) == list(rows[0])
     assert [float(row["value"]) for row in rows] == list(table["value"])
     # The first step is the same in both, the second is not.
-    told = [(row["step"], row["runs"]) for row in rows if row["metric"] == "wall_s"]
-    assert told == [("survey", "2"), ("paint", "1"), ("paint", "1")]
+    counts = [(row["step"], row["runs"]) for row in rows if row["metric"] == "wall_s"]
+    assert counts == [("survey", "2"), ("paint", "1"), ("paint", "1")]
     assert studio("runs", "--table", "folder.csv", ".").exit_code == 0
     assert Path("folder.csv").read_text() == Path("all.csv").read_text()
     assert studio("runs", "--table", "all.csv", "nowhere").exit_code == 2

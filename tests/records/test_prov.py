@@ -41,14 +41,14 @@ def test_the_graph_of_a_run_is_read_by_the_prov_package(studio: Studio) -> None:
     assert set(activities) == {f"cell:{cell.address}" for cell in executed}
     for cell in executed:
         activity = activities[f"cell:{cell.address}"]
-        told = {str(name): value for name, value in activity.attributes}
-        assert told["orthoflow:method"] == cell.method
-        assert told["orthoflow:status"] == cell.status
+        facts = {str(name): value for name, value in activity.attributes}
+        assert facts["orthoflow:method"] == cell.method
+        assert facts["orthoflow:status"] == cell.status
         assert activity.get_startTime() == dt.datetime.fromisoformat(cell.started)
         assert activity.get_endTime() == dt.datetime.fromisoformat(cell.ended)
         for name, value in cell.params.items():
             if isinstance(value, int | float):
-                assert told[f"parameter:{name}"] == value
+                assert facts[f"parameter:{name}"] == value
     outputs = {
         f"product:{cell.address}.{port}": product.digest
         for cell in executed
@@ -85,9 +85,9 @@ def test_strange_names_stay_names(studio: Studio, strange: str) -> None:
     text = prov_document(changed).serialize(format="json")
     document = ProvDocument.deserialize(content=text, format="json")
     (activity,) = document.get_records(ProvActivity)
-    told = {str(name): value for name, value in activity.attributes}
-    assert told["prov:label"] == strange
-    assert '[1, null, {"a": 2}]' in told.values()
-    assert told["parameter:none"] == "null"
-    assert math.isnan(told["parameter:nan"])
-    assert told["parameter:large"] == 10**30
+    facts = {str(name): value for name, value in activity.attributes}
+    assert facts["prov:label"] == strange
+    assert '[1, null, {"a": 2}]' in facts.values()
+    assert facts["parameter:none"] == "null"
+    assert math.isnan(facts["parameter:nan"])
+    assert facts["parameter:large"] == 10**30

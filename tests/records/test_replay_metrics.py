@@ -33,7 +33,7 @@ def run_of(*numbers: Metric) -> Run:
     return Run(path=PATH, record=record([wall, crack]))
 
 
-def told(
+def reported(
     recorded: Run, made: Run, verdicts: tuple[Verdict, Verdict], *changed: str
 ) -> tuple[ReplayedMetric, ...]:
     ports = (("wall", "walls"), ("crack", "found"))
@@ -66,15 +66,15 @@ def test_each_cause_has_a_verdict_of_its_own(
     behind_changed_code: str,
 ) -> None:
     before, after = (run_of(*metrics(rms_mm=value)) for value in (recorded, replayed))
-    [found] = told(before, after, verdicts)
+    [found] = reported(before, after, verdicts)
     assert (found.recorded, found.replayed, found.verdict) == (recorded, replayed, expected)
-    [found] = told(before, after, verdicts, before.cells["wall"].method)
+    [found] = reported(before, after, verdicts, before.cells["wall"].method)
     assert found.verdict == behind_changed_code
 
 
 def test_times_are_left_out_but_for_a_number_that_one_side_calls_a_time() -> None:
     [number] = metrics(n=1.0)
     hidden = replace(number, unit="s")
-    assert told(run_of(hidden), run_of(replace(hidden, value=2.0)), IDENTICAL) == ()
-    [found] = told(run_of(hidden), run_of(number), IDENTICAL)
+    assert reported(run_of(hidden), run_of(replace(hidden, value=2.0)), IDENTICAL) == ()
+    [found] = reported(run_of(hidden), run_of(number), IDENTICAL)
     assert (found.recorded_unit, found.replayed_unit, found.verdict) == ("s", "1", "different")

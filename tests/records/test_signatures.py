@@ -1,4 +1,4 @@
-"""A record can be signed: who signed it is told from everybody else, and a change is noticed."""
+"""Signatures of records: the signer is recognised, and a change is detected."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ def test_a_signed_record_verifies_with_the_key_of_its_signer_and_no_other(
         output = verified(finished, run, 0)
     assert (run / "run.h5").read_bytes() == before
     assert "not checked" not in output
-    told = finished.json("verify", run, "--signer", "jane.pub")
-    assert told["signed_with"] == output.rpartition("signed with ")[2].strip()
+    verdict = finished.json("verify", run, "--signer", "jane.pub")
+    assert verdict["signed_with"] == output.rpartition("signed with ")[2].strip()
     # A crate takes the signature along; another record has another seal.
     assert finished("export", run, "--to", "ro-crate", "-o", tmp_path / "crate").exit_code == 0
     verified(finished, tmp_path / "crate", 0)

@@ -76,13 +76,13 @@ def test_the_collection_is_valid_and_places_what_is_on_earth(finished: Run, tmp_
     assert write_stac(finished, folder) == 2
     collection = pystac.Collection.from_file(str(folder / "collection.json"))
     core = RegisteredValidator.get_validator()
-    told = json.loads((folder / "collection.json").read_text())
-    core.validate_core(told, pystac.STACObjectType.COLLECTION, "1.1.0")
+    parsed = json.loads((folder / "collection.json").read_text())
+    core.validate_core(parsed, pystac.STACObjectType.COLLECTION, "1.1.0")
     items = {item.id: item for item in collection.get_items()}
     assert set(items) == {"mosaic.wall_0_ortho", "mosaic.wall_1_ortho"}
     for item in items.values():
-        told = json.loads(Path(item.self_href).read_text())
-        core.validate_core(told, pystac.STACObjectType.ITEM, "1.1.0")
+        parsed = json.loads(Path(item.self_href).read_text())
+        core.validate_core(parsed, pystac.STACObjectType.ITEM, "1.1.0")
         asset = item.assets["image"]
         href = asset.get_absolute_href()
         assert href is not None

@@ -53,8 +53,8 @@ def test_how_good_results_are_comes_first_and_what_moved_most() -> None:
         moved(rooms[1], "label_iou_mean", 0.9, 0.9024),
         moved(rooms[2], "label_iou_mean", 0.9, math.nan),
     ]
-    told = moved_first(pairs, dict.fromkeys(rooms, "check"))
-    assert [(pair.name, pair.cell[-1]) for pair in told] == [
+    ordered = moved_first(pairs, dict.fromkeys(rooms, "check"))
+    assert [(pair.name, pair.cell[-1]) for pair in ordered] == [
         ("label_iou_mean", "2"),
         ("plane_angle_deg", "2"),
         ("plane_angle_deg", "1"),

@@ -130,8 +130,8 @@ def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
     assert list(figures) == ["scan/plan"]
     assert repr(figures) == "scan/plan: a <plan>"
     figure = figures["scan/plan"]
-    told = Figures({"scan/\x1b[2J": replace(figure, caption="a\u202eb")})
-    assert repr(told) == "scan/\\x1b[2J: a\\u202eb"
+    labelled = Figures({"scan/\x1b[2J": replace(figure, caption="a\u202eb")})
+    assert repr(labelled) == "scan/\\x1b[2J: a\\u202eb"
     assert "a &lt;plan&gt;" in figure._repr_html_()
     # All of them are pictures, too, and beyond some the rest has names.
     assert figures._repr_html_().count("<img") == 1

@@ -138,20 +138,20 @@ def test_pictures_lie_over_the_first_of_their_place_in_shares_of_it() -> None:
         width=240,
         height=120,
     )
-    told = [
+    texts = [
         Picture(uri="", title=title, caption="", frame=frame)
         for title, frame in (("wall 0 (painted)", FRAME), ("no wall", None), ("depth", finer))
     ]
-    (slider,) = sliders(told, 1)
+    (slider,) = sliders(texts, 1)
     assert (slider["name"], slider["ratio"]) == ("wall 0", 1.5)
     first, second = slider["pictures"]  # type: ignore[misc]
     assert (first["title"], second["title"]) == ("wall 0 (painted)", "depth")
     shares = [[one[side] for side in ("left", "top", "width", "height")] for one in (first, second)]
     np.testing.assert_allclose(shares, [(0, 0, 100, 100), (5, 5, 100, 75)], atol=1e-6)
-    assert sliders(told[:2], 1) == []
+    assert sliders(texts[:2], 1) == []
     # A raster alone begins no group.
-    assert sliders([told[2], told[2]], 0) == []
-    assert len(sliders([told[2], told[2]], 1)) == 1
+    assert sliders([texts[2], texts[2]], 0) == []
+    assert len(sliders([texts[2], texts[2]], 1)) == 1
 
 
 # --- comparisons ---

@@ -109,12 +109,12 @@ POINTER = (
 
 def test_the_world_under_the_cursor_of_an_orthoimage_is_told(page: Page) -> None:
     page.evaluate(f"({POINTER})('pointermove', 0.25, 0.5)")
-    told = page.evaluate(f"{FIGURE}.querySelector('.readout').innerText")
+    output = page.evaluate(f"{FIGURE}.querySelector('.readout').innerText")
     # 120 x 80 cells of 0.01 m from (4e5, 5e6, 3), u along x, v down, n along -y.
-    u, v = (float(text) for text in re.findall(r"[uv] ([0-9.]+) px", told))
+    u, v = (float(text) for text in re.findall(r"[uv] ([0-9.]+) px", output))
     assert (u, v) == pytest.approx((30.0, 40.0), abs=0.6)
-    x, y, z = (float(text) for text in re.findall(r"[xyz] (-?[0-9.]+)", told))
-    depth = re.findall(r"depth (-?[0-9.]+) m", told)
+    x, y, z = (float(text) for text in re.findall(r"[xyz] (-?[0-9.]+)", output))
+    depth = re.findall(r"depth (-?[0-9.]+) m", output)
     assert x == pytest.approx(4.0e5 + 0.01 * u, abs=2e-3)
     assert z == pytest.approx(3.0 - 0.01 * v, abs=2e-3)
     assert y == pytest.approx(5.0e6 - (float(depth[0]) if depth else 0.0), abs=2e-3)
@@ -148,8 +148,8 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
     assert first[1:4] == first[5:8]
     assert second[1:4] == second[5:8]
     page.evaluate(f"{panel}.querySelector('[data-part=ties]').click()")
-    told = f"{panel}.querySelector('[data-part=told]').innerText"
-    assert page.evaluate(told).startswith("0 ties; 2 points without a photo")
+    output = f"{panel}.querySelector('[data-part=told]').innerText"
+    assert page.evaluate(output).startswith("0 ties; 2 points without a photo")
     page.evaluate(
         f"(() => {{ const row = {panel}.querySelector('[data-part=list] > div');"
         " const [, photo, u, v] = row.querySelectorAll('input');"
@@ -164,7 +164,7 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
     (read,) = read_measured_ties(tmp_path / "ties.csv")
     assert (read.photo, read.pixel) == ("a, b.jpg", (12.5, 7.0))
     assert read.position == points[0].position
-    assert page.evaluate(told) == "1 ties; 1 points without a photo or pixel position are omitted"
+    assert page.evaluate(output) == "1 ties; 1 points without a photo or pixel position are omitted"
     assert page.complaints == []
 
 
@@ -184,7 +184,7 @@ def test_nothing_sticks_out_of_a_phone(page: Page) -> None:
     width = 390
     page.show_as(width)
     whole = "document.documentElement.scrollWidth"
-    # The page is laid out anew when the browser has told of the new width: within two seconds.
+    # The page is laid out again when the browser reports the new width, within two seconds.
     page.evaluate(
         "new Promise(done => { let looks = 100; const look = () =>"
         f" --looks && {whole} > {width} ? setTimeout(look, 20) : done(); look(); }})"

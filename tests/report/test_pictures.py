@@ -159,7 +159,7 @@ def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
     assert pictured("luminance")[0].caption == (
         "grey of the scan's colours, because the scan has no laser intensity"
     )
-    # Causes of unknown cells are found where the step has told them.
+    # Causes of unknown cells are found where the step reported them.
     (alone,) = pictured("none")
     reasons = "for the reasons, see the log of mosaic@plane=fine"
     assert (alone.title, alone.caption) == (titles[1], f"96.0 % of the depths known; {reasons}")

@@ -121,8 +121,8 @@ def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
 
 def rastered(omega_deg: float, area_m2: float, place: str) -> RecordedCell:
     """A raster of a wall, upright but for its last millidegrees."""
-    told = metrics(omega_deg=omega_deg, phi_deg=0.001, area_m2=area_m2)
-    return cell(f"wall@{place}", method="raster.grid", metrics=told)
+    measured = metrics(omega_deg=omega_deg, phi_deg=0.001, area_m2=area_m2)
+    return cell(f"wall@{place}", method="raster.grid", metrics=measured)
 
 
 @pytest.mark.parametrize(
@@ -168,25 +168,25 @@ def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended(tmp_path:
     write_report([silent], tmp_path / "report.html")
     assert "No unresolved warnings." in (tmp_path / "report.html").read_text()
     failed = replace(orient, status="failed", error_message="no disk", **warned())
-    told = [limit.cells for limit in limits(run(first, reties, failed))]
-    assert told == [("orient",), ("first",)]
+    limiting = [limit.cells for limit in limits(run(first, reties, failed))]
+    assert limiting == [("orient",), ("first",)]
 
 
 def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
-    told = run(
+    whole_run = run(
         cell("wall"),
         cell("paint", status="failed", error_message="no disk"),
         cell("check", status="skipped", error_message="needs paint, which failed"),
         cell("theirs", status="skipped", error_type=NOT_ASKED_FOR),
         cell("match", status="skipped", error_type=NOT_ASKED_FOR),
     )
-    assert results(told) == {
+    assert results(whole_run) == {
         "ok": ("wall",),
         "failed": ("paint",),
         "skipped": ("check",),
         "not asked for": ("theirs", "match"),
     }
-    write_report([told], tmp_path / "report.html")
+    write_report([whole_run], tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "<li>Not reached: check</li>" in page
     assert "<li>Not selected: theirs, match</li>" in page

@@ -70,7 +70,7 @@ FACTS, OTHER_FACTS = (
 
 def test_all_that_differs_between_two_runs_is_in_tables(snapshot: SnapshotAssertion) -> None:
     file = RecordedFile(name="a.e57", size_bytes=3, sha256="0123456789abcdef" * 4)
-    told = differences(
+    tables = differences(
         RunComparison(
             left=record([], run_id="r1"),
             right=record([], run_id="r2"),
@@ -103,7 +103,7 @@ def test_all_that_differs_between_two_runs_is_in_tables(snapshot: SnapshotAssert
             products=(),
         )
     )
-    assert told == snapshot
+    assert tables == snapshot
 
 
 def test_products_that_differ_stand_first_with_their_distances() -> None:
@@ -118,14 +118,14 @@ def test_products_that_differ_stand_first_with_their_distances() -> None:
 
 
 def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:
-    told = run(
+    whole_run = run(
         cell("plane", metrics=metrics(rms_mm=1.25)),
         cell("first", metrics=metrics(check_rmse_mm_worst=2.0, n_oriented=9.0)),
         cell("second", metrics=metrics(check_rmse_mm_worst=7.0, n_oriented=8.0)),
         cell("check", metrics=metrics(completeness_seen_by_both=0.75, main_found=1.0)),
         cell("other", metrics=metrics(depth_rmse_mm=2.0, main_found=0.0)),
     )
-    found = answers(told)
+    found = answers(whole_run)
     assert [(one.cell, one.value) for one in found] == [
         ("other", "no"),
         ("check", "0.75"),

@@ -39,7 +39,7 @@ class Shell:
 
     Attributes:
         folder: working directory of every command.
-        store: what `run` and `plan` use unless told otherwise; the tests of a session share it,
+        store: used by `run` and `plan` by default; the tests of a session share it,
             because compiling kernels anew takes longer than what they test.
         paths: import path before the installed packages.
     """

@@ -42,7 +42,7 @@ class Story:
 
     def follow(self, document: str, shell: Shell) -> dict[str, Ended]:
         """Type the commands of the document's blocks one after the other."""
-        told = {}
+        outputs = {}
         for command in commands_of(ROOT / document):
             if not command.is_block or command.words[0] != "orthoflow":
                 continue
@@ -58,10 +58,10 @@ class Story:
                 own = shell.folder / "kept"
                 own.mkdir(exist_ok=True)
                 words += ("--store", str(own))
-            told[command.text] = shell(*words, timeout_s=900)
-            assert told[command.text].code == 0, f"{command}: {told[command.text].said}"
-        assert told, f"{document} has no commands"
-        return told
+            outputs[command.text] = shell(*words, timeout_s=900)
+            assert outputs[command.text].code == 0, f"{command}: {outputs[command.text].said}"
+        assert outputs, f"{document} has no commands"
+        return outputs
 
 
 @pytest.fixture(scope="module")
@@ -78,12 +78,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Path:
 def test_the_tutorial(shell: Shell) -> None:
     # The short way to an orthoimage in the place of the long one.
     short = Story(coarse=COARSE, instead={"quickstart.yaml": "direct.yaml"})
-    told = short.follow("docs/tutorial.md", shell)
+    outputs = short.follow("docs/tutorial.md", shell)
     (promised,) = blocks(ROOT / "docs" / "tutorial.md", "text")
-    said = told["orthoflow run quickstart.yaml -o first"].out
+    said = outputs["orthoflow run quickstart.yaml -o first"].out
     assert [line for line in promised.splitlines() if line not in said.splitlines()] == []
     assert (shell.folder / "first" / "products" / "metrics.csv").is_file()
-    assert "identical" in told["orthoflow replay first -o again"].out
+    assert "identical" in outputs["orthoflow replay first -o again"].out
 
 
 @pytest.mark.long
@@ -106,18 +106,18 @@ def test_the_comparison(shell: Shell) -> None:
     for name, text in written_files().items():
         (shell.folder / name).write_text(text)
     story = Story(coarse=("--set", "room.scan_step_m=0.08"))
-    told = story.follow("docs/comparing.md", shell)
+    outputs = story.follow("docs/comparing.md", shell)
     swept = orthoflow.open_run(shell.folder / "swept").cells
     assert sum("tolerance_m-0_02" in address for address in swept) > 1
     assert (shell.folder / "both.html").is_file()
-    listed = told["orthoflow runs . --sort started"].out
+    listed = outputs["orthoflow runs . --sort started"].out
     assert [name for name in ("detectors", "swept", "fine") if name not in listed] == []
 
 
 def test_the_archive(finished: Path, shell: Shell) -> None:
     shutil.copytree(finished, shell.folder / "first")
-    told = Story().follow("docs/archiving.md", shell)
-    replayed = told["orthoflow replay first-embedded -o repeated"].out
+    outputs = Story().follow("docs/archiving.md", shell)
+    replayed = outputs["orthoflow replay first-embedded -o repeated"].out
     assert "identical" in replayed
     assert (shell.folder / "crate").is_dir()
 
@@ -127,8 +127,8 @@ def test_the_signature(finished: Path, shell: Shell) -> None:
     shutil.copytree(finished, shell.folder / "runs" / "palace")
     keygen = ["ssh-keygen", "-q", "-t", "ed25519", "-f", "jane", "-N", ""]
     subprocess.run(keygen, cwd=shell.folder, check=True)
-    told = Story().follow("SECURITY.md", shell)
-    assert "signed with SHA256:" in told["orthoflow verify runs/palace --signer jane.pub"].out
+    outputs = Story().follow("SECURITY.md", shell)
+    assert "signed with SHA256:" in outputs["orthoflow verify runs/palace --signer jane.pub"].out
 
 
 def test_the_lines_of_python(shell: Shell) -> None:

@@ -68,9 +68,9 @@ def test_whatever_is_said_of_a_wall_names_one_of_the_rastered_planes(
             *(figure.caption for figure in run.cells[address].figures),
         )
     ]
-    told = {name for text in said for name in NAMED.findall(text)}
-    assert told
-    assert told <= set(names.values())
+    named = {name for text in said for name in NAMED.findall(text)}
+    assert named
+    assert named <= set(names.values())
     figures = {
         int(match[1])
         for cell in run.cells.values()

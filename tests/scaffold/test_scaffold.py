@@ -44,16 +44,19 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
     text = (folder / project.package / "method.py").read_text(encoding="utf-8")
     reported = set(re.findall(r"^ +ctx\.metric\(\"(\w+)", text, re.MULTILINE))
     assert {metric.name for metric in method.metric_specs()} == reported
-    comparison, told = folder / "compare.yaml", (folder / "README.md").read_text(encoding="utf-8")
+    comparison, readme_text = (
+        folder / "compare.yaml",
+        (folder / "README.md").read_text(encoding="utf-8"),
+    )
     # Sources take no variants, and some kinds are in no recipe; their step is in the text instead.
     assert comparison.exists() == (kind in COMPARED)
-    assert ("there is no `compare.yaml`" in told) != comparison.exists()
+    assert ("there is no `compare.yaml`" in readme_text) != comparison.exists()
     if comparison.exists():
         workflow = load_workflow(comparison, catalog)
         cells = [one for one in expand_cells(workflow, catalog) if one.method == project.method_id]
         assert [one.skip_reason for one in cells] == [""]
     else:
-        assert f"`{kind}: {{use: {project.method_id}" in told
+        assert f"`{kind}: {{use: {project.method_id}" in readme_text
 
 
 @pytest.mark.parametrize("kind", ["simulate", "face", "dense"])

@@ -27,8 +27,8 @@ def context(folder: Path, heard: list[StepEvent] | None = None) -> StepContext:
 )
 def test_what_is_no_picture_is_refused_where_it_is_drawn(tmp_path: Path, content: bytes) -> None:
     ctx = context(tmp_path)
-    told = rf"^figure plan must be .* its content begins with {re.escape(repr(content[:16]))}$"
-    with pytest.raises(ProductError, match=told):
+    message = rf"^figure plan must be .* its content begins with {re.escape(repr(content[:16]))}$"
+    with pytest.raises(ProductError, match=message):
         ctx.figure("plan", content)
     assert (ctx.figures, list(tmp_path.iterdir())) == ([], [])
 

@@ -277,7 +277,7 @@ BESIDE_SAYS = {
 }
 
 
-# What stops every run: it is told by the first check that runs the method.
+# Errors that stop every run are reported by the first check that runs the method.
 STOPPED = """
         def look_at(self, cloud):
             return {}["tolerance"]

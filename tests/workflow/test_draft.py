@@ -149,8 +149,8 @@ def test_no_name_of_a_file_says_more_than_that_it_is_one(
     write_scan(data / f"hall{odd}.las")
     (data / f"left{odd}.doc").touch()
     write_photos(data / f"photos{odd}", 2)
-    told = said("new", "data")
-    assert told == shown(told, keep="\n")
+    printed = said("new", "data")
+    assert printed == shown(printed, keep="\n")
     text = Path("workflow.yaml").read_text(encoding="utf-8")
     assert all(line.isprintable() for line in text.split("\n"))
     workflow = load_workflow(Path("workflow.yaml"), discover_catalog())
@@ -171,8 +171,8 @@ def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
     os.mkfifo(data / "photos" / name)
     zero = data.parent / f"link-{name}"
     zero.symlink_to("/dev/zero")
-    told = said("new", data / "hall.las", data / "photos" / name, zero)
-    assert f"not used: {name}, link-{name}: a pipe or a device" in told
+    printed = said("new", data / "hall.las", data / "photos" / name, zero)
+    assert f"not used: {name}, link-{name}: a pipe or a device" in printed
 
 
 # --- what the data show ---

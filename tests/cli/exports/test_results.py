@@ -28,8 +28,8 @@ def test_figures_are_written_in_the_format_that_is_asked_for(tmp_path: Path) -> 
     n_figures = sum(len(cell.figures) for cell in run.cells.values())
     for suffix in ("svg", "pdf", "png"):
         folder = tmp_path / suffix
-        told = module.export_figures(run, folder, Choices(figure_format=suffix))
-        assert told == f"{n_figures} figures, 1 chart and the graph"
+        message = module.export_figures(run, folder, Choices(figure_format=suffix))
+        assert message == f"{n_figures} figures, 1 chart and the graph"
         assert (folder / f"photos_and_walls.{suffix}").stat().st_size > 1000
     pages = list((tmp_path / "pdf").glob("*/*.pdf"))
     assert pages

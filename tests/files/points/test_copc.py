@@ -1,4 +1,4 @@
-"""COPC: only the nodes are read that hold points asked for, and a damaged octree is told."""
+"""COPC: only nodes with requested points are read, and a damaged octree is reported."""
 
 from __future__ import annotations
 

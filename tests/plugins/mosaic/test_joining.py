@@ -407,17 +407,17 @@ def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
     rng = np.random.default_rng(4)
     one = rng.integers(0, 256, (64, 64))
     window = cv2.createHanningWindow((64, 64), cv2.CV_32F)
-    told: dict[str, int] = {}
+    sources: dict[str, int] = {}
     # The same patch with more and more of others mixed in.
     for weight in np.linspace(0.5, 1.0, 41):
         mixed = np.rint((1.0 - weight) * one + weight * rng.integers(0, 256, one.shape))
         peak = cv2.phaseCorrelate(one.astype("f4"), mixed.astype("f4"), window)[1]
         found = len(agreement.overlaps_of([plain_layer(grey=part) for part in (one, mixed)]).photos)
         if 0.16 < peak < 0.28:
-            told["fifth"] = found
+            sources["fifth"] = found
         elif 0.07 < peak < 0.14:
-            told["tenth"] = found
-    assert told == {"fifth": 1, "tenth": 0}
+            sources["tenth"] = found
+    assert sources == {"fifth": 1, "tenth": 0}
 
 
 def test_two_hundred_patches_are_enough() -> None:

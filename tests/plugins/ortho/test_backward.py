@@ -208,9 +208,9 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
     assert [(layer.wall, layer.source) for layer in layers] == [(0, "1.png"), (1, "0.png")]
     assert ctx.warnings == []
     _, ctx = laid(tmp_path, scenes.inputs(*pictures, viewers=viewers))
-    (told,) = ctx.diagnostics
-    assert (told.code, told.values["n"]) == ("photos-show-no-wall", 1)
-    assert told.values["names"] == "1.png"
+    (diagnostic,) = ctx.diagnostics
+    assert (diagnostic.code, diagnostic.values["n"]) == ("photos-show-no-wall", 1)
+    assert diagnostic.values["names"] == "1.png"
 
 
 def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:

@@ -101,6 +101,6 @@ def test_a_block_of_both_depths_has_sixteen_bits_and_says_so(tmp_path: Path) -> 
     assert [layer.rgb.dtype for layer in layers] == [np.uint16, np.uint16]
     assert alone.rgb.dtype == np.uint8
     np.testing.assert_array_equal(layers[1].rgb, sixteen_bits(alone.rgb))
-    found = [(told.code, told.values["n"]) for told in ctx.diagnostics]
+    found = [(diagnostic.code, diagnostic.values["n"]) for diagnostic in ctx.diagnostics]
     assert found == [("photos-of-mixed-depth", 1)]
     assert joined(tmp_path, layers, seams="graph-cut").images[0].rgb.dtype == np.uint16

@@ -139,10 +139,10 @@ def test_without_colours_the_intensity_is_painted_as_grey(tmp_path: Path) -> Non
     cloud, walls = holey_wall(np.zeros((10, 12), dtype=bool))
     shares = np.linspace(0, 1, len(cloud), dtype=np.float32)
     grey = dataclasses.replace(cloud, rgb=None, intensity=shares)
-    layer, told = laid(grey, walls, scenes.context(tmp_path))
+    layer, by_code = laid(grey, walls, scenes.context(tmp_path))
     expected = np.rint(255 * shares).astype(np.uint8)
     np.testing.assert_array_equal(layer.rgb.reshape(-1, 3), np.column_stack([expected] * 3))
-    assert list(told) == ["cloud-without-colour"]
+    assert list(by_code) == ["cloud-without-colour"]
 
 
 @pytest.mark.parametrize("n_black", [0, 1, 9])
@@ -152,8 +152,8 @@ def test_points_of_pure_black_are_told(tmp_path: Path, n_black: int) -> None:
     rgb[0] = (0, 0, 1)
     rgb[200 - n_black :] = 0
     dark = dataclasses.replace(cloud, rgb=rgb)
-    layer, told = laid(dark, walls, scenes.context(tmp_path), inpaint="none")
-    found = [(code, of["n_black"], of["grey"]) for code, of in told.items()]
+    layer, by_code = laid(dark, walls, scenes.context(tmp_path), inpaint="none")
+    found = [(code, of["n_black"], of["grey"]) for code, of in by_code.items()]
     assert found == [("points-black", n_black, 10)] * (n_black > 0)
     # Nothing black is void.
     assert (layer.mask == LayerMask.PAINTED).all()
@@ -164,9 +164,9 @@ def test_specks_of_pure_black_paint_no_cell_and_are_reported(tmp_path: Path) -> 
     rgb = np.full((200, 3), 120, np.uint8)
     rgb[5::20] = 0
     specked = dataclasses.replace(cloud, rgb=rgb)
-    layer, told = laid(specked, walls, scenes.context(tmp_path))
+    layer, by_code = laid(specked, walls, scenes.context(tmp_path))
     assert (layer.rgb[layer.mask == LayerMask.PAINTED] == 120).all()
-    assert told["black-points-left-out"]["n_points"] == 10
+    assert by_code["black-points-left-out"]["n_points"] == 10
     # They are painted where that is asked for.
     layer = painted(specked, walls, tmp_path, skip_below_grey=0)
     assert (layer.rgb == 0).all(axis=2).any()
@@ -360,19 +360,19 @@ def light_painted(
     cloud: PointCloud, walls: Walls, folder: Path, **params: object
 ) -> tuple[NDArray[np.float64], Mapping[str, Any] | None]:
     """Logarithm of the light of each cell (rows, cols, 3), NaN without; what was reported."""
-    layer, told = laid(cloud, walls, scenes.context(folder), inpaint="none", **params)
+    layer, by_code = laid(cloud, walls, scenes.context(folder), inpaint="none", **params)
     light = np.log(np.maximum(light_of_levels(255)[layer.rgb], 1e-3).astype(np.float64))
     light[(layer.mask != LayerMask.PAINTED) | (layer.rgb.min(axis=2) < 20)] = np.nan
-    return light, told.get("scans-balanced")
+    return light, by_code.get("scans-balanced")
 
 
 def test_scans_of_one_white_balance_are_painted_as_they_are(
     tmp_path: Path, room: tuple[PointCloud, Walls]
 ) -> None:
-    found, told = light_painted(*room, tmp_path)
+    found, by_code = light_painted(*room, tmp_path)
     plain, _ = light_painted(*room, tmp_path, balance_scans=False)
     np.testing.assert_array_equal(found, plain)
-    assert told is None
+    assert by_code is None
 
 
 def test_a_cast_of_one_scan_is_taken_away(tmp_path: Path, room: tuple[PointCloud, Walls]) -> None:
@@ -383,12 +383,12 @@ def test_a_cast_of_one_scan_is_taken_away(tmp_path: Path, room: tuple[PointCloud
     rgb[is_off] = lit(rgb[is_off], gains)
     cast = dataclasses.replace(cloud, rgb=rgb)
     expected, _ = light_painted(cloud, walls, tmp_path)
-    found, told = light_painted(cast, walls, tmp_path)
+    found, by_code = light_painted(cast, walls, tmp_path)
     left, silent = light_painted(cast, walls, tmp_path, balance_scans=False)
     assert silent is None
-    assert told is not None
-    assert (told["n"], told["n_scans"]) == (1, int(cloud.scan.max()) + 1)
-    assert told["share"] == pytest.approx(1.0 / CAST.min() - 1.0, abs=0.05)
+    assert by_code is not None
+    assert (by_code["n"], by_code["n_scans"]) == (1, int(cloud.scan.max()) + 1)
+    assert by_code["share"] == pytest.approx(1.0 / CAST.min() - 1.0, abs=0.05)
     apart, before = found - expected, left - expected
     known = np.isfinite(apart).all(axis=2) & np.isfinite(before).all(axis=2)
     # Where that scan paints, its cast is visible, and afterwards no cell differs.

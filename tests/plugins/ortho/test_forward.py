@@ -88,8 +88,8 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
     clock = count()
     ctx = replace(context(tmp_path), clock_s=lambda: float(next(clock)))
     (closed,) = run(DsmForward, ctx, coarse, fill_gap_cells=2).layers.layers
-    told = {metric.name: metric.value for metric in ctx.metrics}
-    assert (told["occluders_s"], told["painting_s"]) == (2.0, 1.0)
+    by_name = {metric.name: metric.value for metric in ctx.metrics}
+    assert (by_name["occluders_s"], by_name["painting_s"]) == (2.0, 1.0)
     assert np.mean(closed.mask == LayerMask.PAINTED) > 0.97
     is_old = (closed.mask == LayerMask.PAINTED) & (closed.filled == 0)
     np.testing.assert_array_equal(is_old, holed.mask == LayerMask.PAINTED)

@@ -90,7 +90,7 @@ VOID = slice(9, 21)
 VOID_SHARE = 144 / 1600
 
 
-def told(
+def stated(
     places_m: NDArray[np.float64],
     *,
     station: tuple[float, float, float] | None = None,
@@ -154,10 +154,10 @@ def in_each_tile(depth_m: float, count: int = 2) -> NDArray[np.float64]:
 def test_two_points_behind_or_before_a_tile_tell_why_it_is_empty(
     depth_m: float, count: int, cause: str
 ) -> None:
-    assert told(in_each_tile(depth_m, count)) == {cause: pytest.approx(1.0)}
+    assert stated(in_each_tile(depth_m, count)) == {cause: pytest.approx(1.0)}
     # Porticoes stand five metres before a wall at most.
-    assert told(in_each_tile(4.9), free_m=np.inf) == {"before": pytest.approx(1.0)}
-    assert told(in_each_tile(5.1), free_m=np.inf) == {"unseen": pytest.approx(1.0)}
+    assert stated(in_each_tile(4.9), free_m=np.inf) == {"before": pytest.approx(1.0)}
+    assert stated(in_each_tile(5.1), free_m=np.inf) == {"unseen": pytest.approx(1.0)}
 
 
 def test_what_stands_before_counts_before_what_lies_behind() -> None:
@@ -165,7 +165,7 @@ def test_what_stands_before_counts_before_what_lies_behind() -> None:
     both[:24:2, 2] -= 0.3
     both[-12:, 2] += 0.2
     # The first half of the tiles.
-    assert told(both) == {"before": pytest.approx(0.5), "behind": pytest.approx(0.5)}
+    assert stated(both) == {"before": pytest.approx(0.5), "behind": pytest.approx(0.5)}
 
 
 @pytest.mark.parametrize(
@@ -185,10 +185,10 @@ def test_a_screen_hides_what_lies_between_it_and_the_station_but_for_their_ends(
     screen = screen[(screen[:, 2] > 1.0) | (screen[:, 0] > 0.45) | (screen[:, 2] < 0.15)]
     room = np.array([[-3.0, -3.0, -1.0], [5.0, 4.0, 5.0]])
     points = np.vstack([screen, np.repeat(room, 40, axis=0)])
-    found = told(points, station=(3.3, 0.3, 3.0))
+    found = stated(points, station=(3.3, 0.3, 3.0))
     assert found.get(cause, 0.0) > 0.8
     # Nobody looks from behind the wall.
-    assert told(points, station=(3.3, 0.3, -3.0)) == {"hidden": pytest.approx(1.0)}
+    assert stated(points, station=(3.3, 0.3, -3.0)) == {"hidden": pytest.approx(1.0)}
 
 
 def screened(station: tuple[float, float, float], *stray: tuple[float, float, float]) -> float:
@@ -197,7 +197,7 @@ def screened(station: tuple[float, float, float], *stray: tuple[float, float, fl
     right, down = (axis.ravel() for axis in np.meshgrid(off, off))
     screen = np.repeat(np.column_stack([right, down, np.full(right.size, 2.0)]), 2, axis=0)
     points = np.vstack([screen, np.array(stray).reshape(-1, 3)])
-    return told(points, station=station).get("hidden", 0.0)
+    return stated(points, station=station).get("hidden", 0.0)
 
 
 @pytest.mark.parametrize("far_m", [5.0, 5e6, 5e12])

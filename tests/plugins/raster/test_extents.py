@@ -288,7 +288,7 @@ def test_a_frame_is_widened_by_whole_cells() -> None:
     np.testing.assert_allclose(grown.origin_world, frame.origin_world - [0.2, 0.0, 0.0])
 
 
-# --- what adjoins a wall, and how it is told ---
+# --- surfaces next to a wall, and their reports ---
 
 
 def rectangle_of(planes: Planes) -> Any:

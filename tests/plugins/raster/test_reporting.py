@@ -1,4 +1,4 @@
-"""What is told of rastered walls: metrics by hand, and warnings in full."""
+"""Reports about rastered walls: metrics computed by hand, and complete warnings."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
         return tuple(f"{camera.photo}: {camera.status}" for camera in found.cameras.cameras)
 
     assert run(given) == tuple(f"a_{face}.png: ok" for face in faces)
-    # Whoever wires the poses only is told what is missing.
+    # If only the poses are connected, the missing input is named.
     with pytest.raises(InputError, match="its lens is a fisheye or a panorama: connect the same"):
         run(None)
 
