@@ -15,12 +15,15 @@ from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix
 from orthoflow.products import Cameras, Photo, Photos, PointCloud
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
-# The rows of a rectified pair are parallel to its base, so photos above each other are no pair.
+# Limit of the angle between base and rows: the rows of a rectified pair are parallel to its base,
+# so photos one above the other cannot be paired.
 _ALONG_ROWS: Final = np.cos(np.radians(30.0))
+# Minimum angle between the base and the optical axis.
 _SIDEWAYS: Final = np.sin(np.radians(25.0))
+# Maximum angle between the optical axes.
 _SAME_VIEW: Final = np.cos(np.radians(30.0))
-# Parallax as a share of the photo width. Image blocks are usually flown with 70 % overlap; below 50
-# %, the photos look too different, and much shorter bases give inaccurate depths.
+# Parallax as a share of the photo width. Image blocks are usually flown with 70 % overlap; with
+# less than 50 %, photos look too different, and with a very short base, depths are inaccurate.
 _BEST_PARALLAX: Final = 0.3
 _LEAST_PARALLAX: Final = 0.05
 _MOST_PARALLAX: Final = 0.5
@@ -43,8 +46,8 @@ class DenseSgm(Method):
     Each photo is paired with the photo to its right that has a similar viewing direction and an
     overlap closest to 70 %. The base must be within 30 deg of the photo's rows and at least 25 deg
     off its axis, the axes within 30 deg of each other, and the overlap 50 to 95 %. Points take the
-    colour of the left photo. Each pair is one scan, with the projection centre of the left photo as
-    its station. Photos above each other are not matched.
+    colour of the left photo. Each pair becomes one scan, whose station is the projection centre of
+    the left photo. Photos one above the other are not matched.
     """
 
     id: ClassVar[str] = "dense.sgm"
@@ -203,7 +206,7 @@ def _matched(
     ]
     reach = abs(p2[0, 3])
     most, least = (int(reach / distance) for distance in (params.nearest_m, params.farthest_m))
-    # A multiple of 16, small enough that pixels to match remain.
+    # OpenCV requires a multiple of 16; it must be small enough to leave pixels to match.
     n_disparities = 16 * min(-(-(most - least) // 16), (size[0] - least - _BLOCK_PX) // 16 - 1)
     if n_disparities < 16:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8), size[0] * size[1]

@@ -33,15 +33,17 @@ from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_sh
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
 
-# Neighbouring cells whose true depths differ by more are a depth step, reported separately.
+# Neighbouring cells whose true depths differ by more form a depth step; errors there are reported
+# separately.
 _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
 # A multiple of the patch size (32 cells), large enough that little is lost at the borders.
 BLOCK_CELLS: Final = 96
-# Limits for all walls together: cells with a colour comparison, and with a visibility test.
+# Maximum number of cells, on all walls together, whose colour is compared.
 _COLOUR_CELLS: Final = 250_000
+# Maximum number of cells, on all walls together, whose visibility is tested.
 _SEEN_CELLS: Final = 600_000
-# Maximum number of errors kept of all walls together, 32 bytes each; the standard error of the
+# Maximum number of errors kept, on all walls together (32 bytes each). The standard error of the
 # median of so many values is 1/2000 of their spread.
 _KEPT_ERRORS: Final = 1 << 23
 # Multiples of these numbers, modulo 1, are spread evenly (R2 sequence, Roberts 2018).
@@ -126,14 +128,14 @@ class WallSamples:
 
     Attributes:
         depth_m: (n,) measured minus true depth, away from true depth steps.
-        sigma_m: (n,) predicted standard deviation of each; NaN if unknown.
+        sigma_m: (n,) predicted standard deviation of each depth; NaN if unknown.
         step_depth_m: (m,) the same error within 2 cells of a true depth step.
         colour: (c,) mean square error of a painted cell over the three channels, away from steps.
         shift_m: (p, 2) displacement of patches along u and v, measured minus true position.
         shift_cells: (p, 2) the same in cells.
-        n_seen: cells with a visibility test whose true surface is seen from a station.
-        n_seen_painted: painted cells among `n_seen`.
-        n_seen_shown: painted or filled cells among `n_seen`.
+        n_seen: number of tested cells whose true surface is visible from a station.
+        n_seen_painted: number of painted cells among these.
+        n_seen_shown: number of painted or filled cells among these.
     """
 
     depth_m: NDArray[np.float64]
@@ -183,7 +185,7 @@ def wall_errors(
         wall: the wall.
         true: the true orthoimage.
         chosen: cells whose colour is compared, and cells with a visibility test.
-        inner: rows to compare, whole patches; the other rows are a margin.
+        inner: rows to compare, a multiple of the patch size; the other rows are a margin.
         error_step: every nth depth error is kept.
     """
     known = true.rectangle >= 0
@@ -218,7 +220,7 @@ def wall_errors(
 
 
 def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return cells within 2 cells of a true depth step or of the border of the surface."""
+    """Return a mask of cells within 2 cells of a true depth step or the border of the surface."""
     import cv2
 
     # Replace missing depths by a very large one, so that the border of the surface is a step, too.
@@ -236,9 +238,10 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool) -> list[Finding]:
-    """Return metrics of the cells of one wall, or of all walls (wall -1); empty without samples.
+    """Return metrics of the cells of one wall, or of all (wall -1); empty if there are none.
 
-    Displacements get a prefix if they are also computed from the cameras, which is more accurate.
+    Displacements of patches get a prefix if displacements are also computed from the cameras, which
+    is more accurate.
     """
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
     numbers = (
@@ -262,7 +265,7 @@ def _square_errors(
 
 
 def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
-    """Return displacements of patches, measured with known cells away from steps."""
+    """Return displacements of patches, measured on known cells away from steps."""
     painted = is_painted(image.mask)
     filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any plausible error.

@@ -64,7 +64,7 @@ from orthoflow_plugins.inspect.point_doubts import (
 )
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
-# Maximum number of unused points that are logged.
+# Maximum number of unused points to log.
 _MAX_LOGGED: Final = 200
 MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
@@ -89,15 +89,15 @@ class InspectCheckpoints(Method):
 
     A point is used if its position was measured (in cells or in metres, see `read.checkpoints`), if
     a black and white quadrant target is recognised there, or, in a simulated room, if its
-    surroundings are found by means of the true scene. Without orthoimages, the points are searched
-    in the intensity of the walls. RMS and standard deviation are those of the lengths of the
-    residuals. A point is an outlier if its residual exceeds twice the RMS of all points (`once`,
-    the rule to compare) or of the remaining points (`iterated`, which removes at most a quarter of
-    the points; `iterated_capped` if it reaches that limit). Metrics of a class of points (flat,
-    vertical ...) have the class as a prefix. `x` points right along u, `y` down along v; residuals
-    are the shown minus the surveyed position. `length_error_..._share` are relative errors of
-    distances between points of a wall. Targets are also compared in space (`3d`): they are
-    projected onto the plane through the depths around them.
+    surroundings, rendered from the true scene, are found. Without orthoimages, the points are
+    searched for in the intensity of the walls. RMS and standard deviation are those of the lengths
+    of the residuals. A point is an outlier if its residual exceeds twice the RMS of all points
+    (`once`, the rule to compare) or of the remaining points (`iterated`, which removes at most a
+    quarter of the points; `iterated_capped` if it reaches that limit). Metrics of a class of points
+    (flat, vertical ...) have the class as a prefix. `x` points right along u, `y` down along v;
+    residuals are the shown minus the surveyed position. `length_error_..._share` are relative
+    errors of distances between points of a wall. Targets are also compared in 3D (`3d`), with their
+    positions on the plane through the depths around them.
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
@@ -132,7 +132,7 @@ class InspectCheckpoints(Method):
         )
 
     class In(Ports):
-        """The surveyed points, and the images in which they are searched."""
+        """The surveyed points, and the images in which they are searched for."""
 
         checkpoints: CheckPoints
         walls: Walls

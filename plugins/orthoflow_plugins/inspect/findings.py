@@ -30,13 +30,14 @@ lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "hig
 _AXES: Final = ("x", "y")
 # Largest share of the points that the iterated rule may remove.
 _OUTLIERS_MOST: Final = 0.25
-# Maximum share of points that the rule without the cap removes.
+# Maximum share of points that the iterated rule would remove without the cap.
 _MOST_WITHOUT_CAP: Final = 0.5
-# Shorter distances between check points depend on single points more than on the scale.
+# Minimum length of a distance between check points, as a share of the longest one. Shorter
+# distances depend more on single points than on the scale.
 _LENGTH_LEAST_SHARE: Final = 0.25
-# If a wall has more points, every nth is used, since the number of pairs grows with the square.
+# If a wall has more points, every nth is used, since the number of pairs is quadratic.
 _POINTS_MOST: Final = 1000
-# Suffix of metrics of the iterated rule where it reached the cap.
+# Suffix of the metrics of the iterated rule if it reached the cap.
 CAPPED: Final = "_capped"
 # Metrics of displacements, check points, and the orthoimage itself.
 DISPLACEMENTS: Final = (
@@ -82,7 +83,7 @@ IMAGE_QUALITY: Final = (
     lower("stretch_share", label="cells smeared over steep relief"),
     lower("smear_share", label="cells smeared along edges"),
 )
-# Metrics that are reported for every wall; the record contains all others.
+# Metrics that are reported for every wall; all others are only in the record.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 
 
@@ -190,12 +191,12 @@ def length_findings(
 
 
 def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which lengths (n,) exceed twice the RMS of all."""
+    """Return a mask (n,) of the lengths that exceed twice the RMS of all lengths."""
     return length_m > 2.0 * rms(length_m)
 
 
 def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which lengths (n,) exceed twice the RMS of the lengths that do not.
+    """Return a mask (n,) of the lengths that exceed twice the RMS of all other lengths.
 
     At most a quarter of the lengths are removed. If there are two kinds of points, such as points
     at edges and points on flat parts, the iteration would continue until it has removed the worse
@@ -205,7 +206,7 @@ def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def cap_binds(length_m: NDArray[np.float64]) -> bool:
-    """Return whether the cap stops the iterated rule before it would end."""
+    """Return whether the iterated rule stops at the cap."""
     n_most = math.floor(_OUTLIERS_MOST * len(length_m))
     n_capped, n_all = (
         count_true(_iterated(length_m, share)) for share in (_OUTLIERS_MOST, _MOST_WITHOUT_CAP)
@@ -224,7 +225,7 @@ def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
 
 
 def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[MetricSpec, ...]:
-    """Return copies of metrics for another subject, which are not headline metrics.
+    """Return copies of metrics for another subject; the copies are not headline metrics.
 
     Args:
         specs: the metrics.
@@ -274,7 +275,7 @@ def report(
     Args:
         findings: findings of walls, and of all walls together (wall -1).
         main: index of the main wall.
-        numbers: index of a wall -> position of its plane.
+        numbers: position of the plane of each wall, by index of the wall.
         ctx: context that receives the metrics.
     """
     per_wall = {finding.name for finding in findings if finding.wall >= 0}

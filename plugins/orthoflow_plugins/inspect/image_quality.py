@@ -3,10 +3,10 @@
 These are completeness, the share of filled cells, sharpness, and the shares of stretched areas.
 
 Sharpness is measured at edges in the image: their width, and the MTF that follows from their
-profile. A photo covers a surface that it sees at a grazing angle with few pixels, which are then
-stretched over many cells, as skarlatos2012 describes for vertical surfaces. The pixel of a cell
-follows from the depths of the wall and the camera, so the distance between the pixels of
-neighbouring cells is known exactly, independent of the image content.
+profile. A surface that a photo sees at a grazing angle covers few pixels, which are then stretched
+over many cells, as skarlatos2012 describes for vertical surfaces. The pixel of a cell follows from
+the wall's depths and the camera, so the distance between the pixels of neighbouring cells is known
+exactly, whatever the image shows.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from orthoflow.products import (
 from orthoflow_plugins.inspect.findings import findings_of
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
-# A pixel is stretched, or smeared, if it covers more cells than this in its longest direction.
+# A pixel is stretched if it covers more cells than this in its longest direction.
 _STRETCHED_CELLS: Final = 2.0
+# A pixel is smeared if it covers more cells than this.
 _SMEARED_CELLS: Final = 5.0
 # Maximum number of cells per photo that are tested.
 _ASKED_MOST: Final = 200_000
@@ -95,7 +96,7 @@ def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
     Args:
         image: the orthoimage.
         wall: its wall, on the same grid.
-        cameras: cameras of its photos; without them, stretched areas are not computed.
+        cameras: cameras of its photos; if None, stretched areas are not computed.
     """
     share = count_cells(image.mask, OrthoMask.FILLED) / max(1, n_shown(image))
     return [
@@ -133,10 +134,11 @@ def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
 
 
 def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
-    """Compute the shares of stretched and smeared cells; empty without cameras.
+    """Compute the shares of stretched and smeared cells; empty if there are no cameras.
 
     In stretched cells (`stretch_share`), a pixel of the photo covers more than two cells in some
-    direction; in smeared ones (`smear_share`) more than five, or the surface is seen from behind.
+    direction; in smeared cells (`smear_share`), it covers more than five, or the surface is seen
+    from behind.
 
     Args:
         image: the orthoimage.
@@ -175,7 +177,7 @@ def cells_per_pixel(
     if name not in image.sources:
         return np.zeros(0)
     rows, columns = np.divmod(_asked_cells(image, wall, name), image.frame.width)
-    # Compute relative to the frame: float64 loses digits at survey coordinates.
+    # Compute relative to the frame, because float64 loses precision with survey coordinates.
     near = replace(image.frame, origin_world=np.zeros(3))
     moved = viewing.shifted(image.frame.origin_world)
     depth = wall.depth_m[rows, columns].astype(np.float64)
@@ -221,7 +223,7 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
     # A single row or column has no gradient.
     if not image.valid.any() or min(image.valid.shape) < 2:
         return np.zeros((0, _ALONG.size))
-    # Fill voids with the nearest value, so that they create no edges and do not affect profiles.
+    # Fill voids with the nearest value, so that they neither create edges nor affect profiles.
     grey = _closed(image)
     smooth = gaussian_filter(grey, 1.0)
     down, right = (np.asarray(part) for part in np.gradient(smooth))
@@ -263,8 +265,9 @@ def _closed(image: GreyImage) -> NDArray[np.float64]:
 
 
 def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return profiles shifted so that their middle is centred."""
-    # The area above the profile gives the edge position from all samples, not just the middle two.
+    """Return profiles shifted so that their edges are centred."""
+    # Computed from the area above the profile, the edge position depends on all samples and not
+    # just on the middle two.
     reach = along[-1]
     offset = reach - np.sum(profiles[:, :-1] + profiles[:, 1:], axis=1) * 0.5 * _STEP_CELLS
     moved = [

@@ -1,4 +1,4 @@
-"""Pair SURF key points of two images on the same grid, and refine them to sub-pixel accuracy."""
+"""Pair SURF key points of two images on the same grid, and refine them with sub-pixel accuracy."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ _AGREEING: Final = 2
 _AGREEING_SHARE: Final = 0.25
 _AGREE_CELLS: Final = 1.0
 _SURF_THRESHOLD: Final = 0.1
-# Larger images are processed in tiles, each needing about 2 GB with its margin, which holds the
-# support of the widest key points.
+# Larger images are processed in tiles with a margin for the support of the widest key points; a
+# tile needs about 2 GB of memory.
 _WHOLE_CELLS: Final = 1 << 24
 _TILE_CELLS: Final = 3072
 _RIM_CELLS: Final = 512
@@ -107,7 +107,7 @@ def _pairs_of_tile(
     images = [cells.cut((rows, columns)) for cells in (shown, reference)]
     first, second = in_order(_levelled, images, threads=threads)
     share = images[0].grey.size / math.prod(shown.shape)
-    # SURF of two tiles at once would need too much memory.
+    # Processing two tiles at once would need too much memory.
     key_points = partial(_key_points, n_most=round(share * _n_most(shown.shape)))
     one, other = in_order(key_points, (first, second), threads=threads if is_whole else 1)
     matches = _matches(one, other, radius_cells)
@@ -132,7 +132,7 @@ def _n_most(shape: tuple[int, int]) -> int:
 
 
 def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which pairs agree with enough of their nearest neighbours; chance matches do not."""
+    """Return a mask of pairs that agree with enough neighbours, unlike chance matches."""
     from scipy.spatial import cKDTree
 
     n_near = min(_NEIGHBOURS, len(places) - 1)
@@ -140,7 +140,7 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
         return np.zeros(len(places), dtype=np.bool_)
     away, near = cKDTree(places).query(places, k=n_near + 1)
     apart = np.linalg.norm(shift[near] - shift[:, None], axis=2)
-    # Very close pairs are the same point found at several scales, and do not count.
+    # Very close pairs are the same point, found at several scales, and do not count as neighbours.
     agrees = (apart <= _AGREE_CELLS) & (away > _WITNESS_CELLS)
     # Repeated texture can make two or three neighbours wrong in the same way, but not a quarter of
     # them.
@@ -252,7 +252,7 @@ def _descriptor_distances(
 def _clear_winners(
     owner: NDArray[np.int64], apart: NDArray[np.float64], n_owners: int
 ) -> NDArray[np.bool_]:
-    """Return which pairs are the nearest of their point and pass the ratio test."""
+    """Return a mask of the pairs that are the nearest of their point and pass the ratio test."""
     order = np.lexsort((apart, owner))
     starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
     nearest = np.full(n_owners, np.inf)

@@ -27,13 +27,14 @@ if TYPE_CHECKING:
 _MAX_SAMPLES: Final = 1 << 24
 # Maximum depth of a recess in the scene.
 _BEHIND_MOST_M: Final = 2.0
-# A recess belongs to a wall if this share of the cells around it is the face of the wall.
+# A recess belongs to a wall if at least this share of the cells around it (within this number of
+# cells) is the face of the wall.
 _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
 # An outline matches an opening if their intersection over union (IoU) is at least this.
 _SAME_IOU: Final = 0.5
-# The true border is searched this far on both sides of an outline, in these steps, along this
-# number of lines.
+# The true border is searched for this far on both sides of an outline, at these intervals, along
+# this number of lines.
 _REACH_CELLS: Final = 10.0
 _STEP_CELLS: Final = 1.0 / 16.0
 _LINES: Final = 33
@@ -45,9 +46,9 @@ class InspectOpenings(Method):
     """Compare outlines of openings with the recesses of a simulated scene.
 
     True openings are the connected areas of a wall where rays perpendicular to it hit a surface
-    deep enough behind it. An outline matches the opening with which its IoU is at least one half;
-    walls with more than 17 million cells are sampled more coarsely for this. Each side that the
-    scan saw is compared with the border of the recess along rays a sixteenth of a cell apart; an
+    deep enough behind it. An outline matches an opening if their IoU is at least one half; to
+    compute it, walls with more than 17 million cells are sampled more coarsely. Each side that was
+    scanned is compared with the border of the recess along rays a sixteenth of a cell apart; an
     error is positive if the outline is too large.
     """
 
@@ -95,7 +96,7 @@ class InspectOpenings(Method):
         walls: Walls
 
     class Out(Ports):
-        """The verdict."""
+        """The errors of the outlines."""
 
         inspection: Inspection
 
@@ -150,7 +151,7 @@ class _TrueWall:
 
     @property
     def frame(self) -> WallFrame:
-        """Return the frame of the raster."""
+        """Frame of the raster."""
         return self.slab.frame
 
     def depths_m(self, places: NDArray[np.float64]) -> NDArray[np.float64]:

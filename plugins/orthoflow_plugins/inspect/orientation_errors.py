@@ -1,6 +1,7 @@
 """True errors of estimated cameras and their ties, which residuals cannot show.
 
-Cameras are compared by position, by angle and on the wall; ties by the true target of their pixels.
+Cameras are compared by position, angle and projection onto the wall, ties by the true targets of
+their pixels.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ _LEAST_COSINE: Final = 0.9
 _WRONG_SIGMAS: Final = 5.0
 # A tie is wrong if its error exceeds this many cells of the wall.
 _WRONG_CELLS: Final = 1.5
-# Number of rays along the longer side of a photo when finding the wall that covers most of it.
+# Number of rays along the longer side of a photo with which the wall that covers most of it is
+# found.
 _RAYS: Final = 32
 
 
@@ -50,11 +52,12 @@ class PoseError:
 
     Attributes:
         photo: name of the photo.
-        status: `ok`, or why it is not oriented; then all other attributes are None.
+        status: `ok`, or the reason why the photo is not oriented; in this case, all other
+            attributes are None.
         centre_m: distance between estimated and true projection centre.
         rotation_deg: angle between estimated and true orientation.
         wall_m: error of one coordinate on the walls, RMS over the visible area; None if the photo
-            shows no wall, infinite if the estimated camera does not look at it.
+            shows no wall, infinite if the estimated camera does not show the wall.
         sigma_wall_m: predicted value of `wall_m`, or None.
     """
 
@@ -93,7 +96,7 @@ def true_camera(truth: Truth, photo: str) -> ViewingCamera:
 def pose_errors(
     cameras: Cameras, walls: Walls, truth: Truth, views: SceneCameras
 ) -> tuple[PoseError, ...]:
-    """Compare each photo's orientation with the truth, on the walls and within their buffer.
+    """Compare each photo's orientation with the truth, on the walls and within their buffers.
 
     Raises:
         MethodError: a photo is not one of the simulated ones.
@@ -156,7 +159,7 @@ def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
 
 
 def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
-    """Compute the shares of wrong ties among all ties and among those the orientation kept."""
+    """Compute the shares of wrong ties among all ties and among those that the orientation kept."""
     ties = cameras.ties
     if ties is None or not len(ties.photo) or not _of_these(ties, walls.walls):
         return []
@@ -175,8 +178,8 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
 def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
     """Return distances (n,) of ties from the true targets of their pixels, in cells of the wall.
 
-    They are measured in the plane of the wall, by the linearised true camera, and are infinite if
-    the true camera does not look towards the point.
+    Distances are measured in the plane of the wall with the linearised true camera; they are
+    infinite if the true camera does not look towards the point.
 
     Raises:
         MethodError: the truth does not contain a photo.
@@ -252,7 +255,7 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
 def _error_on_walls(
     found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
-    """Compare where both cameras project a grid of pixels onto the true surfaces."""
+    """Compare positions of a grid of pixels that both cameras project onto the true surfaces."""
     columns, rows = ((np.arange(n) + 0.5) / n for n in _GRID)
     grid = np.stack(np.meshgrid(columns * true.width, rows * true.height), axis=-1).reshape(-1, 2)
     seen = views.trace(true, grid)
@@ -270,12 +273,12 @@ def _error_on_walls(
     if np.any(facing * ahead <= 0.0):
         return math.inf
     off = camera.centre_world + (ahead / facing)[:, None] * rays - points
-    # The squared length is that of two coordinates; half of it is that of one.
+    # The squared length includes two coordinates; half of it is the mean of one.
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)) / 2.0))
 
 
 def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]:
-    """Return points on a wall: within its raster and buffer, on a surface parallel to it."""
+    """Return a mask of points on a wall: in its raster and buffer, on a surface parallel to it."""
     on_walls = np.zeros(len(seen.points), dtype=np.bool_)
     hit = seen.rectangle >= 0
     for index in range(len(walls.walls)):
@@ -302,7 +305,7 @@ def _scaled(metres: float | None) -> float | None:
 
 
 def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
-    """Return ties (n,) on the wall that covers most of their photo."""
+    """Return a mask (n,) of the ties on the wall that covers most of their photo."""
     most = [
         most_shown(true_camera(truth, name), walls.walls) if (ties.photo == index).any() else -1
         for index, name in enumerate(ties.photo_names)

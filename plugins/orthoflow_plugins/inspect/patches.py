@@ -24,13 +24,13 @@ _AT_ONCE: Final = 2048
 # A patch that moves this far during the refinement was found at a wrong position.
 _STRAYED_CELLS: Final = 2.0
 _CONVERGED_CELLS: Final = 0.002
-# Smoothing correlates neighbouring cells: this many count as one independent observation.
+# Smoothing correlates neighbouring cells, so this many count as one independent observation.
 _CELLS_PER_SAMPLE: Final = 4.0 * np.pi * _SMOOTH_CELLS**2
 _SIGMA_LIMIT_CELLS: Final = 0.15
 
 
 class GreyCells(ABC):
-    """A grey image with valid cells whose parts are computed on request."""
+    """A grey image with a mask of valid cells; its parts are computed on request."""
 
     @property
     @abstractmethod
@@ -69,7 +69,7 @@ class GreyCells(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class GreyImage(GreyCells):
-    """A grey image with valid cells, in memory.
+    """A grey image with a mask of valid cells, in memory.
 
     Attributes:
         grey: (rows, cols) float64.
@@ -152,7 +152,7 @@ class PatchShifts(Rows):
     correlation: NDArray[np.float64]
 
     def within(self, rows: slice) -> PatchShifts:
-        """Return the patches with their centre in a band of rows, relative to its first row."""
+        """Return the patches whose centres are in a band of rows, relative to its first row."""
         first = rows.start or 0
         end = np.inf if rows.stop is None else rows.stop
         own = (self.centre[:, 1] >= first) & (self.centre[:, 1] < end)
@@ -239,8 +239,8 @@ def refine_shifts(
 def _smoothed(image: GreyImage) -> GreyImage:
     """Smooth by a Gaussian of one cell, over valid cells only.
 
-    Cells at the border of the region become invalid, since their neighbours are on one side only,
-    which shifts the mean. Scattered holes do not matter.
+    Cells at the border of the region become invalid, since their neighbours are only on one side
+    and the mean would be shifted. Scattered holes do not matter.
     """
     inside = _gauss(image.region) > _LEAST_REGION
     weight = _gauss(image.valid)

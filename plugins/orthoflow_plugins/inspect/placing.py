@@ -23,7 +23,8 @@ _SAME_DIRECTION_DEG: Final = 2.0
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
     """Return orthoimages whose `wall` is an index of these walls.
 
-    Orthoimages from other programs, and of walls rastered in another step, only refer to a plane.
+    Orthoimages from other programs, and those of walls rastered in another step, only refer to a
+    plane.
 
     Raises:
         MethodError: there is no such wall.

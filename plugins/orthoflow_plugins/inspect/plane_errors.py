@@ -16,10 +16,10 @@ from orthoflow_plugins.inspect.findings import Number, findings_of
 
 _FOUND_ANGLE_DEG: Final = 1.0
 _FOUND_OFFSET_M: Final = 0.015
-# A wall that differs by more does not match a true plane.
+# Maximum differences between a wall and the true plane that it matches.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
-# Scores of labels: their name in metrics and in texts.
+# Names of label scores in metrics and in texts.
 LABEL_SCORES: Final = {"precision": "precision", "recall": "recall", "f1": "F1", "iou": "IoU"}
 MAIN_MISSED: Final = DiagnosticSpec(
     code="main-wall-missed",
@@ -145,7 +145,7 @@ def label_findings(
 ) -> list[Finding]:
     """Compute precision, recall, F1 and IoU of the labels per true plane, matched one to one.
 
-    The result is empty if it is unknown to which points the labels belong. Points that a filter
+    The result is empty if the points to which the labels belong are unknown. Points that a filter
     removed before the detection are ignored.
 
     Args:

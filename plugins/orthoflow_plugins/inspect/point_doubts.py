@@ -12,8 +12,9 @@ from orthoflow.products import CheckPoints, Walls
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
-# Number of unused points listed in a message, and the distance from which it uses metres.
+# Number of unused points listed in a message.
 _NAMED: Final = 4
+# From this distance on, messages use metres.
 _NEAR_M: Final = 1.0
 OWN_POINTS: Final = DiagnosticSpec(
     code="check-points-of-the-image",
@@ -34,7 +35,7 @@ FAR_POINTS: Final = DiagnosticSpec(
 
 
 def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
-    """Return points (n,) whose surveyed coordinates equal those where they were clicked."""
+    """Return a mask (n,) of points whose surveyed coordinates equal the clicked ones."""
     if surveyed.shown_world is None:
         return np.zeros(len(surveyed.names), dtype=np.bool_)
     return np.asarray((surveyed.shown_world == surveyed.points_world).all(axis=1), dtype=np.bool_)
@@ -65,7 +66,7 @@ def report_doubts(
 
 
 def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
-    """Return the distance of a point from its wall if it exceeds the length of the wall, else 0."""
+    """Return the distance of a point from its wall; 0 if it is at most the length of the wall."""
     if picture is None:
         return 0.0
     frame = picture.frame
@@ -89,7 +90,7 @@ def missed_points(
         surveyed: the check points.
         pictures: the images that were searched; at least one.
         walls: the walls of these images.
-        is_simulated: whether points were searched by the true scene, not as targets.
+        is_simulated: whether points were searched for with the true scene and not as targets.
     """
     sought = "nothing similar" if is_simulated else "no black and white quadrant target"
     names = {picture.wall: picture.image.name for picture in pictures}

@@ -25,12 +25,14 @@ from orthoflow_plugins.inspect.targets import find_crossing
 
 How = Literal["measured", "target", "truth", "not found", "outside"]
 
-# Width of the Gaussian weight: the patch around a point counts, not the texture farther away.
+# Width of the Gaussian weight, so that the patch around a point counts, not the texture farther
+# away.
 _FOCUS_CELLS: Final = 5.0
 _LEAST_VALID: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 1.0
-# Targets are not quite flat: the depth of the centre is taken from this share of their radius.
+# Targets are not quite flat, so the depth of the centre is computed within this share of the
+# radius.
 _DEPTH_SHARE: Final = 0.5
 
 
@@ -39,7 +41,7 @@ class ShownPoint:
     """A check point in an image.
 
     Attributes:
-        how: how it was found, or why not.
+        how: how the point was found, or why it was not found.
         wall: index of the wall in `Walls`; -1 if the point is on no wall.
         expected: (2,) column and row of the surveyed position; NaN if the point is on no wall.
         place: (2,) column and row where the image shows it; NaN if not found.
@@ -55,7 +57,7 @@ class ShownPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image in which points are searched.
+    """An image in which points are searched for.
 
     Attributes:
         wall: index of the wall in `Walls`.
@@ -114,7 +116,7 @@ class PointFinder:
         return self._target(picture, expected)
 
     def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
-        """Return the image of a wall by number, or of the wall nearest to the point."""
+        """Return the image of the wall with a number, or of the wall nearest to the point."""
         best, nearest = None, np.inf
         for picture in self.pictures:
             if wall is not None and picture.image.number == wall:
@@ -168,7 +170,7 @@ def find_by_truth(
     buffers_m: tuple[float, float],
     search_cells: int,
 ) -> NDArray[np.float64] | None:
-    """Find where an image shows the surroundings of a point, which are rendered from the scene.
+    """Find a point by its surroundings, which are rendered from the scene.
 
     Args:
         picture: the image to inspect.

@@ -18,7 +18,7 @@ from orthoflow_plugins.inspect.orientation_errors import true_camera
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
-# A cell whose colour comes from farther away shows something else.
+# A cell is wrong if its colour comes from a point farther away than this.
 _FAR_CELLS: Final = 3.0
 
 
@@ -33,9 +33,9 @@ class SourceErrors:
         traced: (rows, cols) bool, cells coloured by an oriented photo.
         expected_m: (rows, cols) predicted error of the orthoimage; None if it has no prediction.
         ghosts: (rows, cols) bool, cells whose pixel shows a free-standing object.
-        n_seen_by_both: cells with a visibility test whose true surface is seen from a station and
-            by a photo.
-        n_seen_painted: painted cells among `n_seen_by_both`.
+        n_seen_by_both: number of tested cells whose true surface is visible from a station and in a
+            photo.
+        n_seen_painted: number of painted cells among these.
     """
 
     frame: WallFrame
@@ -47,7 +47,7 @@ class SourceErrors:
     expected_m: NDArray[np.float32] | None = None
 
     def samples(self, steps: NDArray[np.bool_], error_step: int = 1) -> SourceSamples:
-        """Return the errors for statistics.
+        """Return the errors that are used for statistics.
 
         Args:
             steps: (rows, cols) cells within 2 cells of a true depth step.
@@ -84,11 +84,11 @@ class SourceSamples:
             from true depth steps.
         step_m: (m, 2) the same within 2 cells of a true depth step.
         n_traced: cells coloured by an oriented photo.
-        n_far: traced cells whose pixel has its target more than 3 cells away, or no target.
-        n_ghosts: traced cells whose pixel shows a free-standing object.
-        n_stated: coordinates away from steps with a predicted error.
-        n_within_1_sigma: coordinates whose error is at most the predicted one.
-        n_within_2_sigma: coordinates whose error is at most twice the predicted one.
+        n_far: number of traced cells whose pixel has a target more than 3 cells away, or no target.
+        n_ghosts: number of traced cells whose pixel shows a free-standing object.
+        n_stated: number of coordinates away from steps with a predicted error.
+        n_within_1_sigma: number of coordinates whose error is at most the predicted one.
+        n_within_2_sigma: number of coordinates whose error is at most twice the predicted one.
         n_seen_by_both: as in `SourceErrors`.
         n_seen_painted: as in `SourceErrors`.
     """
@@ -118,7 +118,7 @@ def trace_sources(
 
     The cell's point on the measured surface is projected with the estimated camera, as when the
     orthoimage was made; the ray of that pixel through the true camera meets the true scene, and the
-    position of that point on the wall is compared with that of the cell.
+    position of this intersection on the wall is compared with the position of the cell.
 
     Args:
         image: the orthoimage.
@@ -167,8 +167,8 @@ def trace_sources(
 def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
     """Compute statistics of one wall or of all (wall -1); empty if no photo coloured a cell.
 
-    They cover all cells that show no free-standing object; cells within 2 cells of true depth
-    steps are reported separately.
+    The statistics cover all cells that show no free-standing object; cells within 2 cells of true
+    depth steps are reported separately.
 
     Args:
         samples: errors of the wall, or of all walls.
@@ -211,7 +211,7 @@ def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
 def _seen_by_photos(
     true: TrueOrthoimage, asked: NDArray[np.bool_], truth: Truth, views: SceneCameras
 ) -> NDArray[np.bool_]:
-    """Return the tested cells whose true surface is seen by any photo, oriented or not."""
+    """Return a mask of tested cells whose true surface any photo shows, oriented or not."""
     rows, columns = np.nonzero(asked)
     places = np.column_stack([columns + 0.5, rows + 0.5])
     depths = true.depth_m[rows, columns].astype(np.float64)

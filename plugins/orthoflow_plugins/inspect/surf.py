@@ -50,13 +50,13 @@ from orthoflow_plugins.inspect.key_pairs import find_key_pairs
 from orthoflow_plugins.inspect.patches import GreyImage, IntensityGrey, PatchShifts, unrefined
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
-# The intensity is compared with a copy of itself shifted by this much, in a tile of limited size,
-# to find the accuracy of the comparison.
+# To find the accuracy of the comparison, the intensity is compared with a copy shifted by this
+# much, in a tile of limited size.
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
 _NO_PAIRS: Final = unrefined(*np.zeros((2, 0, 2)))
-# Radius within which a pair is searched, large enough for gross errors.
+# Radius within which the pair of a key point is searched for, large enough for gross errors.
 _RADIUS_CELLS: Final = 40.0
 UNFIT: Final = DiagnosticSpec(
     code="surf-not-inspected",
@@ -70,16 +70,16 @@ class InspectSurf(Method):
 
     This is the inspection of markiewicz2015: SURF key points of both images are paired, and the
     displacements of the pairs are the errors (Table 2), drawn as a map (Figure 25). Both images
-    have the same grid, so pairs are searched within a radius only. Each pair is then refined by
-    least squares, because SURF alone is accurate to about a cell, which is as large as the errors
-    to be measured. Comparing the intensity with a shifted copy of itself gives the best accuracy
-    that the comparison can reach (`floor_`). `x` points right along u, `y` down along v;
-    displacements are the position in the orthoimage minus that in the intensity. Metrics without a
-    prefix describe the first wall, `all_` all walls together, and `surf_` the pairs before the
+    have the same grid, so the pair of a key point is searched for only within a radius. Each pair
+    is then refined by least squares, because SURF alone is accurate to about a cell, which is as
+    large as the errors to be measured. A comparison of the intensity with a shifted copy of itself
+    shows the best accuracy that can be reached (`floor_`). `x` points right along u, `y` down along
+    v; displacements are the position in the orthoimage minus that in the intensity. Metrics without
+    a prefix describe the first wall, `all_` all walls together, and `surf_` the pairs before the
     refinement.
 
     Without laser intensity the comparison is meaningless, since the colours of the scan may come
-    from the same photos: it is then refused or skipped with a warning.
+    from the same photos: in this case, it is refused, or skipped with a warning.
     """
 
     id: ClassVar[str] = "inspect.surf"
@@ -208,7 +208,7 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
 
 
 def _compared(image: Orthoimage, wall: Wall, cameras: Cameras | None, threads: int) -> _Verdict:
-    """Return the pairs of a wall; the rest is computed only if there are enough of them."""
+    """Return the pairs of a wall; all other results are computed only if there are enough pairs."""
     if wall.intensity is None:
         raise MethodError(f"{wall.name} has no intensity to compare with")
     if not n_shown(image):
@@ -231,7 +231,7 @@ def _compared(image: Orthoimage, wall: Wall, cameras: Cameras | None, threads: i
 
 
 def _set_aside(intensity: GreyImage) -> GreyImage:
-    """Return a shifted copy, whose displacements from the original are errors of the comparison."""
+    """Return a shifted copy with which the errors of the comparison are measured."""
     import cv2
 
     right, down = _FLOOR_SHIFT_CELLS

@@ -13,7 +13,8 @@ from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 _ROUNDS: Final = 20
 _CONVERGED_CELLS: Final = 1e-3
 _LEAST_VALID_SHARE: Final = 0.5
-# Least correlation with the image rotated by 180 deg, and with its negative rotated by 90 deg.
+# Minimum correlation of a target with itself rotated by 180 deg, and with its negative rotated by
+# 90 deg.
 _LEAST_ALIKE: Final = 0.6
 _SMOOTH_CELLS: Final = 1.2
 _LEAST_WEIGHT: Final = 0.2
@@ -25,9 +26,9 @@ def find_crossing(
     """Find the centre of a target near a position.
 
     The centre is a saddle point of the smoothed image, first located to a cell where the
-    determinant of the Hessian is lowest. Least squares then move it until the image is symmetric
-    under a rotation by 180 degrees about it: all four edges contribute, and their direction does
-    not matter.
+    determinant of the Hessian is lowest. It is then moved by least squares until the image is
+    symmetric under a rotation by 180 degrees about it; all four edges contribute, and their
+    directions do not matter.
 
     Args:
         picture: grey levels with valid cells.
@@ -53,7 +54,7 @@ def find_crossing(
 
 
 def _window(picture: GreyCells, corner: NDArray[np.int64], side: int) -> GreyImage:
-    """Return a square, invalid beyond the border, with voids filled from their surroundings."""
+    """Return a square with voids filled from their surroundings; invalid beyond the border."""
     part = picture.square(corner, side)
     return _closed(np.where(part.valid, part.grey, 0.0), part.valid)
 

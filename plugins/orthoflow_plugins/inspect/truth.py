@@ -88,11 +88,12 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 _TRACED_POINTS: Final = 4000
-# The true colour of a cell is the mean of this number squared of rays.
+# The true colour of a cell is the mean over n x n rays.
 _SUPERSAMPLE: Final = 3
 # Walls with more cells are compared in bands of this size; a band needs about 1 GB of memory.
 _BAND_CELLS: Final = 1 << 23
-# Figures of large walls show every nth row and column, about this many along the longer side.
+# Figures of large walls show every nth row and column, so that about this many remain along the
+# longer side.
 _DRAWN_CELLS: Final = 1800
 # Metrics of each wall.
 _OF_WALLS: Final = (
@@ -171,25 +172,27 @@ def _needing(ports: tuple[str, ...], *specs: MetricSpec) -> tuple[MetricSpec, ..
 class InspectTruth(Method):
     """Compare with the truth of a simulated scene, cell by cell and patch by patch.
 
-    The true orthoimage is rendered on each wall's own frame: the first surface within the buffer,
-    seen square to the wall. Depths and colours are compared away from true depth steps; a band of 2
-    cells along the steps is reported separately. Displacements come from patches of 32 x 32 covered
-    cells, matched to the truth by least squares. Metrics without a prefix describe the first wall,
-    those with `all_` all walls together. On large walls, colours and patches are compared in evenly
-    spread blocks of 96 x 96 cells, and visibility is tested on a regular lattice of cells; depths
-    and displacements that follow from cameras are compared in every cell. If there are more than
-    eight million errors, statistics are computed from an evenly spread sample.
+    The true orthoimage is rendered in the frame of each wall; it shows the first surface within the
+    buffer, seen perpendicular to the wall. Depths and colours are compared away from true depth
+    steps; a band of 2 cells along the steps is reported separately. Displacements come from patches
+    of 32 x 32 covered cells, matched to the truth by least squares. Metrics without a prefix
+    describe the first wall, those with `all_` all walls together. On large walls, colours and
+    patches are compared in evenly spread blocks of 96 x 96 cells, and visibility is tested on a
+    regular lattice of cells; depths and displacements that follow from cameras are compared in
+    every cell. If there are more than eight million errors, statistics are computed from an evenly
+    spread sample.
 
     With cameras, each photo's orientation is compared with the true one, and the displacement of
     each cell coloured by a photo is computed exactly: the cell's point on the measured surface is
     projected with the estimated camera, and the ray of that pixel through the true camera meets the
     true scene at the point whose colour the cell shows. Displacements of patches then have the
-    prefix `patch_`. Ties that come with the cameras are compared, too: a tie is wrong if it is more
-    than 1.5 cells of the wall from the true target of its pixel. `match_wrong_share` is the share
-    of wrong ties among all, `tie_wrong_share` among those that the orientation kept, and
-    `match_wrong_share_own_wall` among those on the wall that covers most of their photo.
+    prefix `patch_`. The ties stored with the cameras are compared, too. A tie is wrong if it is
+    more than 1.5 cells of the wall from the true target of its pixel. `match_wrong_share` is the
+    share of wrong ties among all ties, `tie_wrong_share` the share among those that the orientation
+    kept, and `match_wrong_share_own_wall` the share among those on the wall that covers most of
+    their photo.
 
-    Without orthoimages, only planes and labels are compared, which suffices to compare plane
+    Without orthoimages, only planes and labels are compared, which is sufficient for plane
     detectors.
     """
 
@@ -275,12 +278,12 @@ class InspectTruth(Method):
         cameras: Cameras | None = None
 
     class Out(Ports):
-        """The verdict."""
+        """The errors found."""
 
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Compare the photos, then wall by wall, then all together."""
+        """Compare the photos, then each wall, then all walls together."""
         if inputs.cloud is not None:
             inputs.cloud.require_points(2)
         if inputs.orthoimages is None or inputs.walls is None:
@@ -393,7 +396,7 @@ def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Judge:
-    """Compares walls one by one; `views` is None without cameras."""
+    """Compares walls one by one; `views` is None if there are no cameras."""
 
     inputs: InspectTruth.In
     walls: Walls
@@ -402,7 +405,7 @@ class _Judge:
     ctx: StepContext
 
     def verdict_on(self, image: Orthoimage) -> _Verdict:
-        """Compare one wall, a large one in bands of whole blocks with a margin of one block."""
+        """Compare one wall; large walls are compared in bands of whole blocks, with a margin."""
         wall = wall_of(image, self.walls, in_files(self.ctx, f"{image.wall}.laid"))
         n_painted = sum(count_cells(image.mask, state) for state in PAINTED_STATES)
         cell_step = max(1, n_painted // _TRACED_POINTS)
@@ -422,7 +425,7 @@ class _Judge:
         )
 
     def _of_band(self, image: Orthoimage, wall: Wall, band: Band, cell_step: int) -> _Verdict:
-        """Compare a band of rows; the result has a limited size however large the wall is.
+        """Compare a band of rows; the size of the result is limited, however large the wall is.
 
         Args:
             image: orthoimage of the whole wall.

@@ -1,4 +1,4 @@
-"""Channels: features of a picture that are the same in other spectral bands, and their texture.
+"""Channels: features of a picture that look the same in other spectral bands, and their texture.
 
 The main channels are dense oriented gradients (after Ye et al. 2019, CFOG): the gradient strength
 in several directions, smoothed and normalised locally. A light joint on dark stone and a dark joint
@@ -24,9 +24,9 @@ from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
-# Gaps between joined cells are filled, as in rasters, if no disc of this radius fits into them.
+# As in rasters, gaps between joined cells are filled if no disc of this radius fits into them.
 _GAP_CELLS: Final = 2
-# Number of cells joined at once; takes about 100 MB.
+# Number of cells joined at once; they need about 100 MB of memory.
 _CELLS_AT_ONCE: Final = 1 << 22
 
 
@@ -93,8 +93,7 @@ def _join(
     measured = blocks.of(wall.mask) == SurfaceMask.MEASURED
     depths_m = np.where(measured, blocks.of(wall.depth_m), np.float32(np.nan))
     n_known = np.isfinite(depths_m).sum(axis=2)
-    # The lower median, which is a measured depth and never between two surfaces; NaN is sorted
-    # last.
+    # The lower median is a measured depth and never between two surfaces; NaN is sorted last.
     middle = np.maximum(n_known - 1, 0) // 2
     depth_m = np.take_along_axis(np.sort(depths_m, axis=2), middle[:, :, None], axis=2)
     on_surface = np.abs(depths_m - depth_m) <= layer_m
@@ -160,12 +159,13 @@ _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
-# The depths around a cell form a relief step if they differ by more than this many cells and this
-# many point spreads; nine depths of a smooth surface differ by three spreads, rarely by five.
+# The depths around a cell form a relief step if they differ by more than this many cells and by
+# more than this many point spreads. The nine depths around a cell of a smooth surface differ by
+# about three spreads, and rarely by five.
 _STEP_CELLS: Final = 1.0
 _STEP_SPREADS: Final = 6.0
 # A surface consists mainly of relief if more than this share of the cells in a window of this width
-# is next to steps: 0.06 to 0.11 in rooms with mouldings, 0.21 on a carved fountain.
+# is next to steps. The share is 0.06 to 0.11 in rooms with mouldings and 0.21 on a carved fountain.
 _RELIEF_CELLS: Final = 121
 _RELIEF_SHARE: Final = 0.16
 # Minimum distance between textured positions; these are taken in turn from the cells of a grid.
@@ -232,7 +232,7 @@ def colour_channels(colours: NDArray[np.float32]) -> Channels:
 
 @dataclass(frozen=True)
 class WallTarget:
-    """A wall to match photos with; its gradients and grey values are computed when needed.
+    """A wall with which photos are matched; gradients and grey values are computed when needed.
 
     Attributes:
         wall: the wall.
@@ -268,11 +268,10 @@ class WallTarget:
 def _at_steps(wall: Wall) -> NDArray[np.bool_]:
     """Find the cells (rows, cols) next to a relief step.
 
-    The position of the edge within a cell is unknown, and the cell contains points of both sides,
+    The position of the edge within a cell is unknown, and the cell contains points from both sides,
     so the edge in the picture is displaced by part of a cell. An oblique photo shows the face of
-    the step or does not show the area behind it. Steep slopes are not steps. Where steps are
-    everywhere, as on carved stone, their cells are not excluded, since too few would be left to
-    compare.
+    the step or misses the area behind it. Steep slopes are not steps. Where steps are everywhere,
+    as on carved stone, their cells are not excluded, since too few would be left to compare.
     """
     import cv2
 
@@ -285,7 +284,7 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
         # Deviation from the line between the two neighbours; NaN next to void cells.
         off_m = np.abs(depth_m[:-2] - 2.0 * depth_m[1:-1] + depth_m[2:])
         found[1:-1] |= off_m > 0.5 * step_m
-    # Where no depth is near, both are infinite.
+    # Where there is no depth nearby, both are infinite.
     with np.errstate(over="ignore"):
         beside = known & bent & (high - low > step_m)
     n_beside, n_known = (
@@ -301,7 +300,7 @@ def least_step_m(wall: Wall) -> float:
 
 
 def grain_of(wall: Wall) -> NDArray[np.float32]:
-    """Return the number of cells per measured cell around each cell (rows, cols), at least 1.
+    """Return the number of cells per measured cell around each cell (rows, cols); at least 1.
 
     Filled cells are interpolated from measured ones and share their errors, so they add no
     information.
@@ -315,7 +314,7 @@ def grain_of(wall: Wall) -> NDArray[np.float32]:
 
 
 def texture(channels: Channels) -> NDArray[np.float32]:
-    """Return how well the patch of each cell (rows, cols) determines a displacement.
+    """Return a measure (rows, cols) of how well the patch of each cell determines a displacement.
 
     The measure is the smaller eigenvalue of the second moments of the gradients in the patch (Shi &
     Tomasi 1994).
@@ -370,7 +369,7 @@ def _gradient(
 
 
 def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Select cells away from void areas, since filling these may create edges."""
+    """Select cells away from void areas, since filling void areas may create edges."""
     import cv2
 
     kernel = np.ones((2 * _MARGIN_CELLS + 1, 2 * _MARGIN_CELLS + 1), dtype=np.uint8)

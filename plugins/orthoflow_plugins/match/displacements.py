@@ -26,7 +26,7 @@ _CONVERGED_CELLS: Final = 0.002
 _MAX_STEP_CELLS: Final = 0.7
 _MIN_KNOWN_SHARE: Final = 0.3
 _RIDGE: Final = 1e-3
-# Neighbouring cells of a search are correlated: there is one independent cell per this many.
+# In a search, neighbouring cells are correlated, so this many count as one independent cell.
 _INDEPENDENT: Final = 1.5
 
 
@@ -47,10 +47,11 @@ def search_shifts(
         first: (rows, cols, c) float32.
         second: (rows, cols, c) float32, or (rows, cols, 3) for combinations.
         places: (n, 2) int64 (column, row), at least half + radius cells from the border.
-        reach: half, radius: patches are 2 half + 1 cells wide, shifts up to the radius are tried.
-        found: (n, 4) float64, filled with the shift (across, down), its correlation, and the
-            difference to the highest correlation away from it, -1 at the border of the search area;
-            for combinations (n, 7), also filled with the gains of the three channels.
+        reach: half, radius: patches are 2 half + 1 cells wide, and shifts up to the radius are
+            tried.
+        found: (n, 4) float64, filled with the shift (across, down), its correlation, and the lead
+            of this correlation over the highest one away from it (-1 at the border of the search
+            area); for combinations (n, 7), also filled with the gains of the three channels.
     """
     side, is_mixed = 2 * reach[1] + 1, found.shape[1] == 7
     scores, gains = np.empty(side * side), np.empty(3)
@@ -71,7 +72,7 @@ def search_shifts(
 
 @kernel_part
 def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
-    """Fill in the shift with the highest of (side^2,) scores, the score, and its lead."""
+    """Fill in the shift with the highest score (of side^2), this score, and its lead."""
     side = round(math.sqrt(scores.shape[0]))
     top = 0
     for k in range(side * side):
@@ -83,7 +84,7 @@ def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
     found[2] = scores[top]
     found[3] = -1.0
     if 0 < down < side - 1 and 0 < across < side - 1:
-        # Without other shifts, the difference is that to the lowest possible correlation.
+        # If there are no other shifts, the lead is that over the lowest possible correlation.
         elsewhere = -1.0
         for k in range(side * side):
             if max(abs(k // side - down), abs(k % side - across)) > 2:
@@ -180,9 +181,8 @@ def match_patches(
         places: (n, 2) int64 (column, row) of the patches' centres in the first picture.
         window: (p, p) float64 weights of a patch's cells.
         patch: scratch arrays: (p, p), (p + 3, p, c) and (p, p, c) float64.
-        found: (n, 4) float64: the shift (across, down), refined in place; then filled with the
-            standard deviation of a coordinate for independent cells (inf if undetermined) and the
-            correlation.
+        found: (n, 4) float64: the shift (across, down), refined in place; the standard deviation of
+            a coordinate for independent cells (inf if undetermined), and the correlation.
     """
     weight, lines, moved = patch
     least = 0.0
@@ -286,7 +286,7 @@ def _improvement(
     """Return a Gauss-Newton step (down, across), its standard deviation, and the correlation."""
     side, n_channels = len(weight), values.shape[2]
     top, left = place[0] - side // 2, place[1] - side // 2
-    # Sums of products of a (reference), b (moved), x and y (slopes across and down).
+    # Sums of products; a: reference, b: moved patch, x and y: slopes across and down.
     saa, sab, sbb, nxx, nxy, nyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     sax, say, sbx, sby = 0.0, 0.0, 0.0, 0.0
     for k in range(n_channels):
@@ -328,7 +328,7 @@ CORRELATION_AREA_CELLS: Final = 6.0
 """Residuals of smoothed pictures are correlated: there is one independent cell per this many."""
 _MAX_DRIFT_CELLS: Final = 1.5
 _MAX_DISAGREEMENT_CELLS: Final = 0.5
-# Margin of patches that are cut out, for the drift and the neighbours used in interpolation.
+# Margin of cut-out patches, for their drift and for the neighbours used in interpolation.
 _CUT_MARGIN_CELLS: Final = 6
 
 
@@ -371,7 +371,7 @@ def measure(
         places: (column, row) cells of the first picture.
         radius_cells: search radius.
         min_score: minimum correlation. The default of 0.35 is half that of correct positions; it
-            may be lower if there are many patches that are checked by their neighbours.
+            can be lower if there are many patches, which are checked against their neighbours.
         min_distinct: minimum difference between the best correlation and the next peak.
         threads: number of threads.
     """
@@ -435,7 +435,7 @@ def _cut_out(
 def _well_known(
     first: Channels, second: Channels, places: NDArray[np.intp], radius_cells: int
 ) -> NDArray[np.intp]:
-    """Select positions with a search area inside the pictures and a mostly known patch."""
+    """Select positions whose search area is inside the pictures and whose patch is mostly known."""
     import cv2
 
     reach = radius_cells + HALF_PATCH_CELLS + 2
@@ -457,7 +457,7 @@ def _refined(
 ) -> Displacements:
     begun = found[:, :2]
     forth, sigma_forth, score = _matched(first, second, places, begun, threads)
-    # Half the difference of both directions, so that effects of interpolation cancel out.
+    # Use half the difference of both directions, so that effects of interpolation cancel out.
     middle = np.rint(forth).astype(np.intp)
     back, sigma_back, _ = _matched(second, first, places + middle, -forth, threads)
     shifts = 0.5 * (forth - back)

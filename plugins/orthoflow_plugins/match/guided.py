@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace
     from orthoflow_plugins.match.warping import Before
 
-# Points of the cloud with fewer neighbours are outliers and do not hide anything, as in `ortho`.
+# As in `ortho`, points of the cloud with fewer neighbours are outliers and hide nothing.
 _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
@@ -39,12 +39,12 @@ class MatchGuided(Method):
 
     Only the visible part of a wall is searched, within a small radius (an extension of the mask of
     markiewicz2015). Oriented gradients, grey values and combinations of the photo's colours are
-    compared, since laser and camera have different wavelengths; each photo keeps the channels with
-    the smallest held-out error for their number and spread. Cells finer than the point spacing are
-    joined. Patches at relief steps are excluded and, if the cloud is connected, those hidden by
-    objects in front of the walls. The pose is estimated again and the photo projected again until
-    held-out ties no longer improve. Photos without a pose are first matched with the other photos
-    projected onto the walls; if that fails, they get no ties.
+    compared, since laser and camera have different wavelengths; for each photo, the channels are
+    used whose ties have the smallest held-out error in relation to their number and spread. Cells
+    finer than the point spacing are joined. Patches at relief steps are excluded and, if the cloud
+    is connected, those hidden by objects in front of the walls. The pose is estimated again and the
+    photo projected again until held-out ties no longer improve. Photos without a pose are first
+    matched with the other photos, projected onto the walls; if that fails, they get no ties.
     """
 
     id: ClassVar[str] = "match.guided"
@@ -84,7 +84,7 @@ class MatchGuided(Method):
     )
 
     class Params(MethodParams):
-        """How positions are matched, and number of ties."""
+        """The preset, the limit of the ratio test, and the number of ties."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",

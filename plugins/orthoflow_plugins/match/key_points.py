@@ -26,7 +26,7 @@ from orthoflow_plugins.match.pictures import CLIP_LIMIT, equalised, wall_picture
 
 # A photo is first matched at this size, which is then doubled until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
-# These numbers of key points of a photo and of each wall are enough to recognise the walls.
+# These numbers of key points in a photo and on each wall are enough to recognise the walls.
 _FIRST_IN_PHOTO: Final = 3000
 _FIRST_ON_WALL: Final = 4000
 # Tolerance relative to the photo's diagonal, since a homography is approximate on relief.
@@ -41,11 +41,11 @@ MIN_AGREEING: Final = 8
 """Minimum number of matches with a common homography to recognise a wall."""
 _SEED: Final = 1
 _MAX_RATIO: Final = 0.85
-# Several matches in a square of this side length count as one.
+# Several matches within a square of this side length count as one.
 _PLACE_PX: Final = 2.0
 
-# Descriptors are invariant to the strength of contrast, but not to its sign. If the brightness of
-# materials differs between laser and photo, half of the edges may be inverted; a combination of the
+# Descriptors are invariant to the strength of contrast, but not to its sign. If materials have
+# different brightness in laser and photo, half of the edges may be inverted; a combination of the
 # photo's colours may restore most of the signs. The combination with the most matches is used.
 MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
     "green less red": (-1.0, 1.0, 0.0),
@@ -59,11 +59,11 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
 # In rooms with inverted contrast, up to 15 matches agreed on a wrong position, and 19 in one case.
 # A mixture needs more than 15 matches, since several are tried.
 LEAST: Final = 16
-# With this many matches, no other mixture is tried, nor matching by structure.
+# With this many matches, neither other mixtures nor matching by structure are tried.
 CLEARLY: Final = 24
 # Mixtures are only used to find the approximate position, so a reduced resolution is enough.
 _LONGEST_SIDE_PX: Final = 2000
-# Mixtures with a smaller contrast, as of photos without colours, are not tried.
+# Mixtures with less contrast, such as those of photos without colours, are not tried.
 _MIN_GREY_LEVELS: Final = 8.0
 
 
@@ -124,7 +124,7 @@ class PhotoPairs:
         pairs: one per wall with matches.
         radius_px: radius of the guided matching; matches with a wrong homography are evenly
             distributed within it.
-        is_mirrored: whether the mirrored photo matches better; then no wall counts as shown.
+        is_mirrored: whether the mirrored photo matches better; if so, no wall counts as shown.
         n_recognised: number of inliers before the guided matching.
         picture: "grey" or name of the mixture.
     """
@@ -211,7 +211,7 @@ def pair_in_colours(
         params: parameters of the matching.
 
     Returns:
-        The matches of the picture with the most inliers: grey, unless a mixture has more.
+        The matches of the picture with the most inliers, which is grey unless a mixture has more.
     """
     best = pair_photo(photo_grey(photo), walls, params)
     if best.n_recognised >= CLEARLY:

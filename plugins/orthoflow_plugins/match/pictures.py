@@ -12,7 +12,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photos, Wall, Walls
 
-# Maximum number of threads; each needs up to a gigabyte for its picture.
+# Maximum number of threads; each needs up to a gigabyte of memory for its picture.
 _MAX_AT_ONCE: Final = 4
 CLIP_LIMIT: Final = 3.0
 """Limit of local contrast equalisation (CLAHE)."""
@@ -76,7 +76,7 @@ def wall_picture(
     low, high = np.percentile(wall.intensity[known], (0.5, 99.5))
     scaled = (wall.intensity - low) / max(float(high - low), 1e-9)
     filled = filled_smoothly(np.where(known, np.clip(scaled, 0.0, 1.0), np.nan))
-    # Cells contain single scan points, whose speckle would hide the texture.
+    # Cells contain single scan points, so speckle would hide the texture.
     grey = np.asarray(cv2.medianBlur(np.rint(filled * 255.0).astype(np.uint8), 3), dtype=np.uint8)
     side = 2 * void_margin_cells + 1
     share = cv2.blur(known.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE)
@@ -117,8 +117,8 @@ def points_on_wall(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Return the surface points at positions (n, 2) = (column, row) of a wall's raster.
 
-    The depth is interpolated where the surface is smooth. At a relief edge, it is that of the
-    nearest cell, and its standard deviation includes the step.
+    The depth is interpolated where the surface is smooth. At a relief edge, the depth is that of
+    the nearest cell, and its standard deviation includes the step.
 
     Args:
         wall: the wall.
@@ -126,8 +126,8 @@ def points_on_wall(
         usual_m: result of `usual_spread_m` for the wall, computed if None.
 
     Returns:
-        World points (n, 3) in metres, their standard deviations (n,) in metres, and whether (n,)
-        the depth is known there; points without a depth are NaN.
+        World points (n, 3) in metres, their standard deviations (n,) in metres, and a mask (n,) of
+        the positions with a known depth; points without a depth are NaN.
     """
     columns, rows = pixels_wall[:, 0] - 0.5, pixels_wall[:, 1] - 0.5
     height, width = wall.frame.shape
@@ -205,8 +205,8 @@ def one_by_one(
 ) -> Iterator[_Result]:
     """Yield a function's results in order, computed by several threads.
 
-    OpenCV's own threads gain little with pictures of this size, so they are divided among the
-    threads.
+    OpenCV's own threads gain little with pictures of this size, so the cores are used for several
+    pictures at once.
     """
     import cv2
 

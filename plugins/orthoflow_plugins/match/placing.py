@@ -1,13 +1,13 @@
-"""Coarse poses of photos from structure, if key points do not match them with a wall.
+"""Coarse poses of photos from structure, if key points do not match the photos with a wall.
 
-Structure that correlates in nine parts does not prove a position, since a repeating motif also
+A correlation of structure in nine parts does not prove a position, since a repeating motif also
 correlates elsewhere. Therefore overlapping patches are matched independently at the most likely
 positions; a position is probably correct if most of the patches fit one pose.
 
 A repeating motif, or another wall with the same tiles, may still fit best. Photos share many more
-key points with each other than with the laser intensity. Therefore a position is accepted if
-another photo, at its own position, shows the same key points at the same positions on the wall: two
-wrong photos would have to be wrong in the same way.
+key points with each other than with the laser intensity. Therefore, a position is accepted if
+another photo, at its own position, shows the same key points at the same positions on the wall: if
+they were wrong, both photos would have to be wrong in the same way.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from orthoflow_plugins.match.ties import TiePiece, piece_on_wall
 from orthoflow_plugins.match.tracing import agrees_around, fitted_pose
 from orthoflow_plugins.match.warping import project_walls, warp_photo
 
-# Number of positions of a photo that are examined patch by patch (all walls together), and number
-# of candidates from each wall at each rotation.
+# Number of positions of a photo, on all walls together, that are examined patch by patch.
 _PLACES: Final = 4
+# Number of candidates from each wall at each rotation.
 _PLACES_EACH: Final = 4
 # Search radius of each round, in coarse cells.
 _RADII: Final = (6, 4, 3, 3)
@@ -55,7 +55,7 @@ _MIN_SCORE: Final = 0.3
 _MIN_DISTINCT: Final = 0.03
 # Minimum number of tie points in a round to determine a pose.
 _MIN_FIT: Final = 8
-# A position with fewer tie points or a smaller share of the patches is dropped.
+# A position is dropped if it has fewer tie points or a smaller share of patches that agree.
 _TIES_FEW: Final = 20
 _SHARE_FEW: Final = 0.05
 # In simulated rooms, wrong positions had leads of up to 6.1 with 15 % of the patches agreeing.
@@ -70,18 +70,20 @@ _OVER_NEXT: Final = 1.5
 _SIGMA_CELLS: Final = 0.5
 # Anticlockwise quarter turns that make a photo upright, by EXIF orientation.
 _QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
-# Two poses are the same position if the wall's displacement is below this share of the longer side.
+# Two poses are the same position if the wall moves in the photo by less than this share of the
+# photo's longer side.
 _SAME_SHARE: Final = 0.1
 _LONGEST_SIDE_PX: Final = 1600
 _PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)
 # Minimum number of common key points; fewer may be a repeated motif.
 _MIN_SHARED: Final = 24
-# Tolerance in coarse cells between the wall positions of a common key point according to two
-# photos; larger for photos that have only a homography, which ignores relief.
+# Maximum distance, in coarse cells, between the positions of a common key point on the wall
+# according to two photos.
 _CONFIRMED_CELLS: Final = 3.0
+# The same for photos that have only a homography, which ignores relief.
 _APART_ROUGHLY_CELLS: Final = 6.0
 _MIN_AGREEING: Final = 0.6
-# Minimum number of common coarse cells of overlapping photos.
+# Minimum number of coarse cells that overlapping photos have in common.
 _OVERLAP_CELLS: Final = 200
 # Agreeing photos are accepted if there are this many, or if one of them is clear by itself.
 _MANY: Final = 3
@@ -94,8 +96,8 @@ class Placed:
     Attributes:
         piece: its tie points.
         camera: the pose from the tie points.
-        lead: lead of the position before patches were matched, as in `Place`.
-        share: share of the patches in the overlap that agree.
+        lead: lead of the position, as in `Place`, before patches were matched.
+        share: share of the patches in the overlap that agree with the pose.
         radius_px: search radius of the patches, photo pixels.
         is_clear: whether it is far better than all other positions.
     """
@@ -113,7 +115,8 @@ def places_of(
 ) -> list[Placed]:
     """Return the possible positions of a photo on the walls, the best first.
 
-    Only the first may be clear. A photo without EXIF is tried in all four orientations.
+    Only the first may be clear. A photo without an EXIF orientation is tried in all four
+    orientations.
 
     Args:
         index: index of the photo.
@@ -125,7 +128,7 @@ def places_of(
     small = reduced(rgb, min(1.0, _SIDE_PX / longest))
     tiny = reduced(rgb, min(1.0, PHOTO_SIDE_PX / longest))
     lens, freedom = photo.lens_prior()
-    # Coarse tie points determine no other lens parameters.
+    # Coarse tie points do not determine other lens parameters.
     freedom = LensFreedom(focal_sigma=freedom.focal_sigma)
     upright = _QUARTERS.get(photo.exif_orientation, 0)
     has_exif = photo.exif_orientation != 1 or photo.exif_focal_px is not None
@@ -158,7 +161,7 @@ def places_of(
 
 
 def _judged(found: Sequence[Placed]) -> list[Placed]:
-    """Sort positions, drop duplicates and poor ones, and decide whether the best is clear."""
+    """Sort positions, drop poor ones and duplicates, and decide whether the best is clear."""
     best_first = sorted(found, key=lambda each: -each.share)
     kept = [
         replace(each, lead=max(other.lead for other in best_first if _is_same(each, other)))
@@ -182,7 +185,7 @@ def _judged(found: Sequence[Placed]) -> list[Placed]:
 def _camera_at(
     place: Place, structure: WallStructure, lens: ViewingCamera, quarters: int
 ) -> ViewingCamera | None:
-    """Return the pose from the positions of a photo's parts, starting perpendicular to the wall.
+    """Return the pose from the positions of a photo's parts; iterate from a perpendicular view.
 
     Args:
         place: position of the photo rotated by `np.rot90`.
@@ -191,7 +194,7 @@ def _camera_at(
         quarters: anticlockwise quarter turns of the rotated photo.
     """
     wall, frame = structure.wall, structure.wall.frame
-    # Transforms axes of the rotated photo to those of the stored one.
+    # Transforms the axes of the rotated photo to those of the stored photo.
     axes = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters % 4)
     stored_px = np.array([lens.width, lens.height])
     rotated_px = np.abs(axes) @ stored_px
@@ -199,7 +202,7 @@ def _camera_at(
     # Right, down and into the wall.
     rotation = np.array([*(axes @ [frame.u_world, frame.v_world]), -frame.normal_world])
     px_per_m = rotated_px[0] / place.width_m
-    # Use an origin near the wall, since large survey coordinates would lose digits.
+    # Use an origin near the wall, since large survey coordinates would reduce the precision.
     origin = frame.origin_world
     middle = frame.world_from_wall(place.centre_m[None] / frame.gsd_m)[0] - origin
     start = replace(
@@ -284,7 +287,7 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
     border = radius + HALF_PATCH_CELLS + 2
 
     def framed(channels: Channels) -> Channels:
-        # Patches at the photo's border are used as far as they are known.
+        # Patches at the photo's border are used if they are mostly known.
         margin = ((border, border), (border, border))
         return Channels(
             values=np.pad(channels.values, (*margin, (0, 0))), known=np.pad(channels.known, margin)
@@ -348,7 +351,7 @@ def confirmed(
     on: tuple[Sequence[Wall], Sequence[WallStructure | None]],
     cores: int = 1,
 ) -> dict[int, Placed]:
-    """Choose the positions that photos confirm for each other.
+    """Choose the positions of photos that confirm each other.
 
     Args:
         photos: all photos.
@@ -359,7 +362,7 @@ def confirmed(
         cores: number of threads.
 
     Returns:
-        The confirmed positions by index of the photo, without photos whose key points are
+        The confirmed positions by index of the photo, except for photos whose key points are
         confirmed.
     """
     if not any(places.values()):

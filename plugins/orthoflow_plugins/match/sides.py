@@ -41,14 +41,16 @@ from orthoflow_plugins.match.pictures import (
     require_photos,
 )
 
-# Cell size relative to the point spacing, radius of gap filling, and maximum number of cells.
+# Cell size relative to the point spacing.
 _SPACINGS_PER_CELL: Final = 0.6
+# Radius of gap filling.
 _FILLED_CELLS: Final = 2
 _MAX_CELLS: Final = 4_000_000
 _MIN_POINTS: Final = 3
-# Minimum number of inliers in all photos to decide on a side, and their minimum ratio to those of
-# the other side, since a symmetric facade partly matches its mirror image.
+# Minimum number of inliers in all photos for a decision on the side.
 _MIN_AGREEING: Final = 16
+# Minimum ratio of these inliers to those of the other side, since a symmetric facade partly matches
+# its mirror image.
 _MIN_MARGIN_RATIO: Final = 2.0
 # A plane faces the other way if its normal is within 45 degrees of the opposite direction.
 _OPPOSITE_COSINE: Final = -math.sqrt(0.5)
@@ -66,11 +68,11 @@ class FaceByPhotos(Method):
     """Turn planes whose side was guessed towards the side that the photos show.
 
     A wall seen from behind is a mirror image of its photos. If no scanner station determines the
-    side of a plane, the cloud is rastered coarsely on the plane, and the photos are matched with
-    this picture both unchanged and mirrored, in mixtures of their colours if grey decides no plane.
-    The side with clearly more inliers is used. A plane that the photos do not decide is turned if
-    it is between two planes with known sides that both face the other way. Planes with a known
-    side, floors and ceilings remain unchanged.
+    side of a plane, the cloud is rastered coarsely on the plane, and the photos are matched both
+    with this picture and with its mirror image. If grey decides no plane, mixtures of the photos'
+    colours are used. The side with clearly more inliers is used. If the photos do not decide the
+    side of a plane, it is turned if it is between two planes with known sides that both face the
+    other way. Planes with a known side, floors and ceilings remain unchanged.
     """
 
     id: ClassVar[str] = "face.photos"
@@ -95,7 +97,7 @@ class FaceByPhotos(Method):
         photos: Photos
 
     class Out(Ports):
-        """The planes, some of them turned."""
+        """The planes, some of which have been turned."""
 
         planes: Planes
 
@@ -154,8 +156,8 @@ class FaceByPhotos(Method):
     ) -> NDArray[np.intp]:
         """Count the inliers (planes, 2) on the front and on the other side of each plane.
 
-        The photos are matched in grey and, if that decides no plane, in the first mixture of
-        colours that decides one.
+        The photos are matched in grey or, if this decides no plane, in the first mixture of colours
+        that decides one.
         """
         counts = np.zeros((len(pictures), 2), dtype=np.intp)
 
@@ -192,9 +194,9 @@ def _is_decided(front: int, behind: int) -> bool:
 def _is_turned_away(planes: Planes, index: int, sources: Sequence[SideSource]) -> bool:
     """Return whether a plane is between planes with known sides that both face the other way.
 
-    The viewer of the plane in front of it is beyond this plane. For example, the step of a fountain
-    is seen from the same side as the facade, although most points of the cloud, those of the
-    facade, are on its other side.
+    For example, the step of a fountain in front of a facade is seen from the same side as the
+    facade, although most points of the cloud, those of the facade, are on the other side of the
+    step.
     """
     known = np.array([source != "guess" for source in sources])
     opposite = known & (planes.normal @ planes.normal[index] < _OPPOSITE_COSINE)
@@ -238,7 +240,7 @@ def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Feat
 def _grey_on(
     frame: WallFrame, tolerance_m: float, cloud: PointCloud, cores: int
 ) -> NDArray[np.float32]:
-    """Return grey values 0..1 (rows, cols) of the topmost points; NaN away from any point."""
+    """Return grey values 0..1 (rows, cols) of the points nearest to the viewer; NaN elsewhere."""
     import cv2
 
     from orthoflow.geometry.rastering import topmost_points

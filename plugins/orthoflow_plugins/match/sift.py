@@ -57,9 +57,9 @@ class MatchSift(Method):
 
     Each photo is matched with each wall, first by its strongest key points, then by all of them on
     the recognised walls. If no wall is clearly recognised in grey, mixtures of the photo's colours
-    are tried. After that, edges are compared regardless of which side is brighter; the position
-    must be confirmed by another photo. Matches that do not fit a homography of the wall are kept as
-    rejected ties. Ties include the depth of the surface.
+    are tried. If these fail, too, edges are compared regardless of which of their sides is
+    brighter; another photo must confirm the resulting position. Matches that do not fit a
+    homography of the wall are kept as rejected ties. Ties include the depth of the surface.
     """
 
     id: ClassVar[str] = "match.sift"
@@ -177,7 +177,7 @@ def _placed(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> dict[int, Placed]:
-    """Find positions of photos without clear key point matches by structure; by index."""
+    """Find, by structure, positions of photos without clear key point matches, by index."""
     from orthoflow_plugins.match.placing import confirmed, places_of
     from orthoflow_plugins.match.structures import wall_structure
 

@@ -3,9 +3,10 @@
 A laser measures at another wavelength than a camera, so contrast may be weaker, missing or
 inverted, depending on the material. Edges keep their position and orientation (modulo 180 degrees);
 relief steps are also edges of the wall. A photo is compared with the wall at many scales: nine
-overlapping parts of the photo are correlated with the whole wall and may shift slightly relative to
-each other to allow for perspective. The scale with the largest lead is chosen: the difference
-between the best sum of correlations and those at all other positions, relative to their spread.
+overlapping parts of the photo are correlated with the whole wall, and may shift slightly relative
+to each other because of perspective. The scale with the largest lead is chosen; the lead is the
+difference between the best sum of correlations and the sums at all other positions, relative to
+their spread.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
 # Number of cells along the shorter side of a wall, unless its raster is coarser.
 _CELLS: Final = 200.0
-# Range of scales, as the size of the photo on the wall relative to the shorter side of the wall:
-# minimum of the photo's longer side and maximum of its shorter side.
+# Range of scales: on the wall, the longer side of the photo is at least the first value times the
+# shorter side of the wall, and its shorter side at most the second value times it.
 _SIZES: Final = (0.2, 1.6)
 _STEP: Final = 1.1
 _MAX_PART_CELLS: Final = 250
@@ -41,7 +42,7 @@ _EVEN_SIGMA_CELLS: Final = 12.0
 _POOL_SIGMA_CELLS: Final = 1.5
 _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
-# Prevents high scores of parts that are mostly outside the wall and overlap it only slightly.
+# Prevents high scores of parts that hardly overlap the wall.
 _MIN_ENERGY: Final = 0.25
 # Two positions are distinct if they differ by this distance, relative to the photo's width, or by
 # this logarithm of scales.
@@ -100,7 +101,7 @@ class Place:
     Attributes:
         centre_m: (2,) float64 metres right and down from the corner of the wall's raster.
         width_m: approximate width of the photo on the wall.
-        lead: difference of its score to the median of all positions at this scale, in robust
+        lead: difference between its score and the median of all positions at this scale, in robust
             standard deviations.
         parts_photo: (9, 2) float64 centres of the photo's parts, relative to its width and height.
         parts_m: (9, 2) float64 positions of the parts on the wall, as in `centre_m`.
@@ -125,7 +126,7 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     levels = [(channels, coarse.frame.gsd_m)]
     intensity, depth_m = coarse.intensity, coarse.depth_m
     for _ in range(1, _LEVELS):
-        # The mean of four intensities, and the first of four depths if most of them are known.
+        # Use the mean of four intensities, and the first of four depths if most of them are known.
         known = _halved(np.isfinite(depth_m)) >= _MIN_KNOWN
         rows, columns = known.shape
         depth_m = np.where(known, depth_m[: 2 * rows : 2, : 2 * columns : 2], np.float32(np.nan))
@@ -207,7 +208,7 @@ def _coarser(wall: Wall, factor: int) -> Wall:
     low, high = np.percentile(wall.intensity[np.isfinite(wall.intensity)], (1.0, 99.0))
     scaled = np.clip((wall.intensity - low) / max(float(high - low), 1e-9), 0.0, 1.0)
     grey = np.rint(255.0 * filled_smoothly(np.where(known, scaled, np.nan))).astype(np.uint8)
-    # Cells contain single scan points, whose speckle is not structure.
+    # Cells contain single scan points, and their speckle is not structure.
     grey = np.asarray(cv2.medianBlur(grey, 3), dtype=np.uint8)
     cells = (slice(0, height * factor), slice(0, width * factor))
 
@@ -255,7 +256,7 @@ def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -
 
 
 def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
-    """Return the photo widths, in cells, that are tried."""
+    """Return the photo widths to try, in cells."""
     height, width = photo[0], photo[1]
     least = _SIZES[0] * min(wall) * width / max(height, width)
     # Each part is half as wide and high as the photo.
@@ -273,7 +274,7 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
     import cv2
     from scipy import fft
 
-    # Sizes that are multiples of a sample.
+    # Round the size to multiples of a sample.
     width, height = (
         max(2, round(length / _SAMPLE_CELLS))
         for length in (width_cells, width_cells * rgb.shape[0] / rgb.shape[1])
@@ -371,8 +372,8 @@ def _channels(
 ) -> NDArray[np.float32]:
     """Return channels (5, rows, cols) of the orientation of edges, for all layers together.
 
-    They consist of the double and fourfold angle of the gradient and its strength, normalised
-    locally: the first terms of a histogram of orientations modulo 180 degrees.
+    The channels consist of the double and fourfold angle of the gradient and its strength,
+    normalised locally; they are the first terms of a histogram of orientations modulo 180 degrees.
     """
     import cv2
 

@@ -1,10 +1,10 @@
 """Ties between photos and walls: from key points or measured by hand, without duplicates.
 
 `preset: paper` matches as in markiewicz2015 (3.5, 3.6, 4.3): with OpenCV's default SIFT, and with
-the best match as in its reference [36], openMVG. This is the nearest descriptor in the photo for a
-key point of the wall if the ratio of the distances of the nearest and the second nearest is below a
-limit (0.8 in openMVG's documentation). Without poses, all key points of a wall are matched; with
-poses, those in the part that the photo shows.
+the best match as in its reference [36], openMVG. This match of a key point of the wall is the
+nearest descriptor in the photo, provided that the ratio of the distances to the nearest and the
+second nearest is below a limit (0.8 in openMVG's documentation). Without poses, all key points of a
+wall are matched; with poses, those in the part that the photo shows.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from orthoflow_plugins.match.warping import Projection, project_walls
 if TYPE_CHECKING:
     from orthoflow.sdk import StepContext
 
-# Standard deviation of a SIFT key point, in pixels of its image: its minimum, and its ratio to the
+# Standard deviation of a SIFT key point, in pixels of its image: the minimum, and the ratio to the
 # size of the key point.
 _MIN_SIGMA_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
-# Key points at relief edges, which have a larger standard deviation, are dropped.
+# Key points whose depths have a larger standard deviation, as at relief edges, are dropped.
 _MAX_SIGMA_CELLS: Final = 3.0
-# The ratio of openMVG's documentation, and the maximum number of key points of a picture.
+# The ratio in openMVG's documentation.
 _PAPER_RATIO: Final = 0.8
+# Maximum number of key points in a picture.
 _PAPER_FEATURES: Final = 50_000
 BY_HAND_ALONE: Final = DiagnosticSpec(
     code="scan-without-texture",
@@ -249,8 +250,8 @@ def parted(pieces: Sequence[TiePiece], kept: NDArray[np.bool_]) -> list[TiePiece
 def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
     """Drop duplicate ties of a key point with the same surface on overlapping walls.
 
-    Rasters of neighbouring planes may contain the same surface, which would count twice in the
-    orientation. The tie with the smallest `sigma_m` is kept.
+    Rasters of neighbouring planes may contain the same surface, so its ties would count twice in
+    the orientation. The tie with the smallest `sigma_m` is kept.
     """
     if len(pieces) < 2:
         return list(pieces)
@@ -304,7 +305,7 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
     kept = np.flatnonzero(known[hand.photo] >= 0)
     ctx.metric("n_by_hand", len(kept), "1")
     own_walls = walls.nearest(hand.points_world[kept])
-    # Any, since the arrays of the product are collected by name.
+    # The type is Any, since the arrays of the product are collected by name.
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(ties, name), getattr(hand, name)[kept]])
         for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m", "role")

@@ -68,12 +68,12 @@ _MAX_ROUNDS: Final = 4
 _SETTLED_CELLS: Final = 0.3
 # Relative decrease of the held-out error required for another round.
 _MIN_GAIN: Final = 0.03
-# Channels to compare, in the order in which they are tried; colours only if the others do not give
-# clearly good results.
+# Channels to compare, in the order in which they are tried; colours are only tried if the others do
+# not give clearly good results.
 _CONTENTS: Final = ("gradients", "grey", "colours")
 _FEW_SHARE: Final = 0.25
 
-# Two photos of a wall share hundreds of key points; fewer than this may be a repeated motif.
+# Two photos of a wall share hundreds of key points; fewer than this may come from a repeated motif.
 _MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
@@ -84,7 +84,7 @@ _NEAR_FOCAL: Final = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """The walls to match photos with, and parameters of the matching.
+    """The walls with which photos are matched, and parameters of the matching.
 
     Attributes:
         targets: all walls; they may hide one another.
@@ -100,7 +100,7 @@ class Setup:
 
     @property
     def walls(self) -> list[Wall]:
-        """The walls in the resolution in which they are matched."""
+        """The walls in the resolution at which they are matched."""
         return [target.wall for target in self.targets]
 
 
@@ -168,14 +168,14 @@ def trace_photo(
         photo: the photo.
         camera: its pose, accurate to a few cells on the walls.
         setup: the walls, and parameters of the matching.
-        lens: uncertainty of an estimated lens. If the lens were fixed, correct ties that contradict
+        lens: uncertainty of an estimated lens; if the lens were fixed, correct ties that contradict
             the first estimate would be rejected.
     """
     view = view_of(index, photo, camera, setup.walls, setup.before)
     found: tuple[Trace, View] | None = None
     for content in _CONTENTS:
         if content == "colours" and found is not None:
-            # If laser and camera differ, grey values match worse than edges, or only at few
+            # If laser and camera differ, grey values match worse than edges, or at only a few
             # positions.
             is_little = found[0].n_ties < _FEW_SHARE * setup.max_ties
             if found[0].content == "grey" and not is_little:
@@ -215,7 +215,7 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
 
 
 def _rank(trace: Trace) -> tuple[float, int]:
-    """Rank by the held-out error divided by the root of the number of ties and their spread."""
+    """Return the held-out error, divided by the ties' spread and the root of their number."""
     pixels, error = joined(trace.pieces).pixels_photo, math.inf
     if len(pixels) >= _LEAST and trace.held_out_px:
         spread_px = math.sqrt(math.sqrt(max(float(np.linalg.det(np.cov(pixels.T))), 1.0)))
@@ -229,7 +229,7 @@ def _traced(
     content: str,
     lens: LensFreedom | None = None,
 ) -> tuple[Trace, View]:
-    """Match a photo in one set of channels; also return its final projection onto the walls."""
+    """Match a photo in one set of channels; return the result and its final projection."""
     view, radius = start
     known = None if lens is None else (lens, view.camera)
     best: _Round | None = None
@@ -267,7 +267,7 @@ def _traced(
 
 
 def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) -> float:
-    """Return the RMS displacement on the walls, at the ties, caused by another pose."""
+    """Return the RMS displacement of the ties on the walls that another pose causes."""
     squares = []
     for piece in pieces:
         projection = view.projections[piece.wall]
@@ -326,8 +326,8 @@ def _piece(
 ) -> TiePiece:
     """Return the ties of one photo with one wall.
 
-    Residuals are correlated over the cells that fill a gap and, independently, over those of the
-    smoothing, so the correlation areas add up.
+    Residuals are correlated within the cells that fill a gap and, independently of this, within the
+    smoothing kernel, so the two correlation areas add up.
     """
     moved, projection = found
     alone = grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64)
@@ -346,7 +346,7 @@ def _piece(
 def _refitted(
     seen: SeenPoints, camera: ViewingCamera, known: _Known | None = None
 ) -> _Refitted | None:
-    """Return the pose from 3/4 of the ties and its misfit at the others; None for too few ties.
+    """Return the pose from 3/4 of the ties, and its misfit at the others; None for too few ties.
 
     The lens is adjusted as well if that reduces the misfit at the held-out ties.
     """
@@ -376,12 +376,12 @@ def fitted_pose(
     camera: ViewingCamera,
     lens: _Known | None = None,
 ) -> ViewingCamera:
-    """Alternate adjustment of a pose to points and rejection of outliers.
+    """Adjust a pose to points and reject outliers, alternately.
 
     Args:
         seen: the points.
         camera: initial camera.
-        lens: free parameters of the lens, and a camera with its prior.
+        lens: free parameters of the lens, and a camera with its prior values.
 
     Raises:
         GeometryError: the points do not determine a pose.
@@ -419,7 +419,7 @@ def _limit(lengths: NDArray[np.float64]) -> float:
 
 
 def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
-    """Select displacements that agree with the median of their neighbours."""
+    """Return a mask of displacements that agree with the median of their neighbours."""
     from scipy.spatial import cKDTree
 
     count = len(moved.places)
@@ -440,7 +440,7 @@ def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
 def _unoccupied(
     places: NDArray[np.intp], projection: Projection, occupied: set[tuple[int, int]]
 ) -> NDArray[np.intp]:
-    """Select positions in parts of the photo not used by another wall, and mark them as used."""
+    """Select positions in parts of the photo that no other wall uses, and mark them as used."""
     side = _OCCUPIED_CELLS * max(projection.pixels_per_cell, 1e-6)
     u = projection.u[places[:, 1], places[:, 0]]
     v = projection.v[places[:, 1], places[:, 0]]
@@ -456,7 +456,7 @@ def recovered_traces(
     setup: Setup,
     traces: Sequence[Trace],
 ) -> dict[str, Trace]:
-    """Match photos without a pose, starting from poses relative to the matched photos.
+    """Match photos without a pose, starting from poses found with the matched photos.
 
     Args:
         photos: all photos.
@@ -515,7 +515,7 @@ def _settled(
 
 
 def _view(trace: Trace, photos: Photos, setup: Setup) -> View:
-    """Project a photo onto the walls with its final pose, with occlusions from its first pose."""
+    """Project a photo onto the walls with its final pose and the occlusions of its first pose."""
     photo = photos.photos[trace.photo]
     first = view_of(trace.photo, photo, trace.camera, setup.walls, setup.before)
     return first.posed(trace.settled, setup.walls)
@@ -569,9 +569,9 @@ def recovered_pose(
 
 
 def lens_of(photo: Photo, oriented: Mapping[str, Camera], photos: Photos) -> Intrinsics | None:
-    """Return a photo's lens: calibrated, or as estimated for a photo of the same camera.
+    """Return a photo's lens: calibrated, or estimated for a photo of the same camera.
 
-    The estimate is preferred to EXIF, which may be wrong for all photos of a lens.
+    The estimate is preferred to EXIF values, which may be wrong for all photos of a lens.
 
     Returns:
         The lens, or None if it is neither calibrated nor estimated.

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 _GRAZING_COSINE: Final = 0.15
 # Cell size of the depth buffer, in wall cells, so that projected surfaces have no gaps.
 _BUFFER_CELLS: Final = 2.0
-# A surface is hidden if it is farther than this behind the nearest one, in wall cells.
+# A surface is hidden if it is more than this many wall cells behind the nearest one.
 _HIDDEN_CELLS: Final = 6.0
 _ROWS_AT_ONCE: Final = 256
 # Cells this close to hidden cells may be hidden as well, since objects in front of a wall were
 # scanned from other positions and the pose is only accurate to a few cells.
 _BESIDE_CELLS: Final = 3
-# Step in cells for the first search for the part of a wall in a photo.
+# Step, in cells, of the first search for the part of a wall that a photo shows.
 _COARSE: Final = 8
 _MIN_CELLS: Final = 100
 # Pixel at which OpenCV samples cells outside the photo; the sampled value is not used.
@@ -87,7 +87,8 @@ class View:
     Attributes:
         index: index of the photo.
         grey: (height, width) grey values of the photo.
-        colours: function that returns its colours (height, width, 3), which few photos need.
+        colours: function that returns its colours (height, width, 3), which are needed for few
+            photos.
         camera: the pose.
         projections: projection of each wall, None if the photo does not show it.
         hidden: cells of each wall that are hidden by points in front of it; empty if unknown.
@@ -139,7 +140,7 @@ def view_of(
     return View(
         index=index,
         grey=photo_grey(photo),
-        # Decoded once for all rounds and walls.
+        # Decode the colours once for all rounds and walls.
         colours=cache(partial(photo_rgb, photo)),
         camera=camera,
         projections=_bared(projections, hidden),
@@ -187,7 +188,7 @@ def _hidden(
 def _bared(
     projections: Sequence[Projection | None], hidden: Sequence[NDArray[np.bool_]]
 ) -> Sequence[Projection | None]:
-    """Mark the hidden cells in the projections."""
+    """Mark hidden cells in the projections."""
     for projection, mask in zip(projections, hidden, strict=bool(hidden)):
         if projection is not None:
             projection.hide(mask[projection.part])
@@ -257,7 +258,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
     )
     if float(towards @ frame.normal_world) <= 0.0:
         return None
-    # Use an origin on the wall, since large survey coordinates would lose digits.
+    # Use an origin on the wall, since large survey coordinates would reduce the precision.
     near = camera.shifted(frame.origin_world)
     coarse = _project_cells(near, wall, (slice(0, frame.height), slice(0, frame.width)), _COARSE)
     part = _part_in_photo(np.isfinite(coarse[0]), frame.shape)
@@ -276,7 +277,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
 
 
 def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[slice, slice] | None:
-    """Return rows and columns of the coarse cells in the photo, with a margin of one cell."""
+    """Return the rows and columns of coarse cells in the photo, with a margin of one cell."""
     if not seen.any():
         return None
     spans = []

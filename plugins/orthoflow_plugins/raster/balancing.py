@@ -3,8 +3,8 @@
 Intensity decreases with range and incidence angle, and each scan may have its own scale. Where two
 scans overlap, the surface is the same, so the ratios of their intensities separate the three
 effects, independently of the texture. On a single wall, range and incidence are coupled (cosine
-times range is the distance of the station from the plane), so only their joint effect is known,
-which suffices for this wall.
+times range is the distance of the station from the plane), so only their joint effect can be
+determined, which suffices for this wall.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Trend:
 
 
 def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
-    """Return the cloud with intensities as if all scans were taken under the same conditions.
+    """Return the cloud with intensities as if all scans had been taken under the same conditions.
 
     Only points on walls are corrected. If scans do not overlap, the cloud is unchanged and a
     warning is reported.

@@ -18,22 +18,25 @@ from orthoflow_plugins.raster.extents import SampledPoints, points_in
 
 Cause = Literal["behind", "before", "hidden", "sparse", "unseen"]
 
-# Causes are determined on tiles of about this side, each with some points of the sample.
+# Causes are determined on tiles of about this side length, each with several sample points.
 _TILE_M: Final = 0.05
 # Minimum number of sample points of a surface.
 _POINTS_LEAST: Final = 2
-# Points farther behind a wall belong to another room or the street. Objects farther in front, such
-# as a portico or a balcony, count as hiding it only if stations are known.
+# Points farther behind a wall belong to another room or the street.
 _BEHIND_MOST_M: Final = 4.0
+# Objects farther in front of a wall, such as a portico or a balcony, count as hiding it only if
+# stations are known.
 _BEFORE_MOST_M: Final = 5.0
 # Share of the points in front of a wall that a suggested buffer includes, per cent.
 _BEFORE_PERCENT: Final = 95.0
-# Rays from the wall to the stations: side of a voxel, maximum number of voxels in total and along
-# one axis, margin at both ends, and maximum number of tested tiles.
+# Side of the voxels through which rays from the wall to the stations are traced.
 _VOXEL_M: Final = 0.1
+# Maximum number of voxels in total and along one axis.
 _VOXELS_MOST: Final = 1 << 24
 _VOXELS_MOST_ALONG: Final = 1 << 11
+# Length at both ends of a ray that is not tested.
 _ENDS_M: Final = 0.35
+# Maximum number of tested tiles.
 _RAYS_MOST: Final = 4000
 
 
@@ -169,7 +172,7 @@ def _blocked(
     sight: Sight,
     stations: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return (n,) whether objects are between tiles (n,) of a wall and every station."""
+    """Return a mask (n,) of the tiles (n,) of a wall that objects hide from every station."""
     every = -(-len(tiles) // _RAYS_MOST)
     asked = tiles[::every]
     places = np.column_stack([asked % frame.width, asked // frame.width]).astype(np.float64) + 0.5
@@ -241,7 +244,7 @@ class _Room:
         return enter_m, leave_m
 
     def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return (n,) whether the voxels at positions (n, 3) contain points."""
+        """Return a mask (n,) of the positions (n, 3) whose voxels contain points."""
         voxels = np.floor((places - self.low_m) / self.side_m).astype(np.int64)
         inside = ((voxels >= 0) & (voxels < self.occupied.shape)).all(axis=1)
         held = np.zeros(len(places), dtype=np.bool_)

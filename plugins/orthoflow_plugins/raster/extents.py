@@ -1,10 +1,10 @@
 """The extent of a wall, up to adjoining surfaces and including its relief.
 
-In markiewicz2015 (section 6), a range in front of and behind each plane is rastered. Here both this
-range and the rectangle are determined from the points connected to the wall, by growing voxels of a
-sample of the cloud along the wall and in depth, starting at those on the plane. If a detected plane
-adjoins the wall, the rectangle ends at its nearest point, because a larger rectangle would show the
-adjoining plane. Otherwise, it ends with the points.
+In markiewicz2015 (section 6), points in a range in front of and behind each plane are rastered.
+Here, both this range and the rectangle are determined from the points connected to the wall: a
+sample of the cloud is divided into voxels, and a region grows along the wall and in depth from the
+voxels on the plane. If a detected plane adjoins the wall, the rectangle ends at its nearest point,
+because a larger rectangle would show the adjoining plane. Otherwise, it ends where the points end.
 """
 
 from __future__ import annotations
@@ -29,15 +29,17 @@ _SIDES: Final[tuple[Side, ...]] = ("left", "right", "top", "bottom")
 _POINTS_MOST: Final = 1 << 21
 # Fibonacci hashing, so that the sample does not coincide with rows or columns of a scan.
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
-# Maximum growth of a rectangle on each side, and maximum depth of relief.
+# Maximum growth of a rectangle on each side.
 _GROWTH_MOST_M: Final = 1.0
+# Maximum depth of relief in front of and behind the plane.
 _FRONT_MOST_M: Final = 0.5
 _BEHIND_MOST_M: Final = 1.0
-# Voxels: maximum number, minimum side along the wall in metres and in spacings of sample points,
-# and side in depth.
+# Maximum number of voxels.
 _VOXELS_MOST: Final = 1 << 22
+# Minimum side of a voxel along the wall, in metres and in spacings of sample points.
 _SIDE_LEAST_M: Final = 0.03
 _SIDE_STEPS: Final = 3.0
+# Side of a voxel in depth.
 _DEPTH_STEP_M: Final = 0.025
 # Surfaces are connected across this many depth steps, because sides of relief are seldom scanned.
 _BRIDGED_STEPS: Final = 5
@@ -50,12 +52,14 @@ _STRAY_SHARE: Final = 0.02
 # Depth searched beyond the limit: an object that extends into it, such as a cornice of an adjoining
 # wall or the side of a piece of furniture, has no front within the limit.
 _BEYOND_MOST_M: Final = 0.1
-# An object farther in front of a wall and connected to it, such as a fountain on a facade, belongs
-# to the wall up to this distance if the part of the wall that only this object covers exceeds this
-# share. The distance is limited to halfway to a surface that faces the wall, or to a scanner.
+# An object that extends farther in front of a wall and is connected to it, such as a fountain on a
+# facade, belongs to the wall up to this distance.
 _FAR_FRONT_MOST_M: Final = 3.0
+# Such an object belongs to the wall only if it alone covers more than this share of the wall.
 _FAR_SHARE_LEAST: Final = 0.03
+# The distance is at most halfway to a surface that faces the wall, or to a scanner.
 _HALFWAY: Final = 0.5
+# A surface faces the wall if the cosine between the normals is smaller.
 _FACING_COSINE: Final = -0.7
 # Opposite walls of a room have similar areas; objects in front of a wall cover a few per cent of
 # it.
@@ -68,15 +72,15 @@ _GROUND_M: Final = 0.15
 _RELIEF_LEAST: Final = 5e-4
 _BEYOND_RELIEF_M: Final = 0.02
 _RELIEF_USUAL_M: Final = 0.15
-# Criteria for adjoining planes: angle to the wall, and minimum share of the side along which their
-# points are in this range of depths in front of or behind the wall. The undersides of cornices are
-# not as deep.
+# Maximum cosine between the normals of a wall and an adjoining plane.
 _ADJOINING_COSINE: Final = 0.7
 _BESIDE_SINE: Final = 0.9
+# Along at least this share of the wall's side, points of an adjoining plane must be in this range
+# of depths in front of or behind the wall. The undersides of cornices are not as deep.
 _BESIDE_SHARE: Final = 0.3
 _STANDING_M: Final = (0.35, 1.0)
 _BESIDE_STEP_M: Final = 0.1
-# Maximum distance of their line inside the rectangle of the points.
+# The line of an adjoining plane may be this far inside the rectangle of the points.
 _WITHIN_M: Final = 0.1
 # Maximum distance of points from an adjoining surface, in its sigmas and in metres.
 _NOISE_SIGMAS: Final = 3.0
@@ -122,7 +126,7 @@ class PointsInside:
 
 
 def sampled(cloud: PointCloud) -> SampledPoints:
-    """Return one of every n points, so that all walls are examined quickly."""
+    """Return one of every n points, so that walls are examined quickly."""
     every = -(-len(cloud) // _POINTS_MOST)
     index = np.arange(0, len(cloud), every)
     if every > 1:
@@ -257,7 +261,7 @@ def extent_of(
 
 @dataclass(frozen=True, kw_only=True)
 class _Bound:
-    """An adjoining plane: the distance of positions (right, down, depth) from it, positive inside.
+    """An adjoining plane, given by the distance of positions (right, down, depth) inside it.
 
     Attributes:
         side: side of the rectangle that the plane bounds.
@@ -400,7 +404,7 @@ def _far_front_m(
         return 0.0
     is_far = surface.front_m > near_m
     is_far &= ~(surface.behind_m <= near_m)
-    # Beyond this depth, objects that extend farther, such as adjoining walls, are thin.
+    # Remove thin parts: these are objects that extend beyond this depth, such as adjoining walls.
     is_far = np.asarray(ndimage.binary_opening(is_far, np.ones((3, 3), dtype=np.bool_)))
     rows, columns = far.inside
     gained_m = surface.front_m[rows, columns][is_far[rows, columns]]
@@ -415,9 +419,9 @@ def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | No
     """Return half the distance from a wall to the nearest surface that faces it, or to a scanner.
 
     Objects farther in front may belong to that surface; the distance is infinite if there is none.
-    Planes whose visible side was guessed may be fronts of objects on the wall with a wrong side.
-    They count as facing the wall only if they, together with nearer ones, have enough area to be
-    the other side of a room.
+    A plane whose visible side was guessed may be the front of an object on the wall, seen from the
+    wrong side. Such planes count as facing the wall only if they, together with nearer ones, are
+    large enough to be the opposite side of a room.
     """
     normal, offset_m = planes.normal[index], float(planes.offset[index])
     facing = [
@@ -610,7 +614,7 @@ def _bound(
     middle = np.array([0.5 * size_m[0], 0.5 * size_m[1], 0.0])
     if offset_m + float(slopes @ middle) < 0.0:
         slopes, offset_m = -slopes, -offset_m
-    # Distances increase to the right of a left wall and below a ceiling, which are inside.
+    # The inside, where distances are positive, is to the right of a left wall and below a ceiling.
     sides: tuple[Side, Side] = ("left", "right") if axis == 0 else ("top", "bottom")
     is_first = bool(slopes[axis] > 0.0)
     along = 1 - axis

@@ -97,7 +97,7 @@ def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
 def mapped(
     frames: Mapping[int, WallFrame], planes: Planes, crs: str, *, reach_m: float, ctx: StepContext
 ) -> dict[int, WallFrame]:
-    """Return grids with those of horizontal planes in the map; others remain in their planes.
+    """Return grids: those of horizontal planes in the map, all others in their planes.
 
     Args:
         frames: grid of each plane by index.

@@ -52,7 +52,7 @@ ExtentOf = Callable[[int], Extent]
 
 # Points of `near` farther from the wall than this are probably wrong.
 _FAR_M: Final = 1.0
-# A larger missing width would be noticed in a drawing.
+# A wider missing strip would be noticed in a drawing.
 _CUT_WORTH_WORDS_M: Final = 0.05
 OBLIQUE: Final = DiagnosticSpec(
     code="wall-beside-an-oblique-surface",
@@ -104,7 +104,7 @@ class RasterGrid(Method):
         MetricSpec(
             "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
         ),
-        # Also by cause.
+        # Also reported by cause.
         MetricSpec("void_share", label="cells without a depth"),
         MetricSpec("void_*_share", label="cells without a depth, by cause"),
         MetricSpec("empty*_share", label="cells without a depth, by cause"),
@@ -236,7 +236,7 @@ def _extents(
 def _frames(
     planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> tuple[dict[int, WallFrame], dict[int, int]]:
-    """Return the grids of the selected planes by index, cropped if requested, and covered planes.
+    """Return the grids of the selected planes by index, and the covered planes.
 
     Raises:
         MethodError: a selected plane does not exist, or no wall contains the requested part.

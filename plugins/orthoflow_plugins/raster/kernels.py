@@ -1,6 +1,7 @@
 """Kernels that compute the surface of a wall from points, and close gaps between points.
 
-Kernels for the entries of `geometry.rastering` run in all threads, each on the cells it owns.
+Kernels for the entries of `geometry.rastering` run in all threads; each thread processes the cells
+that it owns.
 """
 
 from __future__ import annotations
@@ -291,7 +292,7 @@ class Reach(NamedTuple):
     """Limits within which neighbouring points of a scan are assumed to be on the same surface.
 
     Attributes:
-        step: number of rows and columns of the scan between them.
+        step: number of rows and columns of the scan between the points.
         side_cells: maximum distance on the wall along u and along v, in cells.
         step_m: maximum difference of their depths.
     """

@@ -21,8 +21,9 @@ from orthoflow_plugins.raster.emptiness import Cause, Emptiness
 _CELLS_ASKED: Final = 1 << 26
 # Maximum spacing of the points of a scan, in cells.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0
-# Minimum share of empty or interpolated cells for a warning, and minimum share of a cause.
+# Minimum share of empty or interpolated cells for a warning.
 _SHARE_WORTH_WORDS: Final = 0.1
+# Minimum share of cells for a cause to be reported.
 _CAUSE_WORTH_WORDS: Final = 0.01
 # Minimum share for a warning about omitted objects in front of a wall.
 _LEFT_OUT_WORTH_WORDS: Final = 0.05
@@ -156,15 +157,15 @@ def warn(
 
 
 def _least_gsd_m(step_m: float) -> float:
-    """Return the smallest cell size with two digits that is not too fine for a point spacing."""
+    """Return the smallest cell size with two significant digits that suits a point spacing."""
     least_m = step_m / _STEP_MOST_CELLS
     digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
-    # Rounded up, because the nearest number with two digits may be too fine.
+    # Rounded up, because the nearest number with two significant digits may be too fine.
     return float(f"{math.ceil(least_m / digit_m - 1e-6) * digit_m:.2g}")
 
 
 def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> None:
-    """Report walls whose intensity or colour is almost everywhere black, white or one value."""
+    """Report walls whose intensity or colour is almost entirely black, white or uniform."""
     scans = cloud.source.get("scans")
     scales: dict[str, None] = {}
     colours: dict[str, None] = {}

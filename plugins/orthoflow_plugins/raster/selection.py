@@ -17,7 +17,8 @@ from orthoflow_plugins.raster.parameters import Constraint, RasterParams
 
 # Maximum tilt of a plane that counts as vertical or horizontal.
 _LEAN_DEG: Final = 10.0
-# A plane belongs to the relief of a larger wall if the angle is smaller and the overlap is larger.
+# A plane belongs to the relief of a larger wall if the angle between them is less than the first
+# value and the wall contains more than the second value of its area.
 _PARALLEL_DEG: Final = 5.0
 _COVERED_SHARE: Final = 0.8
 

@@ -43,7 +43,7 @@ DENOISE_CELLS: Final = 4
 CELLS_AT_ONCE: Final = 1 << 20
 # Maximum distance of neighbours in the scan, in radii of a narrow gap.
 SPAN_GAPS: Final = 4
-# In a scan with more rows times columns, these numbers are not a grid (2 GB of indices).
+# If a scan has more rows times columns, these numbers do not form a grid (2 GB of indices).
 _GRID_CELLS_MOST: Final = 1 << 28
 # Number of depths sorted at once (256 MB).
 _POINTS_AT_ONCE: Final = 1 << 26
@@ -54,8 +54,9 @@ _NEAR_CELLS: Final = 2
 _KNOWN_LEAST: Final = 6
 # A cell that agrees with fewer neighbours is a speck.
 _AGREEING_LEAST: Final = 2
-# For sparse cells, more neighbours are used, and more must agree: at least half of the known ones.
+# Sparse cells are compared with neighbours up to this number of rows and columns away.
 _SPARSE_CELLS: Final = 4
+# At least this many neighbours, and half of the known ones, must agree with a sparse cell.
 _SPARSE_LEAST: Final = 3
 # Maximum slope of a surface whose sparse cells agree (27 degrees).
 _SLOPE: Final = 0.5
@@ -212,14 +213,14 @@ def _contest(
 def _surface_of_all(
     cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """Compute a surface in two or three passes: count, sort for medians, average points on it."""
+    """Compute a surface in two or three passes: count, sort for medians, average."""
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=threads):
         share_cells(threads, partial(kernels.add_moments, entries, count, moments))
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
     sigma_m = _spread_m(count, moments)
-    del moments  # A third of the memory used so far; the next passes need more.
+    del moments  # This frees a third of the memory used so far; the next passes need more.
     if params.surface != "mean":
         layer_m, gsd_m = LAYER_M, slab.frame.gsd_m
         depth_m = np.empty(count.size, dtype=np.float32)
@@ -367,7 +368,7 @@ def _averaged_values(
         share_cells(threads, *passes)
     intensity = None if cloud.intensity is None else np.empty(slab.n_cells, dtype=np.float32)
     rgb = None if cloud.rgb is None else np.empty((slab.n_cells, 3), dtype=np.uint8)
-    # In parts, because the computation needs several times the memory of the result.
+    # Process in parts, because the computation needs several times the memory of the result.
     for first in range(0, slab.n_cells, CELLS_AT_ONCE):
         part = slice(first, first + CELLS_AT_ONCE)
         with np.errstate(invalid="ignore"):
@@ -382,11 +383,11 @@ def _averaged_values(
 def without_specks(
     depth_m: NDArray[np.float32], *, gsd_m: float, layer_m: float, threads: int
 ) -> NDArray[np.float32]:
-    """Set cells to void that only an outlier measured, with which hardly any neighbour agrees.
+    """Set cells to void whose depth is an outlier, with which hardly any neighbour agrees.
 
     Otherwise such a cell would show a distant part of a photo. In the scan shadow of an edge, cells
-    are sparser than around it, and there are outliers and mixed pixels of both sides of the edge.
-    In such regions most of the few neighbours must agree, allowing for a slope.
+    are sparser than around it, and there are outliers and mixed pixels from both sides of the edge.
+    In such regions, most of the few neighbours must agree, allowing for a slope.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
@@ -569,10 +570,10 @@ def _recover_between_neighbours(
 ) -> NDArray[np.bool_]:
     """Fill void cells of a surface by linear interpolation between neighbours in the scan grids.
 
-    A point that the scanner missed is between its neighbours in the scan, at any distance on the
-    raster. A gap between points that are close neighbours on one surface is therefore interpolated.
-    A gap through which the scanner looked is not, because there are no neighbours on both sides.
-    Clouds without rows and columns have no neighbours.
+    A point that the scanner missed is between its neighbours in the scan, however far apart these
+    are on the raster. A gap between points that are close neighbours on one surface is therefore
+    interpolated. A gap through which the scanner looked is not, because it has no neighbours on
+    both sides. Clouds without rows and columns have no neighbours.
 
     Returns:
         (cells,) True for filled cells; their spread is NaN and their count 0.
@@ -605,7 +606,7 @@ def _recover_between_neighbours(
             grid = kernels.ScanGrid(points, offsets, matrix)
             voids = is_void.reshape(slab.frame.shape)
             kernels.recover_between(grid, intensity, rgb, reach, voids, sums)
-        # The value of a cell is the mean of the triangles that cover it.
+        # The value of a cell is the mean over the triangles that cover it.
         filled = np.flatnonzero(is_void & (sums.n > 0))
         n = sums.n[filled].astype(np.float32)
         is_void[filled] = False

@@ -17,8 +17,9 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.parameters import RasterParams
 
-# Bytes per cell of a finished wall, and additional bytes per cell while a wall is processed.
+# Bytes per cell of a finished wall.
 _BYTES_KEPT: Final = 25
+# Additional bytes per cell while a wall is processed.
 _BYTES_WORKING: Final = 90
 # Bytes per vertex of a triangulation, which is not processed in bands.
 _BYTES_VERTEX: Final = 700
@@ -100,7 +101,7 @@ def rastered_wall(
                 whole[name] = allocate(name, shape, values.dtype)
             of_band = values.reshape(-1, width, *values.shape[1:])
             whole[name][band.rows] = of_band[band.inner]
-    # The arrays have the types of those of the bands.
+    # The arrays have the same types as those of the bands.
     arrays = cast("dict[str, Any]", whole)
     return Wall(frame=frame, plane_index=index, name=planes.names[index], **arrays)
 

@@ -1,4 +1,4 @@
-"""Assembly of a cloud from blocks of several files without copies; rounding of coordinates."""
+"""Assembly of a cloud from blocks of several files without copying; rounding of coordinates."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.read.scales import ColourScale
 
-# Coarser rounding of coordinates limits what an orthoimage can show.
+# Coordinates rounded more coarsely than this limit the detail of an orthoimage.
 COARSE_M: Final = 0.005
-# Offsets are accurate to half a tenth of a millimetre; otherwise, a warning is reported.
+# If offsets are less accurate, a warning is reported.
 FINE_M: Final = 5e-5
 _POINT_BYTES: Final = 40
 _MOST_SCANS: Final = 2**16
@@ -29,11 +29,11 @@ _MOST_SCANS: Final = 2**16
 _POPULATE_WRITE: Final = 23
 _ROUNDING_SAMPLE: Final = 20_000
 _ROUNDING_VALUES: Final = 10
-# No surface has a twentieth of a scan's points at one position, however coordinates are rounded.
+# However coarsely coordinates are rounded, a twentieth of a scan's points cannot have one position.
 _REPEATED_SAMPLE: Final = 2000
 _REPEATED_SHARE: Final = 0.05
 _FEWEST_REPEATED: Final = 20
-# Decimal rounding, and the powers of two to which float32 rounds large coordinates.
+# Decimal steps, and the powers of two to which float32 rounds large coordinates.
 _ROUNDING_STEPS: Final = sorted(
     {digit * 10.0**power for digit in (1, 2, 5) for power in range(-4, 3)}
     | {2.0**power for power in range(-10, 4)},
@@ -52,14 +52,14 @@ class ScanCount:
         scan: metadata of the scan.
         unit_m: metres per unit along x, y and z.
         start: index of the first point in the cloud.
-        stop: index behind the last point in the cloud.
+        stop: index after the last point in the cloud.
         n_read: number of points in the file.
         left_out: number of points not in the cloud, by cause.
         n_without_rgb: number of points in the cloud without a valid colour.
         rounding_m: step to which coordinates are rounded, 0 if it is small.
         colours: scale of the colours, or None if there are none.
         first_far_m: first point that is too far away; empty if there is none.
-        repeated_m: position of so many points that they cannot be returns, or None.
+        repeated_m: position shared by so many points that they cannot be laser returns, or None.
     """
 
     file: str
@@ -118,7 +118,8 @@ class CloudAssembly:
         self._ctx, self._box_m, self._unit_m = ctx, box_m, unit_m
         self._reach_m = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._capacity = sum(file.n_most for file in files)
-        # Checked before writing: if the disk gets full, a mapped file ends the process by a signal.
+        # Check before writing, since a memory-mapped file on a full disk ends the process by a
+        # signal.
         needed, free = self._capacity * _POINT_BYTES, shutil.disk_usage(ctx.scratch).free
         if free < needed:
             raise StoreError(
@@ -194,7 +195,7 @@ class CloudAssembly:
 
     @property
     def offsets(self) -> list[NDArray[Any]]:
-        """Return x, y and z from the origin, cut to the actual number of points."""
+        """Return x, y and z relative to the origin, cut to the actual number of points."""
         return [self._arrays[name][: self.n_points] for name in "xyz"]
 
     def array(self, name: str) -> NDArray[Any] | None:
@@ -203,7 +204,7 @@ class CloudAssembly:
         return None if array is None else array[: self.n_points]
 
     def colour_mask(self) -> NDArray[Any]:
-        """Return the mask of valid colours, cut to the points; it is created if all are valid."""
+        """Return the mask of valid colours, cut to the actual number of points."""
         if "has_rgb" not in self._arrays:
             self._arrays["has_rgb"] = self._new("has_rgb", np.bool_)
             self._arrays["has_rgb"][: self.n_points] = True
@@ -230,7 +231,7 @@ class CloudAssembly:
             # Zeros are correct for all previous points.
             self._arrays["scan"] = self._new("scan", np.uint16)
         if self.n_points == 0:
-            # The median, so that distant stray points do not reduce the precision of the scan.
+            # Use the median, so that distant stray points do not reduce the precision of the scan.
             self.origin = np.floor(np.median(usable, axis=0))
         self._store(usable, block, kept, part)
         if "scan" in self._arrays:
@@ -261,7 +262,7 @@ class CloudAssembly:
     def _kept(
         self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: ScanCount
     ) -> NDArray[np.bool_] | slice:
-        """Return and count which points (n, 3) are usable and in the box; a slice if all are."""
+        """Return a mask of the points (n, 3) to keep, or a slice if all are; count the others."""
         usable: NDArray[np.bool_] | slice = slice(None)
         # NaN propagates through minimum and maximum, and compares as False.
         if not np.all(np.abs(bounds) < FARTHEST_M) and len(points):
@@ -326,8 +327,8 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
         unit_m: the file's unit in metres.
 
     Returns:
-        The largest step that fits all values of an axis, minimum over the axes; 0 if it is smaller
-        than `COARSE_M` or unknown.
+        For each axis, the largest step of which all values are multiples; the smallest of these, or
+        0 if it is less than `COARSE_M` or unknown.
     """
     sample = points[:: max(1, len(points) // _ROUNDING_SAMPLE)]
     found = []
@@ -340,9 +341,10 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
 
 
 def repeated_place(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the position (3,) of so many points (n, 3) that they cannot be returns, or None.
+    """Return a position (3,) shared by too many points (n, 3) to be laser returns, or None.
 
-    Points without a return are written as 0 0 0; programs that move a scan move them, too.
+    Rays without a return are written as points at 0 0 0; programs that transform a scan transform
+    these points, too.
     """
     sample = points[:: max(1, len(points) // _REPEATED_SAMPLE)]
     sample = sample[np.isfinite(sample).all(axis=1)]
@@ -358,9 +360,9 @@ def resolution_m(farthest_m: float) -> float:
 
 
 def _make_ready(array: NDArray[Any], part: slice) -> None:
-    """Request all pages of a memory-mapped file that will be written next, at once.
+    """Request all pages that will be written next to a memory-mapped file in a single call.
 
-    If each page is requested when it is first written, this takes four times as long.
+    This is four times as fast as a page fault for each of them.
     """
     mapping: object = array.base
     if not isinstance(mapping, mmap.mmap):

@@ -36,7 +36,7 @@ NOT_ORIENTED: Final = DiagnosticSpec(
 class ReadCameras(Method):
     """Read poses and lenses: `cameras.json`, COLMAP, Metashape, Bundler, RealityCapture.
 
-    They must be in the frame of the scan; `orient.given` reports cameras that see no wall. Photos
+    Poses must be in the frame of the scan; `orient.given` reports cameras that see no wall. Photos
     are identified by their file names, with or without suffix, and by their folders if several have
     the same name. A photo is not oriented if the files do not contain it, if it was disabled there,
     or if its lens differs from OpenCV's models by more than half a pixel; the reason is reported.
@@ -191,9 +191,9 @@ class GivenByName:
     def of_photo(self, name: str, folder: str = "") -> GivenCamera | None:
         """Return the camera of a photo, by its name or its name without suffix; None if not found.
 
-        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye or a panorama. Of
-        several cameras, the one whose folders match the photo's best is returned; if this is
-        ambiguous, the result has no pose, but a reason.
+        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye or a panorama. If
+        several cameras have the photo's name, the one whose folders match best is returned; if this
+        is ambiguous, the result contains a reason instead of a pose.
         """
         found, face = self._named(_file_name(name)), face_in(_file_name(name))
         if not found and face is not None:
@@ -206,7 +206,7 @@ class GivenByName:
         return _nearest(found, folder, is_only=is_only)
 
     def _named(self, name: str) -> list[GivenCamera]:
-        """Return the cameras of a file name or its stem; in the same case if there are any."""
+        """Return the cameras of a file name or its stem, with the same letter case if possible."""
         for wanted in (name, PurePath(name).stem):
             found = self._by_name.get(wanted.lower(), [])
             if found:
@@ -214,7 +214,7 @@ class GivenByName:
         return []
 
     def _of_stem(self, stem: str) -> list[GivenCamera]:
-        """Return the cameras of a photo with this name except for its suffix."""
+        """Return the cameras of photos with this stem, whatever their suffix."""
         found = [
             camera
             for name, cameras in self._by_name.items()

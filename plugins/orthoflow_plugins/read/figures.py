@@ -88,7 +88,7 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
 
     This is the view in the scanner's own angles, in which straight edges are curved (Figure 2 of
     markiewicz2015). If the station is known, the picture is oriented with up and left as seen from
-    it. None if the cloud has no grid or no intensity.
+    it. The result is None if the cloud has no grid or no intensity.
     """
     if cloud.row is None or cloud.column is None or cloud.intensity is None or not len(cloud):
         return None
@@ -119,10 +119,10 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
 def scan_lines_png(cloud: PointCloud) -> bytes | None:
     """Return a PNG of a wall in rectangular coordinates, with lines along rows and columns.
 
-    Of the scan with the most points, it shows the vertical plane with the most points and all
-    points within 15 cm of that plane, orthogonally and with up at the top. Some rows are yellow
-    lines, some columns blue ones (markiewicz2015, Figure 2b); they bend at objects in front of
-    the wall. None if the cloud has no grid.
+    The largest vertical plane of the scan with the most points is shown orthogonally, with up at
+    the top, and with all points within 15 cm of it. Some rows are drawn as yellow lines, some
+    columns as blue lines (markiewicz2015, Figure 2b); the lines bend at objects in front of the
+    wall. The result is None if the cloud has no grid.
     """
     import cv2
 
@@ -135,7 +135,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     station = _station(cloud, scan)
     viewer = level.mean(axis=0) if station is None else basis_from_up(cloud.up) @ station
     on_wall = np.abs(level[:, :2] @ [along[1], -along[0]] - distance_m) <= _WALL_REACH_M
-    # To the right, seen from the scanner.
+    # To the right, as seen from the scanner.
     right = along if viewer[:2] @ [along[1], -along[0]] > distance_m else -along
     places = np.column_stack([level[:, :2] @ right, -level[:, 2]])[on_wall]
     low, high = np.percentile(places, [0.1, 99.9], axis=0)
@@ -155,7 +155,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
 
 
 class ContactSheet:
-    """Thumbnails of the first hundred photos with their names, as stored, without rotation."""
+    """Thumbnails of the first hundred photos with their names; the EXIF rotation is not applied."""
 
     def __init__(self, n_photos: int) -> None:
         self._n_photos = n_photos
@@ -219,7 +219,7 @@ def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
 def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Return the direction (2,) of the vertical plane with the most points, and its distance."""
     some = plan[:: max(1, len(plan) // _PLAN_SAMPLE)]
-    # Points of damaged files can be anywhere, so limit the table of cells between them.
+    # Points of damaged files can be anywhere, so limit the size of the table of cells.
     is_near = np.all(np.abs(some - np.median(some, axis=0)) <= _WALL_FARTHEST_M, axis=1)
     some = some[is_near] if is_near.any() else some[:1]
     angles = np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG))
@@ -267,7 +267,7 @@ def _ways_of_grid(
     rays = (offsets - station) @ basis_from_up(cloud.up).T
     elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
     upward = float(np.cov(row, elevation)[0, 1]) >= 0.0
-    # Mean directions of the columns; their steps have the same sign where a panorama closes, too.
+    # Mean directions of the columns; steps between them keep their sign where a panorama closes.
     east, north = (np.bincount(column, rays[:, axis]) for axis in (0, 1))
     azimuth = np.arctan2(north, east)[np.bincount(column) > 0]
     steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi

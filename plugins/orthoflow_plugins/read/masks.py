@@ -32,7 +32,7 @@ NO_MASKS: Final = DiagnosticSpec(
 
 
 class Masks:
-    """Mask pictures and polygons, the used ones among them, and files that are not masks."""
+    """Mask pictures and polygons, those already used, and files that are not masks."""
 
     def __init__(
         self,
@@ -139,5 +139,5 @@ def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
 
 
 def _key(stem: str) -> str:
-    """Return the name or stem of the photo for a mask with this stem."""
+    """Return the name or stem of the photo to which a mask with this stem belongs."""
     return stem.removesuffix(_ENDING)

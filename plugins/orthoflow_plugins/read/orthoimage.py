@@ -32,9 +32,9 @@ class ReadOrthoimage(Method):
     files, with `origin_world`, `u_world`, `v_world`, `normal_world` as in the JSON files of
     orthoflow's rasters; a copy of `wall_0_intensity.json` is sufficient. Files from orthoflow need
     no JSON file. X and Y have the same meaning as in orthoflow's GeoTIFF files: at the origin, they
-    are `x_of_left_m` and `height_of_top_m`, or 0 if these are missing in the JSON file. Thus, size,
-    cell size and extent may differ from those of the wall. `wall` in the JSON file is the number of
-    the wall: the index of its plane in `planes.json`, as in file names.
+    have the values `x_of_left_m` and `height_of_top_m` of the JSON file, or 0 if it does not
+    contain these. Thus, size, cell size and extent may differ from those of the wall. `wall` in the
+    JSON file is the number of the wall: the index of its plane in `planes.json`, as in file names.
     """
 
     id: ClassVar[str] = "read.orthoimage"

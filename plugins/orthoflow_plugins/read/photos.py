@@ -101,14 +101,14 @@ class ReadPhotos(Method):
     input.
 
     A panorama, from an E57 file or listed in `panoramas`, is split into six photos, the faces of a
-    cube, as PNG files without distortion. The same is done with photos that have a fisheye lens
-    (OpenCV's model) or are panoramas according to the calibration or the given cameras; of a
-    fisheye photo, only the visible parts of faces are used.
+    cube, as PNG files without distortion. Photos that have a fisheye lens (OpenCV's model) or are
+    panoramas according to the calibration or the given cameras are split in the same way; only
+    those parts of the faces are used that a fisheye photo shows.
 
-    The content of the files is kept and never encoded again. Pixels are those of the stored array:
-    the EXIF orientation is recorded, but not applied. In a TIFF file with several pages, the photo
-    is the largest page that is not a preview. Every photo is decoded once, so that damaged files
-    are found here and not after an hour.
+    The content of the files is kept unchanged and never re-encoded. Pixels are those of the stored
+    array: the EXIF orientation is recorded, but not applied. In a TIFF file with several pages, the
+    photo is the largest page that is not a preview. Every photo is decoded once, so that damaged
+    files are found here and not an hour later.
 
     Pixels that are transparent, black in a mask, or inside polygons are used neither for ties nor
     for colours. Masks are pictures NAME_mask.png next to NAME.jpg, or files of the input `masks`:
@@ -323,7 +323,7 @@ _PANORAMA: Final = PanoramaLens(width=0, height=0)
 def _both(
     one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_] | None:
-    """Return the pixels that are usable in two masks; None means all."""
+    """Return the pixels that are usable in both masks; None means all."""
     return other if one is None else one if other is None else one & other
 
 
@@ -426,7 +426,7 @@ def _require_whole(name: str, encoded: bytes) -> str:
     """Return a remark on an intact but unusual photo, or an empty text.
 
     Raises:
-        InputError: it is not a photo, its format is not supported, or a part of it is lost.
+        InputError: it is not a photo, its format is not supported, or a part of it is missing.
     """
     problem = unreadable(encoded)
     if problem:
@@ -497,7 +497,7 @@ def _read_photo(
 
 
 def _camera(exif: Exif) -> str:
-    """Return camera and focal length, common to photos with one lens; empty if unknown."""
+    """Return the names of camera and focal length, which identify a lens; empty if unknown."""
     if not exif.camera:
         return ""
     return exif.camera if exif.focal_mm is None else f"{exif.camera}, {exif.focal_mm:g} mm"

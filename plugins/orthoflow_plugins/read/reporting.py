@@ -19,8 +19,8 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, ScanCount, resolution_m
 from orthoflow_plugins.read.scales import IntensityScale
 
-# If two sides of a scan are shorter or longer than these, its unit is probably wrong: walls and
-# buildings have other sizes.
+# If two sides of a scan are shorter than the first or longer than the second value, its unit is
+# probably wrong.
 _SMALL_M: Final = 1.0
 _LARGE_M: Final = 1000.0
 # Maximum number of names listed in a sentence.

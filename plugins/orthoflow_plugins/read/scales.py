@@ -28,21 +28,22 @@ _FULL: Final[dict[RgbScale, float]] = {
 
 _BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
-# Correlation of intensity and grey of the colours, from which they count as the same. It is 0.99997
-# for lion-takanawa, whose intensity is that grey; laser intensity at 532..1550 nm is far lower,
-# unless a scene has only two colours. Two roundings to 8 bits cause differences of 0.4 grey levels.
+# From this correlation on, an intensity is considered a copy of the grey of the colours. It is
+# 0.99997 for lion-takanawa, whose intensity is such a copy; laser intensity at 532..1550 nm
+# correlates far less, unless a scene has only two colours.
 _LUMINANCE_CORRELATION: Final = 0.999
+# Two roundings to 8 bits cause differences of 0.4 grey levels.
 _ROUNDING_LEVELS: Final = 0.7
 # Values outside these percentiles by more than the distance between them are extreme.
 _PERCENTILES: Final = (2.0, 98.0)
-# If the data of all scans cover a smaller part of the limits in the metadata, those are the limits
-# of the sensor, and the picture would be black.
+# If the data of all scans cover less than this part of the range in the metadata, it is the range
+# of the sensor, and pictures scaled by it would be black.
 _SMALLEST_PART: Final = 0.25
-# Scans whose ranges overlap by a larger part have a common scale, so that the same surfaces have
-# the same brightness.
+# Scans whose ranges overlap by more than this part get a common scale, so that the same surfaces
+# have the same brightness.
 _COMMON_PART: Final = 0.4
-# Ranges written by scanners and programs, for scans without limits that differ from others: the
-# first range that contains a scan's data is used if the data cover enough of it.
+# Ranges written by scanners and programs, for scans that have no limits and differ from other
+# scans: the first range that contains a scan's data is used if the data cover enough of it.
 _NOMINAL: Final = ((0.0, 1.0), (0.0, 255.0), (-2048.0, 2047.0), (0.0, 4095.0), (0.0, 65535.0))
 _NOMINAL_PART: Final = 0.4
 # A smaller share of colours outside a scale does not change it.
@@ -67,7 +68,7 @@ class IntensityScale:
 
 
 def robust_range(values: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Return the smallest and largest value that is not extreme; None if no value is finite."""
+    """Return the smallest and largest values that are not extreme; None if no value is finite."""
     sample = values[:: max(1, len(values) // _SAMPLE)]
     sample = sample[np.isfinite(sample)]
     if not len(sample):
@@ -91,9 +92,10 @@ def choose_scales(
         intensity_max: full intensity given by the user, or None.
 
     Returns:
-        The user's scale. Otherwise the limits in the metadata, if the data are within them and
-        cover more than a small part. Otherwise the range of the data, common to scans with similar
-        ranges; if scans differ, it is replaced by the first usual range that the data fill.
+        The user's scale if given; otherwise, the limits in the metadata if the data are within them
+        and cover more than a small part; otherwise, the range of the data, which is common to scans
+        with similar ranges. If scans differ, this range is replaced by the first nominal range that
+        the data fill.
     """
     scales: list[IntensityScale | None] = [None] * len(ranges)
     known = [(seen, one) for seen, one in zip(ranges, stated, strict=True) if seen and one]
@@ -266,12 +268,12 @@ class ColourScale:
         if self.scale is None:
             self.scale = seen
         elif full[seen] > full[self.scale]:
-            # Values that seemed to be full brightness were 0 or 1 of 255.
+            # Previous values were scaled by a full brightness that was too low.
             before = self._stored[: self._count]
             before[:] = np.rint(before * np.float32(full[self.scale] / full[seen]))
             self.scale = seen
         fits = limit is None or full[self.scale] == limit or self.largest <= 1.0
-        # Files with any 16-bit data have a 16-bit limit.
+        # A 16-bit limit may be stated for any 16-bit data.
         self.misfit = None if fits or (limit == 65280.0 and self.scale == "16 bit") else limit
 
 

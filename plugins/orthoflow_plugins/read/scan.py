@@ -202,7 +202,7 @@ class ReadScan(Method):
 def _opened(
     path: Path, columns: Columns | None, box_m: NDArray[np.float64] | None, params: ReadScan.Params
 ) -> ScanFile:
-    """Open a file; of a COPC file, only the requested parts are read, in the file's unit."""
+    """Open a file; if it is a COPC file, only the requested parts are read."""
     opened = partial(
         open_scan,
         path,

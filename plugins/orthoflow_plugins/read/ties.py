@@ -74,7 +74,7 @@ class ReadTies(Method):
         if wrong:
             left_out = len(wrong) - _MOST_PROBLEMS
             more = [f"... and {left_out} more problems"] if left_out > 0 else []
-            # Similar names take long to find, so search only for those in the message.
+            # Finding similar names is slow, so it is only done for the ties in the message.
             shown = [_problem(tie, photos) for tie in wrong[:_MOST_PROBLEMS]]
             raise InputError("\n".join(shown + more))
         ties = _ties(found, tuple(photos), params)

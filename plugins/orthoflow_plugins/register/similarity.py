@@ -15,9 +15,9 @@ from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, Poin
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 _AT_ONCE: Final = 1 << 20
-# Points are mirrored if a mirrored copy fits this many times better.
+# Points are considered mirrored if their mirror image fits this many times better.
 _MIRRORED_TIMES: Final = 10.0
-# Points are on one line if their second-largest spread is a smaller share of the largest.
+# Points count as collinear if their second-largest spread is less than this share of the largest.
 _LINE_SHARE: Final = 1e-6
 
 
@@ -28,8 +28,8 @@ class RegisterSimilarity(Method):
     cloud's coordinates, `control` the surveyed positions; points with the same name form a pair.
     All pairs have the same weight. `sigma0_mm` is the standard deviation of one coordinate;
     `left_out_rms_mm` is computed from the distance between each control point and its position
-    predicted by the other pairs, so it is independent of that pair. The transformed cloud has the
-    up direction of the control points.
+    predicted from the other pairs, so no pair influences its own distance. The transformed cloud
+    takes over the up direction of the control points.
     """
 
     id: ClassVar[str] = "register.similarity"
@@ -72,7 +72,7 @@ class RegisterSimilarity(Method):
         control: CheckPoints
 
     class Out(Ports):
-        """The transformed cloud, and the residuals in the control's system."""
+        """The transformed cloud, and the residuals in the system of the control points."""
 
         cloud: PointCloud
         inspection: Inspection
@@ -176,7 +176,7 @@ def _require_same_hand(
     *,
     with_scale: bool,
 ) -> None:
-    """Refuse lists that mirror each other, whose fit would be poor and have a wrong scale.
+    """Refuse lists that are mirror images of each other: their fit is poor and its scale wrong.
 
     Raises:
         GeometryError: the fit is far better if one of the lists is mirrored.
@@ -198,7 +198,7 @@ def _require_same_hand(
 def _left_out(
     source: NDArray[np.float64], target: NDArray[np.float64], *, with_scale: bool
 ) -> NDArray[np.float64]:
-    """Return distances (n,) between points and predictions from the others; empty for 3 pairs."""
+    """Return distances (n,) of points from their predictions by the others; empty for 3 pairs."""
     if len(source) < 4:
         return np.zeros(0)
     apart = []
@@ -250,7 +250,7 @@ def _details(
 
 
 def _moved(cloud: PointCloud, fitted: Similarity, ctx: StepContext) -> PointCloud:
-    """Return the cloud in target coordinates; offsets from the new origin keep their digits."""
+    """Return the cloud in target coordinates, with its transformed origin as the new origin."""
     origin = fitted.apply(cloud.origin[None])[0]
     turn = fitted.scale * fitted.rotation
     offsets = {

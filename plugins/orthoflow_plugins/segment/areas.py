@@ -15,24 +15,28 @@ from numpy.typing import NDArray
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import OpeningKind, PointCloud, SurfaceMask, Wall
 
-# Areas with a narrower connection are separate.
+# Areas connected by a narrower neck are separate.
 _NECK_CELLS: Final = 3
-# Minimum shares of crossed or empty cells that determine the kind of an area.
+# An area is `through` if at least this share of its cells is crossed by rays.
 _CROSSED_LEAST: Final = 0.1
+# Otherwise, it is `no data` if at least this share of its cells is empty.
 _EMPTY_LEAST: Final = 0.5
-# If more than this share of the measured cells is behind the plane, it is not the wall's face.
+# If more than this share of the measured cells is behind the plane, the plane is not the wall's
+# face.
 _FACE_LEAST: Final = 0.5
 _CELLS_TOLD: Final = 1 << 25
 # Rays are counted on tiles of about this side length, which contain many rays.
 _TILE_M: Final = 0.05
-# Larger clouds are sampled to about this number of points, distributed by Fibonacci hashing.
+# From larger clouds, a sample of about this many points is taken by Fibonacci hashing.
 _POINTS_MOST: Final = 1 << 22
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 _BLOCK: Final = 1 << 18
-# Maximum distance behind and in front of an empty area of points that are used without stations.
+# If stations are unknown, only points up to these distances behind and in front of the plane are
+# used.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 1.5
-# Minimum number of rays of a tile that must agree, since isolated distant points are gross errors.
+# Minimum number and share of rays that must pass through a tile, or end in front of it; isolated
+# distant points are gross errors.
 _RAYS_LEAST: Final = 2
 _SHARE_LEAST: Final = 0.2
 
@@ -43,8 +47,9 @@ class SightLines:
 
     Attributes:
         side: number of cells along the side of a tile.
-        crossed: (rows, cols) bool, rays passed through the wall here.
-        stopped: (rows, cols) bool, rays ended in front of the wall here, and none passed through.
+        crossed: (rows, cols) bool, True where rays passed through the wall.
+        stopped: (rows, cols) bool, True where rays ended in front of the wall and none passed
+            through.
     """
 
     side: int
@@ -113,8 +118,8 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
 def _rays(
     cloud: PointCloud,
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64] | None]]:
-    """Yield ends (n, 3) of rays, block by block, and their starts (n, 3), or None if unknown."""
-    # Stations are only used if they are from the file; others may not be those of all scans.
+    """Yield blocks of ray ends (n, 3), each with the ray starts (n, 3), or None if unknown."""
+    # Only stations from the file are used; a viewpoint set by the user may be wrong for some scans.
     stations = cloud.stations if cloud.stations_source == "file" else None
     scan = cloud.scan
     every = -(-len(cloud) // _POINTS_MOST)
@@ -141,7 +146,7 @@ class Relief:
         is_face: (rows, cols) bool, measured and not behind the wall's face.
         is_open: (rows, cols) bool, behind the face or empty, and not hidden.
         is_empty: (rows, cols) bool, depth unknown.
-        is_crossed: (rows, cols) bool, rays passed through.
+        is_crossed: (rows, cols) bool, True where rays passed through.
         depth_m: (rows, cols) float32 depth in front of the plane; NaN where empty.
         face_m: depth of the wall's face; 0 if the face is the plane.
     """
@@ -178,7 +183,7 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
 
     Args:
         wall: the wall; if it has more than 32 million cells, only every nth row and column is used.
-        lines: results of tracing lines of sight; None if unknown, then no cell counts as hidden.
+        lines: the traced lines of sight; if None, no cell counts as hidden.
         behind_m: cells at least this far behind the wall's face do not belong to it.
     """
     import cv2
@@ -192,8 +197,8 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
     if lines is not None:
         is_crossed = lines.over(lines.crossed, wall.frame.shape, step) & is_empty
         is_hidden = lines.over(lines.stopped, wall.frame.shape, step) & is_empty
-    # A detected plane may be at the fronts of pilasters, or between these and the wall. In this
-    # case, the face is the median of the cells behind the plane.
+    # A detected plane may be at the fronts of pilasters, or between the fronts and the wall. In
+    # this case, the face is the median of the cells behind the plane.
     measured_m = depth_m[~is_empty]
     deeper_m = measured_m[measured_m <= -behind_m]
     is_deeper = len(deeper_m) > _FACE_LEAST * len(measured_m)

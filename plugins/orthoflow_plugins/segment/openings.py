@@ -42,10 +42,11 @@ from orthoflow_plugins.segment.outlines import Outline, moved_to_edges, outline_
 _UPRIGHT: Final = math.sin(math.radians(30.0))
 # A surface farther behind the plane is not the face of the same wall.
 _FACE_FARTHEST_M: Final = 0.3
-# Minimum share of its bounding rectangle that an empty area must fill, as round windows do and scan
-# shadows do not.
+# Minimum share of its bounding rectangle that an empty area must fill; round windows fill more,
+# scan shadows less.
 _FILLED_LEAST: Final = 0.7
-# An area is part of the scan's border rather than an opening if less of its outline is measured.
+# If the wall was measured along less than this share of an outline, the area is at the border of
+# the scan and not an opening.
 _SEEN_LEAST_SHARE: Final = 0.5
 _LONGEST_PX: Final = 1004
 _SMALLEST_PX: Final = 500
@@ -90,14 +91,14 @@ class SegmentOpenings(Method):
     plane, or the median of the cells behind it if these are more than half of the wall. If a cloud
     is given, lines of sight are traced: an area that some of them pass through is `through`; an
     area in front of which they end is hidden and is not reported as an opening. An empty area
-    without lines of sight is `no data` if it is about as compact as a round window; usually it is
-    glass or a mirror. An area with a measured back is a `niche`; this includes closed doors and
+    without lines of sight is `no data` if it is about as compact as a round window; usually, this
+    is glass or a mirror. An area with a measured back is a `niche`; this includes closed doors and
     windows that are set back.
 
     Sides are lines fitted to the borders of the cells. The standard deviation of each side follows
     from the cell size, the point spacing and the scatter of the border. With orthoimages from
-    photos, long sides are moved to the corresponding edge of the picture if it is unambiguous and
-    more accurate than the scan.
+    photos, long sides are moved to the corresponding edge in the orthoimage if this edge is
+    unambiguous and more accurate than the scan.
     """
 
     id: ClassVar[str] = "segment.openings"
@@ -186,7 +187,7 @@ class SegmentOpenings(Method):
 def _found_on(
     inputs: SegmentOpenings.In, place: int, params: SegmentOpenings.Params, ctx: StepContext
 ) -> tuple[list[Opening], int]:
-    """Return the openings of one wall, and the number of areas rejected by border or shape."""
+    """Return a wall's openings, and the number of areas rejected for their border or shape."""
     wall, slab = inputs.walls.walls[place], inputs.walls.slab(place)
     lines = None if inputs.cloud is None else sight_lines(inputs.cloud, slab)
     relief = relief_of(wall, lines, params.behind_m)
@@ -218,7 +219,7 @@ def _found_on(
     openings.sort(key=lambda opening: float(opening.outline_m[:, 0].min()))
     if openings:
         frame, step = wall.frame, relief.step
-        # Draw over the orthoimage, or else over the intensity.
+        # Draw over the orthoimage or, if there is none, over the intensity.
         shown = np.where(relief.is_face, np.float32(0.8), np.float32(0.2))
         if grey is not None:
             shown = grey / 255.0
@@ -237,7 +238,8 @@ def _opening(
     wall: Wall, relief: Relief, area: Area, outline: Outline, by_image: NDArray[np.bool_]
 ) -> Opening:
     frame = wall.frame
-    # Convert from every nth cell, starting with the first, to all cells.
+    # Convert coordinates in the reduced grid (every nth cell, starting with the first) to the full
+    # grid.
     cells = np.clip(relief.step * (outline.corners - 0.5) + 0.5, 0.0, [frame.width, frame.height])
     places = frame.raster_from_wall(cells)
     spans_m = frame.gsd_m * (cells.max(axis=0) - cells.min(axis=0))
@@ -269,7 +271,8 @@ def _grey(
     """
     known = () if images is None else images.images
     image = next((each for each in known if each.number == wall.plane_index), None)
-    # Edges in an orthoimage coloured from the cloud are no more accurate than those of its cells.
+    # Edges in an orthoimage coloured from the cloud are no more accurate than the borders of the
+    # cells.
     if image is None or set(image.sources) <= {"cloud"}:
         return None
     if not image.frame.has_cells_of(wall.frame):

@@ -14,20 +14,21 @@ from orthoflow.geometry.frames import signed_area
 from orthoflow.geometry.robust import median_deviation
 from orthoflow_plugins.segment.areas import Area, Relief
 
-# Corners closer to the line between their neighbours are due to cells and noise.
+# Corners closer than this to the line between their neighbours are due to the grid and noise.
 _STRAIGHT_CELLS: Final = 2.0
-# After lines have been fitted to the sides, a smaller deviation is not a corner.
+# After lines have been fitted, two sides are joined if their corner deviates by no more than this.
 _JOINED_CELLS: Final = 1.0
-# Lines are fitted only to longer sides, and a corner is moved by no more than this.
+# Lines are fitted only to sides longer than this, and no corner is moved farther.
 _FITTED_CELLS: Final = 8.0
 # Sides that meet at a smaller angle are not intersected; their corner is kept.
 _TURN_LEAST: Final = math.sin(math.radians(15.0))
-# Length at the ends of a side that belongs to its corners, and rejection limit for cells as a
-# multiple of the median deviation.
+# Length at each end of a side that belongs to the corner.
 _ENDS_CELLS: Final = 3.0
+# Rejection limit for cells, as a multiple of the median deviation.
 _FAR_CELLS: Final = 3.0
-# Distances outside a side at which the wall's face is searched, and the required share.
+# Distances outside a side at which the wall's face is searched for.
 _BESIDE_CELLS: Final = (2.0, 3.0, 4.0)
+# A side counts as measured if the face was found along at least this share of it.
 _BESIDE_LEAST: Final = 0.5
 # Standard deviation of a position that is uniformly distributed in an interval of length 1.
 _UNIFORM: Final = 1.0 / math.sqrt(12.0)
@@ -38,23 +39,27 @@ _BORDER_CELLS: Final = 2.0
 
 _LONG_CELLS: Final = 20.0
 _PROFILE_ENDS_CELLS: Final = 4.0
-# Length of the profiles to both sides of a side, and their step.
+# Profiles extend this far to the inside and outside of an outline.
 _REACH_CELLS: Final = 4.0
+# Sampling interval of the profiles.
 _STEP_CELLS: Final = 0.25
-# Number of pieces of a side, and number of pieces in which the edge must be found.
+# Number of pieces into which a side is divided.
 _PIECES: Final = 5
+# Minimum number of pieces in which the edge must be found.
 _PIECES_LEAST: Final = 4
-# Minimum grey levels per cell of an edge, since weaker edges are stains, and minimum ratio of its
-# slope to the median slope.
+# Minimum slope of an edge in grey levels per cell, since weaker edges are stains.
 _CONTRAST_LEAST_GREY: Final = 4.0
+# Minimum ratio of the slope to the median slope.
 _CONTRAST_LEAST: Final = 3.0
 # Slopes of at least this share of the steepest slope belong to an edge.
 _EDGE_SHARE: Final = 0.2
-# Minimum standard deviation of an edge, since the picture was projected with the same depths.
+# Minimum standard deviation of an edge: the orthoimage was made with the same depths, so their
+# errors affect its edges, too.
 _SIGMA_LEAST_CELLS: Final = 0.5
-# Depth and picture show different edges if they differ by more than this many sigmas of the depth.
+# Depth and orthoimage show different edges if these are more than this many sigmas (of the depth
+# edge) apart.
 _APART_SIGMAS: Final = 1.5
-# The choice is ambiguous if another edge in the profile exceeds this share of the slope.
+# The choice is ambiguous if another edge in the profile exceeds this share of the steepest slope.
 _SECOND_MOST: Final = 0.6
 _PARALLEL: Final = 0.26
 
@@ -158,7 +163,7 @@ def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the indices of the corners of a ring (Douglas and Peucker)."""
     import cv2
 
-    # Doubled coordinates are integers, with which the corners are looked up.
+    # Doubled coordinates are integers, so the corners can be looked up exactly.
     doubled = np.rint(2.0 * ring).astype(np.int32)
     simple = cv2.approxPolyDP(doubled[:, None, :], 2.0 * _STRAIGHT_CELLS, closed=True)[:, 0]
     place_of = {(int(x), int(y)): place for place, (x, y) in enumerate(doubled)}
@@ -270,7 +275,7 @@ def _meeting(first: _Side, second: _Side) -> NDArray[np.float64] | None:
 
 
 def _sigma(side: _Side, spacing: float) -> float:
-    """Return the sigma of a side, from the cells, the point spacing and its scatter."""
+    """Return the sigma of a side, from cell size, point spacing and the scatter of its border."""
     scatter = side.scatter
     if side.middle is not None:
         scatter /= math.sqrt(max(1.0, side.length / spacing))
@@ -394,7 +399,7 @@ def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArr
     for corner in range(len(corners)):
         pair = [corner - 1, corner]
         rows = outwards[pair]
-        # A corner between nearly parallel sides is moved by their mean.
+        # A corner between nearly parallel sides is moved by the mean of their shifts.
         if abs(float(np.linalg.det(rows))) < _PARALLEL:
             moved[corner] += (shifts[pair] @ rows) / 2.0
         else:

@@ -159,7 +159,7 @@ class Side:
             ]
 
     def box(self, extent: Extent, depth_m: float, paint: Paint, *, base_m: float = 0.0) -> None:
-        """Add relief that projects `depth_m` from the depth `base_m`; nothing if `depth_m` is 0."""
+        """Add relief that projects by `depth_m` from the depth `base_m`, unless `depth_m` is 0."""
         if depth_m <= 0.0:
             return
         role = SurfaceRole.RELIEF if base_m >= 0.0 else SurfaceRole.RECESS

@@ -119,7 +119,7 @@ def truth_of(
     """
     rectangle = delivery.scan.points.rectangle
     scene = delivery.room.scene
-    # An additional entry for spoilt points.
+    # The additional entry is for spoilt points.
     plane_of = np.append(scene.plane_index, np.int16(-1)).astype(np.int16)
     raw = plane_of[np.where(rectangle == SPOILT, len(scene), rectangle)]
     n_points = np.bincount(raw + 1, minlength=len(delivery.room.planes) + 1)[1:]
@@ -296,8 +296,9 @@ class _Spots(Rows):
 def check_points(delivery: Delivery, views: SceneCameras, *, n_most: int) -> CheckPoints:
     """Choose check points of each class on the main wall.
 
-    `flat` points are crossings of the painted lines of a fresco with 4 cm of plain wall around;
-    `vertical edge` points are front corners of mouldings. Each is seen from at least one station.
+    `flat` points are crossings of the painted lines of a fresco with 4 cm of plain wall around
+    them; `vertical edge` points are front corners of mouldings. Each is seen from at least one
+    station.
 
     Args:
         delivery: the scanned room.
@@ -363,7 +364,7 @@ def _corners(
         in_rectangle=scene.extent[fronts][:, [[0, 2], [0, 3], [1, 2], [1, 3]]].reshape(-1, 2),
     )
     seen = _are_seen(scene, views, spots.moved(_INSIDE_M * inwards), stations)
-    # A common corner of two bars is in the middle of a face, without an edge.
+    # A corner that two bars share is in the middle of a face and has no edge.
     beside = spots.moved(_INSIDE_M * inwards * np.array([-1.0, 1.0]))
     return spots.points(scene)[seen & ~_are_level(scene, views, beside)]
 
@@ -371,7 +372,7 @@ def _corners(
 def _are_seen(
     scene: Scene, views: SceneCameras, spots: _Spots, stations: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return which positions (n,) are seen from any station."""
+    """Return a mask (n,) of the positions that are visible from any station."""
     points = spots.points(scene)
     seen = np.zeros(len(points), dtype=np.bool_)
     for station in stations:
@@ -381,7 +382,7 @@ def _are_seen(
 
 
 def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.bool_]:
-    """Return which positions (n,) are on a surface of the same height, of any rectangle."""
+    """Return a mask (n,) of positions at the surface, whichever rectangle they belong to."""
     points, normals = spots.points(scene), scene.normal[spots.rectangle]
     inwards = np.where(np.einsum("ij,ij->i", normals, points) > 0.0, -1.0, 1.0)[:, None] * normals
     hits = views.cast(points + _LIFT_M * inwards, -inwards)

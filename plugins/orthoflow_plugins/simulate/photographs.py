@@ -1,6 +1,6 @@
 """Simulated photography: camera positions, camera and JPEG files.
 
-The layouts are those of markiewicz2015; pictures are degraded as by real lenses and sensors.
+The layouts are those of markiewicz2015; pictures have the defects of real lenses and sensors.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FURNITURE_M: Final = -0.45
 _WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
-# Lower and upper end above the room's origin, and half width, of the legs and of the upper body.
+# For the legs and the upper body: lower and upper end above the room's origin, and half the width.
 _BODY_M: Final = ((-1.45, -0.6, 0.17), (-0.6, 0.3, 0.25))
 _ABSENT: Final = 0.5
 _OF_PEOPLE: Final = (
@@ -176,7 +176,7 @@ def planned_shots(
 def with_passers_by(
     scene: Scene, n_photos: int, count: int, rng: np.random.Generator
 ) -> tuple[Scene, ...]:
-    """Return the scene of each photo with people in front of the main wall; empty without people.
+    """Return each photo's scene with people in front of the main wall; empty if there are none.
 
     Each person appears in about half of the photos, chosen at random, 0.5 to 1.4 m in front of the
     wall and always in the same clothes.

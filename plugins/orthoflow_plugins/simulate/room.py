@@ -52,7 +52,7 @@ class SimulateRoom(Method):
     """Scan and photograph a decorated room with relief, niche, door and a free-standing object.
 
     There are two scans per station: a panorama and a detail scan of the main wall. Points are
-    ordered by scan, then by column, then by row from the lowest up. The noise of a distance depends
+    ordered by scan, then by column, then by row from bottom to top. The noise of a distance depends
     on range, incidence angle and material; some points are gross outliers, and at edges the
     distances of two surfaces are mixed. All noise is a function of the seed and the position in the
     scan, so it does not depend on threads.

@@ -32,8 +32,8 @@ from orthoflow_plugins.simulate.building import (
 FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
 _MAIN_OMEGA_DEG: Final = 102.0
-# Ranges of the plane positions in a random geometry, in degrees and metres; small enough that
-# surfaces extend beyond the corners of every such room.
+# Maximum random changes of the planes, in degrees and metres; small enough that surfaces extend
+# beyond the corners of every random room.
 _DRAWN_OMEGA_DEG: Final = 0.5
 _DRAWN_PHI_DEG: Final = 1.0
 _DRAWN_DISTANCE_M: Final = 0.08
@@ -41,8 +41,9 @@ _DRAWN_SLOPE: Final = 0.008
 # The floor is only raised, so that there is no gap below the furniture.
 _DRAWN_FLOOR_M: Final = (0.03, 0.07)
 _DRAWN_CEILING_M: Final = (-0.05, 0.05)
-# Visible area of the main wall, and its textile share: maximum and in the designed room.
+# Visible area of the main wall.
 _MAIN_WALL_M2: Final = 16.7
+# Maximum share of textile on the main wall, and its share in the designed room.
 MOST_TEXTILE: Final = 0.35
 TEXTILE_BY_DESIGN: Final = 0.095
 
@@ -98,9 +99,9 @@ _FURNITURE: Final = (
 )
 # Distance by which random objects extend behind adjoining walls, floor and ceiling.
 _BEYOND_M: Final = 0.1
-# Bays narrower than the first value remain empty; the second is the margin on both sides of
-# objects.
+# Narrower bays remain empty.
 _BAY_LEAST_M: Final = 0.7
+# Margin on both sides of an object in a bay.
 _BESIDE_M: Final = 0.12
 _PLAQUE_GAP_M: Final = 0.1
 _PLAQUE_TRIES: Final = 40
@@ -323,7 +324,7 @@ def _build_wall(
 
 
 def _cloths(share: float) -> list[Extent]:
-    """Return extents of cloth for a share of the main wall: the middle first, then beside it."""
+    """Return extents of cloth that cover a share of the main wall, starting in its middle."""
     middle: Extent = (-0.73, 0.83, -1.3, 1.3)
     by_design: Extent = (-0.45, 0.65, -0.45, 1.0)
     beside: list[Extent] = [
@@ -347,14 +348,14 @@ def _cloths(share: float) -> list[Extent]:
 
 
 def _grown(small: Extent, large: Extent, area_m2: float) -> Extent:
-    """Return a rectangle of a given area, from the small one scaled or grown to the large one."""
+    """Return a rectangle of a given area: the small one, shrunk or grown towards the large one."""
     one, other = np.array(small), np.array(large)
     full = _area_m2(small)
     if area_m2 <= full:
         middle = np.repeat([0.5 * (one[0] + one[1]), 0.5 * (one[2] + one[3])], 2)
         grown = middle + math.sqrt(area_m2 / full) * (one - middle)
     else:
-        # Both sides grow by the same share, which solves a quadratic equation.
+        # Both sides are extended by the same share, the solution of a quadratic equation.
         (width, height), (wider, higher) = (np.diff(e.reshape(2, 2))[:, 0] for e in (one, other))
         linear = width * (higher - height) + height * (wider - width)
         square = (wider - width) * (higher - height)
@@ -478,7 +479,7 @@ def _overlap(one: Extent, other: Extent) -> bool:
 
 
 def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
-    """Return a random extent of cloth for a share of the main wall; None if the share is 0."""
+    """Return a random extent of cloth that covers a share of the main wall; None if it is 0."""
     if share <= 0.0:
         return None
     a0, a1 = _WALLS[0][2]

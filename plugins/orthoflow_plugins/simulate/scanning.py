@@ -2,11 +2,11 @@
 
 Noise depends only on the position in the angular grid, so it does not depend on threads.
 
-A laser measures other reflectances than a camera. Which of red lead, gold, wet plaster and
-retouchings is brighter differs between the laser's single wavelength and the three broad bands of a
-camera. In the simulation, reflectance decreases with red and increases with green, each with a gain
-and a power that depend on the material; wet patches are darker, and retro-reflecting spots saturate
-the detector.
+A laser and a camera measure different reflectances: at the single wavelength of a laser, red lead,
+gold, wet plaster and retouchings have another order of brightness than in the three broad bands of
+a camera. In the simulation, reflectance decreases with red and increases with green, each with a
+gain and a power that depend on the material; wet patches are darker, and retro-reflecting spots
+saturate the detector.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ from orthoflow.geometry.threads import in_runs
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.room_model import main_wall_axes
 
-# Values of `Scanned.rectangle` for a ray without a hit, and for a gross outlier or mixed distance.
+# Value of `Scanned.rectangle` for a ray that hits nothing.
 _MISSED: Final = -1
+# Value of `Scanned.rectangle` for a gross outlier or a mixed distance.
 SPOILT: Final = -2
 _TURN: Final = 2.0 * np.pi
 
@@ -47,7 +48,8 @@ _PLACES: Final = (("scan", np.uint16), ("row", np.uint32), ("column", np.uint32)
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
 
-# Stations along the main wall, towards it, and above the origin, metres; away from all objects.
+# Coordinates of the stations along the main wall, towards it and above the origin, metres; away
+# from all objects.
 _STATIONS_M: Final = (
     (-1.15, -0.10, 0.0),
     (1.20, 0.15, 0.12),
@@ -105,7 +107,7 @@ class Errors:
     Attributes:
         noise_m: standard deviation of a distance at 3 m, perpendicular to a plain wall.
         outlier_share: share of points at a random distance.
-        beam_m: diameter of the laser spot; distances are mixed if it is on two surfaces.
+        beam_m: diameter of the laser spot; distances are mixed if the spot is on two surfaces.
         colour_noise: standard deviation of a colour, grey levels.
         inversion: share of inverted contrast in the laser reflectance, see `laser_reflectance`.
         band_seed: seed of the laser reflectances of materials and of the common errors of points.
@@ -201,7 +203,8 @@ def planned_sweeps(
     lowest, highest = math.radians(LOWEST_ELEVATION_DEG), math.radians(HIGHEST_ELEVATION_DEG)
     _, towards = main_wall_axes()
     forward = math.atan2(towards[1], towards[0])
-    # Points along the edges, too: the middle of an upper edge appears higher than its ends.
+    # Points along the edges are needed, because the middle of an upper edge appears higher than its
+    # ends.
     shares = np.linspace(0.0, 1.0, 33)[:, None]
     rim = np.concatenate(
         [a + shares * (b - a) for a, b in zip(outline, np.roll(outline, -1, 0), strict=True)]
@@ -346,7 +349,7 @@ class Scanner:
         states: NDArray[np.uint64],
         distance: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return mixed distances (n,) where the edge of the spot hits another depth, else NaN."""
+        """Return mixed distances (n,) where the spot's edge hits another depth; NaN elsewhere."""
         turn, reach = _TURN * uniforms(states, 3), 0.5 * self._errors.beam_m / distance
         aside = reach * np.cos(turn) / np.maximum(0.05, np.cos(elevation))
         rims = _directions(azimuth + aside, elevation + reach * np.sin(turn))
