@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 PATCH_CELLS: Final = 64
 _PATCHES_MOST: Final = 200
-# Patches without texture show no displacement, and weak peaks are due to chance.
+# Patches with less contrast show no displacement.
 _CONTRAST_LEAST_GREY: Final = 3.0
+# Weaker peaks of the correlation are due to chance.
 _RESPONSE_LEAST: Final = 0.15
 _ROWS_AT_ONCE: Final = 1024
 
@@ -117,8 +118,8 @@ def seam_steps(
         balance: the colour balance, or None.
 
     Returns:
-        (n,) differences in luminance of the two sources in seam cells, and the distances of their
-        colours in CIE L*a*b* (1976).
+        (n,) differences in luminance between the two sources in seam cells, and distances between
+        their colours in CIE L*a*b* (1976).
     """
 
     def shown(index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -149,7 +150,7 @@ def seam_steps(
 def _before_seams(
     source: NDArray[np.int16], axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Yield rows and columns of cells above (axis 0) or to the left of seams, by strips."""
+    """Yield, strip by strip, rows and columns of cells above (axis 0) or to the left of seams."""
     found: list[NDArray[np.int64]] = []
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
         strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
@@ -162,7 +163,7 @@ def _before_seams(
 
 
 def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
-    """Count seam cells, and seam cells on depth edges, a few rows at a time."""
+    """Count all seam cells, and those on depth edges, a few rows at a time."""
     n_seam = n_edge_seam = 0
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
         # Whether the last row has a seam depends on the row below it.
@@ -175,7 +176,7 @@ def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) 
 
 
 def is_seam(source: NDArray[np.int16]) -> NDArray[np.bool_]:
-    """Return the cells whose right or lower neighbour has a different source."""
+    """Return a mask of the cells whose right or lower neighbour has a different source."""
     seam = np.zeros(source.shape, dtype=np.bool_)
     for into, one, other in (
         (seam[:, :-1], source[:, :-1], source[:, 1:]),

@@ -1,11 +1,11 @@
-"""Colour balance of layers by smooth corrections of their light.
+"""Colour balance of layers by smooth corrections of their brightness.
 
 Corrections are smooth over blocks of cells, and layers are never mixed: detail always comes from
 one photo, so there are no double contours even if some parallax remains.
 
 The model consists of an exposure per photo, the vignetting of its lens, and a smooth field per
-photo, as logarithms, so that factors become sums. Where two photos show the same blocks of a wall,
-the difference of their corrections must equal their observed difference.
+photo. All of these are logarithms, so that factors become sums. Where two photos show the same
+blocks of a wall, the difference of their corrections must equal their observed difference.
 """
 
 from __future__ import annotations
@@ -39,22 +39,25 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
-# Maximum side of a block in cells, and approximate number of blocks on a small wall.
+# Maximum side of a block in cells.
 _BLOCK_CELLS_MOST: Final = 16
+# Approximate number of blocks on a small wall.
 _BLOCKS_LEAST: Final = 4_000
 # Photos whose corrections are all below this (a logarithm) are left unchanged.
 _ALIKE: Final = 0.02
-# Smoothing radius of differences in blocks, and regularisation where few blocks are known.
+# Smoothing radius of differences, in blocks.
 _SMOOTH_BLOCKS: Final = 1.5
+# Regularisation where few blocks are known.
 _KNOWN_LEAST: Final = 0.02
 # Larger differences between balanced photos are due to different objects, not to light.
 _SAME_THING: Final = 0.15
 # Focal lengths of the same lens differ by less than about this (a logarithm).
 _SAME_ZOOM: Final = 0.1
-# Overlaps with fewer blocks are ignored, larger ones are sampled, and this many blocks count as
-# independent.
+# Overlaps with fewer blocks are ignored.
 _LEAST_BLOCKS: Final = 4
+# Overlaps with more blocks are sampled.
 _BLOCKS_MOST: Final = 200
+# An overlap counts as at most this many independent blocks.
 _INDEPENDENT: Final = 50.0
 # Smallest standard deviation of the difference of two photos in a block.
 _SPREAD_LEAST: Final = 0.01
@@ -72,14 +75,14 @@ _FEATHER_CELLS: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Balance:
-    """Corrections of the layers of a wall, as logarithms of factors on light.
+    """Corrections of the layers of a wall, as logarithms of factors on brightness.
 
     Attributes:
         blocks: blocks of the wall.
-        lights: uncorrected light of each layer.
-        logs: (rows, cols, 3) float32 correction in the blocks of each layer; bilinear between the
-            block centres.
-        exposures: model from which the corrections were computed.
+        lights: uncorrected brightness of each layer.
+        logs: (rows, cols, 3) float32 corrections in the blocks of each layer, to be interpolated
+            bilinearly between block centres.
+        exposures: parameters from which the corrections were computed.
     """
 
     blocks: Blocks
@@ -129,7 +132,7 @@ def balance_of(
     wall: Wall | None,
     cameras: Sequence[Camera | None],
 ) -> Balance | None:
-    """Find corrections that equalise the layers of a wall; None if they already agree.
+    """Find corrections that equalise the layers of a wall; None if the layers already agree.
 
     Args:
         layers: layers with painted cells, at least one.
@@ -171,7 +174,8 @@ def _radii(
             found.append(None)
             continue
         lens = camera.intrinsics
-        # If photos are adjusted separately, focal lengths of the same lens differ slightly.
+        # If photos are oriented separately, estimated focal lengths of the same lens differ
+        # slightly.
         key = (lens.width, lens.height, round(math.log(lens.fx) / _SAME_ZOOM))
         rows, columns = down[light.box[0]], right[light.box[1]]
         middles = np.stack(np.broadcast_arrays(columns, rows[:, None]), axis=-1).reshape(-1, 2)
@@ -179,7 +183,7 @@ def _radii(
         pixels = camera.viewing().project(frame.world_from_wall(middles, depths_m))[:, :2]
         half = np.array([0.5 * lens.width, 0.5 * lens.height])
         radii = np.linalg.norm(pixels - half, axis=1) / np.linalg.norm(half)
-        # Painted cells are inside the photo; others, and NaN, are set to the corner.
+        # Painted cells are inside the photo; all others, and NaN, get the radius of the corner.
         radii = np.fmin(radii, 1.0).astype(np.float32)
         values = radii.reshape(len(rows), len(columns))
         found.append(Radii(values=values, lens=lenses.setdefault(key, len(lenses))))
@@ -197,7 +201,7 @@ def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -
 
     Towards a seam, each layer changes to the mean of the layers on both sides, weighted by their
     shares of the neighbourhood. Blocks with depth edges, and blocks where two layers show different
-    objects, do not contribute; where nothing is known, the correction fades to zero.
+    objects, do not contribute; where no difference is known, the correction fades to zero.
 
     Args:
         balance: the colour balance of the layers.
@@ -240,7 +244,7 @@ def _apart(
         pair: indices of the two layers.
         shared: blocks in the boxes of both layers.
         around: the shared blocks with a margin, for which the difference is returned.
-        says: (rows, cols) 1 in blocks of the wall that may be used, else 0.
+        says: (rows, cols) 1 in blocks of the wall that may be used, 0 in all others.
     """
     parts = [inside(shared, balance.lights[k].box) for k in pair]
     first, second = (
@@ -368,7 +372,7 @@ class _Overlap:
     Attributes:
         layers: indices of the two layers.
         places: (n, 2) row and column of each block in the box of the first and of the second layer.
-        apart: (n, 3) logarithm of the light of the second layer minus that of the first.
+        apart: (n, 3) logarithm of the brightness of the second layer minus that of the first.
     """
 
     layers: tuple[int, int]
@@ -379,11 +383,12 @@ class _Overlap:
 def estimate(lights: Sequence[BlockLight], radii: Sequence[Radii | None]) -> Exposures:
     """Estimate the corrections that equalise overlaps, robust against moved objects and glare.
 
-    Exposures and vignetting are first estimated from the mean of the channels; exposures per
-    channel and smooth fields then model the remaining differences, with the fields kept small.
+    Exposures and vignetting are first estimated from the mean of the channels; the remaining
+    differences are then modelled by exposures per channel and by smooth fields, which are kept
+    small.
 
     Args:
-        lights: light of the layers of a wall.
+        lights: brightness of the layers of a wall.
         radii: radii of the same layers; None if the camera of a layer is unknown.
     """
     count = len(lights)
@@ -491,7 +496,7 @@ def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -
 
 
 def _hats(places: NDArray[np.int64], size: int) -> NDArray[np.float64]:
-    """Return the weights (n, nodes) of the nodes along a side, linear in between."""
+    """Return weights (n, nodes) for linear interpolation between the nodes along a side."""
     at = (places + 0.5) / size * (_NODES - 1)
     return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(_NODES)))
 
@@ -509,7 +514,7 @@ def _solved(
 ) -> NDArray[np.float64]:
     """Solve a robust least squares problem (unknowns, channels) with zero-mean priors.
 
-    It uses Cauchy weights, scaled by the scatter of the residuals of each pair of layers.
+    Cauchy weights are used, scaled by the scatter of the residuals of each pair of layers.
     """
     from scipy.sparse import diags_array, hstack
     from scipy.sparse.linalg import spsolve

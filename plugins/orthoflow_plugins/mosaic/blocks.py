@@ -14,9 +14,10 @@ from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import Colours, light_of_levels
 from orthoflow.products import Layer, LayerMask
 
-# Exposure is not measured in blocks with more clipped or almost black pixels than this share.
+# Levels outside this range are almost black or clipped.
 _DARKEST: Final = 10.0 / 255.0
 _BRIGHTEST: Final = 245.0 / 255.0
+# Minimum share of pixels within this range in blocks where exposure is measured.
 _SAYING_LEAST: Final = 0.95
 # Photos differ by parallax at the depth edges of a wall.
 _DEPTH_EDGE_M: Final = 0.03
@@ -27,7 +28,7 @@ Box: TypeAlias = tuple[slice, slice]
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """Blocks with about the same number of cells, arranged symmetrically.
+    """A symmetric division of a raster into blocks with about the same number of cells.
 
     Attributes:
         rows: first row of each row of blocks, and the number of rows.
@@ -39,7 +40,7 @@ class Blocks:
 
     @classmethod
     def over(cls, shape: tuple[int, int], side_cells: int) -> Blocks:
-        """Divide a raster into blocks with sides of `size` cells, or one more."""
+        """Divide a raster into blocks with sides of `side_cells` cells, or one more."""
         rows, columns = (_symmetric_edges(length, side_cells) for length in shape)
         return cls(rows=rows, columns=columns)
 
@@ -90,7 +91,7 @@ def block_means(
     """Return the mean (rows, cols) of each block; `values` returns the cells of given rows."""
     rows, columns = blocks.rows, blocks.columns
     means = np.empty((len(rows) - 1, len(columns) - 1))
-    # Rows of blocks that are processed together, about as many cells as a band.
+    # Process rows of blocks together, with about as many cells as a band.
     for some in row_bands((len(means), int(columns[-1] * np.diff(rows).max()))):
         first, last = rows[some.start], rows[some.stop]
         known = values(slice(int(first), int(last))).astype(np.float64)
@@ -101,7 +102,7 @@ def block_means(
 
 
 def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return the cells whose depth differs from the right or lower neighbour by 3 cm."""
+    """Return a mask of cells whose depth differs from the right or lower neighbour by 3 cm."""
     edges = np.zeros(depth_m.shape, dtype=np.bool_)
     edges[:, :-1] |= np.abs(np.diff(depth_m, axis=1)) > _DEPTH_EDGE_M
     edges[:-1] |= np.abs(np.diff(depth_m, axis=0)) > _DEPTH_EDGE_M
@@ -109,7 +110,7 @@ def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool_]:
-    """Return the cells of the given rows on either side of a depth edge."""
+    """Return a mask of the cells of some rows on either side of a depth edge."""
     first = max(0, rows.start - 1)
     around = depth_m[first : rows.stop + 1]
     beside = depth_edges(around) | depth_edges(around[::-1, ::-1])[::-1, ::-1]
@@ -131,7 +132,7 @@ class BlockLight:
 
     @property
     def is_known(self) -> NDArray[np.bool_]:
-        """Return the blocks (rows, cols) with known brightness."""
+        """Mask (rows, cols) of the blocks with known brightness."""
         return ~np.isnan(self.log_light[..., 0])
 
 
@@ -174,7 +175,7 @@ def common(one: Box, other: Box) -> Box | None:
 
 
 def inside(part: Box, box: Box) -> Box:
-    """Return the slices of a part in the arrays of its box."""
+    """Return the slices of a part within the arrays of its box."""
     rows, columns = (
         slice(inner.start - outer.start, inner.stop - outer.start)
         for inner, outer in zip(part, box, strict=True)

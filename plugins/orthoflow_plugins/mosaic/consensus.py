@@ -1,9 +1,10 @@
-"""Contradictions between photos: people and vehicles are replaced from other photos.
+"""Contradictions between photos: people and vehicles are replaced by colours of other photos.
 
-Photos of the same area, and the colours of the scan, are independent observations of brightness in
-blocks of a few centimetres, once smooth differences (lighting, exposure) are removed. A photo is
-not used in a region where it contradicts another photo that more observations confirm. Reflections
-also cause contradictions; in all cases colours are replaced only by those of another photo.
+Photos of the same area, and the colours of the scan, are independent observations of brightness,
+which are compared in blocks of a few centimetres after smooth differences (lighting, exposure) have
+been removed. A photo is not used in a region where it contradicts another photo that more
+observations confirm. Reflections also cause contradictions. In all cases, colours are only replaced
+by those of another photo.
 """
 
 from __future__ import annotations
@@ -33,20 +34,21 @@ _LEAST_PAINTED: Final = 0.5
 # Added to brightness, so that noise in almost black cells does not count as a difference.
 _DARK: Final = 0.02
 # Two observations contradict each other if the logarithms of their brightness differ by at least
-# this much and by this many standard deviations of all blocks. Each region must contain a core in
-# which they differ by twice as much.
+# this much and, up to twice this, by this many standard deviations of all blocks.
 _APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
+# In the core of a region of contradiction, the difference must exceed the limit by this factor.
 _CORE_TIMES: Final = 2.0
 _LEAST_CORE_BLOCKS: Final = 6
 # Differences that are smooth over this many blocks are attributed to lighting.
 _SMOOTH_BLOCKS: Final = 40.0
-# Regions that are thinner are misaligned edges; gaps up to this many blocks are closed, and regions
-# are extended at their borders.
+# Regions that are thinner than this are misaligned edges.
 _OPENING_BLOCKS: Final = 2
+# Gaps of up to this many blocks in a region are closed.
 _CLOSING_BLOCKS: Final = 9
+# Regions are extended by this many blocks.
 _GROWTH_BLOCKS: Final = 2
-# The intensity of the laser is used if its correlation with the grey of a photo is at least this.
+# The laser intensity is used if its correlation with the grey of the photos is at least this.
 _LEAST_CORRELATION: Final = 0.6
 _LEAST_BLOCKS: Final = 100
 
@@ -81,8 +83,8 @@ def consensus(
     witnesses = [_witness(layer.rgb, layer.mask == LayerMask.PAINTED, blocks) for layer in layers]
     scan = None if wall is None else _scan(wall, blocks, witnesses)
     if scan is not None:
-        # Passers-by affect this comparison less than one with another photo, because a photo and
-        # the scan share more cells.
+        # Passers-by affect this comparison less than a comparison of two photos, because a photo
+        # and the scan have more cells in common.
         witnesses = [_in_light_of(scan, item) for item in witnesses]
     everyone = [*witnesses, *([] if scan is None else [scan])]
     supports, apart = _compared(everyone, len(layers), blocks)
@@ -130,7 +132,7 @@ def _contradicted(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.float64]:
-    """Difference of a photo from better confirmed photos in each block; 0 if there are none."""
+    """Return the difference of a photo from better confirmed ones in each block; 0 if none."""
     worst = np.zeros(blocks.shape)
     for other in range(len(supports)):
         ratio = apart.get((min(photo, other), max(photo, other)))
@@ -145,7 +147,7 @@ def _alone(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.bool_]:
-    """Return the blocks that only one photo shows and that contradict the scan."""
+    """Return a mask of blocks that only one photo shows and that contradict the scan."""
     shown = np.array([_known(item, blocks) for item in photos])
     is_alone = shown.sum(axis=0) == 1
     found = np.zeros(blocks.shape, dtype=np.bool_)
@@ -158,7 +160,7 @@ def _alone(
 
 
 def _of_cells(region: NDArray[np.bool_], blocks: Blocks) -> NDArray[np.bool_]:
-    """Cells (rows, cols) of the given blocks."""
+    """Return a mask (rows, cols) of the cells of some blocks."""
     by_row = np.repeat(region, np.diff(blocks.rows), axis=0)
     return np.repeat(by_row, np.diff(blocks.columns), axis=1)
 
@@ -243,7 +245,7 @@ def _known(witness: _Witness, blocks: Blocks) -> NDArray[np.bool_]:
 def _difference(
     one: _Witness, other: _Witness, box: Box
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Difference of two observations in a box, in grey if one is grey; and where both exist."""
+    """Return the difference of two observations, in grey if one is grey, and where both exist."""
     difference = one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
     if one.is_grey or other.is_grey:
         difference = np.repeat(difference.mean(axis=2, keepdims=True), 3, axis=2)
@@ -266,7 +268,7 @@ def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
 def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
     """Return the difference of two observations in each block, in units of the threshold.
 
-    NaN where one is missing; None if they have no block in common.
+    It is NaN where one of them is missing; the result is None if they have no block in common.
     """
     box = common(one.box, other.box)
     if box is None:
@@ -308,7 +310,7 @@ def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a region extended by its border, where it is mixed with the background."""
+    """Return a region extended by its border, where its colours mix with the background."""
     import cv2
 
     side = 2 * _GROWTH_BLOCKS + 1
@@ -319,7 +321,7 @@ def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _any_left(
     painted: Sequence[NDArray[np.bool_]], is_out: Sequence[NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Return the cells shown by any layer that is not excluded there."""
+    """Return a mask of the cells that are shown by any layer that is not excluded there."""
     left = [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
     return np.asarray(np.logical_or.reduce(left), dtype=np.bool_)
 
@@ -348,7 +350,7 @@ def _without(
         painted = [layer.mask[rows] == LayerMask.PAINTED for layer in layers]
         is_out = [region[at] & shows for region, shows in zip(grown, painted, strict=True)]
         stays = _any_left(painted, is_out)
-        # Between two people, use the border of one rather than the other person.
+        # Between two people, use the border of one of them rather than the other person.
         is_out = [out & (stays | region[at]) for out, region in zip(is_out, outvoted, strict=True)]
         stays = _any_left(painted, is_out)
         for index in changed:

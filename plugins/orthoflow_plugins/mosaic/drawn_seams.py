@@ -16,7 +16,7 @@ from orthoflow.products import InputFiles
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnSeams:
-    """Polygons of one wall, each assigned to a layer; where they overlap, the last one counts.
+    """Polygons of one wall, each assigned to a layer; where they overlap, the last one is used.
 
     Attributes:
         rings: (n, 2) corners of each polygon as (column, row).

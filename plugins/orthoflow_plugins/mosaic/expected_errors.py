@@ -2,9 +2,9 @@
 
 Three independent causes displace the content of a cell along the wall: errors of the pose of the
 photo (its covariance, propagated to the wall), errors of the depth of the cell (times the tangent
-of the angle of view), and displacements between overlapping photos that neither explains. Overlaps
-distinguish the last two: a depth error displaces photos taken from different sides in different
-directions.
+of the angle of view), and displacements between overlapping photos that neither of them explains.
+Overlaps separate the last two, because a depth error displaces photos taken from different sides in
+different directions.
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ from orthoflow_plugins.mosaic.agreement import Overlaps
 if TYPE_CHECKING:
     from orthoflow.geometry import WallFrame
 
-# Pose errors vary smoothly: they are computed at this many nodes per side, and interpolated
+# Pose errors vary smoothly, so they are computed at this many nodes per side and interpolated
 # linearly.
 _NODES: Final = 48
-# Noise of phase correlation: 0.06 and 0.07 cells in a simulated room with pose errors of 0.01
-# cells.
+# Noise of phase correlation. In a simulated room with pose errors of 0.01 cells, it was 0.06 and
+# 0.07 cells.
 _PARALLAX_NOISE_CELLS: Final = 0.065
 _LEAST_OVERLAPS: Final = 10
 # No cell is viewed at more than 84 degrees from the normal.
 _MOST_TANGENT: Final = 10.0
 # Interpolated depths have larger errors than measured ones, by this factor (`docs/accuracy.md`).
 _RECOVERED_TIMES: Final = 2.0
-# The spread of a few points is uncertain; it counts only if larger than that of the whole raster,
-# as at edges.
+# The spread of a few points is uncertain; it is only used if it exceeds that of the whole raster by
+# this factor, as it does at edges.
 _SPREAD_TIMES: Final = 2.0
-# Clouds from photos have depth errors that are correlated over a few centimetres: depths at that
-# distance differ by more than neighbouring ones. The relief of rooms explains a factor of up to
-# 1.35 (neighbouring and distant cells differ by 0.98 and 1.3 mm in the simulated room, 1.2 and 2.4
-# mm in a stuccoed hall, 1.7 and 5.2 mm in a stereo cloud of a fountain).
+# Clouds from photos have depth errors that are correlated over this distance.
 _PATCH_M: Final = 0.05
+# If depths are so correlated, those at that distance differ by more than neighbouring depths times
+# this factor. The relief of rooms explains a factor of up to 1.35 (neighbouring and distant cells
+# differ by 0.98 and 1.3 mm in the simulated room, 1.2 and 2.4 mm in a stuccoed hall, 1.7 and 5.2 mm
+# in a stereo cloud of a fountain).
 _PATCHY_TIMES: Final = 1.5
 # Overlaps reveal depth errors if the tangents of the views differ by this much in this many
 # patches.
@@ -56,7 +57,7 @@ def ties_on(cameras: Cameras | None, number: int) -> tuple[int, int]:
     """Count the control and check points of the photos on a wall.
 
     Args:
-        cameras: orientations with the ties they are based on.
+        cameras: orientations with the ties on which they are based.
         number: number of the wall.
     """
     ties = None if cameras is None else cameras.ties
@@ -109,7 +110,8 @@ def expected_errors_m(
     excess = _excess_of_overlaps(wall, cameras, overlaps)
     position_m, depth_m = (0.0, None) if excess is None else excess
     if depth_m is not None:
-        # Relief over five centimetres looks like correlated errors; overlaps distinguish the two.
+        # Within five centimetres, relief looks like correlated errors; overlaps distinguish the
+        # two.
         patchy_m = depth_m
     for index, name in enumerate(sources):
         camera = cameras.get(name)
@@ -140,15 +142,15 @@ def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
 def _pose_variances(
     camera: Camera, frame: WallFrame, nodes: NDArray[np.float64], depths_m: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Variances (r, c) of a wall coordinate due to the orientation of a photo, in m²."""
+    """Return variances (r, c) of a wall coordinate due to the orientation of a photo, in m²."""
     from orthoflow.geometry.cameras import LensFreedom, linearised
     from orthoflow.geometry.resection import moved_origin, pixels_by_point
 
     if camera.covariance is None:
         return None
     viewing, middle = camera.viewing(), frame.origin_world
-    # Relative to the wall: in survey coordinates, effects of rotations and shifts would almost
-    # cancel, and lose digits.
+    # Use coordinates relative to the wall: in survey coordinates, effects of rotations and shifts
+    # would almost cancel out, and precision would be lost.
     to_local = np.linalg.inv(moved_origin(viewing, middle, 6))
     covariance = to_local @ camera.covariance @ to_local.T
     near = viewing.shifted(middle)
@@ -177,7 +179,7 @@ def _pose_variances(
 def _between(
     values: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp], step: int
 ) -> NDArray[np.float64]:
-    """Interpolate values (n,) at cells linearly between nodes; constant beyond the outermost."""
+    """Interpolate values (n,) at cells linearly between nodes; constant beyond the outer nodes."""
     places, shares = [], []
     for cells, size in zip((rows, columns), values.shape, strict=True):
         place = np.clip((cells + 0.5) / step - 0.5, 0.0, size - 1.0)
@@ -192,7 +194,7 @@ def _between(
 
 
 def _depth_noises_m(wall: Wall) -> tuple[float, float]:
-    """Noise of the depths of single cells, and the error shared by neighbours (0 if none)."""
+    """Return the noise of single depths, and the error shared by neighbours (0 if none)."""
     noise_m = depth_noise_m(wall.depth_m)
     step = max(1, round(_PATCH_M / wall.frame.gsd_m))
     apart_m = depth_noise_m(wall.depth_m[::step, ::step])
@@ -229,16 +231,16 @@ def _depth_variances(
 def _excess_of_overlaps(
     wall: Wall, cameras: Mapping[str, Camera], overlaps: Overlaps
 ) -> tuple[float, float | None] | None:
-    """Separate errors of poses and of depths by displacements; None if there are too few.
+    """Separate errors of poses and depths by means of displacements; None if these are too few.
 
     A squared displacement is the sum of the variances of both poses, twice the additional variance
     of a pose, and the variance of the depth times the squared difference of the tangents of both
-    views. The two unknown variances are fitted by weighted least squares, without outliers, and
-    cannot be negative.
+    views. The two unknown variances are estimated by weighted least squares, without outliers and
+    with the constraint that they are not negative.
 
     Returns:
         The additional standard deviation of a coordinate in one photo, and the standard deviation
-        of depths over a patch, None if the views differ too little.
+        of depths over a patch, which is None if the views differ too little.
     """
     from scipy.optimize import nnls
 
@@ -285,7 +287,7 @@ def _excess_of_overlaps(
 def _views_of(
     wall: Wall, camera: Camera, centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return variances (n,) due to a pose at positions, and tangents (n, 2) of the views."""
+    """Return, at positions, variances (n,) due to a pose and tangents (n, 2) of the views."""
     frame = wall.frame
     depths_m = np.nan_to_num(
         wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)

@@ -35,7 +35,7 @@ _UNITS: Final = 1000.0
 class _Scene:
     """The reduced layers: colours (k, rows, cols, 3) 0..1, views (k, rows, cols), edges.
 
-    `views` is the cost of a layer in a cell, `edges` the additional cost of a seam in it.
+    `views` is the cost of a layer in a cell, `edges` the additional cost of a seam in the cell.
     """
 
     colours: NDArray[np.float32]
@@ -68,9 +68,9 @@ def cut_labels(
 ) -> CutLabels:
     """Assign a layer to each cell by a graph cut; -1 if no layer shows the cell.
 
-    Boykov, Veksler and Zabih 2001: each layer in turn takes over cells of the others where this
-    lowers the total of seam costs (colour differences of both layers on both sides, Kwatra et al.
-    2003, plus depth edges) and view costs. The cut is computed at a reduced scale.
+    Boykov, Veksler and Zabih 2001: each layer in turn takes over cells of the others if this lowers
+    the sum of view costs and seam costs (colour differences between both layers on both sides,
+    Kwatra et al. 2003, plus depth edges). The cut is computed at a reduced scale.
 
     Args:
         layers: layers of one wall.
@@ -125,7 +125,7 @@ def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
 
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
-    """Let one layer take over cells: the optimal move, by a minimum cut."""
+    """Let one layer take over cells; a minimum cut finds the optimal move."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -133,8 +133,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     source, sink = count, count + 1
     flat = labels.ravel()
     cells = np.arange(count)
-    # Unary costs of keeping the label (0) and of changing to alpha (1). Integers, so that sums are
-    # exact, and the order of two neighbours does not matter.
+    # Unary costs of keeping the label (0) and of changing to alpha (1). They are integers, so that
+    # sums are exact and the order of two neighbours does not matter.
     views = np.rint(_UNITS * scene.views)
     keep = views.reshape(len(views), -1)[flat, cells]
     take = views[alpha].ravel().copy()

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
     from orthoflow_plugins.mosaic.drawn_seams import DrawnSeams
 
-# Preference (rows, cols) of a layer in some rows of the wall. Computed band by band, because
-# preferences of a large wall would not fit into memory.
+# Preference (rows, cols) of a layer in some rows of the wall. Preferences are computed band by
+# band, because those of a large wall would not fit into memory.
 Preference = Callable[[slice], NDArray[np.float32]]
 
 NOBODY: Final = -1
@@ -31,8 +31,8 @@ NOBODY: Final = -1
 _BAND_CELLS: Final = 1 << 25
 # Balancing colours temporarily takes more than a hundred bytes per cell.
 _BALANCED_AT_ONCE: Final = 1 << 20
-# In ascending order; a cell takes the highest state of any layer. It is occluded if at least one
-# source faces it, but none shows it.
+# States in ascending order; a cell takes the highest state of any layer. It is occluded if at least
+# one source faces it, but none shows it.
 _RANKED: Final = (
     OrthoMask.NONE,
     OrthoMask.NO_SURFACE,
@@ -54,7 +54,7 @@ def preferences(
     wall: Wall | None = None,
     balance: Balance | None = None,
 ) -> list[Preference]:
-    """Return the preference of each layer by a rule, for rows of the wall; the largest wins.
+    """Return functions that compute each layer's preference by a rule; the largest wins.
 
     `best-view` is the quality of the layers: angle of incidence, resolution and distance from the
     border of the photo. `voronoi` prefers the layer whose area ends farthest away, so that seams
@@ -177,7 +177,7 @@ def joined(
     shape = [*painters, *others][0].frame.shape
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
-    # Cells up to this many rows apart influence each other.
+    # Cells influence each other if they are at most this many rows apart.
     cells_min = params.island_cells_min
     reach = cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
@@ -208,7 +208,7 @@ def coloured(
     *,
     allocate: Allocate,
 ) -> Colours:
-    """Return the colours (rows, cols, 3) of cells from their layers, by bands if many.
+    """Return the colours (rows, cols, 3) of cells from their layers, in bands if there are many.
 
     Args:
         painters: layers of the wall with coloured cells.
@@ -235,7 +235,7 @@ def coloured(
 def best_views(
     layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """Assign each cell to the layer with the highest preference, the first of equal ones.
+    """Assign each cell to the layer with the highest preference; if equal, to the first.
 
     Returns:
         (rows, cols) rank of the state of each cell, and its layer, `NOBODY` if it has none.
@@ -260,7 +260,7 @@ def without_islands(
     """Reassign small patches to the source that surrounds them, if it also shows them.
 
     Cells of a patch are connected by their sides. A cell takes the source of most surrounding
-    cells; it is unchanged if no source of a larger patch shows it.
+    cells; it remains unchanged if no source of a larger patch shows it.
     """
     import cv2
 

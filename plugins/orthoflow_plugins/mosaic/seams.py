@@ -58,12 +58,13 @@ from orthoflow_plugins.mosaic.parameters import SeamsParams
 
 # Figure of the sources: length of its longer side in pixels.
 _LONGEST_PX: Final = 900
-# Maximum number of sources in the legend, which has two columns instead of three if a name has at
-# least this many characters; weight of the source colours over the grey image.
+# Maximum number of sources in the legend.
 _NAMED_MOST: Final = 24
+# The legend has two columns instead of three if a name has at least this many characters.
 _LONG_NAME: Final = 16
+# Weight of the source colours over the grey image.
 _TINT: Final = 0.45
-# Empty cells of a wall are reported from this share on, as are contradicted cells and causes.
+# Minimum shares of empty cells, of contradicted cells and of a cause for which they are reported.
 _EMPTY_WORTH_WORDS: Final = 0.1
 _CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01
@@ -108,9 +109,9 @@ class MosaicSeams(Method):
     """Take each cell from the layer that shows it best; balance photos where they differ.
 
     A single layer is used unchanged. If there are several, each cell is taken from the layer that
-    the rule `seams` prefers; of equal layers, the first. Filled cells are used only where no layer
-    has a measured colour. Small patches are assigned to the source around them if that source shows
-    them, too.
+    the rule `seams` prefers, or from the first of equal layers. Filled cells are used only where no
+    layer has a measured colour. Small patches are assigned to the source around them if that source
+    shows them, too.
 
     `best-view` decides cell by cell, by angle of incidence, resolution and distance from the border
     of the photo; `voronoi` puts seams in the middle of overlaps; `graph-cut` puts them where photos
@@ -121,8 +122,8 @@ class MosaicSeams(Method):
     If photos contradict each other over a region, the photo confirmed by other photos and by the
     colours of the scan is used (`robust`), so that people who pass by in one photo disappear.
 
-    Colours are balanced unless `gains` is none: by an exposure per photo, the vignetting of its
-    lens (if the cameras are connected), a smooth field per photo, and a blend of the remaining
+    Colours are balanced unless `gains` is none: by the exposure of each photo, the vignetting of
+    its lens (if the cameras are connected), a smooth field per photo, and blending of the remaining
     differences near seams. These corrections are smooth, and each cell is taken from one photo
     only, so photos are never mixed. Photos that agree within 2 % are unchanged.
     """
@@ -165,7 +166,7 @@ class MosaicSeams(Method):
         MetricSpec(
             "contradicted_share", label="cells from a single photo that contradicts the scan"
         ),
-        # Metrics of all walls with an accuracy.
+        # Reported for all walls with a known accuracy.
         MetricSpec(
             "expected_mm_median",
             label="expected error of a point measured in the orthoimages, median",
@@ -285,7 +286,7 @@ def _join(
     wall = walls[index] if index < len(walls) else None
     cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
     require_one_raster(group, name)
-    # A layer without painted cells is no source, but it shows which cells are hidden.
+    # A layer without painted cells is not a source, but shows which cells are hidden.
     painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in group if all(layer is not painter for painter in painters)]
     n_outvoted, contradicted = 0, None

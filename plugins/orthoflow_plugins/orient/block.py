@@ -33,7 +33,7 @@ from orthoflow.products import JsonValue, Photo
 from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.orient.pose import Lens, Note
 
-# Lower limit of the standard deviation of a known point; avoids a division by zero.
+# Lower limit of the standard deviation of a known point, to avoid a division by zero.
 _MIN_SIGMA_M: Final = 1e-6
 _CORRELATED: Final = 0.95
 _MIN_FOR_PLANE: Final = 3
@@ -49,7 +49,7 @@ _COLUMNS: Final = {"cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7}
 _TIED_ASPECT: Final = 1e-5
 # Pixel coordinate of dummy observations, far outside the photo.
 _FAR_PX: Final = -1e6
-# Scale of a robust loss under which they have no weight.
+# Scale of a robust loss with which dummy observations have no weight.
 _NOTHING: Final = 1e-9
 LENS_CONFUSED: Final = DiagnosticSpec(
     code="lens-correlated-with-pose",
@@ -115,9 +115,9 @@ class Block:
 
     @property
     def is_joint(self) -> NDArray[np.bool_]:
-        """Points (k,) seen more than once; only these are adjusted.
+        """Mask (k,) of the points seen more than once; only these are adjusted.
 
-        The uncertainty of the others is added to that of their pixel.
+        The uncertainty of all other points is added to that of their pixels.
         """
         return np.bincount(self.seen.point, minlength=len(self.points)) > 1
 
@@ -144,9 +144,9 @@ class BlockCovariance:
 
     Attributes:
         matrix: (p, p), columns as in `Block.columns`.
-        cofactors: (p, p) the same, from the a priori standard deviations.
+        cofactors: (p, p) the same, computed with the a priori standard deviations.
         sigma0: standard deviation of unit weight.
-        redundancy: number of observations minus number of unknowns that they determine.
+        redundancy: number of observations minus the number of unknowns that they determine.
     """
 
     matrix: NDArray[np.float64]
@@ -215,7 +215,7 @@ def solve(block: Block, *, soft_limit: float) -> Block:
 def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float64]:
     """Return the covariances (m, 2, 2) of the pixels.
 
-    They include the uncertainty of points that are seen only once.
+    The covariances include the uncertainty of points that are seen only once.
 
     Args:
         block: the block.
@@ -251,7 +251,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     normal = np.diag(prior)
     squares, n_rows = 0.0, 0
     for columns, jacobian, residuals in rows:
-        # einsum instead of BLAS, where the order of summation depends on the number of threads.
+        # Use einsum, since the order of summation in BLAS depends on the number of threads.
         normal[np.ix_(columns, columns)] += np.einsum("ij,ik->jk", jacobian, jacobian)
         squares += float((residuals**2).sum())
         n_rows += len(residuals)
@@ -318,9 +318,9 @@ def lens_statistics(block: Block) -> JsonValue:
 def correlation_notes(
     block: Block, photos: Sequence[Photo], cofactors: NDArray[np.float64]
 ) -> list[tuple[str, Note]]:
-    """Return a note for each lens parameter correlated with poses, with the lens's first photo."""
+    """Return a note on each lens parameter correlated with poses, with the lens's first photo."""
     notes: list[tuple[str, Note]] = []
-    # Each of several lenses is determined by its own photos only, even if it is one camera.
+    # Each lens is only determined by its own photos, even if the same camera took all photos.
     shared = ", or set intrinsics: shared if one camera took all photos at the same zoom"
     also = shared if len(block.lenses) > 1 else ""
     scale = np.sqrt(np.diag(cofactors))
@@ -350,7 +350,7 @@ def _adjusted_points(
 ) -> AdjustedPoints:
     """Return the scan points with their residuals in the photos."""
     known = np.isfinite(block.points.sigma_m[block.seen.point])
-    # Points seen by several photos are compared with the scan as well.
+    # Points seen by several photos are compared with the scan, too.
     at_scan = replace(block.points, now=block.points.known)
     block = replace(block, points=at_scan, seen=block.seen.take(known))
     seen, n_known = block.seen, len(block.seen)
@@ -459,7 +459,7 @@ def _set_up(block: Block) -> tuple[Any, Any]:
     """Set up poses and lenses as COLMAP's scene and adjuster.
 
     Only COLMAP's adjuster provides the manifold of a pose, and it requires observations. So each
-    photo gets two observations of a point with residuals so large that they have no weight.
+    photo gets two observations whose residuals are so large that they have no weight.
     """
     import pycolmap
 
@@ -498,7 +498,7 @@ def _add_observations(
     joint: dict[int, NDArray[np.float64]],
     soft_limit: float,
 ) -> None:
-    """Add the observations; those of points seen once include the point's covariance."""
+    """Add the observations; for a point seen only once, they include the covariance of the point."""
     import pyceres
     import pycolmap
     from pycolmap import cost_functions
@@ -537,7 +537,7 @@ def _values(camera: ViewingCamera) -> NDArray[np.float64]:
 
 
 def _limit_lens(problem: Any, lens: Lens, values: NDArray[np.float64]) -> None:
-    """Hold the fixed parameters of a lens, and constrain the free ones by their prior."""
+    """Keep the fixed parameters of a lens, and constrain the free ones by their priors."""
     import pyceres
 
     ceres: Any = pyceres

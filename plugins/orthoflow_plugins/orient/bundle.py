@@ -89,14 +89,15 @@ _TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
 # Scan points of different photos within this distance are the same point.
 _SAME_PLACE_M: Final = 1e-6
 # Photos without EXIF may or may not share a lens. A series is usually taken with one lens, and many
-# photos determine a lens far better than a single one does. But the photographer may have zoomed,
-# and a photo may have been rotated or cropped. Therefore each photo's focal length from its own
-# ties is compared with the shared one. Zooming changes it by more than this share; correlated scan
-# errors change it by less (up to 0.7 % with photogrammetric clouds of 10 to 30 mm noise).
+# photos determine a lens far better than a single one does. However, the photographer may have
+# zoomed, and a photo may have been rotated or cropped. Therefore, the focal length from each
+# photo's own ties is compared with the shared one. Zooming changes it by more than this share,
+# correlated scan errors by less (up to 0.7 % with photogrammetric clouds with 10 to 30 mm of
+# noise).
 _MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
-# Photos with the largest contradiction distort the shared lens, so that others contradict it as
-# well. Those within this share of the largest are separated first.
+# The photo with the largest contradiction distorts the shared lens, so that other photos contradict
+# it as well. Only photos whose contradiction exceeds this share of the largest are separated first.
 _SHARE_OF_WORST: Final = 0.5
 NO_BLOCK: Final = DiagnosticSpec(
     code="bundle-without-result",
@@ -111,7 +112,7 @@ class OrientColmapBundle(Method):
     Each photo is first oriented separately; photos whose ties agree with their pose no better than
     by chance are excluded. Key points are then matched between overlapping photos. COLMAP's cost
     functions and the Ceres solver adjust poses, lenses and points together: ties to walls are
-    weighted by the standard deviations from their matcher, ties between photos by that of their
+    weighted by the standard deviations from the matching step, ties between photos by that of their
     residuals. Uncalibrated lenses start from EXIF and are refined. Photos with the same focal
     length in EXIF share a lens; so do photos without EXIF unless their ties contradict this. The
     gates and withheld ties are those of `orient.pnp`.
@@ -192,7 +193,7 @@ class OrientColmapBundle(Method):
 def _by_itself(
     tied: TiedPhoto, ties: Ties, params: OrientColmapBundle.Params
 ) -> Trusted | Oriented:
-    """Orient a photo by its own ties; refuse it if they agree only by chance."""
+    """Orient a photo by its own ties; refuse it if the ties agree only by chance."""
     found = by_itself(tied, ties, params, estimate_pose)
     if isinstance(found, Oriented):
         return found
@@ -321,7 +322,7 @@ def adjust_block(
     groups: tuple[tuple[int, ...], tuple[Lens, ...]],
     params: OrientParams,
 ) -> Adjusted:
-    """Adjust photos and lenses together; reject and reweight until the inliers stay the same.
+    """Adjust photos and lenses together; reject and reweight until the inliers do not change.
 
     Args:
         photos: the photos.
@@ -385,7 +386,7 @@ def adjust_block(
 
 
 def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
-    """Find the photos whose own focal length contradicts a lens shared only by image size.
+    """Find photos whose own focal length contradicts a lens shared only because of the image size.
 
     Args:
         photos: photos of the block.
@@ -427,7 +428,7 @@ def _start(
             # Start from the photo whose own ties determine the focal length best.
             best = min(members, key=lambda k: focal_sigma(photos[k].estimate.resection))
             if best != at:
-                # A different focal length changes the position.
+                # The position depends on the focal length.
                 own = posed(alone[best], own)
                 with suppress(GeometryError):
                     own = fitted(item.tied.control(item.estimate.agreeing), own)
@@ -506,7 +507,7 @@ def _weigh_between(
         weights: current inliers and weights, updated in place.
         rejection_sigma: limit in standard deviations.
     """
-    from scipy.special import chdtri  # scipy.stats would take seconds to import
+    from scipy.special import chdtri  # importing scipy.stats would take seconds
 
     active = weights.tie_active
     # m observations have 2 m coordinates, 3 of which determine the point: the sum of squares has a

@@ -47,7 +47,7 @@ from orthoflow_plugins.orient.report import hand_over
 
 Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
 
-# Practically free: control points with relief determine a lens far better.
+# Practically free, since control points with relief determine a lens far better.
 _FREE: Final = {"focal_sigma": 1.0, "aspect_sigma": 0.5}
 _CENTRE_SHARE: Final = 0.5
 _SKEW_SHARE: Final = 0.5
@@ -60,7 +60,7 @@ _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
     _FULL: LensFreedom(**_FREE, k1_sigma=0.5, k2_sigma=0.5, tangential_sigma=0.01),
 }
 _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
-# Relief below this many standard deviations of the points is mostly their noise.
+# Relief smaller than this many standard deviations of the points is mostly noise.
 _RELIEF_SIGMAS: Final = 10.0
 # With flatter control points, the eleven parameters depend on rounding errors of coordinates.
 _MAX_CONDITION: Final = 5000.0
@@ -83,10 +83,10 @@ class OrientDlt(Method):
     """Orient each photo by eleven parameters, or more with distortion, from its ties only.
 
     Calibration and EXIF are used only to reject wrong ties; `prior: none` does not use them at all.
-    The linear solution is the start of a weighted adjustment of pose, fx, fy and principal point
-    (and distortion). The skew is recorded, but used only if requested, since modern cameras have
-    none. Photos with nearly coplanar control points are refused, since these do not determine the
-    parameters. The gates are those of `orient.pnp`.
+    The linear solution is the start of a weighted adjustment of pose, fx, fy, principal point and,
+    if requested, distortion. The skew is recorded, but used only if requested, since modern cameras
+    have none. Photos with nearly coplanar control points are refused, since such points do not
+    determine the parameters. The gates are those of `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.dlt"
@@ -175,8 +175,8 @@ def direct_linear(
     rows = np.zeros((len(pixels), 2, 12))
     rows[:, 0, :4], rows[:, 0, 8:] = xyz, -uv[:, :1] * xyz
     rows[:, 1, 4:8], rows[:, 1, 8:] = xyz, -uv[:, 1:] * xyz
-    # Normal equations with a fixed order of summation, since a singular value decomposition depends
-    # on the number of threads. The subsequent adjustment recovers the lost digits.
+    # Use normal equations with a fixed order of summation, since a singular value decomposition
+    # depends on the number of threads. The subsequent adjustment recovers the lost precision.
     values, vectors = np.linalg.eigh(np.einsum("nij,nik->jk", rows, rows))
     matrix = vectors[:, 0].reshape(3, 4)
     inverse_px = np.array(
@@ -189,7 +189,7 @@ def direct_linear(
 
 
 def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
-    """Orient a photo by a direct linear transform of its control points, or return why not.
+    """Orient a photo by a direct linear transform, or return the reason why not.
 
     With `prior: none`, neither calibration nor EXIF is used to reject wrong ties. Without `skew`,
     the adjustment assumes perpendicular pixel rows and columns.
@@ -277,7 +277,7 @@ def _freedom(distortion: Distortion, size_px: tuple[int, int], *, keeps_skew: bo
 
 
 def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
-    """Return why the control points do not suffice for a DLT; empty if they do."""
+    """Return the reason why the control points do not suffice for a DLT; empty if they do."""
     if len(control) < least:
         return (
             f"only {len(control)} control ties agree with one pose; a DLT with distortion "
@@ -301,13 +301,14 @@ def _with_what_is_missing(
 
     Residuals contain less than a tenth of the missing distortion: the other parameters absorb most
     of it and distort the photo between and beyond the ties. Therefore the error is that of the
-    complete model plus the difference between the models. Otherwise the predicted error of eleven
-    parameters with the unknown distortion of a typical lens would be a ninth of the actual one.
+    complete model plus the difference between the models. Otherwise, for a typical lens with
+    unknown distortion, the predicted error of eleven parameters would be a ninth of the actual
+    error.
 
     Args:
         estimate: estimate with the incomplete model.
         control: its control points.
-        start: start of its adjustment.
+        start: initial values of its adjustment.
         freedom: free lens parameters of the complete model.
     """
     model = estimate.resection
@@ -350,7 +351,7 @@ def _flat(control: SeenPoints, why: str) -> str:
 
 
 def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArray[np.float64]:
-    """Return the parameter change (p,) that best reproduces the complete model over the photo.
+    """Return the parameter change (p,) that best reproduces the complete model in the photo.
 
     The plain difference of the parameters is unsuitable: large changes of focal length and distance
     compensate each other, but not in the linearised model.

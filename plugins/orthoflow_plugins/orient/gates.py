@@ -81,7 +81,7 @@ class WallError:
 
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
-    """Describe the walls of the chosen ties as their matcher did, or else by their points."""
+    """Describe the walls of the chosen ties as in `ties.walls` or, if missing, by their points."""
     known = []
     for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]).tolist():
         has_side = index < len(ties.walls)
@@ -135,7 +135,7 @@ def sigmas_on_wall(
 def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
     """Return the variances (4,) at the image corners, the largest of the walls shown there."""
     camera, worst = resection.camera, np.full(4, np.nan)
-    # Centres of the outermost pixels.
+    # Centres of the pixels in the corners.
     corners_px = np.array(
         [[u, v] for v in (0.5, camera.height - 0.5) for u in (0.5, camera.width - 0.5)]
     )
@@ -203,7 +203,7 @@ def _seen(
 
 
 def _about(points: NDArray[np.float64]) -> TieWall:
-    """Describe the bounding rectangle of points in their best-fitting plane."""
+    """Return the bounding rectangle of points in their best-fitting plane, as a wall."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ axes[:2].T
@@ -258,8 +258,8 @@ class Candidate:
         known: the walls of the inliers.
         error: predicted error on these walls, None if the photo shows none of them.
         params: parameters with the limits.
-        search_radius_px: radius around the expected positions within which the matcher searched,
-            so that wrong ties are within it, too; inf if it searched the whole photo.
+        search_radius_px: radius around the expected positions within which ties were searched for,
+            so that wrong ties are within it, too; inf if the whole photo was searched.
     """
 
     photo: Photo
@@ -306,8 +306,8 @@ class Candidate:
 
     @property
     def chance(self) -> float:
-        """Probability that as many check points agree with a wrong pose (binomial)."""
-        from scipy.special import bdtrc  # scipy.stats would take seconds to import
+        """Probability that as many check points would agree with a wrong pose (binomial)."""
+        from scipy.special import bdtrc  # importing scipy.stats would take seconds
 
         fit, limit = self.estimate.fit, self.estimate.limit
         inside = self.estimate.agreeing & (fit.normalised > 0.0)
@@ -351,10 +351,10 @@ class Candidate:
 
     @cached_property
     def poor_quarter(self) -> tuple[int, str] | None:
-        """Number of ties in a quarter of the photo that has too few, and the reason.
+        """Number of ties in a quarter of the photo with too few ties, and the reason.
 
         In markiewicz2015, each quarter needs two ties. However, a quarter without ties may show
-        only an obstacle, or what is beyond the end of the wall. Such a photo is usable if the other
+        only an obstacle, or an area beyond the end of the wall. Such a photo is usable if the other
         quarters determine the pose: the largest predicted error on the walls in that quarter must
         meet the limit for the average over the photo. A quarter that shows no wall needs no ties.
         `strict` applies the rule of the paper.
@@ -394,7 +394,7 @@ class Candidate:
 
     @cached_property
     def hull_ratio(self) -> float:
-        """Ratio of the area of the control points' hull to that of the walls in the photo.
+        """Ratio of the area of the control points' hull to the area of the walls in the photo.
 
         It is 0 if the photo shows none of the walls.
         """
@@ -405,7 +405,7 @@ class Candidate:
 
     @cached_property
     def needed_tie(self) -> tuple[float, NDArray[np.float64]] | None:
-        """Largest predicted error, in cells, if one tie is left out, and the pixel of that tie.
+        """Largest predicted error, in cells, if one tie is omitted, and the pixel of that tie.
 
         An undetected error of a tie displaces the pose by no more than the uncertainty of the pose
         without that tie.
@@ -458,7 +458,7 @@ CONTROL_GATES: Final = (
     Gate(
         name="share",
         value=lambda c: float(c.estimate.agreeing.mean()),
-        limit=0.04,  # robust sampling finds a pose among these outliers (benchmarks/robust_pose.py)
+        limit=0.04,  # robust sampling tolerates these outliers (benchmarks/robust_pose.py)
         reason=lambda c, value, limit: (
             f"only {value:.1%} of {len(c.seen)} ties agree with one pose; at least {limit:.1%} are "
             "required"
@@ -591,7 +591,7 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[
 
     Args:
         candidate: the orientation.
-        gates: the gates, in order; None chooses them by the origin of the ties.
+        gates: the gates, in order; if None, they are chosen by the origin of the ties.
 
     Returns:
         Name of the first gate that is not passed, and the reason; None if all are passed.
@@ -608,7 +608,7 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[
 
 
 def too_few(n_ties: int) -> str:
-    """Return why there are too few ties for an orientation; empty if they suffice."""
+    """Return the reason why there are too few ties for an orientation; empty if they suffice."""
     if n_ties >= _MIN_TIES:
         return ""
     return (
@@ -633,7 +633,9 @@ def warnings_for(candidate: Candidate) -> list[Note]:
 
 
 def hull_area(pixels: NDArray[np.float64]) -> float:
-    """Return the area of the convex hull of points (n, 2); 0 for fewer than three or collinear."""
+    """Return the area of the convex hull of points (n, 2); 0 for fewer than three or collinear
+    points.
+    """
     from scipy.spatial import ConvexHull, QhullError
 
     if len(pixels) < 3:

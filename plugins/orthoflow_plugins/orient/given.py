@@ -40,11 +40,11 @@ POSE_DISAGREES: Final = DiagnosticSpec(
 class OrientGiven(Method):
     """Use poses from other programs unchanged.
 
-    They are not verified: their status is ok, the source of their lens is `given`, and their error
-    on the wall is known only if the files contain it. A photo with at least six ties measured by
-    hand is oriented from these, with the given lens, and must pass the gates for such ties; fewer
-    ties are used only to check the given pose. If none of the poses shows a wall, they are refused,
-    since they are not in the coordinate system of the scan.
+    The poses are not verified: their status is `ok`, the source of their lens is `given`, and their
+    error on the wall is only known if the files contain it. A photo with at least six ties measured
+    by hand is oriented from these, with the given lens, and must pass the gates for such ties;
+    fewer ties are used only to check the given pose. If no photo shows a wall with its given pose,
+    the poses are refused, since they are not in the coordinate system of the scan.
     """
 
     id: ClassVar[str] = "orient.given"
@@ -66,7 +66,7 @@ class OrientGiven(Method):
     Out = OrientOut
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> OrientOut:
-        """Return the poses, and check those with ties."""
+        """Check poses that have ties, and return all poses."""
         given = {camera.photo: camera for camera in inputs.cameras.cameras}
         if inputs.walls is not None:
             _require_a_wall_in_view(list(given.values()), inputs.walls)
@@ -101,7 +101,7 @@ def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
 
 
 def _details(unchecked: Sequence[str]) -> dict[str, JsonValue]:
-    """Name the photos whose poses were used unchecked."""
+    """List the photos whose poses were used unchecked."""
     return {"given": list(unchecked)}
 
 
@@ -151,7 +151,7 @@ def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
     """Refuse the poses if none of them shows the front of a wall.
 
     Raises:
-        MethodError: none of them does.
+        MethodError: none of them shows a wall.
     """
     oriented = [camera.viewing() for camera in cameras if camera.status == "ok"]
     for wall in walls.walls:

@@ -1,4 +1,4 @@
-"""Ties between photos: key points matched in pairs of photos and joined to tracks."""
+"""Ties between photos: key points matched in pairs of photos and joined into tracks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PhotoTies:
 
     Attributes:
         photo: (m,) index of the photo of each observation.
-        point: (m,) index of its point, 0..k-1; each point is observed at least twice.
+        point: (m,) index of the observed point, 0..k-1; each point is observed at least twice.
         pixels: (m, 2) pixels of the photo.
         scale: (m,) photo pixels per pixel of the reduced picture in which the key point was found.
         points_world: (k, 3) metres, intersected with the given poses.
@@ -47,7 +47,7 @@ class PhotoTies:
 
 
 def photo_features(photo: Photo, n_most: int) -> Features:
-    """Find the strongest key points of a photo, spread over it."""
+    """Find the strongest key points of a photo, distributed over the photo."""
     scale = _reduction(photo.width, photo.height)
     return find_features(reduced(photo_grey(photo), 1.0 / scale), n_most).scaled(scale)
 
@@ -87,7 +87,7 @@ def tie_photos(
     pairs: Sequence[tuple[int, int]],
     n_most: int,
 ) -> PhotoTies:
-    """Match key points of pairs of photos, and join those that agree with the poses to tracks.
+    """Match key points of photo pairs, and join matches that agree with the poses into tracks.
 
     Args:
         cameras: cameras of the photos, accurate to a few pixels.
@@ -128,7 +128,7 @@ def _off_line_px(
 
 
 def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return tracks of linked key points, longest first; none with two points in one photo."""
+    """Return tracks of linked key points, longest first, without two key points in one photo."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -188,9 +188,9 @@ def _located(
 def _meeting(
     tracks: NDArray[np.intp], centres: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return tracks (k, m) whose rays meet in front of the cameras at a sufficient angle.
+    """Return tracks (k, m) whose rays intersect in front of the cameras at a sufficient angle.
 
-    The second value is their points of intersection (k, 3).
+    The second value contains the points of intersection (k, 3).
     """
     unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
     cosines = np.einsum("nid,njd->nij", unit, unit)

@@ -45,7 +45,7 @@ from orthoflow_plugins.orient.report import Oriented, numbers_json
 
 MIN_TIES: Final = 6
 _MAX_WRONG: Final = 2
-# Maximum number of subsets to try; enough to leave out two of up to 24 ties.
+# Maximum number of subsets to try: enough to leave out any two of 24 ties.
 _MAX_TRIALS: Final = 300
 # Probability that correct ties are classified as contradictory.
 _CONTRADICTION: Final = 1e-3
@@ -75,7 +75,7 @@ the camera, and the prior of its lens.
 
 
 def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
-    """Orient a photo from its ties measured by hand, or return why not.
+    """Orient a photo from its ties measured by hand, or return the reason why not.
 
     Args:
         tied: the photo, with at least `MIN_TIES` ties measured by hand.
@@ -147,8 +147,8 @@ def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] |
 
 
 def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
-    """Adjust from every start and yield the fits that are consistent with the ties."""
-    from scipy.special import chdtrc  # scipy.stats would take seconds to import
+    """Adjust from every initial pose, and yield the fits that are consistent with the ties."""
+    from scipy.special import chdtrc  # importing scipy.stats would take seconds
 
     for lens in (known.prior, *known.guesses):
         for start in _starts(seen, lens):
@@ -202,7 +202,7 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
             n_found, turns, shifts, _ = call(
                 of_method, pixels, opencv_matrix(lens), None, flags=method
             )
-        except cv2.error:  # the points have no such solution
+        except cv2.error:  # there is no such solution for these points
             continue
         starts += [
             lens.at_opencv_pose(turn, shift, middle)
@@ -213,14 +213,14 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
 
 
 def _as_stated(resection: Resection) -> Resection:
-    """Use the a priori standard deviations if the residuals are smaller than these."""
+    """Use the a priori standard deviations if the residuals are smaller than expected."""
     unit = max(1.0, resection.sigma0)
     covariance = resection.covariance * (unit / resection.sigma0) ** 2
     return replace(resection, covariance=covariance, sigma0=unit, variance_factor=unit**2)
 
 
 def _places(pixels: NDArray[np.float64] | Sequence[NDArray[np.float64]]) -> str:
-    """List pixels in the convention of tie files."""
+    """List pixels in the convention of files with ties."""
     counted = to_opencv(np.asarray(pixels))
     return ", ".join(f"(u {u:.0f}, v {v:.0f})" for u, v in counted)
 
@@ -268,7 +268,9 @@ class Trusted:
     kept: NDArray[np.bool_]
 
     def judged(self, ties: Ties, params: OrientParams, estimate: Estimate) -> Oriented:
-        """Test an orientation; return that from ties by hand if it fails or contradicts them."""
+        """Test an orientation; if it fails or contradicts ties by hand, return that from the
+        latter.
+        """
         found = judged(self.tied, candidate_of(self.tied, ties, params, estimate))
         is_with_hand = not (self.kept & (found.role == TieRole.REJECTED)).any()
         if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
@@ -305,7 +307,7 @@ def tied_photo(
     photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
 ) -> TiedPhoto:
     """Choose the ties of a photo and split them into control and check."""
-    # One draw per photo, so that its samples do not depend on the ties of other photos.
+    # Draw once per photo, so that its samples do not depend on the ties of other photos.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
     chosen = ties_of_photo(ties, photo.name)
     chosen = chosen[ties.role[chosen] != TieRole.REJECTED]
@@ -340,8 +342,8 @@ def withheld(
 ) -> NDArray[np.bool_]:
     """Choose check points (n,): a share of the ties, evenly from all parts of the image.
 
-    The ties are shuffled and sorted by the image cell they are in; then every (1 / share)-th is
-    taken. So each cell contributes its share, and the total is at least `share`.
+    The ties are shuffled and sorted by image cell; then every (1 / share)-th tie is taken. So each
+    cell contributes its share, and the total is at least `share`.
     """
     shuffled = rng.permutation(len(pixels_photo))
     cells = image_cells(pixels_photo, size_px, _STRATA)
@@ -358,8 +360,9 @@ def with_believable_priors(
 ) -> list[Photo]:
     """Replace EXIF focal lengths that contradict the ties.
 
-    Digital zoom, adapters and cropping make EXIF wrong for all photos of a lens. Those with the
-    most ties are tested, and the resulting focal length is used for all of them.
+    Due to digital zoom, adapters or cropping, EXIF is wrong for all photos of a lens. The photos
+    with the most ties are tested, and the resulting focal length is used for all photos of the
+    lens.
     """
     believed = list(photos)
     lenses: dict[tuple[object, ...], list[int]] = {}
@@ -511,7 +514,7 @@ def oriented_by_hand(
 
 
 def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, start: Start) -> Estimate | None:
-    """Orient a photo from all ties, starting at the pose by hand; None if they contradict it."""
+    """Orient a photo from all ties, starting from the pose by hand; None if they contradict it."""
     try:
         joined = adjusted(tied, start, params)
     except GeometryError:

@@ -35,7 +35,7 @@ _LEAST: Final = 6
 
 
 class OrientPnp(Method):
-    """Orient each photo separately: robust pose, then a weighted adjustment with the full lens.
+    """Orient each photo separately: a robust pose, then a weighted adjustment with the full lens.
 
     Some ties are withheld to check the pose. A photo is `ok` only if it has enough ties, they are
     well distributed, more withheld ties agree than by chance, the camera is in front of the wall,
@@ -80,7 +80,7 @@ class OrientPnp(Method):
 
 
 def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo by `cv2.solvePnP` (iterative, Levenberg-Marquardt), or return why not.
+    """Orient a photo by `cv2.solvePnP` (Levenberg-Marquardt), or return the reason why not.
 
     All ties have the same weight, the lens is fixed, and solvePnP gets no initial pose. Outliers
     are rejected, and solvePnP is called again, until the set of inliers no longer changes. The
@@ -89,7 +89,7 @@ def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
     robust = robust_start(tied, params)
     if robust is None:
         return no_pose(tied.seen)
-    # All pixels get the same uncertainty, and the points are treated as exact.
+    # All pixels have the same uncertainty, and the points are considered exact.
     n = len(tied.seen)
     sigma_px = np.full(n, expected_px(tied.control(robust.agreeing)))
     equal = replace(tied, seen=replace(tied.seen, sigma_px=sigma_px, sigma_m=np.zeros(n)))
@@ -112,9 +112,9 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
         raise GeometryError(f"solvePnP needs {_LEAST} ties; only {len(seen)} agree with one pose")
     if lens.skew:
         raise GeometryError(f"solvePnP does not support skew, and the lens has {lens.skew:.1f} px")
-    # Large survey coordinates would lose digits.
+    # Large survey coordinates would reduce the precision.
     middle = seen.points_world.mean(axis=0)
-    # Any, because OpenCV's type stubs do not accept these arrays.
+    # The type is Any, because OpenCV's type stubs do not accept these arrays.
     call: Any = cv2.solvePnP
     try:
         found, turn, shift = call(

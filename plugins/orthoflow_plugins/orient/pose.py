@@ -234,10 +234,10 @@ def lens_groups(
     Args:
         photos: the photos.
         cameras: cameras from separate orientations, as initial values of lenses without a prior.
-        sharing: `focal-group`: photos with the same size and the same EXIF focal length or
-            calibration share a lens, as do those of the same size without either; `shared`: all
-            photos of the same size; `per-photo`: none.
-        apart: photos that get their own lens in any case.
+        sharing: with `focal-group`, photos of the same size share a lens if they have the same EXIF
+            focal length or calibration, or if they have neither; with `shared`, all photos of the
+            same size share a lens; with `per-photo`, none do.
+        apart: photos that get a separate lens in any case.
 
     Returns:
         Index of each photo's lens, and the lenses.
@@ -298,7 +298,7 @@ class TiedPhoto:
     seed: int
 
     def control(self, agreeing: NDArray[np.bool_]) -> SeenPoints:
-        """Return the inliers (n,) that are not check points."""
+        """Return a mask (n,) of the inliers that are not check points."""
         return self.seen.take(agreeing & ~self.is_check)
 
 
@@ -344,7 +344,7 @@ Solver = Callable[[SeenPoints, ViewingCamera], ViewingCamera]
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """The start of an adjustment.
+    """Initial values of an adjustment.
 
     Attributes:
         camera: pose and lens.
@@ -360,7 +360,7 @@ class Start:
 
 
 def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo from its control points, weighted by their sigmas, or return why not."""
+    """Orient a photo from its weighted control points, or return the reason why not."""
     start = robust_start(tied, params)
     if start is None:
         return no_pose(tied.seen)
@@ -427,7 +427,7 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
 def adjusted(
     tied: TiedPhoto, start: Start, params: OrientParams, solve: Solver | None = None
 ) -> Estimate:
-    """Alternate adjustment and rejection until the set of control points no longer changes.
+    """Adjust and reject alternately until the set of control points no longer changes.
 
     Args:
         tied: the photo.
@@ -446,7 +446,7 @@ def adjusted(
         used = agreeing & ~is_check
         lens = start.lens.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
         control, soft_limit = seen.take(used), math.inf if solve else SOFT_LIMIT * unit
-        # A lens that is not adjusted is that of the prior.
+        # If the lens is not adjusted, use that of the prior.
         begin = camera if lens.sigmas.size else posed(prior, camera)
         if solve:
             camera = solve(control, begin)
@@ -486,8 +486,8 @@ def image_cells(
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
     """Tighten a limit until it accepts hardly any outliers by chance.
 
-    Near a pose, residuals of outliers are distributed evenly. The ring from one to three times the
-    limit has eight times the area of the circle inside, so an eighth as many outliers as in the
+    Near a pose, residuals of outliers are uniformly distributed. The ring from one to three times
+    the limit has eight times the area of the circle inside, so an eighth as many outliers as in the
     ring are expected within the limit.
     """
     lengths = np.sort(normalised[np.isfinite(normalised)])
@@ -499,13 +499,13 @@ def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
 
 
 def unit_deviation(normalised: NDArray[np.float64]) -> float:
-    """Return the robust standard deviation of unit weight, within plausible limits."""
+    """Return the robust standard deviation of unit weight, restricted to plausible values."""
     median = float(np.median(normalised)) if normalised.size else 1.0
     return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
 
 
 def expected_px(seen: SeenPoints) -> float:
-    """Return the a priori deviation of a tie, with the image scale from the spread of the ties."""
+    """Return the a priori deviation of a tie, with the scale from the spread of the ties."""
     spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
     lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
     per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
@@ -527,7 +527,7 @@ def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDAr
 
 
 def _contradicted_calibration(found: Estimate, control: SeenPoints) -> str:
-    """Return why a calibration contradicts the ties of a photo; empty if it may be correct.
+    """Return the reason why a calibration contradicts a photo's ties; empty if it does not.
 
     The pose absorbs most of a wrong focal length, so the residuals do not reveal it.
     """
@@ -585,7 +585,7 @@ def _robust_pose(
     call: Any = cv2.solvePnPRansac
     try:
         found, _, turn, shift, agreed = call(points, pixels, opencv_matrix(lens), None, params=usac)
-    except cv2.error:  # no sample has a solution
+    except cv2.error:  # there is no solution for any sample
         return None
     if not found or agreed is None:
         return None

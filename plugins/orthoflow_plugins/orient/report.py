@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # 4.55 % of a normal distribution are beyond this limit, and at most a quarter of any (Chebyshev).
 _BEYOND: Final = 2.0
 _SIDE_PX: Final = 900
-# As in markiewicz2015, Figure 17: control green, rejected red, check yellow.
+# Colours as in markiewicz2015, Figure 17: control green, rejected red, check yellow.
 _ROLE_RGB: Final = {
     TieRole.REJECTED: (220, 40, 40),
     TieRole.CONTROL: (40, 200, 60),
@@ -45,22 +45,25 @@ _ROLE_RGB: Final = {
 }
 _MAX_FIGURES: Final = 24
 _SUB_PIXEL_BITS: Final = 4
-# Cells along the longer side of a map of predicted errors.
+# Number of cells along the longer side of a map of predicted errors.
 _MAP_CELLS: Final = 90
 # Histograms with normal distributions as in markiewicz2015, Figures 18, 20, 21 and 23.
 _BARS: Final = 40
 _BARS_OF_A_PHOTO: Final = 25
-# Rows of the figure with single photos, and the height of the highest bar relative to the row.
+# Maximum number of rows in the figure of single photos.
 _MAX_PHOTOS: Final = 30
+# Height of the highest bar relative to its row.
 _ROW_SHARE: Final = 0.8
 _BAR_COLOUR: Final = "#9db8d2"
 _CURVE_COLOUR: Final = "#b03a2e"
-# Plan of the photos: length of an arrow, and maximum number of control points per photo.
+# Length of an arrow in the plan of the photos.
 _VIEW_M: Final = 0.4
+# Maximum number of control points per photo in the plan.
 _MAX_CONTROL: Final = 300
 _PERCENTILE: Final = 99.5
-# Maximum length of a photo name in figures, and maximum number of residuals for a density.
+# Maximum length of a photo name in figures.
 _NAME_LETTERS: Final = 14
+# Maximum number of residuals from which a density is estimated.
 _MAX_KERNELS: Final = 5000
 _KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
@@ -234,14 +237,14 @@ def hand_over(
 
 
 def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
-    """Report the errors on the wall of the cameras for which they are known."""
+    """Report the errors on the wall for cameras that have one."""
     sigmas = [camera.sigma_wall_m for camera in cameras if camera.sigma_wall_m is not None]
     _sum_up(ctx, "sigma_wall_mm", [1000.0 * sigma for sigma in sigmas], "mm")
 
 
 def _chance_of_mean(values: NDArray[np.float64]) -> float | None:
     """Return the p-value of the mean (t test against 0); None for fewer than two values."""
-    from scipy.special import stdtr  # scipy.stats would take seconds to import
+    from scipy.special import stdtr  # importing scipy.stats would take seconds
 
     n = len(values)
     if n < 2:
@@ -349,7 +352,7 @@ def _with_legend(canvas: NDArray[np.uint8], counts: Mapping[TieRole, int]) -> by
 
 
 def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
-    """Draw the predicted error over each wall, at each position that of the most accurate photo.
+    """Draw the predicted error on each wall, using the most accurate photo at each position.
 
     Args:
         ctx: the context.
@@ -370,7 +373,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         shown = np.isfinite(best)
         if not shown.any():
             continue
-        # Percentiles, so that a hardly covered corner does not dominate the scale.
+        # Use percentiles, so that a hardly covered corner does not dominate the scale.
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         error_mm = np.where(shown, 1e3 * best, np.nan)
         label = "predicted error of a coordinate [mm]"
@@ -389,8 +392,8 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
 def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     """Draw the positions of photos and control points in two views of the first wall.
 
-    One view is along the wall, one faces it; for a floor, the second view is its plan. The figure
-    follows skarlatos2012, Figure 3.
+    One view is along the wall, the other faces it; for a floor, the second view is a plan. The
+    figure follows skarlatos2012, Figure 3.
 
     Args:
         ctx: the context.
@@ -459,7 +462,7 @@ def _draw_position(
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
     axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
-    # In the other view, photos above each other coincide, and so would their names.
+    # In the other view, photos one above the other coincide, so their names would overlap.
     if is_named:
         axes.annotate(
             candidate.photo.name, (x, y), xytext=(2, 2), textcoords="offset points", fontsize=6.0
@@ -544,12 +547,12 @@ def _draw_curves(
     scale: float = 1.0,
     base: float = 0.0,
 ) -> None:
-    """Draw the normal distribution and the density of the values, which may have several peaks."""
+    """Draw the normal distribution and the density of values, which may have several peaks."""
     grid = np.linspace(edges[0], edges[-1], 161)
     curve = scale * _normal(values, edges, grid) + base
     axes.plot(grid, curve, color="black", linestyle="--", linewidth=0.6, label="normal")
-    # Silverman's rule of thumb with a robust spread: an SD inflated by outliers would smooth
-    # secondary peaks away.
+    # Use Silverman's rule of thumb with a robust spread, since an SD increased by outliers would
+    # smooth secondary peaks away.
     spread = min(float(values.std()), median_deviation(values, float(np.median(values))))
     width = max(0.9 * spread * len(values) ** -0.2, 1e-9)
     some = values[:: max(1, len(values) // _MAX_KERNELS)]

@@ -30,14 +30,14 @@ VISIBILITY_OFF: Final = DiagnosticSpec(
 
 
 class DsmBackward(Method):
-    """Project each cell of a wall into the photos and take the colour from there.
+    """Project each cell of a wall into the photos and take its colour from them.
 
     The depth of a cell gives its point in the world, and the camera with its distortion gives the
-    position of that point in the photo. The cell takes its colour from there unless it is hidden by
-    the relief of the wall (the ray to the camera is traced over the raster) or by points of the
-    cloud in front of the depth range of the wall (a depth buffer in the photo; isolated points are
-    treated as outliers). If the photo has a higher resolution than the wall, colours are averaged
-    over the cell.
+    position of that point in the photo. The cell takes the colour at this position unless the cell
+    is hidden by the relief of the wall (the ray to the camera is traced over the raster) or by
+    points of the cloud in front of the depth range of the wall (a depth buffer in the photo;
+    isolated points are treated as outliers). If the photo has a higher resolution than the wall,
+    colours are averaged over the cell.
 
     The quality of a cell is the number of photo pixels that it covers: the cosine of the angle of
     incidence times the squared ratio of cell size to photo GSD, decreasing to 0 at the border of

@@ -34,7 +34,7 @@ _BAND_CELLS: Final = 1 << 23
 
 
 class DsmForward(Method):
-    """Trace the ray of each pixel to its first intersection with the surface, and colour that cell.
+    """Trace the ray of each pixel to the first cell of the surface that it hits, and colour it.
 
     If several pixels hit the same cell, the one closest to the cell centre is used unchanged;
     colours are not interpolated. Objects in front of the depth range of the wall hide it as in
@@ -113,7 +113,7 @@ def _layer(
         return None
     shape, level = surface.frame.shape, level_of(photo.pixels)
     scratch = stack.scratch(wall)
-    # Kernels accept plain arrays only, not mapped files.
+    # Kernels accept only plain arrays, not memory-mapped files.
     catch = Catch(
         pixel=np.asarray(scratch("pixel", shape, np.int32), np.int32).view(np.ndarray),
         square=np.asarray(scratch("square", shape, np.float32), np.float32).view(np.ndarray),
@@ -137,7 +137,8 @@ def _layer(
     # Find the cells inside the photo, ignoring occlusion.
     from_anywhere, empty = view._replace(cosine_least=-1.0), nothing_in_the_way(photo.viewer)
     free = surface.relief._replace(bottoms=np.full_like(surface.relief.bottoms, np.inf))
-    # A gap is narrow depending on cells up to two discs away; its colour depends on one more.
+    # Whether a gap is narrow depends on cells up to two discs away; its colour depends on one more
+    # cell.
     reach_rows = 2 * params.fill_gap_cells + 2
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
         inner, width = band.inner, surface.frame.width
@@ -145,7 +146,7 @@ def _layer(
         visible = cells_seen(from_anywhere, free, empty, band.rows, slice(0, width))
         seen = visible.mask == LayerMask.PAINTED
         quality = np.maximum(visible.quality, np.float32(0.0))
-        # Release 12 bytes per cell before the gaps need memory.
+        # This frees 12 bytes per cell before memory for the gaps is needed.
         del visible
         is_painted = pixel != NO_PIXEL
         gaps = narrow_gaps(is_painted, params.fill_gap_cells)
@@ -155,7 +156,7 @@ def _layer(
         rgb = photo.pixels.reshape(-1, 3)[np.maximum(pixel, 0).ravel()].reshape(*pixel.shape, 3)
         rgb[~is_painted] = 0
         nowhere = np.where(is_painted, np.float32(0.0), np.float32(np.nan))
-        # A gap takes the colours around it, from any surface.
+        # A gap takes the colours around it, whatever surface they are on.
         is_filled = painted_between(
             gaps,
             rgb,
@@ -175,7 +176,7 @@ def _layer(
 
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
-    """Return rays (n, m, 3) of every 16th pixel as (columns, rows, metres along the normal)."""
+    """Return rays (n, m, 3) of every 16th pixel: columns, rows, and metres along the normal."""
     from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     frame = surface.frame

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 _WINDOWS: Final = (3, 5, 7)
 # Painted cells within this distance of a gap need the position of their point.
 _BESIDE_CELLS: Final = 2
-# OpenCV propagates colours through successive gaps; beyond this, the effect is below 8 bits.
+# OpenCV propagates colours through successive gaps; beyond this distance, the effect is less than
+# one level of 8 bits.
 _FRONT_CELLS: Final = 64
 
 
@@ -31,7 +32,7 @@ def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
 
 
 def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """Return void cells with few void cells around them.
+    """Return a mask of void cells with few void cells around them.
 
     The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, including
     the cell itself; all three counts must be within their limits. Cells outside the image count as

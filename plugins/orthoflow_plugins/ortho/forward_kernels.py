@@ -37,7 +37,7 @@ def throw_pixels(
 ) -> int:
     """Trace the ray of each pixel to its first intersection, and offer the pixel to that cell.
 
-    A cell takes the pixel that hits it closest to its centre; of several, the first. A ray that
+    A cell takes the pixel that hits it closest to its centre, or the first of several. A ray that
     hits the side of a depth step is ignored, since no cell shows that side.
 
     Args:
@@ -110,7 +110,7 @@ def _first_meeting(
 
     The ray is traced from cell to cell, each a flat patch, from the highest surface down to the
     lowest. A ray that enters a cell below its surface has hit the side of a step: a small height
-    difference is due to noise or a slope, and the cell counts as hit; a larger one is an edge.
+    difference is due to noise or a slope, so the cell counts as hit; a larger one is an edge.
     """
     rows, columns = relief.depth.shape
     begin = max(_NEAREST_M, (view.height_m - relief.highest_m) / -dn)

@@ -1,4 +1,4 @@
-"""Collection of the layers of photos on walls."""
+"""Collection of the layers that photos form on walls."""
 
 from __future__ import annotations
 

@@ -32,12 +32,12 @@ Tile = tuple[slice, slice]
 TILE_CELLS: Final = 512
 # The part of a photo that covers a tile stays below 27 MB; cv2.remap needs sides below 32767.
 _CROP_MOST_PX: Final = 3_000
-# Margin of that part: Lanczos needs 4 pixels, so the result does not depend on the cropping.
+# Margin of that part; Lanczos needs 4 pixels, so the result does not depend on the cropping.
 _REACH_PX: Final = 5
 # A weaker filter changes colours by less than one level.
 _SIGMA_LEAST_PX: Final = 0.2
 _BASE_CELLS: Final = 4.0
-# Cells this close to a hidden area take no colour from a photo, because its edges are blurred.
+# Cells this close to a hidden area are not coloured, because edges in a photo are blurred.
 _EROSION_CELLS: Final = 1
 # Twenty bits are enough to rank photos by quality, and compress to half the size.
 _QUALITY_BITS: Final = np.uint32(0xFFFFF000)
@@ -45,7 +45,7 @@ _QUALITY_BITS: Final = np.uint32(0xFFFFF000)
 
 @dataclass(frozen=True, kw_only=True)
 class CellFootprint:
-    """How a photo sees the middle of a tile.
+    """Geometry of a photo in the middle of a tile.
 
     Attributes:
         pixels_across: length of a cell along u in photo pixels.
@@ -68,7 +68,7 @@ class Painting:
 
     Attributes:
         mask: (rows, cols) uint8 `LayerMask`.
-        rgb: (rows, cols, 3) in the bit depth of the photo; None if no cell is painted.
+        rgb: (rows, cols, 3) with the bit depth of the photo; None if no cell is painted.
         quality: (rows, cols) float32; None if no cell is painted.
         footprints: footprint of each painted tile, by its first row and column.
     """
@@ -97,8 +97,8 @@ def paint(
         surface: the wall.
         buffer: depth buffer of objects in front of the wall.
         params: which cells are painted, and how colours are sampled.
-        allocate: allocates zeroed arrays of the layer; colours and quality only if a cell is
-            painted.
+        allocate: allocates zeroed arrays of the layer; those of colours and quality only if a cell
+            is painted.
         threads: number of tiles processed at once; it does not change the result.
     """
     import cv2
@@ -180,14 +180,14 @@ def _visible(
 
 
 def near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Return cells near hidden patches of at least 2 x 2 cells.
+    """Return a mask of cells near hidden patches of at least 2 x 2 cells.
 
     A single hidden cell usually has a wrong depth, which does not affect its neighbours.
     """
     import cv2
 
     lowest = cv2.erode(is_hidden.view(np.uint8), np.ones((2, 2), dtype=np.uint8), anchor=(0, 0))
-    # One dilation restores the patches from their upper left cells and adds the margin.
+    # A single dilation restores the patches from their upper left cells and adds the margin.
     window = np.ones((2 * reach + 2,) * 2, dtype=np.uint8)
     return np.asarray(cv2.dilate(lowest, window, anchor=(reach + 1,) * 2) > 0, dtype=np.bool_)
 
@@ -242,7 +242,7 @@ def footprint_of(
     )
     aside = view.gsd_m * math.hypot(view.column - column, view.row - row)
     return CellFootprint(
-        # A neighbour of a painted cell may be beyond the lens model, which gives NaN.
+        # A neighbour of a painted cell may be outside the lens model, so its position may be NaN.
         pixels_across=across if math.isfinite(across) else 1.0,
         pixels_down=down if math.isfinite(down) else 1.0,
         photo_gsd_m=centre[2] / math.sqrt(view.camera[12] * view.camera[13]),

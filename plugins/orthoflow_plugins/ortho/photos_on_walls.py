@@ -68,7 +68,7 @@ WITHOUT_WALL: Final = DiagnosticSpec(
 
 
 class PhotosOnWalls(Ports):
-    """The walls, the cloud they were made from, and the oriented photos."""
+    """The walls, the cloud from which they were made, and the oriented photos."""
 
     walls: Walls
     photos: Photos
@@ -224,7 +224,7 @@ def warn_of_heads(
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
-    """Return the numpy type in which photos are projected: 16 bits if any photo has more than 8.
+    """Return the numpy type of projected colours: 16 bits if any photo has more than 8.
 
     8-bit levels are then multiplied by 257, so that white stays white and no level is lost.
     """

@@ -32,19 +32,21 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 
-# Standard deviation of the weight in cells: a point in a corner of its cell has a weight of 1/7.
+# Standard deviation of the weight in cells; a point in a corner of its cell has a weight of 1/7.
 _SIGMA_CELLS: Final = 0.36
 _NO_COLOUR: Final = 999
 # Maximum number of points for the median.
 _TOP_MOST: Final = 5
 # Maximum number of points sorted at once for the median.
 _POINTS_AT_ONCE: Final = 1 << 24
-# Colours of scans are compared in squares of this size, with this number of points per scan, using
-# levels that are neither clipped nor almost black, if a scan has this number of squares.
+# Colours of scans are compared in squares with this side length.
 _PLACE_M: Final = 0.05
+# Minimum number of points of each scan in a square.
 _POINTS_LEAST: Final = 4
+# Points with levels outside this range are almost black or clipped.
 _DARKEST: Final = 10
 _BRIGHTEST: Final = 245
+# Scans with fewer squares are ignored.
 _PLACES_LEAST: Final = 20
 # Maximum share of clipped or almost black points in a square.
 _USELESS_MOST: Final = 0.05
@@ -141,11 +143,11 @@ def colours_of(
 
 
 def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> NDArray[np.float64]:
-    """Find the logarithms (scans, 3) of the factors on light that remove colour casts of scans.
+    """Find factors on the brightness of scans that remove colour casts, as logarithms (scans, 3).
 
     Where two scans overlap they show the same surface, so differences of their mean colours are due
     to exposure and white balance, except at edges of texture and objects; the L1 norm is robust to
-    these. Among scans that overlap, the median keeps its colours.
+    these. In a group of overlapping scans, the median scan keeps its colours.
 
     Args:
         painters: coloured points with scan numbers.
@@ -179,8 +181,7 @@ def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> ND
             shades = np.column_stack([light[values], is_useless, np.ones(len(values))])
             for channel in range(5):
                 sums[:, channel] += np.bincount(key, shades[:, channel], len(sums))
-        # Exclude whole squares, not points: otherwise the darker scan would lose more of its
-        # points.
+        # Exclude whole squares, not points; otherwise, the darker scan would lose more points.
         is_known = (sums[:, 4] >= _POINTS_LEAST) & (sums[:, 3] <= _USELESS_MOST * sums[:, 4])
         known = np.flatnonzero(is_known)
         logs = np.log(sums[known, :3] / sums[known, 4:])

@@ -80,9 +80,10 @@ BLACK_POINTS: Final = DiagnosticSpec(
 class PointcloudDirect(Method):
     """Colour each cell of a wall from its topmost point; fill small gaps.
 
-    The topmost point is the one nearest to the viewer within the buffer of the wall; of several,
-    the one nearest to the cell centre, then the one with the lowest index. `colouring` offers other
-    rules. Gaps are void cells with few void cells around them; filled cells are marked as filled.
+    The topmost point is the one nearest to the viewer within the buffer of the wall; if there are
+    several, it is the one nearest to the cell centre, then the one with the lowest index.
+    `colouring` offers other rules. Gaps are void cells with few void cells around them; filled
+    cells are marked as filled.
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
@@ -216,9 +217,9 @@ def _mask(ctx: StepContext, n_points: int) -> NDArray[np.bool_]:
 def _left_out(
     cloud: PointCloud, rgb: NDArray[np.uint8], params: DirectParams, ctx: StepContext
 ) -> NDArray[np.bool_] | None:
-    """Return points (n,) without a colour, or too dark to have one; None if all have a colour.
+    """Return a mask (n,) of points without a colour or too dark; None if all have a colour.
 
-    These points keep their depth and colour no cell. Black points that are used are reported.
+    These points have a depth but colour no cell. Black points that are used are reported.
     """
     n_points, has_rgb = len(rgb), cloud.has_rgb
     counts = np.zeros(256, dtype=np.int64)

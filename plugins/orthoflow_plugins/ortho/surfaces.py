@@ -34,7 +34,7 @@ _TOLERANCE_CELLS: Final = 0.5
 _BORDER_SHARE: Final = 0.05
 # The occluding surface is computed in bands of this many cells.
 _BAND_CELLS: Final = 1 << 17
-# A cell influences the occluding surface up to this distance in rows.
+# A cell influences the occluding surface within this number of rows.
 _REACH_ROWS: Final = 4
 # A height difference between neighbours of more than this many cells (79 degrees) is an edge.
 _EDGE_CELLS: Final = 5.0
@@ -48,7 +48,7 @@ class Surface:
         frame: grid of the cells.
         relief: depths of the cells, and the surface that hides other cells.
         front_m: largest depth of the relief; the depth buffer contains only points beyond it.
-        tolerance_m: how far the surface must be above a ray to block it.
+        tolerance_m: minimum height of the surface above a ray that it blocks.
     """
 
     frame: WallFrame
@@ -58,7 +58,7 @@ class Surface:
 
 
 def surfaces_of(walls: Walls, ctx: StepContext, *, hides: bool = True) -> list[Surface]:
-    """Prepare all walls; with `hides` false they do not hide parts of themselves."""
+    """Prepare all walls; if `hides` is false, they do not hide parts of themselves."""
     return [
         surface_of(walls, index, hides=hides, allocate=_in_file(ctx, index))
         for index in range(len(walls.walls))
@@ -154,7 +154,7 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
 
 
 def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
-    """Return the occluding surface (rows, cols): without spikes, and with complete edges.
+    """Return the occluding surface (rows, cols), without spikes and with complete edges.
 
     Voids of one cell are closed. Cells higher than all 2 x 2 patches that contain them are lowered,
     since a single outlier in front of a wall would hide a long strip. The position of an edge

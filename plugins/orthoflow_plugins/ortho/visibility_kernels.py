@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# Rays from all cells of a block are traced up to a common height. Bounds of small blocks are only
-# computed where that of the large block does not exclude occlusion.
+# Rays from all cells of a block are traced up to a common height, the bound of the block. Bounds of
+# small blocks are only computed if the bound of the large block does not exclude occlusion.
 BLOCK_CELLS: Final = 32
 FINE_CELLS: Final = 8
 
-# Cells of a row are projected in runs of this length, relative to the first cell of the run, in
-# float32. Runs begin at multiples of it, so that results do not depend on the tile.
+# Cells of a row are projected in float32, in runs of this length and relative to the first cell of
+# the run. Runs begin at multiples of this length, so that results do not depend on the tile.
 _RUN_CELLS: Final = 512
 _N_QUANTITIES: Final = 6
 
@@ -38,7 +38,7 @@ class WallView(NamedTuple):
         height_m: height of the projection centre above the plane.
         gsd_m: side of a cell.
         front_m: largest depth of the relief; the depth buffer contains only points beyond it.
-        tolerance_m: how far the surface must be above a ray to block it.
+        tolerance_m: minimum height of the surface above a ray that it blocks.
         cosine_least: smallest cosine of the angle of incidence of visible cells.
         border_px: distance from the image border over which quality decreases to 0.
     """
@@ -154,7 +154,7 @@ def _project_run(
     steps: NDArray[np.float32],
     projected: NDArray[np.float32],
 ) -> None:
-    """Project cells of a row, void or not, as `camera_kernels.project_point` does.
+    """Project cells of a row, including void ones, as `camera_kernels.project_point` does.
 
     Each loop has no branches and writes to one array only, so that the compiler can vectorise it;
     constants of another type would prevent that.
@@ -185,7 +185,7 @@ def _project_run(
         nears[j] = one / (z0 + zu * steps[j] + zn * depths[j])
     for j in range(depths.size):
         us[j] = (x0 + xu * steps[j] + xn * depths[j]) * nears[j]
-    # Use the rows of other quantities for b and the distorted b until these are computed.
+    # Until the other quantities are computed, use their rows for b and the distorted b.
     bs = cosines
     for j in range(depths.size):
         bs[j] = (y0 + yu * steps[j] + yn * depths[j]) * nears[j]
@@ -247,7 +247,7 @@ def _set_states(
         u, v = us[j], vs[j]
         is_inside = (u >= zero) & (u < width) & (v >= zero) & (v < height)
         at_row, at_column = v * per_pixel, u * per_pixel
-        # Close to the border, the quotient may be rounded up beyond the last pixel of the buffer.
+        # Near the border, the quotient may be rounded up beyond the last pixel of the buffer.
         down = min(np.int32(at_row if is_inside else zero), last_row)
         places[j] = down * stride + min(np.int32(at_column if is_inside else zero), last_column)
     for j in range(mask.size):
@@ -284,12 +284,12 @@ def _hide_low_cells(
 ) -> None:
     """Trace the rays from painted cells of a row towards the camera, up to a height.
 
-    A ray advances by one row or column at a time, whichever direction it runs along more.
+    A ray advances by one row or one column at a time, along the axis on which it is longer.
 
     Args:
         surface: (cells of the wall,) occluding surface, flattened.
         eye: row, column and height of the projection centre.
-        tolerance_m: how far the surface must be above a ray to block it.
+        tolerance_m: minimum height of the surface above a ray that it blocks.
         top: height above which nothing can hide the cells.
         place: row and first column of the cells, numbers of rows and columns of the wall.
         depths: (n,) depths of the cells.
@@ -319,8 +319,8 @@ def _hide_low_cells(
         start = here * stride
         for _ in range(n_steps):
             start, at, level = start + step, at + move, level + rise
-            # Interpolate the surface between the two cells on either side of the ray.
-            # Rounding must not lead outside the wall.
+            # Interpolate the surface between the two cells on either side of the ray. Rounding
+            # errors must not lead outside the wall.
             first = int(at)
             share, second = np.float32(at - first), min(first + 1, n_beside - 1)
             one = surface[np.uintp(start + first * side)]
@@ -334,7 +334,7 @@ def _hide_low_cells(
 def _bound_rays(
     view: WallView, relief: Relief, row: int, first_column: int, highest: NDArray[np.float64]
 ) -> None:
-    """Bound the height up to which rays from fine blocks must be traced; -inf if not at all.
+    """Bound the height up to which rays from fine blocks must be traced; -inf if none must be.
 
     Args:
         view: the camera in the axes of the wall.
