@@ -7,15 +7,15 @@
     python benchmarks/balanced_colours.py --room 9021
     python benchmarks/balanced_colours.py RUN --exposure 0.3 --store store
 
-The second use draws a smaller room by a seed, with true planes and cameras. The third multiplies
-the brightness of real photos by 0.7 to 1.3 and compares the result with the balanced original
-photos.
+The second command draws a smaller room by a seed, with true planes and cameras. The third command
+multiplies the brightness of real photos by 0.7 to 1.3 and compares the result with the balanced
+original photos.
 
 The layers of a run are joined again, without and with balancing. A step is the difference between
-the means of two cells on either side of a seam, averaged over stretches of 24 cells along it. Part
-of it is the change of the wall itself, measured as the difference that each photo alone shows
-between the same four cells, averaged over both photos. The excess is the remaining part, which is
-caused by using two photos.
+the means of two cells on either side of a seam, averaged over stretches of 24 cells along the seam.
+Part of a step is the change of the wall itself, which is measured as the difference that each
+single photo shows between the same four cells, averaged over both photos. The excess is the
+remaining part, caused by the use of two photos.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ Cells: TypeAlias = NDArray[np.int64]
 
 
 def product(run: Run, store: Store, step: str, cls: type) -> object:
-    """Return the product of a type from a step of a run."""
+    """Return the product of a given type from a step of a run."""
     return next(
         store.get_product(output.digest, cls)
         for output in run.cells[step].outputs.values()
@@ -95,7 +95,7 @@ class Mosaic:
     def is_painted(
         self, photo: NDArray[np.int16], rows: Cells, columns: Cells, *, turned: bool
     ) -> NDArray[np.bool_]:
-        """Return whether photos (n,) show cells (n,); `turned` exchanges rows and columns."""
+        """Return a mask of cells (n,) that photos (n,) show; `turned` swaps rows and columns."""
         found = np.zeros(len(rows), dtype=np.bool_)
         places = (columns, rows) if turned else (rows, columns)
         for index, layer in enumerate(self.painters):
@@ -120,11 +120,11 @@ class Mosaic:
 
 @dataclass(frozen=True, kw_only=True)
 class Steps:
-    """Steps (n, 3) in CIE L*a*b* of stretches along seams.
+    """Steps (n, 3), in CIE L*a*b*, of stretches along seams.
 
     Attributes:
         seen: steps from one photo to the other.
-        wall: steps that each photo alone shows across the same line, mean of both.
+        wall: steps that each single photo shows across the same line, mean of both photos.
         share: share of seam cells where both photos show two cells on either side.
     """
 
@@ -167,7 +167,8 @@ def steps(mosaic: Mosaic) -> Steps:
         ]
         # (photo, side, n, 3): means of two cells.
         shown = np.reshape(cells, (2, 2, 2, -1, 3)).mean(axis=2)
-        # Of the same two photos, in the same order: steps there and back do not cancel.
+        # A stretch has the same two photos in the same order, so that steps from one to the other
+        # and back do not cancel out.
         stretch = np.stack([rows // STRETCH, columns // STRETCH, *both])
         _, of, counts = np.unique(stretch, axis=1, return_inverse=True, return_counts=True)
         for found, values in (
@@ -196,7 +197,7 @@ def levels(light: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def against(image: Orthoimage, reference: Orthoimage) -> str:
-    """Compare block colours up to a factor per channel, and gradients near seams and elsewhere."""
+    """Compare block colours, up to a factor per channel, and gradients near seams and elsewhere."""
     both = (image.mask == OrthoMask.PAINTED) & (reference.mask == OrthoMask.PAINTED)
     whole = blocks(both[..., None].astype(float))[..., 0] == 1.0
     table = light_of_levels(255)
@@ -222,7 +223,7 @@ def against(image: Orthoimage, reference: Orthoimage) -> str:
 
 
 def exposed(layers: Layers, share: float) -> Layers:
-    """Change the exposure of the photos of layers, with the largest contrast between neighbours."""
+    """Change the exposures of photos, with the largest differences between neighbours."""
     factors = 1.0 + share * np.linspace(-1.0, 1.0, len(layers.layers))
     factors = np.concatenate([factors[::2], factors[1::2]])
     table = light_of_levels(255)
@@ -278,7 +279,7 @@ def inputs_of_room(seed: int, share: float) -> MosaicSeams.In:
 
 
 def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
-    """Return the mosaic of the first wall and the photos on it, balanced as by the method."""
+    """Return the mosaic of the first wall and its photos, balanced as the method balances them."""
     params = MosaicSeams.Params.model_validate(chosen)
     with tempfile.TemporaryDirectory() as folder:
         ctx = StepContext(rng=np.random.default_rng(0), cores=2, scratch=Path(folder))
@@ -300,7 +301,7 @@ def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
 
 
 def main() -> None:
-    """Print a line each for no balancing, balancing, and balancing along graph cuts."""
+    """Print a line for each of: no balancing, balancing, and balancing with graph cuts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, nargs="?")
     parser.add_argument("--room", type=int, metavar="SEED")

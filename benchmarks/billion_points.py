@@ -1,16 +1,16 @@
-"""Measure time per point and memory from LAZ files to orthoimages, for one room and for many.
+"""Measure time per point and memory from LAZ files to orthoimages, for one room and many rooms.
 
     python benchmarks/great_room.py room
     python benchmarks/billion_points.py --npy room/room.npy --tiles 1 21 --folder FOLDER
     python benchmarks/billion_points.py --npy room/room.npy --tiles 21 --gsd-m 0.01 --folder FOLDER
 
-Each file contains the great room, shifted along its main wall: 21 files form a suite of rooms 180 m
-long with a billion points. The engine reads them, finds the planes, computes the rasters of the
-walls and projects the points onto them. Memory is the maximum sampled sum of RssAnon over all
-processes, which excludes memory-mapped files. The folder needs 18 bytes of store and 4 bytes of
-files per point, and about 55 bytes per raster cell (21 rooms have 660 million cells of 5 mm): 60 GB
-in all. `--gsd-m 0.01` reduces the number of cells to a quarter. The contents of the folder are
-removed at the end.
+Each file contains the great room, shifted along its main wall; 21 files form a 180 m long row of
+rooms with a billion points. The engine reads them, finds the planes, computes the rasters of the
+walls and projects the points onto them. The memory is the maximum of sampled sums of RssAnon over
+all processes, which excludes memory-mapped files. The folder needs 18 bytes per point for the store
+and 4 for the files, and about 55 bytes per raster cell (21 rooms have 660 million cells of 5 mm):
+60 GB in all. `--gsd-m 0.01` reduces the number of cells to a quarter. The contents of the folder
+are removed at the end.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from pathlib import Path
 import numpy as np
 from plane_streaming import measured, write_laz
 
-# Along the main wall, right beside each other but for a hand's breadth.
+# Shift along the main wall; it leaves a gap of a few centimetres between rooms.
 STEP_M = 8.7
 ALONG = np.array([0.97814760, 0.20791169, 0.0])
-# Where a LAS 1.4 header has the offsets, and the bounds of x, y and z.
+# Positions of the offsets and of the bounds of x, y and z in a LAS 1.4 header.
 OFFSETS_AT, BOUNDS_AT = 155, 179
 WORKFLOW = """\
 orthoflow: 1
@@ -45,7 +45,7 @@ steps:
 
 
 def main() -> None:
-    """Run the chain for each number of rooms."""
+    """Run the workflow for each number of rooms."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def run_small(folder: Path, workflow: Path, points: np.ndarray) -> None:
-    """Run the chain on few points first, so that no compilation is measured."""
+    """First run the workflow on a few points, so that no compilation is measured."""
     small, store, out = folder / "small.laz", folder / "small-store", folder / "small-out"
     write_laz(small, points[:: max(1, len(points) // 300_000)])
     measured(run_command(workflow, [small], store, out))
@@ -100,7 +100,7 @@ def run_small(folder: Path, workflow: Path, points: np.ndarray) -> None:
 
 
 def beside(first: Path, tile: int) -> Path:
-    """Copy a file shifted by a number of rooms: change the offsets and bounds in its header."""
+    """Copy a file, shifted by a number of rooms: change the offsets and bounds in its header."""
     path = first.with_name(f"room_{tile:02}.laz")
     if path.exists():
         return path
@@ -111,13 +111,13 @@ def beside(first: Path, tile: int) -> Path:
             file.seek(at)
             values = np.array(struct.unpack(f"<{3 * repeat}d", file.read(24 * repeat)))
             file.seek(at)
-            # Bounds are largest and smallest of x, then of y, then of z.
+            # Bounds are the largest and smallest x, then y, then z.
             file.write(struct.pack(f"<{3 * repeat}d", *(values + np.repeat(shift, repeat))))
     return path
 
 
 def run_command(workflow: Path, files: list[Path], store: Path, out: Path) -> list[str]:
-    """Return the command that runs the chain."""
+    """Return the command that runs the workflow."""
     pattern = files[0].parent / ("room_*.laz" if len(files) > 1 else files[0].name)
     run = ["run", str(workflow), "--input", f"scan={pattern}", "--store", str(store)]
     return [sys.executable, "-m", "orthoflow", *run, "-o", str(out)]

@@ -4,10 +4,10 @@
         --measured-points-m 16 --measured-photos 6 --workers 1 16 256
 
 Each step of the record becomes one task per room. Its time and the size of its products grow with
-the number of points or of photos: whichever is among its inputs, points if both are. It reads
-everything that the preceding steps stored. A worker is a machine like the measured one and runs one
-task at a time. Workers that transfer data share the bandwidth of the server, and none exceeds that
-of its own link. Ready tasks run in the order of the rooms.
+the number of photos if photos or layers are among its inputs, otherwise with the number of points.
+It reads all products that the preceding steps stored. A worker is a machine like the measured one
+and runs one task at a time. Workers that transfer data share the bandwidth of the server, and none
+exceeds the bandwidth of its own link. Ready tasks run in the order of the rooms.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from orthoflow.records.open import open_run
 
-# What a task costs besides its work: `benchmarks/many_cells.py`.
+# Overhead of a task, as measured by `benchmarks/many_cells.py`.
 _TASK_S = 0.25
 _NOTHING_MB = 1e-6
 
@@ -33,7 +33,7 @@ class Task:
         seconds: duration, including its start.
         read_mb: data read from the server.
         written_mb: data written to the server.
-        needs: addresses of the tasks that it needs.
+        needs: addresses of the tasks on which it depends.
     """
 
     address: str
@@ -61,9 +61,9 @@ class Simulated:
 
 
 def tasks_of(run: str, points: float, photos: float, cores: float | None = None) -> list[Task]:
-    """Return the tasks of one room, with times and sizes scaled to its points or photos.
+    """Return the tasks of one room, with times and sizes scaled to its numbers of points or photos.
 
-    For a record made under other load, the processor seconds are divided among `cores`.
+    If the record was made under other load, processor seconds divided by `cores` are used.
     """
     stored: dict[str, float] = {}
     found: list[Task] = []
@@ -98,7 +98,7 @@ class Cluster:
     """Workers that run the tasks of many rooms, and a server that they share.
 
     Attributes:
-        tasks: tasks of one room, each after those that it needs.
+        tasks: tasks of one room, each after those on which it depends.
         n_rooms: number of rooms.
         n_free: number of workers without a task.
         server_mb_s: bandwidth of the server.
@@ -113,9 +113,9 @@ class Cluster:
     _clock: float = 0.0
     _work_s: float = 0.0
     _saturated_s: float = 0.0
-    # Room, place of the task, and whether it reads -> MB left.
+    # Remaining MB, by room, position of the task, and whether it reads.
     _transfers: dict[tuple[int, int, bool], float] = field(default_factory=dict)
-    # End, room, place of the task.
+    # End time, room, and position of the task.
     _computing: list[tuple[float, int, int]] = field(default_factory=list)
 
     def run(self) -> Simulated:
@@ -176,7 +176,7 @@ class Cluster:
 
 
 def main() -> None:
-    """Print a line per number of workers."""
+    """Print a line for each number of workers."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run")
     parser.add_argument("--rooms", type=int, default=200)

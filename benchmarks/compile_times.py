@@ -1,9 +1,9 @@
-"""Measure the processor time for compiling each kernel, in a run without compiled kernels.
+"""Measure the processor time of compiling each kernel, in a run without compiled kernels.
 
 python benchmarks/compile_times.py WORKFLOW [--set STEP.PARAM=VALUE ...] [--top 25]
 
 All steps run in this process, so numba's own functions, which it does not cache, are compiled once;
-a normal run compiles those that a step needs in the process of each step.
+in a normal run, each process of a step compiles those that it needs.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Compilations(event.Listener):
     """Records which kernels numba compiles.
 
     Attributes:
-        cpu_s: kernel -> its own processor time, without that of kernels it calls.
-        versions: kernel -> number of compilations.
+        cpu_s: processor time by kernel, without that of the kernels that it calls.
+        versions: number of compilations by kernel.
     """
 
     cpu_s: Counter[str] = field(default_factory=Counter)

@@ -2,14 +2,14 @@
 
     python benchmarks/courtyard.py [--seeds 1 2 3] [--photos 16]
 
-Four plastered facades stand around a courtyard of 12 x 10 m, each with rows of identical windows
-0.25 m deep, scanned from one station. A seed draws stains, viewpoints and noise. Photos are taken
-4 to 6 m in front of a facade and show two or three windows per row, so only the stains distinguish
-the windows. Photos are processed by the steps of `photos-on-scan.yaml`, with a focal length from
-EXIF: `match.sift`, a bundle adjustment with relaxed gates, `match.guided`, a bundle adjustment. The
-output lists the facades found, the oriented photos with their errors (of the centre, and per
-coordinate on the wall, next to the expected one), the reasons for rejecting the others, and the
-number of accepted photos with a wrong position.
+Four plastered facades enclose a courtyard of 12 x 10 m, which is scanned from one station; each has
+rows of identical windows 0.25 m deep. Stains, viewpoints and noise are drawn by a seed. Photos are
+taken 4 to 6 m in front of a facade and show two or three windows per row, so only the stains
+distinguish the windows. Photos are processed by the steps of `photos-on-scan.yaml`, with a focal
+length from EXIF: `match.sift`, a bundle adjustment with relaxed gates, `match.guided`, and a bundle
+adjustment. The output lists the facades found, the oriented photos with their errors (of the
+centre, and per coordinate on the wall, next to the expected error), the reasons for rejecting the
+others, and the number of accepted photos with a wrong position.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def _shot(nth: int, side: Side, coarser: float, rng: np.random.Generator) -> Sho
 
 
 def n_found(planes: Planes) -> int:
-    """Count the facades with a detected plane, within one degree and 2 cm at the centre."""
+    """Count the facades with a detected plane within one degree and 2 cm at the centre."""
     count = 0
     for omega, away in zip(np.radians(_OMEGA_DEG), _AWAY_M, strict=True):
         inwards = -np.array([math.cos(omega), math.sin(omega), 0.0])

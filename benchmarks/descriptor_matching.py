@@ -2,9 +2,9 @@
 
     python benchmarks/descriptor_matching.py [--photo 8000] [--wall 8000] [--threads 2] [--repeat 5]
 
-Both return mutual nearest neighbours that pass the ratio test of 0.85, and their results agree.
-OpenCV's version searches two nearest neighbours in one direction and one in the other. Times are
-the minimum over interleaved runs.
+Both return mutual nearest neighbours that pass the ratio test with a limit of 0.85, and their
+results agree. OpenCV's version searches for two nearest neighbours in one direction and one in the
+other. Times are minima over interleaved runs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RATIO = 0.85
 
 
 def descriptors(n: int, seed: int) -> NDArray[np.float32]:
-    """Return RootSIFT-like integer rows; every tenth row is almost the same in all sets."""
+    """Return integer rows similar to RootSIFT; every tenth row is almost the same in all sets."""
     rng, shared = np.random.default_rng(seed), np.random.default_rng(0)
     raw = rng.gamma(0.6, size=(n, 128))
     common = shared.gamma(0.6, size=(n // 10, 128))

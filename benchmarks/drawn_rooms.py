@@ -1,25 +1,25 @@
-"""Measure the rows of docs/papers.md in drawn rooms, and write it and docs/choosing.md.
+"""Measure the rows of docs/papers.md in drawn rooms; write this page and docs/choosing.md.
 
     python benchmarks/drawn_rooms.py FOLDER
     python benchmarks/drawn_rooms.py FOLDER --part surfaces --rooms 5
     orthoflow runs FOLDER --table numbers.csv
 
-The seed of a room draws the directions, tilts and distances of all planes, the decoration, scanner
-stations, photos and lens: ten rooms have seeds from 1, and five other rooms, which verify rankings,
-have seeds from 101. Each room is measured in four parts: `planes` (plane-methods.yaml,
+The directions, tilts and distances of all planes, the decoration, scanner stations, photos and lens
+of a room are drawn by its seed: ten rooms have seeds from 1, and five other rooms, which verify
+rankings, have seeds from 101. Each room is measured in four parts: `planes` (plane-methods.yaml,
 paper_planes.yaml), `orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces`
-(matched_surface.yaml). The last compares orthoimages from photos projected onto a surface
+(matched_surface.yaml). The last part compares orthoimages from photos projected onto a surface
 (backward) with those from points (direct), for the scan and for points matched in the photos, as in
-skarlatos2012. Check points are compared over those that all orthoimages of a room show, poses over
-the photos that all methods orient.
+skarlatos2012. Comparisons include only the check points that all orthoimages of a room show, and
+only the photos that all methods orient.
 
 The runs of a room are recorded in `FOLDER/<part>-<seed>/`, together with the numbers for the pages
-in `numbers.json`; they are not repeated. Products are deleted after the room is measured.
+in `numbers.json`; finished runs are not repeated. Products are deleted after the room is measured.
 docs/papers.md and docs/choosing.md are written from these files and the templates in
 benchmarks/pages. `{{part: cell metric}}` is replaced by mean±standard deviation over the first ten
 rooms. `{{part: cell metric < cell metric ? text | other text}}` is replaced by the text if the
-ranking holds (see `ranking_holds`), otherwise by the other text, with the counts of rooms.
-Combinations of variants that no page uses do not run.
+ranking holds (see `ranking_holds`), otherwise by the other text, and by the counts of rooms.
+Combinations of variants that no page uses are not run.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from orthoflow.records.runs import cell_metrics
 from orthoflow.report.notebooks import OpenedRun
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-# The rooms that are summed up, and others by which rankings are checked.
+# Seeds of the rooms that are summarised, and of those with which rankings are verified.
 SETS: Final = (range(1, 11), range(101, 106))
 DRAWN: Final = {"geometry": "drawn", "decoration": "drawn"}
 COARSE: Final = {
@@ -65,7 +65,7 @@ COARSE: Final = {
     "panorama_step_m": 0.04,
     "photo_gsd_m": 0.005,
 }
-# Recipes of a part, and what is set in their rooms.
+# Recipes of a part, and parameters of their rooms.
 RECIPES: Final[Mapping[str, tuple[tuple[str, ...], dict[str, Any]]]] = {
     "planes": (
         ("workflows/plane-methods.yaml", "benchmarks/paper_planes.yaml"),
@@ -77,8 +77,9 @@ RECIPES: Final[Mapping[str, tuple[tuple[str, ...], dict[str, Any]]]] = {
 }
 PAGES: Final = ROOT / "benchmarks" / "pages"
 WALL_GSD_M: Final = 0.008
-# A ranking is stated where it holds in this share of the rooms of each set, and a two-sided sign
-# test over all rooms gives less than this probability by chance.
+# A ranking holds if it is true in at least this share of the rooms of each set, and if the
+# probability of a chance result in a two-sided sign test over all rooms is less than the second
+# value.
 RANKING_SHARE: Final = 0.9
 RANKING_P: Final = 0.05
 PLACE: Final = re.compile(r"\{\{(\w+): ([^}]+)\}\}")
@@ -112,7 +113,7 @@ def measure(folder: Path, part: str, seed: int) -> Iterator[tuple[str, float]]:
                     yield f"{cell.address} {finding.name}", finding.value
     yield from on_common(points, WALL_GSD_M)
     yield from common_poses(poses)
-    # Gigabytes that the records do not need.
+    # Delete gigabytes that the records do not need.
     shutil.rmtree(store)
     for products in folder.glob("*/products"):
         shutil.rmtree(products)
@@ -121,7 +122,7 @@ def measure(folder: Path, part: str, seed: int) -> Iterator[tuple[str, float]]:
 def errors_of_orientation(
     run: OpenedRun, address: str, store: Path
 ) -> tuple[list[Any], tuple[PoseError, ...]]:
-    """Return findings on poses and ties, and pose errors, also for rejected photos."""
+    """Return findings on poses and ties, and pose errors including those of rejected photos."""
     cameras = run.product(address, "cameras", store=store)
     walls, truth = (
         run.product(*place, store=store) for place in (("wall", "walls"), ("room", "truth"))
@@ -131,7 +132,7 @@ def errors_of_orientation(
 
 
 def common_poses(poses: Mapping[str, Sequence[PoseError]]) -> Iterator[tuple[str, float]]:
-    """Return the RMS error on the wall of the photos that all methods orient by guided ties."""
+    """Return the RMS error on the wall for photos that all methods orient by guided ties."""
     walls_mm = {
         address: {
             error.photo: 1e3 * error.wall_m
@@ -168,7 +169,7 @@ def reduced(part: str, name: str, seed: int) -> dict[str, Any]:
             varied[step] = list(content["variants"])
             for variant in content["variants"].values():
                 variant.pop("repeat", None)
-    # Of steps that a page names together, the combinations that it does not name.
+    # The combinations that no page uses, of steps that are combined on a page.
     left_out = [
         combination
         for together in {tuple(one): None for one in named}
@@ -215,7 +216,7 @@ def assignment_of(address: str) -> dict[str, str]:
 
 
 def cells_named(part: str) -> set[str]:
-    """Return the addresses of cells whose metrics are on the pages."""
+    """Return the addresses of the cells whose metrics are on the pages."""
     places = [
         place[2]
         for page in PAGES.glob("*.md")
@@ -226,10 +227,10 @@ def cells_named(part: str) -> set[str]:
 
 
 def on_common(points: Mapping[str, Residuals], gsd_m: float) -> Iterator[tuple[str, float]]:
-    """Return statistics over the check points that all orthoimages show, by class.
+    """Return statistics, by class, of the check points that all orthoimages show.
 
     Args:
-        points: cell -> residuals of its orthoimage.
+        points: residuals of the orthoimage of each cell.
         gsd_m: cell size.
     """
     if not points:
@@ -258,7 +259,7 @@ def by_point(inspection: Inspection) -> Residuals:
 
 
 def measured(folder: Path, part: str, seed: int) -> None:
-    """Measure a room, unless its numbers exist."""
+    """Measure a room unless its numbers exist."""
     room = folder / f"{part}-{seed}"
     if (room / "numbers.json").is_file():
         return
@@ -280,7 +281,7 @@ def filled_in(text: str, sets: Sets) -> str:
         text: text with placeholders `{{part: cell metric}}`, `{{part: cell metric : share}}` for
             per cent, `: mean` without scatter, `: median`, and
             `{{part: cell metric < cell metric ? text | other text}}`.
-        sets: part -> sets -> rooms -> numbers by `cell metric`.
+        sets: for each part, set and room, the numbers by `cell metric`.
     """
     return PLACE.sub(lambda place: _text_of(place[2].strip(), sets[place[1]]), text)
 
@@ -299,22 +300,23 @@ def _text_of(place: str, sets: Sequence[Sequence[Mapping[str, float]]]) -> str:
         return "no value" if any(sets[0]) else "not measured"
     if form in ("mean", "median"):
         return _number(float(getattr(np, form)(values)))
-    # Without spaces, so that lines are not broken there.
+    # Use no spaces, so that lines are not broken there.
     spread = f"±{_number(float(values.std(ddof=1)), 2)}" if len(values) > 1 else ""
     return f"{_number(float(values.mean()))}{spread}"
 
 
 def counted(first: str, second: str, rooms: Sequence[Mapping[str, float]]) -> tuple[int, int]:
-    """Return the number of rooms in which the first value is smaller, and of rooms with both."""
+    """Return the number of rooms where the first value is smaller, and of rooms with both."""
     both = [(abs(room[first]), abs(room[second])) for room in rooms if {first, second} <= set(room)]
     return sum(a < b for a, b in both), len(both)
 
 
 def ranking_holds(counts: Sequence[tuple[int, int]]) -> bool:
-    """Return whether a ranking is significant: it holds in both sets of seeds, not by chance.
+    """Return whether a ranking is significant, that is, true in both sets and not by chance.
 
     Args:
-        counts: for each set, the number of rooms where it holds, and of all rooms.
+        counts: for each set, the number of rooms where the ranking is true, and the number of
+            rooms.
     """
     n_true, n_both = (sum(column) for column in zip(*counts, strict=True))
     if not all(n and true >= RANKING_SHARE * n for true, n in counts):
@@ -323,7 +325,7 @@ def ranking_holds(counts: Sequence[tuple[int, int]]) -> bool:
 
 
 def _number(value: float, digits: int = 3) -> str:
-    # Never as a power of ten.
+    # Never use exponents.
     return np.format_float_positional(
         float(f"{value:.{digits}g}"), trim="-", fractional=False, precision=digits
     )
@@ -361,7 +363,7 @@ def main() -> None:
 
 
 def _read(folder: Path, part: str, seed: int) -> dict[str, float]:
-    """Return the numbers of a room with shares of found planes; empty if it was not measured."""
+    """Return the numbers of a room with shares of planes found; empty if it was not measured."""
     path = folder / f"{part}-{seed}" / "numbers.json"
     room: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
     for key in [key for key in room if key.endswith(" true_planes_found")]:

@@ -5,7 +5,7 @@
 Each drawn room runs through all steps of `quickstart.yaml`, from points and photos, and is compared
 with the truth of the simulation (`inspect.truth`). `--fountain` uses five photos in
 ../shared/data/fountain-p11 instead and compares with their reference poses, at the depths that were
-found, so depth errors are not included. A normal distribution has 0.68 and 0.95.
+found, so depth errors are not included. For a normal distribution, the shares are 0.68 and 0.95.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ASKED = 50_000
 
 
 def main() -> None:
-    """Print a row per room, or per photo of the fountain."""
+    """Print a row for each room, or for each photo of the fountain."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, default=6)
     parser.add_argument("--first", type=int, default=11)
@@ -72,7 +72,7 @@ def orthoflow_run(
 
 
 def fountain(folder: Path, store: Path) -> None:
-    """Compare the fountain with its reference poses."""
+    """Compare the photos of the fountain with their reference poses."""
     photos = folder / "photos"
     photos.mkdir()
     for name in PHOTOS:

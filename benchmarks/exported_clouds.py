@@ -1,7 +1,7 @@
 """Measure the time and memory of cloud exports by number of points.
 
 `python -m benchmarks.exported_clouds --points 50` writes 50 million points of a simulated room as
-LAZ, COPC, PLY and E57, each in its own process, and prints the time and the peak memory of each,
+LAZ, COPC, PLY and E57, each in a separate process, and prints the time and the peak memory of each,
 with and without memory-mapped files.
 """
 
@@ -55,7 +55,7 @@ def mapped_room(folder: Path, n_points: int) -> PointCloud:
 
 
 def export(name: str, folder: Path, n_points: int) -> None:
-    """Open the files of the room, export them, and print time and memory."""
+    """Open the files of the room, export the cloud, and print time and memory."""
     names = {"x": "x", "y": "y", "z": "z", "intensity": "i"}
     arrays = {
         field: np.memmap(folder / file, dtype=np.float32, mode="r", shape=(n_points,))
@@ -87,7 +87,7 @@ def export(name: str, folder: Path, n_points: int) -> None:
 
 
 def main() -> None:
-    """Write the room once per format."""
+    """Write the room in each format."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=float, default=50.0, help="millions of points")
     parser.add_argument("--format", choices=WRITERS, help="only this one")

@@ -1,18 +1,18 @@
-"""Count the oriented photos as laser intensity and photos become less similar.
+"""Count oriented photos while laser intensity and photos become less similar.
 
     python benchmarks/gap_curve.py --rooms 6 --first 301
     python benchmarks/gap_curve.py --rooms 40 --first 301 --photo-gsd-m 0.00085
     # the gap spread evenly over the rooms, half of them from EXIF, half with drawn mouldings:
     python benchmarks/gap_curve.py --rooms 40 --first 7001 --mixed
 
-The seed of a room draws the share of the contrast that is inverted in the laser intensity (0 to 1),
-besides scan noise, camera and viewpoints. Rooms are those of `orientation_truth.py`: six photos of
-the main wall, 4 mm cells, a point spacing of 2.6 mm. Photos are processed as in
-`photos-on-scan.yaml`: `match.sift`, a bundle adjustment with relaxed gates, `match.guided`, a
-bundle adjustment. `wall` is the error per coordinate on the wall; `wrong` counts accepted photos
-whose error exceeds five expected standard deviations or two cells. Seconds are CPU seconds of both
-matchers per photo. Photos that are rejected or have an error above 0.5 mm are listed with the area
-of the wall that they truly show.
+The share of the contrast that is inverted in the laser intensity (0 to 1), the scan noise, the
+camera and the viewpoints of a room are drawn by its seed. Rooms are those of
+`orientation_truth.py`: six photos of the main wall, 4 mm cells, a point spacing of 2.6 mm. Photos
+are processed as in `photos-on-scan.yaml`: `match.sift`, a bundle adjustment with relaxed gates,
+`match.guided`, and a bundle adjustment. `wall` is the error per coordinate on the wall; `wrong`
+counts accepted photos whose error exceeds five expected standard deviations or two cells. Seconds
+are CPU seconds of both matching steps per photo. Photos that are rejected or have an error above
+0.5 mm are listed with the area of the wall that they truly show.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import Cameras, Photos, Truth, Walls
 
 _WRONG_CELLS = 2.0
-# Asked of 95 % of the photos, calibrated and from EXIF.
+# Limits of the error for 95 % of the photos, with calibration and with EXIF.
 _ASKED_MM = {True: 0.5, False: 0.8}
 
 
@@ -45,7 +45,7 @@ class Outcome:
         n_photos: number of photos taken.
         n_wrong: number of photos accepted with a wrong pose.
         walls_mm: errors of the accepted photos on the wall.
-        photo_s: CPU seconds of both matchers per photo.
+        photo_s: CPU seconds of both matching steps per photo.
     """
 
     share: float
@@ -112,7 +112,7 @@ def _name_unplaced(cameras: Cameras, when: str, walls: Walls, truth: Truth) -> N
 
 
 def _shares(outcomes: list[Outcome]) -> None:
-    """Print the shares of photos oriented and accurate enough, calibrated and from EXIF."""
+    """Print the shares of oriented and of accurate photos, with calibration and with EXIF."""
     for is_calibrated, asked_mm in _ASKED_MM.items():
         some = [each for each in outcomes if each.is_calibrated is is_calibrated]
         walls_mm = np.array([value for each in some for value in each.walls_mm])
@@ -147,7 +147,8 @@ def main() -> None:
         drawn = float(np.random.default_rng(seed).uniform())
         chosen.inverted = drawn if chosen.share is None else chosen.share
         if chosen.mixed:
-            # Neighbours in the list differ in kind, and each kind is spread over the whole gap.
+            # Neighbouring rooms are of different kinds, and each kind covers the whole range of the
+            # gap.
             chosen.inverted = nth / max(1, chosen.rooms - 1)
             chosen.decoration = "drawn" if nth // 2 % 2 else "designed"
         photos, walls, truth = room(seed, "easy", chosen)

@@ -4,11 +4,11 @@
     python benchmarks/golden_runs.py compare BEFORE AFTER
 
 `make` runs the quickstart with three seeds, `plane-methods.yaml` and, if the real data are in
-../shared/data, the hall (coloured scan alone) and the fountain with and without a calibration. It
+../shared/data, the hall (coloured scan only) and the fountain with and without a calibration. It
 keeps the output of each command and, if Chromium is installed, a picture of each report. `compare`
-prints, per run, the planes, poses and orthoimages that changed, and the metrics that changed by
-more than rounding. Make the runs of an earlier commit in a worktree of that commit: the repository
-contains no real data.
+prints, for each run, the planes, poses and orthoimages that changed, and the metrics that changed
+by more than rounding errors. Make the runs of an earlier commit in a worktree of that commit: the
+repository contains no real data.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FOUNTAIN_LENS = (
     'cameras: {"*": {width: 3072, height: 2048, fx: 2759.48, fy: 2764.16,'
     " cx: 1520.69, cy: 1006.81, distortion: [0, 0, 0, 0, 0]}}\n"
 )
-# Costs differ from run to run.
+# Suffixes of costs, which differ between runs.
 COSTS = ("_s", "_mib", "_bytes")
 ROUNDING = 1e-6
 
@@ -71,7 +71,7 @@ def runs(folder: Path) -> dict[str, list[str]]:
 
 
 def make(folder: Path, only: set[str]) -> None:
-    """Make the golden runs in a folder, with one store."""
+    """Make the golden runs in a folder with a common store."""
     folder.mkdir(parents=True, exist_ok=True)
     folder = folder.resolve()
     for name, words in runs(folder).items():
@@ -145,7 +145,7 @@ def of_product(first: Path, second: Path) -> str:
 
 
 def of_planes(old: list[dict[str, object]], new: list[dict[str, object]]) -> str:
-    """Describe how much planes changed, each against the nearest earlier one."""
+    """Describe how much planes changed relative to the nearest earlier plane."""
     if old == new:
         return ""
     lines = [f"{len(old)} -> {len(new)} planes"] if len(old) != len(new) else []
@@ -162,7 +162,7 @@ def of_planes(old: list[dict[str, object]], new: list[dict[str, object]]) -> str
 
 
 def centre(camera: dict[str, object]) -> np.ndarray:
-    """Return the position of the camera of a photo, world."""
+    """Return the world position of a photo's camera."""
     rotation = np.asarray(camera["R_camera_from_world"])
     return -rotation.T @ np.asarray(camera["t_camera_from_world"])
 
@@ -178,7 +178,7 @@ def metrics(run: Path) -> dict[tuple[str, str], float]:
 
 
 def of_metrics(old: dict[tuple[str, str], float], new: dict[tuple[str, str], float]) -> None:
-    """Print metrics that changed, and those in only one of the runs."""
+    """Print metrics that changed, and those that only one of the runs has."""
     moved = [
         f"  {cell} {name}: {old[cell, name]:.6g} -> {new[cell, name]:.6g}"
         for cell, name in sorted(old.keys() & new.keys())

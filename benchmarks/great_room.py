@@ -1,10 +1,11 @@
-"""Build the room for measuring the plane detectors: a palace hall, scanned by ray casting.
+"""Build the room with which plane detectors are measured: a palace hall, scanned by ray casting.
 
 The room follows markiewicz2015: 8.6 x 4.2 x 5 m, a leaning main wall, a niche 25 cm deep, a
 fireplace, pilasters, mouldings, windows, furniture, and a leaning mirror that shows the scanner a
 reflected copy of the room. The scan consists of a panorama and a detail scan of the main wall, with
-points in scan order. The room is built and scanned with the same code as `simulate.room`. A seed
-draws the rotation, tilt and shift of the room, so that no wall coincides with a search grid.
+points in scan order. The room is built and scanned with the same code as `simulate.room`. The
+rotation, tilt and shift of the room are drawn by a seed, so that no wall coincides with a search
+grid.
 
     python benchmarks/great_room.py FOLDER        # room.npy, labels.npy and truth.json for others
 """
@@ -40,9 +41,9 @@ from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, cell_stat
 from orthoflow.geometry.threads import in_runs
 
 SEED = 20150807
-# The paper's cloud; other sizes have other steps between rays.
+# Size of the paper's cloud; in clouds of other sizes, the angles between rays differ.
 FULL_POINTS = 48_000_000
-# Share of the points that the panorama has.
+# Share of the points in the panorama.
 PANORAMA_SHARE = 1.0 / 3.0
 FLOOR_M, CEILING_M = -1.5, 3.5
 MIRROR_SHARE = 0.85
@@ -60,7 +61,7 @@ class GreatRoom:
     """A scanned room.
 
     Attributes:
-        x: (n,) float32 metres; y and z are the same.
+        x: (n,) float32 metres; y and z likewise.
         y: see x.
         z: see x.
         plane_index: (n,) int8 true plane of each point, -1 for none.
@@ -99,7 +100,7 @@ def main() -> None:
 
 
 def great_room(n_points: int, *, cores: int, seed: int = 1) -> GreatRoom:
-    """Build the room, scan it with about the given number of rays, and move it by a seed."""
+    """Build the room, scan it with about the given number of rays, and move it at random."""
     draft = SceneDraft()
     mirror = _build(draft)
     scene = draft.finished(spectral_gap=0.0)
@@ -153,7 +154,7 @@ def _moved(room: GreatRoom, turn: NDArray[np.float64], shift_m: NDArray[np.float
 
 
 def _sweeps(n_points: int) -> list[Sweep]:
-    """Return a panorama from near the origin, and the main wall from the origin."""
+    """Return a panorama from near the origin, and a scan of the main wall from the origin."""
     sweeps = []
     for number, (station, azimuths, elevations, share) in enumerate(
         (
@@ -187,7 +188,7 @@ def _mirrored(scene: Scene, mirror: int, sweep: Sweep, points: Scanned) -> None:
     ways = rays / np.linalg.norm(rays, axis=0)
     normal = scene.normal[mirror]
     back = ways - 2.0 * normal[:, None] * (normal @ ways)
-    # From a little before the mirror, so that its noise does not put the start behind it.
+    # Start slightly in front of the mirror, so that noise does not move the start behind it.
     seen = SceneRays(scene).cast(ends - 0.05 * ways, back)
     is_seen = seen.rectangle >= 0
     index, further = index[is_seen], (ways * seen.t)[:, is_seen]
@@ -272,7 +273,7 @@ def _build_wall(
 
 
 def _add_mouldings(wall: Side, half_m: float) -> None:
-    """Add a cornice of two steps under the ceiling, and a skirting."""
+    """Add a cornice of two steps below the ceiling, and a skirting board."""
     wall.box((-half_m, half_m, 3.1, 3.6), 0.08, _PLASTER)
     wall.box((-half_m, half_m, 3.28, 3.6), 0.16, _PLASTER)
     wall.box((-half_m, half_m, FLOOR_M - 0.1, FLOOR_M + 0.2), 0.03, _PLASTER)

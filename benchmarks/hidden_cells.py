@@ -6,10 +6,10 @@
     python benchmarks/hidden_cells.py --rooms 2 --first 551 --panorama-step-m 0.0022 --no-stations
 
 Rooms are those of `scan_formats.py`: one station, points 4.4 mm apart on the main wall, one stray
-point in 250. `ortho.dsm-backward` projects six photos with their true poses onto the wall. Of the
-cells inside a photo, `missed` are those that it shows and that are treated as hidden, `through` are
-those that something hides and that are coloured. Both are determined from the true scene, over all
-photos.
+point in 250. `ortho.dsm-backward` projects six photos with their true poses onto the wall. `missed`
+are cells that a photo shows but that are treated as hidden; `through` are cells inside the photo
+that are coloured although an object hides them. Both are determined with the true scene and summed
+over all photos.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Find and fill narrow gaps of a raster, compared with OpenCV's nearest known cell.
+"""Find and fill narrow gaps of a raster; compare this with OpenCV's nearest known cell.
 
     python benchmarks/hole_filling.py [--repeat 7] [--threads 2]
 
 `cv2.distanceTransformWithLabels` returns the nearest known cell for every void cell, including
-those of windows, and does not distinguish gaps from windows. Our code distinguishes them and
-interpolates. The raster has the size of a 9 x 5 m wall with 3 mm cells; 8 % of its cells are
-scattered void cells, and windows cover a sixth of it. Times are medians of interleaved runs.
+those of windows; it does not distinguish gaps from windows. Our code does, and interpolates in
+gaps. The raster has the size of a 9 x 5 m wall with 3 mm cells; 8 % of its cells are scattered void
+cells, and windows cover a sixth of it. Times are medians of interleaved runs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RADII_CELLS = (1, 2, 3, 5, 10)
 
 
 def raster() -> NDArray[np.bool_]:
-    """Return which cells are known."""
+    """Return a mask of the known cells."""
     is_known = np.random.default_rng(2).random(SHAPE, dtype=np.float32) > 0.08
     for row in range(200, SHAPE[0] - 300, 700):
         for column in range(150, SHAPE[1] - 250, 500):
@@ -71,7 +71,7 @@ def main() -> None:
         for name, task in tasks.items():
             started = time.perf_counter()
             task()
-            # The first round compiles.
+            # The first round includes compilation.
             if round_number:
                 times[name].append(time.perf_counter() - started)
     medians = {name: statistics.median(values) for name, values in times.items()}

@@ -2,7 +2,7 @@
 
 python benchmarks/install_size.py [--without open3d-cpu]
 
-`--without` lists the distributions that only the given one needs.
+With `--without`, the distributions are listed that only the given one needs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from packaging.utils import canonicalize_name
 
 
 def needed(root: str, without: str = "") -> set[str]:
-    """Return installed distributions that one needs, including itself, if another were missing."""
+    """Return the distributions that one needs, including itself, if another one is missing."""
     found: set[str] = set()
     waiting = [root]
     while waiting:

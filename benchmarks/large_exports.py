@@ -1,7 +1,7 @@
 """Measure the memory of exports of a large orthoimage.
 
-`python -m benchmarks.large_exports --side 20000` writes a finished run with one wall of 400 million
-cells (cloud-optimised GeoTIFF, layer in the store), then exports it in a separate process for each
+`python -m benchmarks.large_exports --side 20000` writes a finished run with a wall of 400 million
+cells (cloud-optimised GeoTIFF, layer in the store), exports it in a separate process for each
 format, and prints the processor time and the peak memory of that process, with and without
 memory-mapped files. `--to sheet` and similar options select formats.
 """
@@ -31,14 +31,14 @@ FORMATS = ("sheet", "dxf", "tiles", "stac", "layers")
 
 
 def write_large_run(folder: Path, side: int) -> None:
-    """Write a run with one orthoimage, and its only layer to a store."""
+    """Write a run with one orthoimage, and store its only layer."""
     run, store = folder / "run", Store(folder / "store")
     published = run / "products" / "mosaic"
     published.mkdir(parents=True)
     path = large_orthoimage(published, side, side)
     frame, _ = placed_raster(path)
     shape = frame.shape
-    # Zeros of an empty file: what a layer holds does not change how it is read.
+    # Zeros of an empty file suffice, since the content of a layer does not affect how it is read.
     rgb = np.memmap(folder / "rgb", dtype=np.uint8, mode="w+", shape=(*shape, 3))
     mask = np.memmap(folder / "mask", dtype=np.uint8, mode="w+", shape=shape)
     quality = np.memmap(folder / "quality", dtype=np.float32, mode="w+", shape=shape)
@@ -85,7 +85,7 @@ def watch(peaks: list[float], is_over: threading.Event) -> None:
 
 
 def export(folder: Path, target: str) -> None:
-    """Export, and print time and memory."""
+    """Export in a child process, and print time and memory."""
     peaks, is_over = [own_mib()], threading.Event()
     watcher = threading.Thread(target=watch, args=(peaks, is_over))
     watcher.start()

@@ -2,9 +2,9 @@
 
     python benchmarks/large_orthoimage.py [--side 20000] [--megapixels 24] [--threads 2]
 
-The depths of the wall, simulated as in `ortho_backward.py`, and the layer are in memory-mapped
-files, as between steps; nothing else is. Memory is the maximum of the memory not backed by files
-(RssAnon), sampled every 20 ms.
+Only the depths of the wall, simulated as in `ortho_backward.py`, and the layer are in memory-mapped
+files, as they are between steps. The memory is the maximum of RssAnon (memory not backed by files),
+sampled every 20 ms.
 """
 
 from __future__ import annotations

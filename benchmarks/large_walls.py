@@ -2,11 +2,11 @@
 
     python benchmarks/large_walls.py FOLDER [--side 10000] [--only surf checkpoints openings]
 
-makes a wall of side x side cells in FOLDER, an orthoimage and an intensity with the same waves,
-displaced by half a cell. A second wall has a niche, which is detected (`segment.openings`) and
-inspected (`inspect.openings`). Each method runs in its own process on memory-mapped files. The
-output is the processor time and the anonymous memory of each; the exit code is 1 if a number
-differs from its true value.
+creates in FOLDER a wall of side x side cells, with an orthoimage and an intensity that show the
+same waves, displaced by half a cell. A second wall has a niche, which is detected
+(`segment.openings`) and inspected (`inspect.openings`). Each method runs in a separate process on
+memory-mapped files. The output is the processor time and the anonymous memory of each; the exit
+code is 1 if a number differs from its true value.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PAINT = Paint(kind=TextureKind.PLAIN, rgb=(200, 200, 200), reflectance=0.5)
 
 
 def main() -> None:
-    """Run each method in its own process; with --run, run one in this process."""
+    """Run each method in a separate process; with --run, run one method in this process."""
     methods = {"surf": run_surf, "checkpoints": run_checkpoints, "openings": run_openings}
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
@@ -197,7 +197,7 @@ def pictures(folder: Path, side: int) -> tuple[Orthoimage, Walls]:
 
 
 def waves(right: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return grey levels without repetition: waves of many lengths and directions."""
+    """Return grey levels without repetition: waves with many lengths and directions."""
     rng = np.random.default_rng(11)
     total = np.zeros(np.broadcast_shapes(right.shape, down.shape))
     for length in np.geomspace(6.0, 60.0, 14):
@@ -225,7 +225,7 @@ def frame(side: int) -> WallFrame:
 
 
 def expect(what: str, *, is_met: bool) -> None:
-    """Exit if a number differs from the expected one."""
+    """Exit if a condition is not met."""
     if not is_met:
         sys.exit(f"not met: {what}")
 

@@ -1,8 +1,8 @@
-"""Measure the overhead of a run besides its methods: cells that do nothing, by executor.
+"""Measure the overhead of a run apart from its methods, with cells that do nothing, by executor.
 
     python -m benchmarks.many_cells [--cells 1000] [--executor local] [--jobs 2]
 
-Prints the elapsed time, in total and per cell, and the peak memory of the coordinator.
+The output is the elapsed time, in total and per cell, and the peak memory of the coordinator.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Run many rooms with several detectors by two executors; compare digests and times.
+"""Run many rooms with several detectors on two executors, and compare digests and times.
 
     python benchmarks/many_rooms.py FOLDER [--rooms 24] [--photos]
 
-Runs a workflow of simulated rooms, four plane detectors, rasters, orthoimages and their comparison
-with the truth with `--executor local --jobs 2` and with `--executor dask --jobs 4`, each with its
-own store, after one room has compiled all code. With `--photos`, orthoimages are made from photos
-that the workflow orients, otherwise from points. Prints the elapsed and processor time of both; the
-exit code is 1 if a digest differs or a cell failed.
+A workflow with simulated rooms, four plane detectors, rasters, orthoimages and their comparison
+with the truth is run with `--executor local --jobs 2` and with `--executor dask --jobs 4`, each
+with a separate store, after all code has been compiled with one room. With `--photos`, orthoimages
+are made from photos that the workflow orients, otherwise from points. The output is the elapsed and
+the processor time of both; the exit code is 1 if a digest differs or a cell fails.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def main() -> None:
 
 
 def write_workflow(folder: Path, *, n_rooms: int, has_photos: bool) -> None:
-    """Write the workflow and a table of rooms with different design, noise and stations."""
+    """Write the workflow, and a table of rooms with different designs, noise and stations."""
     scan = "{scan_step_m: 0.02, panorama_step_m: 0.03, decoration: drawn}"
     shot = "{scan_step_m: 0.008, panorama_step_m: 0.03, photo_layout: quick, photo_gsd_m: 0.006}"
     text = WORKFLOW.replace("{ROOM}", shot if has_photos else scan)

@@ -2,11 +2,11 @@
 
     python benchmarks/matching_memory.py [--megapixels 24] [--longest-side-px 6000] [--other-wall]
 
-The photo shows a wall of random texture, perpendicular to it, and is matched at the size of its
-cells. With --other-wall, it does not show the wall and is searched at all sizes up to the full one.
-The photo is made beforehand, so that the child process does nothing but match. The output is the
-peak resident memory of that process, including Python and all libraries; the limit for 24
-megapixels is 1.5 GB.
+The photo is a perpendicular view of a wall with a random texture, and is matched at the resolution
+of the wall's cells. With --other-wall, the photo does not show the wall and is matched at all sizes
+up to the full size. The photo is made beforehand, so that the child process only matches. The
+output is the peak resident memory of the child process, including Python and all libraries; the
+limit for 24 megapixels is 1.5 GB.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@
 
 Each recipe runs with its simulated room into `FOLDER/<recipe>`, like `orthoflow run <recipe>.yaml`,
 unless that folder contains a finished run. One report of all recipes is written to
-`FOLDER/report.html`. Values of single runs are not bold; of metrics with repeats, the best value is
-bold, with all values that do not differ from it significantly. docs/choosing.md compares methods
+`FOLDER/report.html`. For metrics with repeats, the best value and all values that do not differ
+from it significantly are bold; values of single runs are not. docs/choosing.md compares methods
 over many rooms. Processor seconds exclude loading and compiling; docs/performance.md has times.
 """
 
@@ -39,7 +39,7 @@ VARIANTS = {
     },
     "variant2": {**COARSE, "room.photo_layout": "variant2", "room.calibrated": "false"},
 }
-# Metrics of each table and what stands over them; the record has many more.
+# Metrics of each table and their column headings; the record has many more metrics.
 COLUMNS: dict[str, dict[str, str]] = {
     "plane-methods": {
         "check.plane_angle_deg": "angle to truth / deg",
@@ -81,7 +81,7 @@ COLUMNS: dict[str, dict[str, str]] = {
         "ortho.cpu_s": "processor / s",
     },
 }
-# Of several walls, each its own.
+# Several walls have separate metrics.
 COLUMNS["variant1"] = {
     "orient.n_oriented": "photos oriented",
     "check.match_wrong_share": "wrong matches",
@@ -123,7 +123,7 @@ def finished_run(folder: Path, recipe: str) -> Run:
         command = [sys.executable, "-m", "orthoflow", "run", f"{workflow}.yaml", "-o", str(target)]
         for name, value in VARIANTS.get(recipe, {}).items():
             command += ["--set", f"{name}={value}"]
-        # Failed cells are rows of the table, so the exit code is no reason to stop.
+        # Failed cells are shown in the table, so the exit code is ignored.
         subprocess.run([*command, "--store", str(folder / "store")], check=False)
     return open_run(target)
 

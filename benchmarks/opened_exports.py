@@ -2,12 +2,12 @@
 
     python -m benchmarks.opened_exports RUN FOLDER --store STORE --scale 50
 
-Exports RUN in every format, clouds in every colouring, and opens each file with another program:
-pdfplumber and poppler, ezdxf and LibreCAD, laspy, open3d, pye57, trimesh and the Khronos validator
-(`npm install gltf-validator` in the folder where this is started), Pillow, QGIS, prov, pystac,
-rasterio, pycolmap, roc-validator, Chromium. The output has a line per file with the findings, and
-lists programs that are not installed. The exit code is 1 if a file is rejected or contradicts the
-record. Pictures are in FOLDER/pictures.
+RUN is exported in every format, clouds in every colouring, and each file is opened with another
+program: pdfplumber and poppler, ezdxf and LibreCAD, laspy, open3d, pye57, trimesh and the Khronos
+validator (`npm install gltf-validator` in the folder where this is started), Pillow, QGIS, prov,
+pystac, rasterio, pycolmap, roc-validator, Chromium. The output has a line with the findings for
+each file, and lists programs that are not installed. The exit code is 1 if a file is rejected or
+contradicts the record. Pictures are in FOLDER/pictures.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Walk:
         print(f"{'      ' if is_right else 'WRONG '}{name}: {text}", flush=True)
 
     def export(self, target: str, *more: str, name: str = "") -> Path | None:
-        """Export as a user would; None, with a message, if the run has no such content."""
+        """Export as a user would; print a message and return None if the run lacks such content."""
         folder = self.folder / (name or target)
         shutil.rmtree(folder, ignore_errors=True)
         words = ["export", str(self.run), "--to", target, "-o", str(folder), *more]
@@ -104,7 +104,7 @@ class Walk:
         return folder if done.exit_code == 0 else None
 
     def started(self, words: list[str], folder: Path) -> subprocess.CompletedProcess[str] | None:
-        """Start a program; None, with a message, if it is not installed."""
+        """Run a program; print a message and return None if it is not installed."""
         if shutil.which(words[0]) is None:
             self.say(words[0], "not installed")
             return None
@@ -128,7 +128,7 @@ class Walk:
             self.say(pdf, f"poppler: {said}", is_right=not done.returncode and not done.stderr)
 
     def frames(self) -> Iterator[tuple[int, float, float]]:
-        """Return number, width and height in metres of the walls with orthoimages."""
+        """Return the number, width and height (metres) of each wall with an orthoimage."""
         for path in sorted((self.run / "products").glob("*/wall_*_ortho.json")):
             content = json.loads(path.read_text())
             yield (
@@ -164,7 +164,7 @@ def walk_sheets(walk: Walk) -> None:
                 for pair in shown
                 for got, due in zip(pair, wanted, strict=True)
             )
-            # Segments of the bar are whole metres, or a round part of one.
+            # Segments of the scale bar are whole metres or a round fraction of a metre.
             parts = [width / metre_mm for width in bar]
             is_round = all(abs(part * 1000 - round(part * 1000)) < 0.5 for part in parts)
             walk.say(
@@ -242,7 +242,7 @@ READERS: Final[dict[str, tuple[str, str, Callable[[Path], tuple[np.ndarray, np.n
 
 
 def walk_clouds(walk: Walk) -> None:
-    """Check for equal points and colours in four formats and all colourings; draw each."""
+    """Check that points and colours are equal in four formats and all colourings; draw each."""
     for colour in COLOURS:
         seen: list[tuple[np.ndarray, ...]] = []
         for target, (name, reader, read) in READERS.items():
@@ -270,7 +270,7 @@ def walk_clouds(walk: Walk) -> None:
 
 
 def draw_points(xyz: np.ndarray, rgb: np.ndarray, up: np.ndarray, path: Path) -> None:
-    """Draw the points along their thinnest horizontal direction, the nearest on top."""
+    """Draw the points, seen along the horizontal axis of smallest extent, the nearest on top."""
     flat = xyz - xyz.mean(0)
     flat = flat - np.outer(flat @ up, up)
     across, along = np.linalg.eigh(np.cov(flat[:: max(1, len(flat) // 100_000)].T))[1].T[1:]
@@ -310,7 +310,7 @@ def walk_viewers(walk: Walk) -> None:
 
 
 def photographed(walk: Walk, path: Path, name: str) -> None:
-    """Return a screenshot by Chromium, without errors and further requests."""
+    """Return a screenshot by Chromium, and check that there are no errors and further requests."""
     if not IS_HERE:
         walk.say("chromium", "not installed")
         return
@@ -321,7 +321,7 @@ def photographed(walk: Walk, path: Path, name: str) -> None:
         time.sleep(5.0)
         (walk.pictures / f"{name}.png").write_bytes(page.screenshot())
         asked = [address for address in page.requests if not address.startswith(("file:", "data:"))]
-        # A machine without graphics draws by software, and Chromium says so.
+        # On a machine without a graphics card, Chromium renders in software and reports this.
         said = [line for line in page.complaints if "WebGL" not in line] + asked
     walk.say(path, f"Chromium: {said or 'no complaint'}", is_right=not said)
 

@@ -3,9 +3,9 @@
     python benchmarks/orientation_time.py [--cores 2] [--gap easy] [--exif] [--gsd-m 0.00215]
 
 A simulated room is made before the clock starts. Then the steps of the shipped recipes run:
-`match.sift`, a bundle adjustment with relaxed gates, `match.guided`, the final bundle adjustment.
-The first run with an empty numba cache takes some seconds longer for compilation. Elapsed times
-require an idle machine, CPU times do not.
+`match.sift`, a bundle adjustment with relaxed gates, `match.guided`, and the final bundle
+adjustment. With an empty numba cache, a run takes some seconds longer because of compilation.
+Elapsed times require an idle machine; CPU times do not.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""Compare our projection of photos onto a wall, with visibility, with plain cv2.remap.
+"""Compare our projection of photos onto a wall, including visibility, with cv2.remap alone.
 
     python benchmarks/ortho_backward.py [--megacells 4] [--megapixels 6] [--threads 2]
                                         [--repeat 5] [--fresh]
 
 Times are medians of interleaved runs and exclude decoding. cv2.remap gets precomputed maps, whose
 time is not counted, and does not test visibility. Both write into existing arrays. With `--fresh`,
-both allocate new arrays each time, two and a half times as much for the layer (quality and mask):
-on a virtual machine that returns unused memory to its host, allocation may take longer than
-projection. Each task runs twice in a row, and the second run counts. `layer` is one photo on one
-wall with everything: relief, cloud, erosion, anti-aliasing, quality. `cloud` is the additional time
-per photo for examining the cloud.
+both allocate new arrays each time; those of the layer, with quality and mask, are two and a half
+times as large. On a virtual machine that returns unused memory to its host, allocation may take
+longer than projection. Each task runs twice in a row, and the second run is measured. `layer` is
+the complete projection of one photo onto one wall: relief, cloud, erosion, anti-aliasing, quality.
+`cloud` is the additional time per photo for examining the cloud.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from orthoflow.products import PointCloud, Wall, Walls
 
 GSD_M = 0.003
 UP = np.array([0.0, 0.0, 1.0])
-# What is worked out in float64 at once.
+# Number of rows that are processed in float64 at once.
 BAND_ROWS = 256
 MOST_POINTS = 10_000_000
 
@@ -76,7 +76,7 @@ def wall(megacells: float) -> Walls:
 
 
 def cloud(walls: Walls) -> PointCloud:
-    """Return all or some wall cells as points, and a tenth as many on a board in front of it."""
+    """Return all or some wall cells as points, and a tenth as many points on a board in front."""
     frame, depth = walls.walls[0].frame, walls.walls[0].depth_m
     points, step = [], max(1, depth.size // MOST_POINTS)
     for first in range(0, frame.height, BAND_ROWS):
@@ -119,14 +119,14 @@ def camera(frame: WallFrame, megapixels: float, oblique_deg: float) -> ViewingCa
 
 
 def seconds(task: Callable[[], object]) -> tuple[float, float]:
-    """Return elapsed time and processor time of all threads; other load affects the latter less."""
+    """Return elapsed and processor time of all threads; other load affects the latter less."""
     started, used = time.perf_counter(), time.process_time()
     task()
     return time.perf_counter() - started, time.process_time() - used
 
 
 def peak_bytes(task: Callable[[], object]) -> int:
-    """Return the peak memory of arrays while a task ran, without OpenCV's own."""
+    """Return the peak memory of arrays while a task runs, without OpenCV's own arrays."""
     tracemalloc.start()
     task()
     peak = tracemalloc.get_traced_memory()[1]
@@ -254,7 +254,7 @@ def main() -> None:
     for kind in ("bilinear, visibility none", "bilinear", "cubic"):
         ratio = medians[f"layer {kind}"] / medians[f"cv2.remap {kind.split(',', maxsplit=1)[0]}"]
         print(f"layer / cv2.remap, {kind}: {ratio[0]:.2f}, of processor time {ratio[1]:.2f}")
-    # A layer is colours, quality and mask: eight bytes per cell.
+    # A layer consists of colours, quality and mask: eight bytes per cell.
     layer_bytes = 8 * raster.depth_m.size
     for kind in ("none", "full"):
         task = layer("bilinear", is_seen_through=kind == "none", is_fresh=True)

@@ -2,13 +2,13 @@
 
     python benchmarks/orthoimage_truth.py [--gsd-m 0.003] [--surfaces nearest denoised]
 
-The scan has 2 mm point spacing and 2 mm noise, six photos have 2 mm pixels, one wall has 3 mm
-cells, and several surface rules are used. `true` projects the photos with their true orientations,
-`estimated` with those found on the last surface (sift, bundle, guided, bundle as in
-`photos-on-scan.yaml`). `u` and `v` are RMSE over all cells away from depth steps, `step` over those
-within two cells of one, in mm. `far` is the share of cells whose colour comes from a point more
-than three cells away; `ghosts` counts cells coloured from free-standing objects in front of the
-wall; `surf` comes from `inspect.surf`, in mm. Seconds are CPU time.
+The scan has 2 mm point spacing and 2 mm noise, the six photos have 2 mm pixels, and one wall is
+rastered with 3 mm cells and several surface rules. `true` projects the photos with their true
+orientations, `estimated` with those estimated on the last surface (sift, bundle, guided, bundle as
+in `photos-on-scan.yaml`). `u` and `v` are RMSE over all cells away from depth steps, `step` over
+cells within two cells of a depth step, in mm. `far` is the share of cells whose colour comes from a
+point more than three cells away; `ghosts` counts cells coloured from free-standing objects in front
+of the wall; `surf` comes from `inspect.surf`, in mm. Seconds are CPU time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow.products import Cameras, Inspection, Orthoimages, Photos, Ties, Walls
 from orthoflow.sdk import StepContext
 
-# As the shipped workflows have it: a first pose needs to be good to a few cells only.
+# As in the shipped workflows: a first pose only needs to be accurate to a few cells.
 ROUGHLY = {
     "min_quadrant_ties": 0,
     "min_hull_ratio": 0.1,
@@ -116,7 +116,7 @@ class Bench:
 
 
 def numbers(inspection: Inspection) -> dict[str, float]:
-    """Return the findings for the first wall, and those that belong to no wall."""
+    """Return the findings on the first wall, and those that do not refer to a wall."""
     measured = {finding.name: finding.value for finding in inspection.findings if finding.wall < 0}
     return measured | {
         finding.name: finding.value for finding in inspection.findings if finding.wall == 0

@@ -1,10 +1,10 @@
-"""Count cells that show a passer-by although another photo shows the wall, over simulated rooms.
+"""In simulated rooms, count cells that show a passer-by although another photo shows the wall.
 
     python benchmarks/passers_by.py [--rooms 10] [--first 1] [--people 3] [--layout variant2]
 
 Each room is photographed twice from the same positions, with and without people in front of the
-main wall; the differences are people. Photos are projected with their true cameras, so that nothing
-else is measured.
+main wall; differences between the two photos are people. Photos are projected with their true
+cameras, so that nothing else is measured.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow.products import LayerMask, Layers, Orthoimages, Walls
 from orthoflow.sdk import StepContext
 
-# What differs by more than noise and JPEG.
+# Minimum difference of levels; noise and JPEG compression cause smaller ones.
 _LEVELS = 30
 
 
 def main() -> None:
-    """Print a row per room, with and without the robust selection."""
+    """Print a row for each room, with and without the robust selection."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, default=10)
     parser.add_argument("--first", type=int, default=1)
@@ -93,7 +93,7 @@ def joined(layers: Layers, walls: Walls, folder: Path, *, robust: bool) -> Ortho
 def shown(
     images: Orthoimages, layers: Layers, people: list[NDArray[np.bool_]]
 ) -> tuple[float, float]:
-    """Return the shares of cells that show people: in the only photo, or despite another photo."""
+    """Return the shares of cells that show people, if one photo or several photos show the cell."""
     image = images.images[0]
     painters = {layer.source: place for place, layer in enumerate(layers.layers)}
     shows = np.zeros(image.mask.shape, dtype=np.bool_)

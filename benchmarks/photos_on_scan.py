@@ -3,11 +3,11 @@
     python benchmarks/photos_on_scan.py FOLDER [--points 16e6] [--photo-gsd-m 0.00085]
         [--gsd-m 0.004] [--runs 1]
 
-First makes a simulated room, which is not timed: `scan.e57`, from one station, `photos` (by default
-six of 6 MP) and `calibration.yaml`. Then runs `orthoflow warm photos-on-scan.yaml` and the workflow
-as often as requested, each time with a new store. The output contains elapsed and processor time of
-each step, its compilation, and the remaining time of the run: starting processes, storing products,
-record and report. Processor times include the command and all its processes.
+First, a simulated room is made, which is not timed: `scan.e57` from one station, `photos` (by
+default six of 6 MP) and `calibration.yaml`. Then `orthoflow warm photos-on-scan.yaml` is run, and
+the workflow as often as requested, each time with a new store. The output contains the elapsed and
+processor time of each step, its compilation, and the remaining time of the run: process starts,
+storage of products, record and report. Processor times include the command and all its processes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from orthoflow.records.open import open_run
 
 RECIPE = "photos-on-scan.yaml"
 INPUTS = {"scan": "scan.e57", "photos": "photos", "calibration": "calibration.yaml"}
-# The number of points is predicted from a scan with this step: it grows with the inverse square.
+# The number of points is predicted from a scan with this step; it is proportional to the inverse
+# square of the step.
 _COARSE_M = 0.05
 
 
@@ -69,7 +70,7 @@ def main() -> None:
 
 
 def make(folder: Path, options: argparse.Namespace) -> None:
-    """Write the inputs; the calibration last, as a sign that all are complete."""
+    """Write the inputs, with the calibration last, which shows that all are complete."""
 
     def room(step_m: float, **more: object) -> SimulateRoom.Out:
         params = {"scan_step_m": step_m, "n_stations": 1, **more}

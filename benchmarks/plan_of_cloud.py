@@ -2,13 +2,13 @@
 
     python benchmarks/plan_of_cloud.py FOLDER --scan CLOUD.laz --up -z [--scale 1] [--mirrored]
 
-Some points of the cloud are picked, and their survey coordinates are computed by a rotation, a
-scale and a shift to (634512, 486215, 112). With these pairs, `orthoflow run plan.yaml` runs as from
-the command line, for the whole cloud (`plane.part_min_share=0`) and in EPSG:32635. Four more points
-are check points, measured in the map 13 mm east and 8 mm south of their true positions. The output
-contains the distances of the borders of the map from the outermost points, in cells, ignoring
-points that the map leaves out, and the results for the check points and the scale. `--mirrored`
-reverses the sign of the survey eastings.
+Some points of the cloud are selected, and their survey coordinates are computed by a rotation, a
+scale and a shift to (634512, 486215, 112). With these pairs, `orthoflow run plan.yaml` is run as
+from the command line, for the whole cloud (`plane.part_min_share=0`) and in EPSG:32635. Four more
+points are check points, whose positions measured in the map are 13 mm east and 8 mm south of the
+true ones. The output contains the distances of the borders of the map from the outermost points, in
+cells, without the points that the map omits, and the results for the check points and the scale.
+`--mirrored` reverses the sign of the survey eastings.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def turn(up: UpDirection) -> NDArray[np.float64]:
-    """Return the rotation (3, 3) that makes the cloud's up axis z and turns it by 40 degrees."""
+    """Return the rotation (3, 3) from the cloud's up axis to z, followed by 40 degrees about z."""
     return Rotation.from_euler("z", 40, degrees=True).as_matrix() @ basis_from_up(up_vector(up))
 
 

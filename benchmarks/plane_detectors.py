@@ -4,11 +4,11 @@
     python benchmarks/plane_detectors.py --points 5000000 --method ransac --no-peers
     python benchmarks/plane_detectors.py --npy room.npy --truth truth.json --labels labels.npy
 
-F is the time of one pass over separate x, y and z arrays at memory speed, measured in the same run:
-seconds on different machines cannot be compared, but multiples of F can. Code is compiled, and
-points are in memory. Detection and labelling are measured, and statistics separately; figures and
-files are not measured. Processor seconds are the sum over both threads: on an idle machine, the
-elapsed time is at least half of it.
+F is the time of one pass over separate x, y and z arrays at full memory bandwidth, measured in the
+same run. Seconds on different machines cannot be compared, but multiples of F can. Code has been
+compiled, and points are in memory. Detection and labelling are measured together, statistics
+separately; figures and files are not measured. Processor seconds are the sum over both threads; on
+an idle machine, the elapsed time is at least half of it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _pass(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]
 
 
 def times_s(task: Callable[[], object], repeats: int) -> tuple[float, float, float]:
-    """Return minimum and maximum times of some runs, and the processor time of the fastest."""
+    """Return the minimum and maximum time of some runs, and the fastest run's processor time."""
     runs = []
     for _ in range(repeats):
         start, cpu = time.perf_counter(), time.process_time()
@@ -100,10 +100,10 @@ class Room:
 
     Attributes:
         cloud: the points.
-        truth: name, (3,) normal, offset and (3,) centroid of its points, per true plane; the main
-            wall first.
-        is_main: (n,) whether a point is truly on the main wall.
-        floor_s: seconds of one pass over the points at memory speed, F.
+        truth: for each true plane, with the main wall first: name, (3,) normal, offset, and (3,)
+            centroid of its points.
+        is_main: (n,) mask of the points that are truly on the main wall.
+        floor_s: F, the seconds of one pass over the points at full memory bandwidth.
     """
 
     cloud: PointCloud
@@ -179,7 +179,7 @@ def pass_s(cloud: PointCloud) -> float:
 def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
     """Print times, memory and accuracy of a method; return the room with the fastest pass."""
     cloud, cores = room.cloud, options.cores
-    detect(method, cloud, most=2, cores=cores)  # warm
+    detect(method, cloud, most=2, cores=cores)  # compiles the code
     before_mib = forget_peak()
     prepared, found = detect(method, cloud, most=16, cores=cores)
     grown_mib = peak_mib() - before_mib
@@ -194,7 +194,7 @@ def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
         ),
     ):
         fastest, slowest, cpu_s = times_s(task, options.repeats)
-        # Measured beside each task: other work on the machine slows both.
+        # Measure F next to each task, because other load on the machine slows both.
         room = replace(room, floor_s=min(room.floor_s, pass_s(cloud)))
         cells.append(
             f"{fastest:.2f}..{slowest:.2f} s, processor {cpu_s:.2f} s"
@@ -207,7 +207,7 @@ def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
 
 
 def accuracy(room: Room, prepared: PreparedCloud, found: list[FoundPlane]) -> tuple[str, str]:
-    """Return the errors of planes: of the main wall, and the maximum of the others."""
+    """Return the errors of planes: those of the main wall, and the maxima of the other planes."""
     nearest = [_nearest(normal, offset, centre, found) for _, normal, offset, centre in room.truth]
     hits = [item for item in nearest if item is not None]
     others = [item for item in nearest[1:] if item is not None]
@@ -239,7 +239,7 @@ def _nearest(
     centre: NDArray[np.float64],
     found: list[FoundPlane],
 ) -> tuple[float, float, int] | None:
-    """Return the nearest plane: angle, distance at the true centroid (mm) and number."""
+    """Return the nearest plane: angle, distance at the true centroid (mm), and index."""
     best = None
     for index, item in enumerate(found):
         plane = item.raster.plane
@@ -252,7 +252,7 @@ def _nearest(
 
 
 def report_peers(room: Room) -> None:
-    """Print the main walls found by other programs in the same points."""
+    """Print the main walls that other programs find in the same points."""
     print("| peer | points | time | main wall | planes |")
     print("|---|---|---|---|---|")
     _, normal, offset, centre = room.truth[0]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 Points = NDArray[np.float32]
 CELL_M, TOLERANCE_M = 0.02, 0.05
-# The share of occupied plan cells that the line transforms are shown, the densest ones: shown all,
-# they find floor and ceiling everywhere and no wall.
+# Share of the occupied plan cells, the densest ones, that line transforms get. With all cells, they
+# find floor and ceiling everywhere and no wall.
 DENSEST_SHARE = 0.03
 
 
@@ -40,8 +40,8 @@ class Peer:
 
     Attributes:
         name: name of the program and its call.
-        every: it gets every n-th point.
-        run: finds the first plane of (n, 3) points, or the plane nearest to the wall's.
+        every: the program gets every n-th point.
+        run: function that finds the first plane in (n, 3) points, or the plane nearest to the wall.
     """
 
     name: str

@@ -4,12 +4,12 @@
     python benchmarks/plane_streaming.py --points 48000000 --npy room.npy --repeats 3
     python benchmarks/plane_streaming.py --points 48000000 --npy room.npy --tiled 5
 
-Each of these is measured in its own process: laspy decoding all chunks and keeping nothing; laspy
-reading the file (`laspy.read`, then coordinates and intensities as arrays), which is the reference;
-`read.scan` and a detector in one process; the same two steps through the engine. Memory is the
-maximum sampled sum of RssAnon over a process and its children, which excludes memory-mapped files,
-because the system can drop their pages. `--tiled n` detects planes in n copies of the points, from
-memory-mapped files, and compares the time per point with that of a single copy.
+Four tasks are measured, each in a separate process: laspy decodes all chunks and keeps nothing;
+laspy reads the file (`laspy.read`, then coordinates and intensities as arrays), which is the
+reference; `read.scan` and a detector run in one process; and the engine runs the same two steps.
+The memory is the maximum of sampled sums of RssAnon over a process and its children, which excludes
+memory-mapped files, because the system can drop their pages. `--tiled n` detects planes in n copies
+of the points, in memory-mapped files, and compares the time per point with that of a single copy.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def report_file(folder: Path, options: argparse.Namespace) -> None:
     small = folder / "small.laz"
     write_laz(small, points[:: max(1, len(points) // 300_000)])
     del points
-    for name in DETECTORS:  # so that nothing is compiled in what is measured
+    for name in DETECTORS:  # so that compilation is not measured
         measured(child_command(["process", name, str(small), str(folder)]))
         measured(engine_command(name, small, folder))
     costs: dict[str, list[Cost]] = {name: [] for name in commands}
@@ -112,7 +112,7 @@ def report_file(folder: Path, options: argparse.Namespace) -> None:
 
 
 def report_tiles(folder: Path, options: argparse.Namespace) -> None:
-    """Print the cost per point of finding planes in one and many copies, from mapped files."""
+    """Print the cost per point of finding planes in one copy and in many, from mapped files."""
     points = room(options)
     for name in ("once", "tiled"):
         copies = 1 if name == "once" else options.tiled
@@ -152,7 +152,7 @@ def room(options: argparse.Namespace) -> NDArray[np.float32]:
 
 
 def write_laz(path: Path, points: NDArray[np.float32]) -> None:
-    """Write points as scanner software does: format 6, a tenth of a millimetre, intensity."""
+    """Write points as scanner software does: format 6, scale 0.1 mm, with intensity."""
     import laspy
 
     header = laspy.LasHeader(point_format=6, version="1.4")
@@ -176,7 +176,7 @@ def engine_command(method: str, path: Path, folder: Path) -> list[str]:
     workflow.write_text(WORKFLOW.format(method=method))
     forced = ("--force", "cloud", "--force", "plane")
     run = ["run", str(workflow), "--input", f"scan={path}", *forced, "--store", str(folder / "st")]
-    # Without -o every run has a folder of its own.
+    # Without -o, every run has a separate folder.
     return [sys.executable, "-m", "orthoflow", *run]
 
 
@@ -233,7 +233,7 @@ def detect_mapped(method: str, folder: Path, name: str) -> None:
         detector().run(detector.In(cloud=cloud), detector.Params(), ctx)
 
 
-def method_of(name: str):  # a class; which one is known when it is run
+def method_of(name: str):  # returns a class that is only known at run time
     from orthoflow_plugins.plane.hough2d import Hough2d
     from orthoflow_plugins.plane.ransac import Ransac
 

@@ -33,7 +33,7 @@ class Took:
 
 
 def install(site: Path, n_plugins: int) -> None:
-    """Write the given number of distributions into a folder, as pip would."""
+    """Write the given number of distributions to a folder, as pip would."""
     for n in range(n_plugins):
         package, info = site / f"many{n}", site / f"many_{n}-1.0.dist-info"
         package.mkdir()

@@ -1,4 +1,4 @@
-"""Measure how fast products as large as a scan are digested, written and read.
+"""Measure how fast products as large as a scan are hashed, written and read.
 
 Run with `python benchmarks/product_files.py [POINTS]`; the default is 50 million points. Files are
 written to a temporary folder in the working directory.

@@ -3,11 +3,11 @@
     python benchmarks/raster_top.py [--millions 48] [--threads 2] [--repeat 5]
 
 Times are medians of interleaved runs. F is the time of one streaming pass over the coordinates,
-measured in the same run: the minimum for any method that reads the cloud once. Goals: at most 20 F,
-at least four times as fast as `np.maximum.at`, depths identical to those of `np.lexsort`. numpy's
-version has less to do: it assumes that the wall is vertical along x, does not count points, and
-does not define which of several topmost points gives its intensity. The complete `raster.grid` is
-also timed.
+measured in the same run; it is the minimum for any method that reads the cloud once. The goals are:
+at most 20 F, at least four times as fast as `np.maximum.at`, and depths identical to those of
+`np.lexsort`. numpy's version does less: it assumes that the wall is vertical and along x, does not
+count points, and does not define which of several topmost points provides the intensity. The
+complete `raster.grid` is also measured.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SIZE_M = (9.2, 5.2)
 
 
 def scan(n_points: int) -> PointCloud:
-    """Return the columns of a scan of a room corner, half of it on the wall, in scan order."""
+    """Return the columns of a scan of a room corner, in scan order; half of it is on the wall."""
     rng = np.random.default_rng(20150807)
     n_columns = int(np.sqrt(2 * n_points))
     per_column = n_points // n_columns
@@ -86,7 +86,7 @@ def with_ours(cloud: PointCloud, slab: Slab, threads: int) -> tuple[NDArray, NDA
 
 
 def laid_out(cloud: PointCloud, slab: Slab) -> tuple[NDArray, NDArray, NDArray]:
-    """Return cell, depth and intensity of the points inside, as found with numpy."""
+    """Return cell, depth and intensity of the points inside, computed with numpy."""
     frame = slab.frame
     depth = -cloud.y
     near = np.abs(depth) <= np.float32(BUFFER_M)
@@ -133,7 +133,7 @@ def interleaved(
         for name, run in contestants.items():
             started, used = time.perf_counter(), time.process_time()
             run()
-            # The first round compiles.
+            # The first round includes compilation.
             if round_number:
                 seconds[name].append(time.perf_counter() - started)
                 processor[name].append(time.process_time() - used)

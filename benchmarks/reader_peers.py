@@ -5,8 +5,9 @@
 The library of each format writes a file of points with intensity and colours. A new process reads
 the file with the library into arrays of coordinates, intensity and colours. Other processes read it
 block by block with `open_scan`, and as a whole cloud with `read.scan`, which also measures its
-quality and draws it. Prints the fastest of `--repeats` runs, without imports, and the anonymous
-memory. Ratios compare processor times, which other load on the machine hardly affects.
+quality and draws it. The output is the time of the fastest of `--repeats` runs, without imports,
+and the anonymous memory. Ratios compare processor times, which other load on the machine hardly
+affects.
 """
 
 from __future__ import annotations
@@ -176,7 +177,7 @@ def read(path: Path, way: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Write the files, read each with every method, print a table."""
+    """Write the files, read each with every method, and print a table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

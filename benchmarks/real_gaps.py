@@ -1,14 +1,14 @@
-"""Orient photos rendered from a real scan's colours on its intensity, to measure their differences.
+"""Orient photos that are rendered from a real scan's colours on the scan's intensity.
 
     python benchmarks/real_gaps.py SCAN --gsd-m 0.006 --ranks 0
     python benchmarks/real_gaps.py FOLDER/T1.1.txt --paper --gsd-m 0.0013
 
-A scan with colours and intensity shows the same points in both. Each wall is flattened, and five
-photos are rendered from its colours at angles of up to 25 degrees. They are processed as in
-`photos-on-scan.yaml`, with EXIF data: `match.sift`, a bundle adjustment with relaxed gates,
-`match.guided`, a bundle adjustment. Parts missing from the wall are grey in the photos. `wall` is
-the error per coordinate on the wall over the area that a photo shows, in cells; `stated` is the
-expected error of the pose.
+The colours and the intensity of a scan show the same points, so the true poses are known. Each wall
+is flattened, and five photos are rendered from its colours at angles of up to 25 degrees. They are
+processed as in `photos-on-scan.yaml`, with EXIF data: `match.sift`, a bundle adjustment with
+relaxed gates, `match.guided`, and a bundle adjustment. Void parts of the wall are grey in the
+photos. `wall` is the error per coordinate on the wall over the area that a photo shows, in cells;
+`stated` is the expected error of the pose.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from orthoflow.products import Camera, InputFiles, Photo, Photos, Planes, PointC
 
 _SIZE_PX = (1200, 900)
 _FOCAL_PX = 1100.0
-# Degrees aside and above, and of roll.
+# Angles to the side, upwards and about the axis, in degrees.
 _VIEWS = (
     (0.0, 5.0, 1.0),
     (-25.0, 0.0, -3.0),
@@ -55,7 +55,7 @@ def flat(wall: Wall) -> Wall:
 
 
 def cameras_before(wall: Wall) -> list[ViewingCamera]:
-    """Return cameras that show most of the known part of a wall."""
+    """Return cameras that show most of the measured part of a wall."""
     frame = wall.frame
     rows, columns = np.nonzero(np.isfinite(wall.depth_m))
     low, high = np.percentile(np.column_stack([columns, rows]), (2.0, 98.0), axis=0)
@@ -91,7 +91,7 @@ def cameras_before(wall: Wall) -> list[ViewingCamera]:
 
 
 def photo_of(wall: Wall, camera: ViewingCamera, name: str) -> Photo:
-    """Render the colours of a flat wall as a camera would see them."""
+    """Render the colours of a flat wall as seen by a camera."""
     import cv2
 
     if wall.rgb is None or wall.rgb_mask is None:
@@ -122,7 +122,7 @@ def whole_photo(step: int) -> NDArray[np.float64]:
 def landed(
     wall: Wall, camera: ViewingCamera, pixels: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the cells (n, 2) of a flat wall in view of pixels, and whether they are in front."""
+    """Return the cells (n, 2) of a flat wall that pixels show, and a mask of those in front."""
     frame = wall.frame
     rays = camera.rays_world(pixels)
     towards = camera.centre_world - frame.origin_world
@@ -134,7 +134,7 @@ def landed(
 
 
 def error_cells(wall: Wall, truth: ViewingCamera, found: ViewingCamera) -> float:
-    """Return the RMS error per coordinate on the wall, over the known cells in a photo."""
+    """Return the RMS error per coordinate on the wall, over the measured cells in a photo."""
     pixels = whole_photo(20)
     cells, known = landed(wall, truth, pixels)
     inside = known & ((cells >= 0) & (cells < wall.frame.shape[::-1])).all(axis=1)
@@ -161,7 +161,7 @@ def walls_in(cloud: PointCloud) -> Planes:
 
 
 def paper(cloud: PointCloud) -> Planes:
-    """Return the plane of a small patch, seen from the origin of its file."""
+    """Return the plane of a small patch of a target, seen from the origin of its file."""
     normal, offset_m = paper_plane(cloud.points_world(np.arange(len(cloud))))
     params = GivenPlane.Params(normal=tuple(normal.tolist()), offset_m=offset_m)
     return GivenPlane().run(GivenPlane.In(cloud=cloud), params, context(1)).planes

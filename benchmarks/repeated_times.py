@@ -1,14 +1,14 @@
-"""Measure how far the times of a comparison differ between repeated runs.
+"""Measure how much the times of a comparison differ between repeated runs.
 
     python benchmarks/repeated_times.py FOLDER [--recipe plane-methods] [--step plane] [--runs 2]
 
 Runs `orthoflow run RECIPE` into `FOLDER/1` with a new store and no compiled code, then into
 `FOLDER/2`, `FOLDER/3` ... with the step forced; existing runs are reused. Each run is compared with
-the previous one: every `*_s` of the step's cells except `compile_s`, if one of both exceeds 0.2 s.
-The output lists times that differ by more than 30 %. For each time, it gives the order of the
-variants by the medians of their repeats, and the pairs that change order: smaller differences are
-not significant, neither here nor in a report. On a machine with other load, only `cpu_s` and
-`*_cpu_s` describe the methods; the load is also printed.
+the previous one by every metric `*_s` of the step's cells except `compile_s`, provided that one of
+the two values exceeds 0.2 s. The output lists times that differ by more than 30 %. For each time,
+it lists the variants in the order of the medians of their repeats, and the pairs that change order;
+smaller differences are not significant, neither here nor in a report. On a machine with other load,
+only `cpu_s` and `*_cpu_s` are meaningful; the load is also printed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def measured(folder: Path, recipe: str, step: str, number: int) -> Times:
     if not (target / "run.h5").is_file():
         command = [sys.executable, "-m", "orthoflow", "run", recipe, "-o", str(target)]
         command += ["--store", str(folder / "store"), *(["--force", step] if number > 1 else [])]
-        # Kernels that earlier runs of this user compiled are not taken over.
+        # Kernels compiled in earlier runs are not used.
         variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder.resolve() / "kernels")}
         before = os.getloadavg()[0]
         subprocess.run(command, check=True, env=variables, stdout=subprocess.DEVNULL)
@@ -108,7 +108,7 @@ def print_orders(before: Times, after: Times) -> None:
 
 
 def medians(times: Times, name: str) -> dict[str, float]:
-    """Return variant -> median over its repeats."""
+    """Return the median over the repeats of each variant."""
     of: defaultdict[str, list[float]] = defaultdict(list)
     for (cell, metric), value in times.items():
         if metric == name:

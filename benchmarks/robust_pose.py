@@ -2,14 +2,14 @@
 
     python benchmarks/robust_pose.py [--photos 100] [--ties 600]
 
-Photos show a wall with 12 cm of relief; correct ties have 1.5 px of noise, and a share of the ties
-is at random pixels; the lens is known. `found` counts poses whose centre is within 50 mm of the
-truth; `centre` is the RMS error of those that all programs found; `over best` is our error divided
-by that of the best other program; `time` is the median per photo, and `over usac` our time divided
-by OpenCV's. Ours is the robust search with the adjustment and rejection that follow it in
-`orient.pnp`. The others are used as their manuals advise: USAC with MAGSAC and a
-Levenberg-Marquardt refinement on the inliers, LO-RANSAC with refinement. PoseLib is included if it
-is installed (`pip install poselib`).
+Photos show a wall with 12 cm of relief; correct ties have 1.5 px of noise, a given share of the
+ties is at random pixels, and the lens is known. `found` counts poses whose centre is within 50 mm
+of the truth; `centre` is the RMS error of those that all programs found; `over best` is our error
+divided by that of the best other program; `time` is the median per photo, and `over usac` our time
+divided by OpenCV's. Our estimation is the robust search followed by the adjustment and rejection of
+`orient.pnp`. The other programs are used as their manuals advise: USAC with MAGSAC and a
+Levenberg-Marquardt refinement on the inliers, and LO-RANSAC with refinement. PoseLib is included if
+it is installed (`pip install poselib`).
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def main() -> None:
         for seed in range(chosen.photos):
             seen = tied_photo(seed, chosen.ties, wrong_share)
             for name, solve in named.items():
-                # Loaded and warm: the first photo is solved twice.
+                # Solve the first photo twice, so that loading is not measured.
                 for _ in range(2 if seed == 0 else 1):
                     started = time.thread_time()
                     centre = solve(seen)

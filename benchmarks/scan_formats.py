@@ -7,10 +7,10 @@
 A room is scanned from one station, with points 4.4 mm apart on its main wall (median), and written
 as E57 with rows and columns, E57 without them, LAZ, and E57 without them in random order. Each file
 is processed separately: `read.scan`, `plane.hough2d`, `raster.grid` with cells of 2, 4 and 8 mm,
-ties of the six photos (`match.guided` from the true poses) and `orient.colmap-bundle`. `u` and `v`
-are the mean offsets of the ties from the true positions of their pixels, in cells to the right and
-down, over all photos: the displacement of the raster, and of any photo with it. `wall` is the error
-per coordinate on the wall, RMS over the photos; `stated` is the expected error of the poses;
+ties of six photos (`match.guided` from the true poses), and `orient.colmap-bundle`. `u` and `v` are
+the mean offsets, over all photos, of the ties from the true positions of their pixels, in cells to
+the right and down: this is the displacement of the raster, and thus of every photo. `wall` is the
+error per coordinate on the wall, RMS over the photos; `stated` is the expected error of the poses;
 `ratio` is the first divided by the second, RMS.
 """
 
@@ -40,15 +40,16 @@ from orthoflow.products import InputFiles, Planes, PointCloud, Ties, Truth, Wall
 
 FORMATS = ("e57 with rows", "e57 without", "laz", "random order")
 CELLS_M = (0.002, 0.004, 0.008)
-# Right before the station; farther off points lie farther apart. Drawn within a twentieth, as one
-# step would meet the same edges of the wall in the same places in every room.
+# Point spacing opposite the station; it is larger farther away. It is varied by a twentieth at
+# random, because with a single value, the scan would meet the same edges of the wall at the same
+# positions in every room.
 _STEP_M = 0.00356
 _STEP_SHARE = 0.05
-# The main wall and what stands out of it or goes into it is seen by its own scan alone.
+# The main wall, its relief and its recesses are only in the detail scan.
 _BEFORE_WALL_M = 0.5
 _ALONG_COSINE = 0.99
 _LAZ_SCALE_M = 1e-4
-# Ties farther off are wrong ones, which estimators reject: no bias.
+# Ties with larger offsets are wrong, and estimators reject them, so they cause no bias.
 _WRONG_CELLS = 1.5
 
 
@@ -155,7 +156,7 @@ def scanned_apart(cloud: PointCloud, truth: Truth) -> tuple[PointCloud, Truth]:
 
 
 def main_wall_found(cloud: PointCloud, truth: Truth) -> tuple[Planes, int]:
-    """Find planes and the main wall; turn it to the room, because LAZ has no stations."""
+    """Find planes and the main wall; turn it towards the room, because LAZ has no stations."""
     planes = Hough2d().run(Hough2d.In(cloud=cloud), Hough2d.Params(), context(1)).planes
     main = truth.planes.names.index("main wall")
     middle = truth.planes.corners[main].mean(axis=0)
@@ -167,7 +168,7 @@ def main_wall_found(cloud: PointCloud, truth: Truth) -> tuple[Planes, int]:
 
 
 def displacements_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
-    """Return the offsets of tie points, right and down, from where their pixels look."""
+    """Return the offsets of tie points, right and down, from the true targets of their pixels."""
     frame = walls.walls[0].frame
     parts = []
     for photo in np.unique(ties.photo):

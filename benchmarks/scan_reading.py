@@ -1,10 +1,10 @@
-"""Measure the reading of large scans with one and two cores: time, memory, and equal clouds.
+"""Measure time and memory of reading large scans with one and two cores; compare the clouds.
 
     python benchmarks/scan_reading.py FOLDER [--points 12000000] [--files 2]
 
 writes files of points with intensity, as E57 and as PLY, and reads the files of each format with
-`read.scan`, alternately, each time in a new process. Prints the elapsed time, the processor time
-and the anonymous memory of all processes, of the fastest of `--repeats` runs.
+`read.scan`, alternately, each time in a new process. The output is the elapsed time, the processor
+time and the anonymous memory, over all processes, of the fastest of `--repeats` runs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ WRITERS = {"e57": write_e57, "ply": write_ply}
 
 
 def main() -> None:
-    """Write the files, read them, compare; with --read, only read in this process."""
+    """Write the files, read them and compare the clouds; with --read, only read in this process."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -66,7 +66,7 @@ def main() -> None:
 
 
 def write(folder: Path, n_points: int, n_files: int) -> None:
-    """Write a room, and links to it that stand for other files."""
+    """Write a room, and links to it in place of other files."""
     cloud = mapped_room(folder, n_points)
     attributed = AttributedCloud(
         cloud=cloud, colouring="intensity", neighbourhoods=neighbourhoods_of(cloud)

@@ -1,12 +1,13 @@
-"""Find the targets of a real scan in intensity orthoimages and back-project them into space.
+"""Find the targets of a real scan in intensity orthoimages, and compute their 3D positions.
 
     python benchmarks/scan_targets.py FOLDER [--targets T1 T2 T3] [--gsd-m 0.0013]
 
 FOLDER contains scan patches around targets, `T1.1.txt` and so on (x y z r g b intensity, metres),
 and `target_centers_SP1.json`, the centres measured by operators: for each target, a list with one
-point per patch. For each patch, a plane is fitted, then `scan_targets.yaml` runs as from the
-command line: intensity orthoimage, intersection of the quadrants, position on the surface. The
-output is the distances from the operators' centres in the plane and in space, RMS and maximum.
+point per patch. For each patch, a plane is fitted, then `scan_targets.yaml` is run as from the
+command line: it computes an intensity orthoimage, the intersection of the quadrants, and the
+position on the surface. The output is the RMS and the maximum of the distances from the operators'
+centres, in the plane and in space.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def _metrics(patch: Path, centre: list[float], runs: Path, gsd_m: float) -> dict
     normal, offset_m = paper_plane(np.loadtxt(patch, comments="//", usecols=(0, 1, 2)))
     inputs = ["--input", f"scan={patch}", "--input", f"checkpoints={survey}"]
     inputs += ["--set", f"plane.normal={normal.tolist()}", "--set", f"plane.offset_m={offset_m}"]
-    # A new store each time: nothing of an earlier run is taken.
+    # Use a new store each time, so that no results of an earlier run are used.
     command = ["-m", "orthoflow", "run", str(WORKFLOW), *inputs, "-o", str(run)]
     command += ["--set", f"wall.gsd_m={gsd_m}", "--store", str(runs / "store")]
     ended = subprocess.run([sys.executable, *command], capture_output=True, text=True, check=False)

@@ -1,11 +1,11 @@
-"""Record a terminal during a run and measure how long lines of the live table do not change.
+"""Record the terminal of a run, and measure how long lines of the live table do not change.
 
     python benchmarks/standing_lines.py -o terminal.txt --most 2 -- orthoflow run quickstart.yaml
 
 prints, for each step, its duration, the longest time in which its line did not change, and the end
 of that time; and the same for the whole screen, from the start of the command. The exit code is 1
 if a line did not change for longer than `--most` seconds, or if the command failed. The recording
-has a frame per change, each with its time in seconds.
+contains a frame for each change, with its time in seconds.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Screen:
 
 @dataclass
 class Stillness:
-    """How long something was observed, and the longest time without a change."""
+    """The time during which content was observed, and the longest time without a change."""
 
     began_s: float
     changed_s: float
@@ -82,7 +82,7 @@ class Stillness:
     longest_until_s: float = 0.0
 
     def see(self, content: str, now_s: float) -> None:
-        """Observe it once more."""
+        """Observe the content again."""
         if now_s - self.changed_s > self.longest_s:
             self.longest_s, self.longest_until_s = now_s - self.changed_s, now_s
         self.ended_s = now_s
@@ -94,7 +94,7 @@ def record(command: list[str], frames: Path | None) -> tuple[dict[str, Stillness
     """Run a command in its own terminal; observe the lines of running steps, and the whole screen.
 
     Returns:
-        Line -> its stillness; and the exit code.
+        The observations by line, and the exit code.
     """
     controlling, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", _ROWS, _COLUMNS, 0, 0))

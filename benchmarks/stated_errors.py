@@ -3,19 +3,19 @@
     python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...]
     python benchmarks/stated_errors.py --entry FOLDER --fountain FOLDER   # real photos, see below
 
-Drawn rooms: for each type of cloud, there are some rooms with their own scan noise, camera and
-viewpoints, and six photos without a known focal length. Scans are registered to 5 mm, or the cloud
-is bent by 8 mm at the ends of the room, or its points have errors correlated over half a metre, as
-in stereo matching. Photos are matched at their true poses (`match.guided`) and oriented by bundle
-adjustment. `true` is the error per coordinate on the wall relative to the scan, RMS over all
-photos; `stated` is the expected error; `wrong` counts accepted photos whose error exceeds five
-expected standard deviations. `cloud` is the mean offset of the points that a photo shows. Nothing
-in the scan can reveal it, so `true` and `stated` exclude it.
+Drawn rooms: for each type of cloud, there are several rooms with different scan noise, cameras and
+viewpoints, each with six photos without a known focal length. Scans are registered with an accuracy
+of 5 mm, or the cloud is bent by 8 mm at the ends of the room, or the errors of its points are
+correlated over half a metre, as in stereo matching. Photos are matched at their true poses
+(`match.guided`) and oriented by bundle adjustment. `true` is the error per coordinate on the wall
+relative to the scan, RMS over all photos; `stated` is the expected error; `wrong` counts accepted
+photos whose error exceeds five expected standard deviations. `cloud` is the mean offset of the
+points that a photo shows. The scan cannot reveal this offset, so `true` and `stated` exclude it.
 
 Real photos: folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11) with
 `images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same
-coordinate system. Each runs with `photos-on-scan.yaml` and 10 mm cells, with and without its
-calibration.
+coordinate system. Each folder is processed with `photos-on-scan.yaml` and 10 mm cells, with and
+without its calibration.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ CLOUDS: Final[dict[str, dict[str, float]]] = {
     "far": {"shared_noise_m": 0.004, "shared_noise_length_m": 3.0},
 }
 _BUFFER_M: Final = 0.3
-# Of the points of a wall, every so many tell how far they are off.
+# Offsets are computed for every nth point of a wall.
 _EVERY: Final = 50
-# Photos that no cloud of these folders was made from.
+# Photos from which no cloud of these folders was made.
 ENTRY: Final = ("0002", "0003", "0004", "0007", "0008", "0009")
 FOUNTAIN: Final = ("0000", "0003", "0006", "0009", "0010")
 
@@ -64,7 +64,7 @@ def context(folder: str, seed: int) -> StepContext:
 
 @dataclass(frozen=True, kw_only=True)
 class Oriented:
-    """Photos of one room: true and expected errors, reasons for rejection, wrong ones."""
+    """True and expected errors of the photos of a room, reasons for rejection, and wrong poses."""
 
     errors_m: list[tuple[float, float]]
     refused: list[str]
@@ -73,7 +73,7 @@ class Oriented:
 
 
 def simulated(cloud: str, seed: int, folder: str) -> SimulateRoom.Out:
-    """Build a room with the cloud errors given in `CLOUDS`, or only noise if there are none."""
+    """Build a room with the cloud errors given in `CLOUDS`, or with noise only."""
     chosen: dict[str, object] = {"scan_step_m": 0.004, "panorama_step_m": 0.02, "noise_m": 0.002}
     chosen |= {"photo_gsd_m": 0.003, "photo_layout": "quick", "textile_share": 0.33}
     params = SimulateRoom.Params.model_validate(chosen | CLOUDS[cloud])
@@ -157,7 +157,7 @@ def room(cloud: str, seed: int, folder: str) -> Oriented:
 
 
 def moved(camera: Camera, by_m: NDArray[np.float64]) -> Camera:
-    """Return a camera moved to another position in the world."""
+    """Return a camera shifted in the world."""
     if camera.status != "ok":
         return camera
     return replace(
@@ -248,9 +248,9 @@ def read_camera(written: dict[str, Any]) -> ViewingCamera:
 
 
 def reference_camera(folder: Path, name: str, lens: list[float]) -> ViewingCamera:
-    """Read a camera of the benchmark of Strecha et al.; `lens` is K row by row."""
+    """Read a camera of the benchmark of Strecha et al.; `lens` contains K row by row."""
     lines = (folder / "images" / f"{name}.jpg.camera").read_text().splitlines()
-    # Written with few digits: the nearest rotation.
+    # The file contains few digits, so take the nearest rotation.
     left, _, right = np.linalg.svd([[float(word) for word in row.split()] for row in lines[4:7]])
     rotation = (left @ right).T
     centre = np.array([float(word) for word in lines[7].split()])

@@ -2,10 +2,10 @@
 
     python benchmarks/store_checking.py [WORKFLOW] [--set STEP.PARAM=VALUE ...] [--force STEP ...]
 
-Runs a workflow in this process, in a temporary folder of the working directory: computed, twice
-from the cache, and with the steps of --force recomputed from cached inputs, which are then checked.
-Checking includes looking up results and objects, reading their bytes, and recording the digests of
-stored data; `synced` is the time for flushing the run folder to disk.
+A workflow is run in this process, in a temporary folder of the working directory: once computed,
+twice from the cache, and once with the steps of --force recomputed from cached inputs, which are
+then checked. Checks include looking up results and objects, reading their bytes, and recording the
+digests of stored data; `synced` is the time for flushing the run folder to disk.
 """
 
 from __future__ import annotations

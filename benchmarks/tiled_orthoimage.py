@@ -1,8 +1,8 @@
 """Measure the time and memory of making tiles of a large orthoimage.
 
 `python benchmarks/tiled_orthoimage.py --side 20000` writes a simulated orthoimage of 400 million
-cells as an export would find it (a cloud-optimised GeoTIFF with its sidecar), then its tiles in a
-separate process, and prints the time and the peak memory.
+cells in the form that exports read (a cloud-optimised GeoTIFF with its sidecar), then its tiles in
+a separate process, and prints the time and the peak memory.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def export(path: Path, target: Path) -> None:
 
 
 def largest_mib() -> float:
-    """Return the peak memory of this process; getrusage would return that of its parent."""
+    """Return the peak memory of this process; getrusage may return that of its parent."""
     lines = Path("/proc/self/status").read_text().splitlines()
     (found,) = [line for line in lines if line.startswith("VmHWM")]
     return int(found.split()[1]) / 1024

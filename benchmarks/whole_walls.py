@@ -3,13 +3,13 @@
     python benchmarks/whole_walls.py --rooms 12 --first 1001
     python benchmarks/whole_walls.py --rooms 12 --first 1001 --rectangle points
 
-`simulate.room` with `decoration: drawn` draws cornices, pilasters, niches and recessed doors by the
-seed. The true wall extends from corner to corner and from floor to ceiling. One of its cells counts
-if the first surface in front of it, seen perpendicular to the wall, is parallel to the wall and
-visible from a station. `scanned` is the share of these cells that the raster shows. `painted` is
-the share of those also visible in a photo that the orthoimage shows (planes by `plane.hough2d`,
+With `decoration: drawn`, cornices, pilasters, niches and recessed doors of `simulate.room` are
+drawn by the seed. The true wall extends from corner to corner and from floor to ceiling. A cell of
+it counts if the first surface, seen perpendicular to the wall, is parallel to the wall and visible
+from a station. `scanned` is the share of these cells that the raster shows. `painted` is the share,
+of the cells that are also visible in a photo, that the orthoimage shows (planes by `plane.hough2d`,
 `raster.grid` with default settings and 4 mm cells, true poses of the photos). `front` and `behind`
-are the buffer found, next to the buffer that the true relief needs. `lost` gives the location of
+are the buffer found, next to the buffer that the true relief needs. `lost` is the location of
 missing cells: `out`side the raster, beyond the `buf`fer, in a `void` cell of the raster, or in a
 cell with a depth.
 """
@@ -34,12 +34,13 @@ from orthoflow.geometry.scenes import SurfaceRole, Viewers
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask, Truth, Walls
 
 _GSD_M = 0.004
-# Drawn relief stands out by 0.3 m and goes in by 0.45 m at most; furniture stands farther out.
+# Random relief projects by at most 0.3 m, and recesses are at most 0.45 m deep; furniture is
+# farther in front.
 _FRONT_M, _BEHIND_M = 0.5, 0.6
 _ALONG_COSINE = 0.99
-# Floors and ceilings are rastered too, but no true wall is known of them.
+# Floors and ceilings are rastered, too, but have no true wall.
 _UPRIGHT_SINE = 0.5
-# A surface counts from this share of the wall on as what a buffer should hold.
+# A buffer must contain a surface that covers at least this share of the wall.
 _RELIEF_LEAST = 1e-3
 
 
@@ -49,8 +50,8 @@ class TrueWall:
 
     Attributes:
         points: (n, 3) world.
-        depth_m: (n,) in front of the true plane.
-        in_photo: (n,) whether a photo also shows the cell.
+        depth_m: (n,) metres in front of the true plane.
+        in_photo: (n,) mask of cells that a photo shows, too.
     """
 
     points: NDArray[np.float64]
@@ -58,7 +59,7 @@ class TrueWall:
     in_photo: NDArray[np.bool_]
 
     def reach_m(self) -> tuple[float, float]:
-        """Return how far its relief extends in front of and behind the plane."""
+        """Return the extents of the relief in front of and behind the plane."""
         low, high = np.quantile(self.depth_m, [_RELIEF_LEAST, 1.0 - _RELIEF_LEAST])
         return float(high), float(-low)
 
@@ -76,11 +77,13 @@ def true_wall(truth: Truth, name: str) -> TrueWall:
     none = np.zeros(frame.shape, dtype=np.bool_)
     reach = {"front_m": _FRONT_M, "behind_m": _BEHIND_M}
     shown = render(truth.scene, frame, **reach, viewers=viewers, coloured=none, cores=2)
-    # Upright axes tell the wall's surfaces from the sides of the pilasters of adjoining walls.
+    # The direction of axis b distinguishes the wall's surfaces from the sides of pilasters on
+    # adjoining walls.
     along = np.abs(truth.scene.normal @ normal) > _ALONG_COSINE
     along &= np.abs(truth.scene.axis_b @ frame.v_world) > _ALONG_COSINE
     own = along & (truth.scene.role != SurfaceRole.OBJECT)
-    # -1, where nothing is, counts from the end: no such cell is seen.
+    # Index -1, where there is no surface, refers to the last rectangle, but such cells are not
+    # seen.
     rows, columns = np.nonzero(shown.seen & own[shown.rectangle] & (shown.rectangle >= 0))
     depth_m = shown.depth_m[rows, columns].astype(np.float64)
     points = frame.world_from_wall(np.column_stack([columns, rows]) + 0.5, depth_m)
@@ -153,7 +156,7 @@ def main() -> None:
         planes = Hough2d().run(Hough2d.In(cloud=room.cloud), Hough2d.Params(), context(1)).planes
         rule = RasterGrid.Params(
             gsd_m=_GSD_M,
-            # The four walls and, larger at times, floor and ceiling.
+            # Include the four walls, and floor and ceiling, which may be larger.
             n_walls_max=1 if chosen.layout == "quick" else 6,
             rectangle=chosen.rectangle,
         )

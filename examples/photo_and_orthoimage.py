@@ -3,8 +3,8 @@
     orthoflow run quickstart.yaml --embed -o runs/quickstart
     python examples/photo_and_orthoimage.py runs/quickstart picture.jpg
 
-Reads everything from the record; `--embed` keeps the photos in it. The picture in the README was
-made so.
+All data are read from the record; `--embed` stores the photos in it. The picture in the README was
+made with this program.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ GAP_PX = 12
 
 
 def picture_of(run_folder: Path) -> NDArray[np.uint8]:
-    """Give the three images in a row, (rows, cols, 3), on white."""
+    """Return the three images in a row on a white background, (rows, cols, 3)."""
     run = orthoflow.open_run(run_folder)
     photos = run.product("room", "photos")
     walls = run.product("wall", "walls")
@@ -48,7 +48,7 @@ def picture_of(run_folder: Path) -> NDArray[np.uint8]:
 
 
 def shrunk(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Average an image down to the picture's height."""
+    """Reduce an image to the height of the picture by averaging."""
     import cv2
 
     width = round(image.shape[1] * HEIGHT_PX / image.shape[0])
@@ -57,7 +57,7 @@ def shrunk(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def main() -> None:
-    """Write the picture of a run."""
+    """Write the picture for a run."""
     if len(sys.argv) != 3:
         sys.exit("usage: python examples/photo_and_orthoimage.py RUN PICTURE.jpg")
     Path(sys.argv[2]).write_bytes(encode_jpeg(picture_of(Path(sys.argv[1]))))

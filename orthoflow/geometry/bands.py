@@ -1,4 +1,4 @@
-"""Bands of rows: large rasters are kept in files and never completely in memory."""
+"""Bands of rows, since large rasters are kept in files and never completely in memory."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-# Creates a zeroed array from a name, shape and type; in a memory-mapped file if it is large.
+# Creates a zeroed array from a name, a shape and a type, in a memory-mapped file if it is large.
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
-# Finished rasters with more cells are kept in files, because a project may have many walls.
+# Finished rasters with more cells are kept in files, because there may be many walls.
 IN_MEMORY_CELLS: Final = 1 << 22
 # Temporary arrays of a band need about 16 MB per byte of a cell.
 _BAND_CELLS: Final = 1 << 24
 
 
 def in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-    """Return a zeroed array in memory, for small rasters; an `Allocate`."""
+    """Return a zeroed array in memory; an `Allocate` for small rasters."""
     del name
     return np.zeros(shape, dtype=dtype)
 
@@ -28,7 +28,7 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
     """Divide a raster into bands of rows.
 
     Args:
-        shape: numbers of rows and columns, and further dimensions of a cell.
+        shape: numbers of rows and columns, and the further dimensions of a cell.
         multiple: the height of every band except the last is a multiple of this.
 
     Yields:
@@ -53,13 +53,13 @@ class Band:
 
     @property
     def inner(self) -> slice:
-        """Return the position of `rows` within `around`."""
+        """Position of `rows` within `around`."""
         first = self.rows.start - self.around.start
         return slice(first, first + self.rows.stop - self.rows.start)
 
 
 def bands_with_reach(shape: tuple[int, int], *, cells_most: int, reach_rows: int) -> Iterator[Band]:
-    """Divide a raster into bands of similar height, with at most `n_cells` including margins."""
+    """Divide a raster into bands of similar height, each with at most `cells_most` cells."""
     n_rows, n_columns = shape
     height = max(1, cells_most // max(1, n_columns) - 2 * reach_rows)
     height = -(-n_rows // -(-n_rows // height))

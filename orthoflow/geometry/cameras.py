@@ -1,6 +1,6 @@
-"""Cameras with distortion: world points to pixels, pixels to rays, derivatives of lens models.
+"""Cameras with distortion: projection of points, rays of pixels, derivatives of lens models.
 
-The centre of the first pixel is at (0.5, 0.5). In OpenCV it is at (0, 0); all conversions between
+The centre of the first pixel is at (0.5, 0.5). In OpenCV, it is at (0, 0); all conversions between
 the two conventions use the functions of this module.
 """
 
@@ -33,7 +33,7 @@ def from_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
 
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-12
-# Points with a smaller depth count as behind the camera.
+# Points with a smaller depth are considered to be behind the camera.
 _NEAREST_M: Final = 1e-9
 _PROJECTED_AT_ONCE: Final = 1 << 15
 _UNTURNED: Final = np.eye(3)
@@ -71,7 +71,7 @@ class ViewingCamera:
     skew: float = 0.0
 
     def __post_init__(self) -> None:
-        # Negated comparison, so that NaN is refused.
+        # The comparison is negated, so that NaN is refused.
         if not np.abs(self.rotation @ self.rotation.T - _UNTURNED).max() <= 1e-6:
             raise GeometryError("a camera's rotation must be orthonormal")
         if np.linalg.det(self.rotation) < 0.0:
@@ -100,8 +100,8 @@ class ViewingCamera:
     def shifted(self, origin_world: NDArray[np.float64]) -> ViewingCamera:
         """Return the same camera in coordinates whose origin is at `origin_world` (3,).
 
-        For survey coordinates of 10^6 m, project offsets with the shifted camera: R x + t, a sum of
-        large numbers, would lose the precision of float32 offsets.
+        With survey coordinates of 10^6 m, use it to project offsets: R x + t, a sum of large
+        numbers, would not keep the precision of float32 offsets.
         """
         return replace(self, translation=self.rotation @ origin_world + self.translation)
 
@@ -123,7 +123,7 @@ class ViewingCamera:
         """Return (u, v, depth in metres) (n, 3) of world points (n, 3).
 
         u and v are NaN for points behind the camera or outside the valid range of the lens model.
-        Points outside the image have pixels outside it.
+        Points outside the image have pixel coordinates outside its limits.
         """
         points = np.asarray(points_world, dtype=np.float64)
         projected = np.empty((len(points), 3))
@@ -154,7 +154,7 @@ class ViewingCamera:
         return np.column_stack([u, v, z])
 
     def sees(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels (n, 2) are inside the image; NaN counts as outside."""
+        """Return a mask (n,) of pixels (n, 2) that are inside the image; NaN counts as outside."""
         u, v = pixels_photo[:, 0], pixels_photo[:, 1]
         return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
@@ -162,8 +162,8 @@ class ViewingCamera:
         """Return ray directions (n, 3) with z = 1, in camera axes, of pixels (n, 2).
 
         Raises:
-            GeometryError: the distortion cannot be inverted there, for example beyond the radius at
-                which the model folds back.
+            GeometryError: the distortion cannot be inverted, for example beyond the radius at which
+                the model folds back.
         """
         found = undistorted(*self.bent_rays(pixels_photo.T), self.distortion)
         if found.size and not np.abs(found[2]).max() < 1e-9:
@@ -225,10 +225,10 @@ def looking_at(
     target_world: NDArray[np.float64],
     up: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the rotation (3, 3) camera_from_world of a level camera aimed at a point.
+    """Return the rotation (3, 3) camera_from_world of a levelled camera aimed at a point.
 
     Raises:
-        GeometryError: the camera would look straight up or down, so that level is undefined.
+        GeometryError: the camera would look straight up or down, so it cannot be levelled.
     """
     forward = target_world - centre_world
     forward = forward / np.linalg.norm(forward)
@@ -247,20 +247,21 @@ def opencv_matrix(lens: ViewingCamera) -> NDArray[np.float64]:
 
 
 POSE_PARAMETERS: Final = 6
-# Standard deviations of ln(focal length) with and without EXIF. EXIF contains the focal length in
-# whole millimetres or as full-frame equivalent, and not the focusing distance; without EXIF, the
-# range of common lenses is used.
+# Standard deviation of ln(focal length) with EXIF, which contains the focal length in whole
+# millimetres or as a full-frame equivalent, and not the focusing distance.
 _EXIF_SIGMA: Final = 0.05
+# Standard deviation of ln(focal length) without EXIF: the range of common lenses.
 _UNKNOWN_SIGMA: Final = 0.35
 # Standard deviations of the other parameters of an uncalibrated lens. Fixing them at zero distorts
-# the pose: photos had 2.4 times their predicted error and 1.7 times the error with free parameters.
-# Pixels are square to 1/1000, which is more than a pixel at the edge of an image.
+# the pose: errors of photos were 2.4 times the predicted ones and 1.7 times those with free
+# parameters. Pixels are square to 1/1000, which corresponds to more than a pixel at the edge of an
+# image.
 _ASPECT_SIGMA: Final = 1e-3
 _CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
 _K2_SIGMA: Final = 0.1
 _TANGENTIAL_SIGMA: Final = 1e-3
-# Index of a name in the distortion coefficients k1, k2, p1, p2, k3.
+# Indices in the distortion coefficients k1, k2, p1, p2, k3.
 _COEFFICIENTS: Final = {"k1": 0, "k2": 1, "p1": 2, "p2": 3}
 
 
@@ -443,7 +444,7 @@ class _Bent:
     a: NDArray[np.float64]
     b: NDArray[np.float64]
     a_by_a: NDArray[np.float64] | float
-    a_by_b: NDArray[np.float64] | float  # and of b by a
+    a_by_b: NDArray[np.float64] | float  # also of b by a
     b_by_b: NDArray[np.float64] | float
 
 
@@ -467,7 +468,7 @@ def _bent(a: NDArray[np.float64], b: NDArray[np.float64], distortion: NDArray[np
 def _lens_columns(
     a: NDArray[np.float64], b: NDArray[np.float64], bent: _Bent
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return derivatives of the distorted ray by all lens parameters except the centre."""
+    """Return derivatives of the distorted ray by all lens parameters except the principal point."""
     r2 = a * a + b * b
     return {
         "focal": (bent.a, bent.b),
@@ -480,5 +481,5 @@ def _lens_columns(
 
 
 def _factor(logarithm: float) -> float:
-    """Return the factor for a change of a logarithm, at most e, to prevent divergence."""
+    """Return the factor for a change of a logarithm; at most e, to prevent divergence."""
     return math.exp(min(1.0, max(-1.0, logarithm)))

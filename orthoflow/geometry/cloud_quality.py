@@ -16,9 +16,9 @@ from orthoflow.geometry.robust import median_deviation
 def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
     """Estimate the point spacing on a wall from the numbers of points per cell.
 
-    Cells are merged 2 x 2 until blocks with points contain at least four on average. Then hardly
-    any block of scanned surface is empty by chance, and the blocks with points show the scanned
-    area.
+    Cells are merged 2 x 2 until blocks with points contain at least four points on average. Then
+    hardly any block on a scanned surface is empty by chance, so the area of the blocks with points
+    is the scanned area.
 
     Args:
         count: (rows, cols) number of points per cell.
@@ -49,24 +49,24 @@ def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
     return sums
 
 
-# Sides of pieces in metres; the next one is used if pieces contain too few points.
+# Sides of pieces in metres; if pieces contain too few points, the next value is used.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
 _PIECES_MOST: Final = 300
 _PIECES_LEAST: Final = 20
-# Minimum number of points of one scan in a piece, and maximum number used.
+# Minimum number of points of one scan in a piece, and maximum number of points used.
 _POINTS_LEAST: Final = 30
 _POINTS_MOST: Final = 4000
-# Points processed together, few enough for the cache of the processor.
+# Number of points processed together; small enough for the processor's cache.
 _AT_ONCE: Final = 1 << 16
 _HASH_BITS: Final = 20
 _CUBE_BITS: Final = 21
 _GATHERED_MOST: Final = 1_500_000
-# Points assigned to cubes; for larger clouds, only those in some slabs of cubes.
+# Maximum number of points assigned to cubes; of larger clouds, only some slabs of cubes are used.
 _LOOKED_AT_MOST: Final = 4_000_000
 # Odd numbers with well distributed bits, so that the upper bits of a product depend on all bits.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
-# A piece is a single surface if this share of its points is near its plane, if their scatter is
-# below this share of its side, and if they cover it in both directions.
+# A piece is a single surface if at least this share of its points is near its plane, if the scatter
+# of the points is below this share of its side, and if they extend over it in both directions.
 _SURFACE_SHARE: Final = 0.85
 _SCATTER_SIDES: Final = 0.1
 _COVER_SIDES: Final = 0.15
@@ -74,11 +74,12 @@ _NEAR_SIGMAS: Final = 4.0
 # Standard deviation of the median of n values, relative to that of one value divided by sqrt(n).
 _MEDIAN_SIGMA: Final = 1.2533
 _SURE_SIGMAS: Final = 3.0
-# Scans closer to each other than this agree, even if they scatter less.
+# Scans closer to each other than this agree, even if their scatter is smaller.
 _AGREE_M: Final = 0.001
-# Tolerance in degrees for level and upright pieces; noise tilts the smallest pieces by 2 degrees.
+# Tolerance for level and upright pieces; noise tilts the smallest pieces by 2 degrees.
 _SQUARE_DEG: Final = 5.0
-# If the given up direction is right, hardly any building lacks level pieces.
+# If fewer pieces than this share are level, the given up direction is wrong, since hardly any
+# building lacks level surfaces.
 _LEVEL_NONE: Final = 0.03
 _LEVEL_PLAIN: Final = 0.15
 _SQUARE_PLAIN: Final = 0.8
@@ -122,12 +123,12 @@ class CloudQuality:
         return float(is_level.mean()), float((is_level | is_upright).mean())
 
     def plainly_up(self, up: NDArray[np.float64]) -> int | None:
-        """Return the axis (0, 1, 2) that is up judging by surfaces; None if `up` may be right.
+        """Return the axis (0, 1, 2) that is up according to surfaces; None if `up` may be right.
 
         `up` is wrong if no surface is level with respect to it and many are inclined, while all
-        surfaces are level or upright with respect to one axis, and some of them are level. None is
-        returned for slopes, single walls and rooms parallel to all axes, which look the same along
-        each axis.
+        surfaces are level or upright with respect to one axis, and some of them are level. The
+        result is None for slopes, single walls, and rooms that are parallel to all axes, since they
+        look the same along each axis.
         """
         level, square = self.square_shares(up)
         for axis, direction in enumerate(np.eye(3)):
@@ -139,12 +140,12 @@ class CloudQuality:
 
     @property
     def is_thick(self) -> bool:
-        """Return whether the thickness of the cloud exceeds its point spacing."""
+        """Whether the thickness of the cloud exceeds its point spacing."""
         return self.sigma_m > self.scan_step_m
 
     @property
     def disagrees(self) -> bool:
-        """Return whether scans are farther apart than they scatter, and than by chance."""
+        """Whether scans are farther apart than their scatter and than could be due to chance."""
         if self.scans_apart_m is None:
             return False
         limit_m = max(self.sigma_m, _AGREE_M, _SURE_SIGMAS * self.sigma_apart_m)
@@ -153,7 +154,7 @@ class CloudQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class _Piece:
-    """Measurements of one piece; `apart_m` is NaN if it is in one scan only."""
+    """Measurements of one piece; `apart_m` is NaN if only one scan contains it."""
 
     sigma_m: float
     width_95_m: float
@@ -166,14 +167,14 @@ class _Piece:
 def judge_quality(
     offsets: Sequence[NDArray[np.float32]], scan: NDArray[np.uint16] | None
 ) -> CloudQuality | None:
-    """Measure a cloud on a few hundred pieces of surfaces distributed over it.
+    """Measure a cloud on a few hundred pieces of surfaces that are distributed over it.
 
     Args:
         offsets: three arrays (n,) of coordinates in metres.
-        scan: (n,) scan of each point; None if there is one scan.
+        scan: (n,) scan of each point; None if there is only one scan.
 
     Returns:
-        The medians; None if there are too few pieces with a surface.
+        The medians; None if too few pieces contain a surface.
     """
     for side_m in _SIDES_M:
         pieces = [
@@ -208,11 +209,11 @@ def _indices_of_pieces(
         chosen = start + np.flatnonzero(is_slab[slabs])
         found.append(chosen[is_asked[_hash(_cubes(offsets, lows, chosen, side_m))]])
     indices = np.concatenate(found)
-    # Different cubes with the same hash are distinguished by their numbers.
+    # Cubes with the same hash are distinguished by their numbers.
     x, y, z = (axis.astype(np.int64) for axis in _cubes(offsets, lows, indices, side_m))
     groups = x + (y << _CUBE_BITS) + (z << 2 * _CUBE_BITS)
     known = np.unique(groups)
-    # For a dense cloud, fewer pieces suffice.
+    # In a dense cloud, fewer pieces suffice.
     known = known[:: max(1, len(indices) // _GATHERED_MOST)]
     is_known = np.isin(groups, known)
     indices, groups = indices[is_known], groups[is_known]

@@ -1,4 +1,4 @@
-"""Progress of the compilation of kernels; this module does not load the compiler."""
+"""Progress of the compilation of kernels. This module does not load the compiler."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _listeners: list[Listener] = []
 
 @contextmanager
 def on_compiling(listener: Listener) -> Iterator[None]:
-    """Report the kernels that are compiled within a `with` block, in any thread.
+    """Report the kernels that any thread compiles within a `with` block.
 
     Args:
         listener: called with `compiling NAME (3 so far)` when a compilation begins, and with an

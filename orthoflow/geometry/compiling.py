@@ -5,8 +5,9 @@ are among the arguments, the wrappers take as long to compile as the function it
 are called only by kernels need no wrappers.
 
 Numba caches kernels, but not its own functions, so each process that compiles a kernel also
-compiles the numba functions called by it. Assigning an array to a slice (`part[2:] = array`) needs
-forty of them for an error message about shapes; kernels therefore assign single numbers.
+compiles the numba functions called by it. To assign an array to a slice (`part[2:] = array`), forty
+of them are compiled just for an error message about shapes; therefore, kernels assign single
+numbers.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from orthoflow.geometry.compile_events import report_compiling
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
-# About 40 kB each; one version of orthoflow has about 400.
+# Maximum number of files in the cache, of about 40 kB each. One version of orthoflow has about 400.
 _MAX_FILES: Final = 8000
 _UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -56,12 +57,12 @@ def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def kernel_part(function: _Kernel) -> _Kernel:
-    """Compile a function called only by kernels, when the calling kernel is compiled."""
+    """Compile a function that only kernels call, when a kernel that calls it is compiled."""
     return cast("_Kernel", _kept(function, **_UNWRAPPED))
 
 
 def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
-    """Compile a function called only by kernels for one signature, when it is loaded.
+    """Compile a function that only kernels call for one signature, when it is loaded.
 
     Without a signature, a version would be compiled for each constant argument.
     """
@@ -76,15 +77,15 @@ def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
     return compile_part
 
 
-# Any, because numba has no types for kernels.
+# The type is Any, because numba has no types for kernels.
 def _kept(function: Callable[..., Any], **options: object) -> Any:
     """Return a kernel whose compiled code is cached between processes."""
-    # No exception for a division by 0, so that loops can be vectorised.
+    # Divisions by 0 raise no exception, so that loops can be vectorised.
     kernel = numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload]  # the stubs leave options out
     if not isinstance(kernel, Dispatcher):
         # With NUMBA_DISABLE_JIT, the function runs in Python.
         return kernel
-    # Without a writable folder for the cache, kernels are compiled in each process.
+    # If there is no writable folder for the cache, each process compiles its kernels.
     with suppress(RuntimeError):
         # Numba has no public attribute for the cache.
         vars(kernel)["_cache"] = _KernelCache(function)  # type: ignore[no-untyped-call]
@@ -95,10 +96,10 @@ def _kept(function: Callable[..., Any], **options: object) -> Any:
 class _KernelCache(FunctionCache):
     """Cache of the compiled code of a function, identified by the content of all its code.
 
-    Numba itself checks only the file of a kernel, not the functions that it calls in other files.
-    Here, file names contain the digest of the kernel, of all functions that it calls, and of the
-    constants used in them. Thus only kernels affected by an edit are recompiled, independently of
-    the folder of a checkout, and several versions of the code can share a cache.
+    Numba itself checks only the file that contains a kernel, not the functions that the kernel
+    calls in other files. Here, file names contain a digest of the kernel, all functions that it
+    calls, and the constants used in them. Thus only kernels affected by an edit are recompiled,
+    independently of the folder of a checkout, and several versions of the code can share a cache.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -118,7 +119,7 @@ class _KernelCache(FunctionCache):
             self._cache_file.save(key, self._impl.reduce(data))  # type: ignore[no-untyped-call]
 
     def _open_files(self) -> None:
-        """Return the cache files; at the first call, because callees may be defined later."""
+        """Return the cache files, set up at the first call because callees may be defined later."""
         if not isinstance(self._cache_file, _KernelFiles):
             root = cast("str", vars(config)["CACHE_DIR"])
             folder = Path(root, "kernels") if root else Path(self._cache_path)
@@ -139,9 +140,9 @@ class _KernelCache(FunctionCache):
 class _KernelFiles(IndexDataCacheFile):
     """Files with the index and the compiled versions of a kernel.
 
-    Numba numbers the files of versions, so two processes that compile two versions at the same time
-    may use the same number, and an index may refer to the code of the other version. Here all file
-    names are unique. A file truncated by a power failure is ignored.
+    Numba numbers the files of versions. Two processes that compile different versions at the same
+    time may therefore use the same number, and an index may refer to the code of the wrong version.
+    Here all file names are unique. A file truncated by a power failure is ignored.
     """
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
@@ -168,7 +169,7 @@ class _KernelFiles(IndexDataCacheFile):
 
 
 def content_digest(function: FunctionType) -> str:
-    """Return the SHA-256 of everything, except argument types, that affects compiled code.
+    """Return the SHA-256 of everything that affects compiled code, except argument types.
 
     This includes the bytecode and the constants of the function and of all functions that it calls,
     and the values of module constants used in them.
@@ -195,7 +196,7 @@ def content_digest(function: FunctionType) -> str:
 
 
 def _decisive(function: FunctionType) -> tuple[object, ...]:
-    """Code of a function and of its nested functions, and the values of global names in it."""
+    """Return the code of a function and its nested functions, and values of their globals."""
     cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
     found: list[object] = [function.__defaults__, cells]
     for code in _all_code(function.__code__):
@@ -218,7 +219,7 @@ def _described(value: object) -> bytes:
         return f"{value.__module__}.{value.__qualname__}{fields}".encode()
     if isinstance(value, int | float | complex | str | bytes | None):
         return repr(value).encode()
-    # Part of a library; the version of numba and the platform are part of the digest.
+    # This is part of a library; the digest includes the version of numba and the platform.
     return str(getattr(value, "__name__", type(value).__name__)).encode()
 
 
@@ -231,7 +232,7 @@ def _all_code(code: CodeType) -> Iterator[CodeType]:
 
 
 def _field_names(type_: object) -> tuple[object, ...]:
-    """Return field names of named tuples in types, because numba compares only field types."""
+    """Return field names of named tuples among types, because numba compares only field types."""
     if isinstance(type_, types.NamedTuple | types.NamedUniTuple):
         fields = type_.instance_class._fields
         return (fields, *map(_field_names, type_.types))
@@ -240,9 +241,9 @@ def _field_names(type_: object) -> tuple[object, ...]:
 
 
 def _give_constants_no_version(kernel: Any) -> None:
-    """Let kernels call the same version for all integers, whether constant or not.
+    """Let kernels call the same version of a function for all integers, constant or not.
 
-    Otherwise numba would compile a version for each constant, and an unused one for the initial
+    Otherwise, numba would compile a version for each constant, and an unused one for the initial
     value 0 of a counter.
     """
     template_for = kernel.get_call_template
@@ -259,7 +260,7 @@ def _give_constants_no_version(kernel: Any) -> None:
 
 
 class _Compilation(event.Listener):
-    """Reports which kernel is being compiled, including the kernels needed by another one.
+    """Reports which kernel is being compiled, including kernels that other kernels call.
 
     The lock of the compiler ensures that only one thread compiles at a time.
     """

@@ -9,21 +9,24 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-# Correlation lengths, as shares of the extent of the points of a photo: for rough errors
+# Correlation lengths, as shares of the extent of the points of a photo, for rough errors
 # (exponential correlation: matching, structure, steps between scans) and smooth errors (Gaussian
-# correlation: bending, drift of a path, stereo). Shorter ones are practically independent errors;
-# longer ones are shifts and tilts of all points, which do not appear in residuals.
+# correlation: bending, drift of a path, stereo). Errors with shorter correlation lengths are
+# practically independent; those with longer ones are shifts and tilts of all points, which do not
+# appear in residuals.
 _ROUGH: Final = (0.04, 0.15, 0.5, 1.5)
 _SMOOTH: Final = (0.05, 0.15, 0.4, 1.0)
 # Ratios of the standard deviation of the common error to that of the independent error. Their prior
-# is uniform on a logarithmic scale, with an exponential decay at ratios above about 1.
+# is uniform on a logarithmic scale and decays exponentially above a ratio of about 1.
 _RATIOS: Final = np.geomspace(0.003, 10.0, 25)
-# Neighbouring points of a photo are averaged in cells; these are the maximum numbers of cells.
+# Neighbouring points of a photo are averaged in cells. These are the maximum numbers of cells for
+# one photo and for several.
 _MAX_CELLS: Final = 130
 _MAX_CELLS_OF_SEVERAL: Final = 280
+# Side of the smallest cells, as a share of the extent of the points of a photo.
 _FINEST_CELL: Final = 0.02
 _COARSER: Final = 1.15
-# Directions of the residuals are absorbed by the adjustment if less than this share remains.
+# The adjustment absorbs directions of the residuals of which less than this share remains.
 _ABSORBED: Final = 1e-3
 
 
@@ -38,7 +41,7 @@ class AdjustedPoints:
         jacobian: (n, 2, p) derivatives with respect to the unknowns, in standard deviations.
         by_place: (n, 2, 3) derivatives with respect to the position, standard deviations per metre.
         pulls: (n, p, 3) effect of a position error on the normal equations, per metre.
-        towards: (n, 3) unit vectors out of the surface, the direction of depth errors, which are
+        towards: (n, 3) unit vectors out of the surface, in the direction of depth errors, which are
             the largest errors of a cloud.
         cofactors: (p, p) inverse of the normal matrix.
     """
@@ -54,7 +57,7 @@ class AdjustedPoints:
 
     @property
     def extent_m(self) -> float:
-        """Return the extent of the points of a photo in metres, median over the photos."""
+        """Median over the photos of the extent of a photo's points, in metres."""
         reaches = []
         for photo in np.unique(self.photo):
             mine = self.places[self.photo == photo]
@@ -67,21 +70,23 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
     """Return the covariance (p, p) of an adjustment whose points may have common errors.
 
     Each residual has an independent error and an error in common with its neighbours: of the
-    positions (common to all photos), of their depth only, or of one photo (its lens or matching).
-    The part of a common error that the adjustment absorbs leaves no residual, so its size and
-    correlation length are never known exactly. Therefore the covariance is not chosen by a test. It
-    is a mean over all kinds, lengths and sizes of common errors, each weighted by the likelihood of
-    the residuals (restricted likelihood: Harville 1977, doi:10.1080/01621459.1977.10480998; model
-    averaging: Hoeting et al. 1999, doi:10.1214/ss/1009212519).
+    positions (common to all photos), of their depths only, or of one photo (due to its lens or to
+    matching). The part of a common error that the adjustment absorbs leaves no residual, so its
+    size and correlation length are never known exactly. Therefore, the covariance is not chosen by
+    a test; it is a mean over all kinds, lengths and sizes of common errors, each weighted by the
+    likelihood of the residuals (restricted likelihood: Harville 1977,
+    doi:10.1080/01621459.1977.10480998; model averaging: Hoeting et al. 1999,
+    doi:10.1214/ss/1009212519).
 
     A common shift of all positions leaves no residual at all and is not included.
 
     Args:
         points: the points with known positions.
-        sigma0: standard deviation of unit weight of the whole adjustment. Its variance counts as
-            independent, since ties between photos are not affected by position errors.
+        sigma0: standard deviation of unit weight of the whole adjustment. It is used as that of the
+            independent errors, since position errors do not affect ties between photos.
     """
-    # One thread only: on a busy machine, synchronisation makes eigenvalues ten times as slow.
+    # Use one thread only: on a busy machine, synchronisation makes eigenvalue solvers ten times as
+    # slow.
     with threadpoolctl.threadpool_limits(1):
         return _averaged(points, sigma0)
 
@@ -98,7 +103,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
         np.add.at(sums, cells, values)
         return sums / counts.reshape(-1, *[1] * (values.ndim - 1))
 
-    # Means per cell, in units of the standard deviation of a mean of independent errors.
+    # Compute means per cell, in units of the standard deviation of a mean of independent errors.
     roots = np.sqrt(counts)[:, None, None]
     residuals = means(points.residuals)
     scatter = float(((points.residuals - residuals[cells]) ** 2).sum())
@@ -138,7 +143,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
             values, vectors = np.linalg.eigh(whitening.T @ expected @ whitening / unit)
             spread = 1.0 + _RATIOS[:, None] ** 2 * np.maximum(values, 0.0)
             squares = ((vectors.T @ white) ** 2 / spread).sum(axis=1) + scatter
-            # Avoids the logarithm of 0 for points without any error.
+            # Avoid the logarithm of 0 for points without any error.
             squares = np.maximum(squares, np.finfo(np.float64).tiny)
             evidence.append(
                 -0.5 * np.log(spread).sum(axis=1) - 0.5 * n_free * np.log(squares) - _RATIOS
@@ -147,9 +152,10 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
             errors.append(pulled / unit)
     weights = np.exp(np.array(evidence) - np.max(evidence))
     weights *= np.array(variances) / weights.sum()
-    # Mean of the standard deviation; a mean of the variance would depend on the tail of the prior.
+    # Average the standard deviation, since a mean of the variance would depend on the tail of the
+    # prior.
     of_kinds = (weights @ _RATIOS) ** 2 / np.maximum(weights.sum(axis=1), 1e-300)
-    # Rounded so that later results do not depend on the order of summation.
+    # Round, so that later results do not depend on the order of summation.
     shares_of = [float(f"{value:.4g}") for value in of_kinds]
     common = sum(share * error for share, error in zip(shares_of, errors, strict=True))
     moves = points.cofactors @ _stable(np.asarray(common)) @ points.cofactors
@@ -166,7 +172,7 @@ def _kinds(
     towards: NDArray[np.float64],
     photo: NDArray[np.float64],
 ) -> list[tuple[list[_Direction], NDArray[np.bool_]]]:
-    """Return the directions of each kind of common error, and which pairs (n, n) share it."""
+    """Return the directions of each kind of common error, and a mask (n, n) of pairs sharing it."""
     axes = [(by_place[:, :, axis].ravel(), pulls[:, :, axis]) for axis in range(3)]
     by_depth = np.einsum("nid,nd->ni", by_place, towards).ravel()
     depth = [(by_depth, np.einsum("npd,nd->np", pulls, towards))]
@@ -177,7 +183,7 @@ def _kinds(
 
 
 def _cells(points: AdjustedPoints, extent_m: float, n_most: int) -> NDArray[np.intp]:
-    """Return the cell (n,) of each point; cells are cubes in space, separate for each photo."""
+    """Return the cell (n,) of each point; cells are cubes in space, separately for each photo."""
     side = _FINEST_CELL
     while True:
         cubes = np.floor(points.places / (side * extent_m)).astype(np.intp)

@@ -12,7 +12,7 @@ from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.slabs import Offsets
 
-# Counts are limited, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
+# Limit of counts, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
 COUNT_MOST: Final = 2000
 
 # Points closer to the projection centre belong to the camera or its tripod.

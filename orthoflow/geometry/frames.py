@@ -1,6 +1,6 @@
 """Directions, planes and wall frames in the world.
 
-A wall frame transforms between the cells of a wall's raster and the world.
+A wall frame converts between the cells of a wall's raster and the world.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ UP_VECTORS: Final[dict[UpDirection, tuple[float, float, float]]] = {
     "-z": (0.0, 0.0, -1.0),
 }
 
-# Axis e1 for each up axis; e2 = up x e1 completes the right-handed frame: (x, y, z) if up = z.
+# Axis e1 for each up axis; e2 = up x e1 completes the right-handed frame, which is (x, y, z) if up
+# = z.
 _FIRST_AXES: Final[dict[int, tuple[float, float, float]]] = {
     0: (0.0, 1.0, 0.0),
     1: (0.0, 0.0, 1.0),
@@ -40,7 +41,7 @@ def up_vector(direction: UpDirection) -> NDArray[np.float64]:
 
 
 def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the right-handed frame in which "horizontal" and the angles omega and phi are defined.
+    """Return the right-handed frame that defines horizontal directions and angles omega, phi.
 
     Args:
         up: (3,) unit vector in world axes.
@@ -168,7 +169,7 @@ def signed_area(ring: NDArray[np.float64]) -> float:
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
-# A plane is a floor or ceiling if the angle between its normal and the vertical is smaller: for a
+# A plane is a floor or ceiling if the angle between its normal and the vertical is smaller. With a
 # nearly vertical normal, the direction to the right of the viewer would depend on noise.
 LEVEL_LIMIT_DEG: Final = 10.0
 # Coordinates in survey frames on Earth are smaller; larger ones are corrupt.
@@ -253,7 +254,7 @@ class WallFrame:
 
     @property
     def raster_corner_m(self) -> tuple[float, float]:
-        """Return X and Y, in files, of the outer corner of the top-left cell."""
+        """X and Y, in files, of the outer corner of the top-left cell."""
         axes = self.raster_axes
         if axes == "map":
             return float(self.origin_world[0]), float(self.origin_world[1])
@@ -264,17 +265,17 @@ class WallFrame:
 
     @property
     def raster_down(self) -> float:
-        """Return the change of Y per metre in the direction of v: -1, or 1 for ceilings."""
+        """Change of Y per metre in the direction of v: -1, or 1 for ceilings."""
         if self.up is None or self.raster_axes != "level":
             return -1.0
         return 1.0 if float(self.normal_world @ self.up) < 0.0 else -1.0
 
     @property
     def crs(self) -> str:
-        """Return the name of the coordinate system in files: that of the map or of the wall.
+        """Name of the coordinate system in files: that of the map or of the wall.
 
-        The latter consists of the name of the wall and a hash of the world position of X = Y = 0,
-        so it is the same for all rasters and parts of one wall, and unique to the wall.
+        The latter consists of the name of the wall and a hash of the world position of X = Y = 0.
+        So it is the same for all rasters and parts of a wall, and differs between walls.
         """
         if self.map_crs is not None:
             return self.map_crs
@@ -287,7 +288,7 @@ class WallFrame:
 
     @property
     def plane(self) -> Plane:
-        """Return the plane of the raster."""
+        """Plane of the raster."""
         return Plane(
             normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
         )
@@ -298,7 +299,7 @@ class WallFrame:
         return replace(self, origin_world=corner, height=rows.stop - rows.start)
 
     def has_cells_of(self, other: WallFrame) -> bool:
-        """Return whether both have the same cells, within 0.001 cells at the corners."""
+        """Return whether both frames have the same cells, within 0.001 cells at the corners."""
         if self.shape != other.shape:
             return False
         apart = np.abs(self.corners_world() - other.corners_world()).max()
@@ -355,8 +356,8 @@ def wall_axes(normal: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[n
     """Return the axes u and v of a wall frame on a plane.
 
     u is horizontal and points to the right of the viewer. For floors and ceilings (normal within 10
-    degrees of the vertical) u is the axis e1 of `basis_from_up` projected onto the plane, so that a
-    floor looks like a map, with e1 to the right and e2 upwards.
+    degrees of the vertical), u is the axis e1 of `basis_from_up` projected onto the plane, so that
+    a floor looks like a map, with e1 to the right and e2 upwards.
 
     Args:
         normal: (3,) unit vector towards the viewer.
@@ -405,8 +406,7 @@ def frame_over(
         v_world=np.cross(u, normal),
         normal_world=normal.copy(),
         gsd_m=gsd_m,
-        # With a tolerance of 1e-6 cells, so that 3.000000001 m with 3 mm cells does not add a
-        # column.
+        # The tolerance is 1e-6 cells, so that 3.000000001 m with 3 mm cells does not add a column.
         width=max(1, math.ceil(width_m / gsd_m - 1e-6)),
         height=max(1, math.ceil(height_m / gsd_m - 1e-6)),
     )

@@ -1,10 +1,10 @@
 """Interpolation of raster cells from surrounding points.
 
 All cells around a cell are used, weighted by the distance of their points from its centre, and a
-plane through their values gives the value at the centre. No direction is preferred, so rotating or
-mirroring a raster rotates or mirrors the result, up to the order of summation.
+plane through their values gives the value at the centre. No direction is preferred: if a raster is
+rotated or mirrored, so is the result, except for the order of summation.
 
-This module loads numba: methods import it inside functions.
+This module loads numba, so methods import it inside functions.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.threads import in_parts
 
-# Cells up to this multiple of the distance of the nearest one are used, and all eight neighbours.
+# Cells are used up to the distance of the nearest one plus this number of cells.
 _BEYOND_CELLS: Final = 1.0
+# Cells within this squared distance, the eight neighbours, are always used.
 _NEIGHBOURS_SQUARE: Final = 2.0
 # Standard deviation of the weights, relative to the distance to the nearest cell (at least 1 cell).
 _SIGMA_SHARE: Final = 0.5
 # (1 - x / 8)^8 approximates exp(-x) in a tenth of the time; it is 0 for the outermost cells.
 _WEIGHT_LEAST: Final = 1e-6
-# A slope is set to zero if the points hardly determine it.
+# Regularisation that reduces a slope to zero if the points hardly determine it.
 _RIDGE: Final = 0.005
 # Points with a smaller difference of squared distances count as equally near.
 _AS_NEAR: Final = 1e-6
 
 
 class CellValues(NamedTuple):
-    """Values of the cells of a raster, in flat arrays; empty arrays are ignored.
+    """Values of the cells of a raster, as flat arrays; empty arrays are ignored.
 
     Attributes:
         depth_m: float32, NaN if void.
@@ -87,21 +88,21 @@ def interpolate(
 ) -> NDArray[np.bool_]:
     """Interpolate cells linearly from surrounding cells.
 
-    A void cell is interpolated from the surrounding points of one surface: that of its own depth if
-    known, otherwise that of the nearest point (of equally near points, the one nearest to the
-    viewer). The value of a cell with points is shifted from the position of its points to the
-    centre. Results are limited to the range of the surrounding values.
+    A void cell is interpolated from the surrounding points of one surface: the surface at its own
+    depth if known, otherwise that of the nearest point (or, of equally near points, the one nearest
+    to the viewer). The value of a cell with points is shifted from the position of its points to
+    the centre. Results are limited to the range of the surrounding values.
 
     Args:
         cells: (n,) flat indices of the cells to interpolate.
         around: cells from which they are interpolated.
-        values: values of these cells, and depths of the cells to interpolate if known.
-        into: output; may be `values` if none of `cells` is used for others.
+        values: values of these cells and, if known, depths of the cells to interpolate.
+        into: output; may be `values` if no cell in `cells` is used to interpolate others.
         reach_cells: maximum distance to the nearest cell that can be used.
         threads: number of threads.
 
     Returns:
-        (n,) whether each cell was interpolated; others are unchanged.
+        Mask (n,) of the cells that were interpolated; all others are unchanged.
     """
     wanted = _Wanted(
         cells=cells,
@@ -125,7 +126,7 @@ def _offsets_within(radius_cells: float) -> NDArray[np.int64]:
 
 
 class _Wanted(NamedTuple):
-    """The cells to interpolate, their neighbourhood, and whether they were interpolated."""
+    """The cells to interpolate, their neighbourhood, and a mask of interpolated cells."""
 
     cells: NDArray[np.int64]
     offsets: NDArray[np.int64]

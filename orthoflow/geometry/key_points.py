@@ -1,8 +1,8 @@
 """Evenly distributed key points of pictures, and matching of their descriptors.
 
 OpenCV's SIFT shifts all key points by a quarter of a pixel to the right and down unless its precise
-upscaling is enabled (opencv issue 23123; measured with 5.0: 0.25 px, for all sizes). This would be
-a systematic error of an orientation, so it is subtracted if the default upscaling is used.
+upscaling is enabled (opencv issue 23123; measured with 5.0: 0.25 px, for all sizes). The shift
+would be a systematic error of an orientation, so it is subtracted if the default upscaling is used.
 """
 
 from __future__ import annotations
@@ -17,24 +17,25 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.rows import Rows
 
-# OpenCV's default contrast threshold, half of it, which still gives correct matches, and OpenCV's
-# default ratio of curvatures.
+# OpenCV's default contrast threshold.
 _OPENCV_CONTRAST: Final = 0.04
+# Half of the default, which still gives correct matches.
 _MIN_CONTRAST: Final = 0.02
+# OpenCV's default ratio of curvatures.
 _MAX_EDGE_RATIO: Final = 10.0
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
 # SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. Tiles limit the memory.
 _TILE_PX: Final = 2048
 _TILE_OVERLAP_PX: Final = 96
 _SPREAD_CELLS: Final = 12
-# No key points are searched in smaller pictures.
+# In smaller pictures, no key points are searched for.
 _MIN_SIDE_PX: Final = 16
-# Unit of RootSIFT entries is 1/512. Sums of their products are below 2^24, so float32 products are
-# exact, regardless of the order of summation in a BLAS library.
+# The unit of RootSIFT entries is 1/512. Sums of their products are below 2^24, so float32 products
+# are exact, regardless of the order of summation in a BLAS library.
 _QUANTA: Final = 512.0
-# Number of pairs whose descriptors are gathered at once: 2 x 32 MB.
+# Number of pairs whose descriptors are gathered at once (2 x 32 MB).
 _PAIRS_AT_ONCE: Final = 65_536
-# Number of entries in a block of distances: 12 MB, which fits into a processor's cache.
+# Number of entries in a block of distances; its 12 MB fit into a processor's cache.
 _BLOCK_ENTRIES: Final = 3_000_000
 
 
@@ -43,7 +44,7 @@ def in_turns(
 ) -> NDArray[np.intp]:
     """Return indices (k,) of up to `n_most` of n items, taken in turn from the cells of a grid.
 
-    The selection covers the same area as the cells; within a cell, items are taken in sort order.
+    The selection covers the same area as the items; within a cell, items are taken in sort order.
 
     Args:
         cell: (n,) cell of each item.
@@ -108,7 +109,7 @@ class Features(Rows):
         """Return the key points of the image of this width, mirrored left to right.
 
         In a descriptor, mirroring reverses the order of the rows of the 4 x 4 fields and the sense
-        of the 8 directions, both relative to the main direction.
+        of rotation of the 8 directions, both relative to the main direction.
         """
         fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
         turned = fields[..., (8 - np.arange(8)) % 8]
@@ -157,7 +158,7 @@ def find_features(
         most = np.array(usable.shape[::-1]) - 1
         columns, rows = np.clip(pixels[chosen].astype(np.intp), 0, most).T
         chosen = chosen[usable[rows, columns]]
-    # Take the strongest in turn from the cells of a coarse grid.
+    # Take the strongest key points in turn from the cells of a coarse grid.
     scale = _SPREAD_CELLS / np.array([picture.shape[1], picture.shape[0]])
     cells = np.minimum((pixels[chosen] * scale).astype(np.intp), _SPREAD_CELLS - 1)
     u, v, strengths = points[chosen][:, [0, 1, 4]].T
@@ -207,8 +208,8 @@ def _described(
 ) -> NDArray[np.float32]:
     """Compute SIFT descriptors (n, 128) of the chosen key points, numbered over all tiles.
 
-    Only chosen key points are described: in a picture with much texture, one in ten is kept, and
-    description takes longer than detection.
+    Only chosen key points are described: in a picture with much texture, only one in ten is kept,
+    and description takes longer than detection.
     """
     raw = np.empty((len(chosen), 128), dtype=np.float32)
     first = 0
@@ -299,7 +300,7 @@ def mutual_matches(
 def best_matches(
     first: NDArray[np.float32], second: NDArray[np.float32], *, ratio: float
 ) -> Matches:
-    """Match each descriptor of the first set with its nearest in the second, in one direction.
+    """Match each descriptor of the first set with the nearest one in the second set.
 
     Args:
         first: (n, d) integer values, small enough that products are exact in float32.
@@ -403,7 +404,7 @@ def _distances(
 
 def _ratio(best: NDArray[np.float32], next_best: NDArray[np.float32]) -> NDArray[np.float64]:
     ratio = np.sqrt(np.maximum(best, 0.0) / np.maximum(next_best, 1e-12)).astype(np.float64)
-    # A single candidate cannot be compared, and of two identical candidates neither is distinct.
+    # A single candidate cannot be compared, and neither of two identical candidates is distinct.
     ratio[~np.isfinite(next_best) | (next_best <= 0.0)] = 1.0
     return ratio
 

@@ -1,4 +1,4 @@
-"""Colour levels with 8 or 16 bits per channel, converted in proportion to white.
+"""Conversion of colour levels with 8 or 16 bits per channel, in proportion to white.
 
 255 in 8 bits corresponds to 65535 in 16 bits; an 8-bit level times 257 is its 16-bit level.
 """
@@ -20,15 +20,17 @@ Level: TypeAlias = type[np.uint8] | type[np.uint16]
 REC_601: Final = np.array([0.299, 0.587, 0.114])
 # 16-bit levels per 8-bit level.
 DEEPER: Final = 257
-# Steps of the table from linear light to levels, which is nearly linear between them.
+# Number of steps of the table from linear light to levels, between which it is nearly linear.
 _STEPS: Final = 1 << 16
-# A picture has a single tone if this share of its cells is within one of 256 levels of the median,
-# darker than this share of white, or brighter than white minus this share.
+# A picture has a single tone if at least this share of its cells is almost black, almost white, or
+# within one of 256 levels of the median.
 _PLAIN_SHARE: Final = 0.98
+# Cells are almost black or white if they differ from black or white by less than this share of
+# white.
 _DARK: Final = 0.03
 _LEVEL: Final = 0.5 / 255.0
 _TONE_SAMPLE: Final = 40_000
-# Smaller pictures are not checked.
+# Pictures with fewer cells are not checked.
 _TONE_CELLS_MIN: Final = 2000
 
 
@@ -66,7 +68,7 @@ def light_of_levels(highest: int) -> NDArray[np.float32]:
 
 @cache
 def _share_of_light() -> NDArray[np.float32]:
-    """Return levels, 0 to 1, for equal steps of light; one more, for interpolation."""
+    """Return levels, 0 to 1, for equal steps of light, and an additional one for interpolation."""
     light = np.minimum(np.arange(_STEPS + 1) / (_STEPS - 1.0), 1.0)
     level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     return level.astype(np.float32)
@@ -75,7 +77,7 @@ def _share_of_light() -> NDArray[np.float32]:
 def lit_shares(
     levels: NDArray[np.floating], log_gains: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Multiply the light of levels (n, 3), 0 to 1, by the exponential of (n, 3)."""
+    """Multiply the linear light of levels (n, 3), 0 to 1, by exp(log_gains), (n, 3)."""
     light = np.interp(levels, np.linspace(0.0, 1.0, _STEPS), light_of_levels(_STEPS - 1))
     # Light is clipped to white, the end of the table.
     gained = light * np.exp(log_gains)
@@ -84,7 +86,7 @@ def lit_shares(
 
 
 def lit(colours: Colours, log_gains: NDArray[np.float32]) -> Colours:
-    """Multiply the light of colours (n, 3) by the exponential of (n, 3)."""
+    """Multiply the linear light of colours (n, 3) by exp(log_gains), (n, 3)."""
     highest = int(np.iinfo(colours.dtype).max)
     light = light_of_levels(highest)[colours] * np.exp(log_gains)
     place = np.clip(light, 0.0, 1.0) * np.float32(_STEPS - 1)
@@ -97,7 +99,7 @@ def lit(colours: Colours, log_gains: NDArray[np.float32]) -> Colours:
 def plain_tone(
     picture: NDArray[np.generic], mask: NDArray[np.uint8], shown: Sequence[int], *, white: float
 ) -> tuple[str, float] | None:
-    """Check whether a picture is almost entirely black, white or of one value.
+    """Check whether a picture is almost entirely black, white or uniform.
 
     Args:
         picture: (rows, cols) or (rows, cols, 3); NaN is ignored.

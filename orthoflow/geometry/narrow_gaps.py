@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 def narrow_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArray[np.int64]:
     """Find the void cells in narrow gaps.
 
-    A gap is narrow if no disc with the given radius fits into it. All other void cells are the
-    morphological opening of the void cells, so the shapes of windows and outlines are not changed.
+    A gap is narrow if no disc with the given radius fits into it. The other void cells are the
+    morphological opening of all void cells, so the shapes of windows and outlines do not change.
     Cells outside the raster count as void. Each cell found has a measured cell within the radius.
 
     Args:
@@ -26,7 +26,7 @@ def narrow_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArray[np
         return np.empty(0, dtype=np.int64)
     steps = np.arange(-radius_cells, radius_cells + 1)
     disc = (np.add.outer(steps**2, steps**2) <= radius_cells**2).astype(np.uint8)
-    # Padded with void cells, so that discs may extend beyond the raster.
+    # Pad with void cells, so that discs may extend beyond the raster.
     void = np.pad((~is_measured).astype(np.uint8), radius_cells, constant_values=1)
     opened = cv2.morphologyEx(void, cv2.MORPH_OPEN, disc, borderType=cv2.BORDER_REPLICATE)
     inner = (slice(radius_cells, -radius_cells),) * 2

@@ -23,19 +23,20 @@ from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24
-# Small enough to separate the legs of a chair, large enough to contain several points of a surface.
+# Side of a voxel: small enough to separate the legs of a chair, large enough to contain several
+# points of a surface.
 _VOXEL_CELLS: Final = 6.0
-# Scanners do not measure at shorter range. Points there are errors, and dense.
+# Scanners do not measure at shorter ranges. Points there are errors, even if they are dense.
 _BLIND_M: Final = 0.3
-# A voxel is empty if fewer than one in this many rays of a station end in it. A rod of 1 mm stops a
-# larger share of the rays through a cube of 0.2 m.
+# A voxel is empty if fewer than one in this many rays of a station end in it. A 1 mm rod stops a
+# larger share of the rays through a 0.2 m cube.
 _PASSING_RAYS: Final = 200
 _N_ELEVATIONS: Final = 90
 # Half the number of points in 3 x 3 x 3 voxels of a surface scanned with the spacing of the wall.
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
-# The corner of a surface has a quarter of these points, its edge half.
+# At the corner of a surface there are a quarter of these points, at its edge half.
 _CORNER_SHARE: Final = 0.25
-# Share of pairs of points in the same voxel: closer to 1 in 27 than to 1 in 9.
+# Limit of the share of point pairs in the same voxel; closer to 1 in 27 than to 1 in 9.
 _SPREAD_SHARE: Final = 0.07
 _SAMPLED_MOST: Final = 1 << 20
 # Points with fewer points around them (including themselves) are outliers and hide nothing.
@@ -95,7 +96,7 @@ def occluders_before(
         spacing_m: approximate point spacing on a wall. It must not be the size of coarser cells,
             because larger voxels contain more stray points of a dense scan.
         stations_world: (s, 3) metres, positions of the scanner, if known.
-        n_least: points with fewer neighbours are outliers; the number is increased for large boxes,
+        n_least: points with fewer neighbours are outliers; the number is increased in large boxes,
             whose voxels are larger.
         threads: see `Occluders`.
     """
@@ -207,10 +208,10 @@ def _part(points: Offsets, piece: slice) -> Offsets:
 
 
 def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_few: float) -> None:
-    """Reject voxels with few points that are spread over all 27 voxels, unlike a surface.
+    """Reject voxels with few points that, unlike a surface, are spread over all 27 voxels.
 
-    One in 27 pairs of points is in the same voxel if points are scattered, one in 9 on a surface
-    and one in 3 along a line.
+    If points are scattered, one in 27 pairs of points is in the same voxel; on a surface, it is one
+    in 9, and along a line, one in 3.
 
     Args:
         counts: numbers of points in 27 voxels, changed in place.
@@ -227,11 +228,11 @@ def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_fe
 def _forget_passed(
     grid: VoxelGrid, points: Offsets, stations: NDArray[np.float64], n_few: float
 ) -> None:
-    """Reject voxels that nearly all rays of the stations passed through.
+    """Reject voxels through which nearly all rays of the stations passed.
 
     Stray points of a dense scan can be as dense as points of a surface, especially near a station,
-    but only a small share of the rays in their direction ends at them. In a thinned cloud, points
-    near a station are as few, but as many as expected for a surface.
+    but only a small share of the rays in their direction ends at them. In a thinned cloud, there
+    are equally few points near a station, but as many as expected on a surface.
     """
     every = slice(None, None, max(1, len(points.x) // _SAMPLED_MOST))
     places = np.column_stack([axis[every] for axis in points]).astype(np.float64)

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, Plane, basis_from_up
 
-# Rectangles of points end before a corner hidden by furniture, and extend past one at a reveal.
+# Rectangles of points may end this far before a corner, if furniture hides it, or extend this far
+# beyond it, at a reveal.
 REACH_M: Final = 0.3
 SHORTEST_M: Final = 0.1
-# The intersection of planes that are more nearly parallel is poorly determined.
+# The intersection of planes at a smaller angle is poorly determined.
 _LEAST_ANGLE_DEG: Final = 20.0
 
 Interval = tuple[float, float]
@@ -51,7 +52,7 @@ class Edge:
 
     @property
     def length_m(self) -> float:
-        """Its length."""
+        """Length of the segment."""
         return float(np.linalg.norm(self.ends_world[1] - self.ends_world[0]))
 
 
@@ -69,9 +70,9 @@ class Corner:
 
 
 def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the intersection line of two planes: its point nearest the origin, its direction.
+    """Return the line where two planes intersect: its point nearest to the origin, its direction.
 
-    None if the planes are nearly parallel.
+    The result is None if the planes are nearly parallel.
     """
     direction = np.cross(first.normal, second.normal)
     size = float(np.linalg.norm(direction))
@@ -84,9 +85,9 @@ def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> tuple[Edge, ...]:
-    """Return the segments of intersection lines where planes adjoin.
+    """Return the segments of intersection lines along which planes adjoin.
 
-    Along a segment, both planes were measured within `reach_m` of the line.
+    Along a segment, both planes have points within `reach_m` of the line.
 
     Args:
         surfaces: planes with their rectangles.
@@ -112,7 +113,7 @@ def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> t
 def corners_between(
     surfaces: Sequence[Surface], edges: Sequence[Edge], *, reach_m: float = REACH_M
 ) -> tuple[Corner, ...]:
-    """Return the intersection points of three planes that adjoin at the point."""
+    """Return the points at which three planes intersect and adjoin."""
     by_pair: dict[tuple[int, int], list[Edge]] = {}
     for edge in edges:
         by_pair.setdefault((edge.first, edge.second), []).append(edge)
@@ -187,9 +188,9 @@ def _distance(edge: Edge, point: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(point - begin - along * (end - begin)))
 
 
-# Maximum distance between the end of a wall's points and its corner with the next wall.
+# Maximum distance between the end of a wall's points and the corner with the next wall.
 _JOINED_M: Final = 1.0
-# Walls with the same direction that are closer to each other are one wall with relief.
+# Parallel walls that are closer to each other are one wall with relief.
 _RELIEF_M: Final = 0.5
 
 
@@ -198,7 +199,7 @@ class RoomOutline:
     """The boundary of a room.
 
     Attributes:
-        walls: indices of the bounding planes that join another one, in the order of the chains.
+        walls: indices of the bounding planes that meet another one, in the order of the chains.
         chains_world: outlines (n, 3) in metres at the height of the floor; consecutive walls share
             a point.
         closed: whether the last point of each chain joins its first point.
@@ -246,7 +247,8 @@ def room_outline(
     """Join the walls of a room into its outline.
 
     Only the first plane of a wall with relief is used. A wall ends at its intersection with the
-    next wall if its points extend to within a metre of it, otherwise at the end of its points.
+    next wall if its points extend to within a metre of this intersection, and otherwise at the end
+    of its points.
 
     Args:
         planes: planes with normals into the room, in descending order of their numbers of points.
@@ -363,7 +365,7 @@ def _chains(count: int, joints: dict[_End, _End]) -> list[tuple[list[_End], bool
     """Return chains of walls, each wall with its first end; and whether chains are closed."""
     left = set(range(count))
     chains: list[tuple[list[_End], bool]] = []
-    # Begin at free ends, so that open chains are followed from their beginning.
+    # Begin at free ends, so that open chains are followed from one end to the other.
     free = [(k, side) for k, side in product(range(count), (0, 1)) if (k, side) not in joints]
     for start in [*free, *((k, 0) for k in range(count))]:
         if start[0] not in left:
@@ -432,7 +434,7 @@ def _on_line(
     level: Plane | None,
     near: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return where a line meets a plane; without a plane, its point nearest to `near`."""
+    """Return the point of a line on a plane or, without a plane, its point nearest to `near`."""
     point, direction = line
     if level is None:
         return np.asarray(point + (near - point) @ direction / (direction @ direction) * direction)

@@ -1,10 +1,11 @@
 """Binning of the points of a cloud into the raster of a wall.
 
 The cloud is processed in chunks. `project_points` transforms a chunk; the passes then process the
-points inside the raster, each thread for the cells assigned to it. Thus each cell is visited in the
-order of the points, and results, including sums of floats, do not depend on the number of threads.
+points inside the raster, each thread for the cells assigned to it. Thus, the points of each cell
+are processed in order, and results, including sums of floats, do not depend on the number of
+threads.
 
-This module loads numba: methods import it inside functions.
+This module loads numba, so methods import it inside functions.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.slabs import BOXED_POINTS, OffsetPoints, Offsets, Slab, read_only
 from orthoflow.geometry.threads import in_parts, in_threads
 
-# Cells are assigned to threads in runs of 2^17, a few dozen rows. Scans run along columns or rows,
-# and a thread is faster if the points of its cells come in long runs.
+# Cells are assigned to threads in runs of 2^17, a few dozen rows. The points of a scan run along
+# columns or rows, and a thread is faster if the points of its cells come in long runs.
 _RUN_SHIFT: Final = 17
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
 # One record per cell, because a scan along columns needs a different row of the raster, and thus at
@@ -74,7 +75,7 @@ def project_points(
     first: int,
     end: int,
 ) -> None:
-    """Set cell, depth and distance from the centre of the cell for points of a chunk.
+    """Set the cell, the depth and the distance from the cell's centre of points in a chunk.
 
     Depths at both limits are inside. The left and upper edges of a cell belong to it.
 
@@ -115,10 +116,10 @@ def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers
 
 @compiled
 def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
-    """Select the point with the largest depth; of equal ones the nearest to the centre.
+    """Select the point of each cell with the largest depth; if equal, that nearest to the centre.
 
     Args:
-        entries: points of one chunk; of equally near ones the first counts.
+        entries: points of one chunk; the first of equally near points is used.
         winners: (cells,) of `WINNER`, updated; depths are initially minus infinity.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells are processed.
@@ -136,7 +137,7 @@ def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner
 
 @compiled
 def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
-    """Select the point nearest to the centre of each cell; of equal ones the first.
+    """Select the point nearest to the centre of each cell; if equal, the first.
 
     Args:
         entries: points of one chunk.
@@ -235,14 +236,14 @@ def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[
 def _may_hold_points(
     boxes_m: NDArray[np.float64], target: Target, rows: slice | None
 ) -> NDArray[np.bool_]:
-    """Return which bounding boxes (n, 2, 3) may intersect a slab, which may be oblique."""
+    """Return a mask of bounding boxes (n, 2, 3) that may intersect a slab, which may be oblique."""
     axes = target.wall_from_offset[:, :3]
     middles = boxes_m.mean(axis=1) @ axes.T + target.wall_from_offset[:, 3]
     halves = 0.5 * (boxes_m[:, 1] - boxes_m[:, 0]) @ np.abs(axes).T
     first_row, end_row = (0, target.height) if rows is None else (rows.start, rows.stop)
     low = np.array([0.0, first_row, target.behind_m])
     high = np.array([target.width, end_row, target.front_m])
-    # A tolerance that is much larger than rounding errors.
+    # Use a tolerance that is much larger than rounding errors.
     slack = 1e-9 * (np.abs(middles) + halves) + 1e-6
     # Comparisons with NaN are false, so a box with a NaN coordinate is kept.
     is_beside = (middles + halves < low - slack) | (middles - halves > high + slack)
@@ -251,11 +252,12 @@ def _may_hold_points(
 
 
 def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
-    """Run passes one after the other, each in threads that process their own cells.
+    """Run passes one after the other, each in several threads that process separate cells.
 
     Args:
         threads: number of threads, rounded down to a power of two.
-        passes: functions of the number of owners and of the owner whose cells are processed.
+        passes: functions of the number of owners and the index of the owner whose cells are
+            processed.
     """
     owners = 1 << (max(1, threads).bit_length() - 1)
 

@@ -1,7 +1,7 @@
-"""Resection: the pose of one camera from points of its photo with known world coordinates.
+"""Resection: the pose of one camera from points in its photo with known world coordinates.
 
-The method is a weighted least-squares adjustment (Gauss-Markov model, damped as by Levenberg and
-Marquardt) with the full lens model. The observations are the pixels; the covariance of each pixel
+The method is a weighted least-squares adjustment (Gauss-Markov model with Levenberg-Marquardt
+damping) with the full lens model. The observations are the pixels; the covariance of each pixel
 includes the uncertainty of its point.
 """
 
@@ -33,8 +33,9 @@ from orthoflow.geometry.frames import cross_matrix
 from orthoflow.geometry.rows import Rows
 
 _ITERATIONS: Final = 40
-# Relative change of the sum of squares at convergence. With a few hundred points, such a step moves
-# no parameter by more than 1 % of its standard deviation, and the next step by far less.
+# Relative change of the sum of squares at convergence. With a few hundred points, a step with such
+# a change moves no parameter by more than 1 % of its standard deviation, and the next step is far
+# smaller.
 _CONVERGED: Final = 1e-7
 _DAMPING_START: Final = 1e-6
 _DAMPING_MOST: Final = 1e8
@@ -70,8 +71,8 @@ class Resection:
             translation, and free lens parameters in the order of `LensFreedom.names`; scaled by the
             residuals.
         sigma0: standard deviation of unit weight; 1 if the sigmas of the points are correct.
-        variance_factor: ratio of `covariance` to the covariance from the given sigmas, mean over
-            its axes. It is sigma0 squared, or more if residuals of neighbouring points are similar,
+        variance_factor: mean ratio, over its axes, of `covariance` to the covariance from the given
+            sigmas. It is sigma0 squared, or more if residuals of neighbouring points are similar,
             so that the points are not independent.
         lens: the free lens parameters.
     """
@@ -92,7 +93,7 @@ class Misfit:
             point.
         normalised: (n,) float64 length of the residual in units of its expected standard deviation
             (chi distribution with 2 degrees of freedom); inf if the camera cannot see the point, or
-            if the point is so close that it could be anywhere in the image.
+            if the point is so close that its projection could be anywhere in the image.
     """
 
     residuals_px: NDArray[np.float64]
@@ -116,7 +117,7 @@ def adjust(
         prior: camera whose interior orientation is the prior of the free lens parameters; `start`
             by default.
         lens: free parameters of the interior orientation; none by default.
-        independent: whether the errors of the points are independent; otherwise neighbouring points
+        independent: whether the errors of the points are independent; if false, neighbouring points
             may have common errors (`geometry.covariances`).
         soft_limit: residuals beyond this many standard deviations get less weight (Huber).
 
@@ -152,7 +153,7 @@ def stated(
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise GeometryError("the points of a photo do not determine its pose") from error
-    # Part of the unknowns is determined by the prior instead of the points.
+    # The prior, not the points, determines part of the unknowns.
     from_prior = float((np.diag(cofactors)[POSE_PARAMETERS:] / lens.sigmas**2).sum())
     redundancy = 2 * len(seen) - n_free + from_prior
     sigma0 = math.sqrt(float((errors.residuals**2).sum()) / redundancy)
@@ -225,10 +226,10 @@ def pixels_by_point(
 def moved_origin(
     camera: ViewingCamera, middle: NDArray[np.float64], n_free: int
 ) -> NDArray[np.float64]:
-    """Return the derivative (n_free, n_free) of a camera's parameters by its shifted ones.
+    """Return derivatives (n_free, n_free) of a camera's parameters by those of a shifted camera.
 
-    The shifted coordinates have their origin at `middle`: t = t_local - R middle, and a rotation w
-    left of R moves R middle by w x (R middle).
+    The coordinates of the shifted camera have their origin at `middle`: t = t_local - R middle, and
+    a rotation w left of R moves R middle by w x (R middle).
     """
     derivative = np.eye(n_free)
     derivative[3:6, :3] = cross_matrix(camera.rotation @ middle)
@@ -337,7 +338,7 @@ class _Problem:
 
     def normal(self, errors: _Errors) -> NDArray[np.float64]:
         along, down = errors.jacobian.transpose(1, 2, 0)
-        # einsum instead of BLAS, where the order of summation depends on the number of threads.
+        # Use einsum, since the order of summation in BLAS depends on the number of threads.
         normal: NDArray[np.float64] = np.einsum("jn,kn->jk", along, along)
         normal += np.einsum("jn,kn->jk", down, down)
         free = np.arange(POSE_PARAMETERS, len(normal))
@@ -354,7 +355,7 @@ def _problem(
 ) -> tuple[NDArray[np.float64], _Problem]:
     """Return the centroid of the points, and the adjustment in coordinates relative to it.
 
-    Large survey coordinates would lose digits.
+    Large survey coordinates would reduce the precision.
     """
     freedom = LensFreedom() if lens is None else lens
     # The lens parameters have a prior, so the points only need to determine the pose.

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 NMAD_FACTOR: Final = 1.4826
 # Median length of a vector with two standard normal components (Rayleigh distribution).
 MEDIAN_LENGTH: Final = 1.1774
-# Number of iterations for the L1 norm, and residual below which the weight is constant.
+# Number of iterations for the L1 norm.
 _ROUNDS: Final = 20
+# Below this residual, the weight is constant.
 _FLOOR: Final = 0.01
 
 
@@ -54,8 +55,8 @@ _SAMPLES: Final = 300_000
 def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
     """Estimate the standard deviation of a depth from second differences of neighbours.
 
-    Their median is not influenced by edges. The result is 0 if a raster (rows, cols) has no three
-    adjacent measured cells.
+    Edges do not influence the median of the differences. The result is 0 if there are no three
+    adjacent measured cells in a raster (rows, cols).
     """
     # Half of the samples are horizontal, half vertical.
     step = max(1, 2 * depth_m.size // _SAMPLES)
@@ -66,7 +67,7 @@ def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
     n_known = int(np.count_nonzero(np.isfinite(bends)))
     if not n_known:
         return 0.0
-    # The median; NaN is sorted last.
+    # Take the median; NaN is sorted last.
     half = n_known // 2
     bends = np.partition(bends, half)
     upper = float(bends[half])

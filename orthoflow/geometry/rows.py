@@ -1,4 +1,4 @@
-"""Selection of rows from dataclasses of arrays, per item or per row of a raster."""
+"""Selection of rows from dataclasses of arrays with one row per item or per row of a raster."""
 
 from __future__ import annotations
 

@@ -5,9 +5,9 @@ rectangles that a ray cannot hit, and if two rectangles are at the same distance
 smaller index is returned.
 
 A texture is a function of position, without grids or images, so the true orthoimage can be computed
-at any resolution. Stains are value noise on hashed lattices with quintic interpolation: twice
-continuously differentiable, with a shortest wavelength of about twice the lattice spacing.
-Ornaments have sharp edges.
+at any resolution. Stains are value noise on hashed lattices with quintic interpolation: the noise
+is twice continuously differentiable, and its shortest wavelength is about twice the lattice
+spacing. Ornaments have sharp edges.
 
 This module loads numba, so methods import it inside functions.
 """
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_part
 from orthoflow.geometry.scenes import Scene
 
-# The small functions have explicit types, since numba would otherwise compile a separate version
-# for each constant argument, which takes seconds in the first run.
+# Small functions have explicit types, since numba would otherwise compile a separate version for
+# each constant argument, which takes seconds in the first run.
 
 
 class Shade(NamedTuple):
@@ -272,7 +272,7 @@ def paint_points(
 
 Index: TypeAlias = int | np.int64
 
-# Minimum distance of a hit, so that a ray does not hit the surface on which it starts.
+# Minimum distance of a hit, so that a ray does not hit the surface from which it starts.
 _NEAREST: Final = 1e-9
 
 
@@ -285,8 +285,9 @@ class CastTable(NamedTuple):
             first and the last + 1 of its holes.
         holes: (h, 4) float64 extents of the holes.
         nodes: (m, 9) float64 nodes of the tree: bounds of a box (low, then high); the next node for
-            a ray that misses the box; the first and the last + 1 of its rectangles in `order`
-            (empty unless the node is a leaf). Parents precede children, and node 0 is the root.
+            rays that miss the box; the first and the last + 1 of its rectangles in `order` (an
+            empty range unless the node is a leaf). Parents precede children, and node 0 is the
+            root.
         order: (r,) int64 rectangles in the order of the leaves.
     """
 
@@ -313,7 +314,7 @@ def _hit_distance(
     rectangles: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
     """Return the distance to a rectangle along a ray, in units of its direction, or inf."""
-    # Scalars, since a row as an array would be reference-counted in each use.
+    # Use scalars, since a row as an array would be reference-counted at each use.
     r = rectangles
     facing = r[index, 9] * ray.dx + r[index, 10] * ray.dy + r[index, 11] * ray.dz
     if abs(facing) < 1e-12:
@@ -354,7 +355,8 @@ def _along(axes: NDArray[np.float64], axis: int, x: float, y: float, z: float) -
 
 @typed_kernel_part("f8(f8)")
 def _inverse(value: float) -> float:
-    # A large number instead of infinity: 0 times infinity is NaN for a ray in the plane of a slab.
+    # Use a large number instead of infinity, since 0 times infinity is NaN for a ray in the plane
+    # of a slab.
     if abs(value) < 1e-30:
         return 1e30 if value >= 0.0 else -1e30
     return 1.0 / value
@@ -392,8 +394,8 @@ def cast_rays(
         ray = Ray(x, y, z, dx, dy, dz)
         inverse = Ray(x, y, z, _inverse(dx), _inverse(dy), _inverse(dz))
         best_t, best = t[i], np.int64(-1)
-        # Test the rectangle hit by the previous ray first: this skips most boxes without changing
-        # the result.
+        # First test the rectangle that the previous ray hit, which excludes most boxes without
+        # changing the result.
         if guess >= 0:
             distance = _hit_distance(rectangles, holes, guess, ray)
             if distance < best_t:
@@ -413,7 +415,7 @@ def cast_rays(
         rectangle[i] = guess = best
 
 
-# Rays per batch, so that arrays with one number per ray fit into the processor's cache.
+# Number of rays per batch, for which arrays with one number per ray fit into the processor's cache.
 RAYS_AT_ONCE: Final = 1 << 14
 
 
@@ -496,7 +498,7 @@ class SceneRays:
 def points_on(
     starts: NDArray[np.float64], ways: NDArray[np.float64], hits: Hits
 ) -> NDArray[np.float64]:
-    """Return the points (3, n) that rays hit; for rays without a hit, their start."""
+    """Return the points (3, n) that rays hit, or the start of a ray that hits nothing."""
     return starts + np.where(hits.rectangle < 0, 0.0, hits.t) * ways
 
 
@@ -529,7 +531,7 @@ def _cast_table(scene: Scene) -> CastTable:
 class _BoxTree:
     """Bounding boxes of rectangles, split where the cost of rays is lowest.
 
-    The boxes are aligned with the rectangle that makes them smallest. In a room, most rectangles
+    The boxes are parallel to the rectangle for which they are smallest. In a room, most rectangles
     are parallel or perpendicular to it, so their boxes are thin.
     """
 
@@ -542,7 +544,8 @@ class _BoxTree:
             return
         self.axes = _tightest_axes(scene)
         corners = scene.corners_m() @ self.axes.T
-        # A tolerance of 1 micrometre, so that rectangles along the axes have no empty boxes.
+        # Add a tolerance of 1 micrometre, so that the boxes of rectangles along the axes are not
+        # empty.
         self._low = corners.min(axis=1) - 1e-6
         self._high = corners.max(axis=1) + 1e-6
         self._add(np.arange(len(scene)))
@@ -601,7 +604,7 @@ def _running_surfaces(low: NDArray[np.float64], high: NDArray[np.float64]) -> ND
 def _tightest_axes(scene: Scene) -> NDArray[np.float64]:
     corners = scene.corners_m()
     axes = np.stack([scene.axis_a, scene.axis_b, scene.normal], axis=1)
-    # Many rectangles have the same axes, so each set of axes is tried once.
+    # Many rectangles have the same axes, so try each set of axes only once.
     _, first = np.unique(axes.reshape(-1, 9).round(9), axis=0, return_index=True)
     axes = axes[np.sort(first)]
     surfaces_m2 = [_surfaces_m2(np.ptp(corners @ turn.T, axis=1)).sum() for turn in axes]

@@ -158,9 +158,11 @@ class SceneCameras:
         return SeenPoints(points=points, rectangle=rectangle)
 
     def sees(self, camera: ViewingCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which surface points (n, 3), in metres from the scene's origin, a camera sees.
+        """Return a mask (n,) of the surface points (n, 3) that a camera sees.
 
-        A point counts as seen if the hiding surface is within 0.02 % of its distance.
+        Points are in metres from the scene's origin.
+
+        A point counts as seen unless a surface is more than 0.02 % of the distance in front of it.
         """
         shifted = camera.shifted(self._origin)
         inside = shifted.sees(shifted.project(np.nan_to_num(points, nan=np.inf))[:, :2])
@@ -220,7 +222,7 @@ class _Renderer:
         self._viewers = viewers
         self._front_m = front_m
         self._reach_m = front_m + behind_m
-        # Flat views of the arrays, which share their memory.
+        # Flat views share the memory of the arrays.
         self._rgb = truth.rgb.reshape(-1, 3)
         self._depth_m = truth.depth_m.reshape(-1)
         self._rectangle = truth.rectangle.reshape(-1)
@@ -245,18 +247,18 @@ class _Renderer:
     def shows_something(
         self, cells: NDArray[np.int64], wanted: NDArray[np.bool_] | None
     ) -> NDArray[np.bool_]:
-        """Return which cells (n,) show a surface and are requested."""
+        """Return a mask (n,) of cells that show a surface and are requested."""
         shows: NDArray[np.bool_] = self._rectangle[cells] >= 0
         return shows if wanted is None else shows & wanted.reshape(-1)[cells]
 
     def look_from(
         self, position: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
     ) -> None:
-        """Set which cells (n,) with surface points (3, n) a viewer at a position sees."""
+        """Mark the cells (n,) whose surface points (3, n) are seen from a position."""
         viewers = self._viewers
         if viewers is None:
             return
-        # With a small tolerance, since the sine of straight up may be rounded to more than 1.
+        # Subtract a small tolerance, since the sine of straight up may be rounded to more than 1.
         lowest = math.sin(math.radians(viewers.lowest_elevation_deg)) - 1e-12
         highest = math.sin(math.radians(viewers.highest_elevation_deg)) + 1e-12
         ways = points - position[:, None]
@@ -272,7 +274,7 @@ class _Renderer:
         sums, n_hits = np.zeros((3, len(cells)), dtype=np.float32), np.zeros(len(cells))
         ways = np.broadcast_to(-self._normal, (3, len(cells)))
         for sub in range(n_sub * n_sub):
-            # A sheared grid has n^2 different positions in each direction, so edges along rows or
+            # A sheared grid has n^2 different positions along each axis, so edges along rows or
             # columns, which are frequent on walls, are not rounded to 1/n of a cell.
             i, j = sub % n_sub, sub // n_sub
             starts = self._starts(

@@ -1,7 +1,8 @@
 """Simulated scenes of textured rectangles, independent of the position of the world's origin.
 
-Random numbers are a function of a lattice cell, a seed and the index of the draw. They are the same
-in any order and with any number of threads. The formulas are those of `scene_rays`, for arrays.
+Random numbers are functions of a lattice cell, a seed and the index of the draw, so they do not
+depend on the order of computation or the number of threads. The formulas are those of `scene_rays`,
+for arrays.
 """
 
 from __future__ import annotations

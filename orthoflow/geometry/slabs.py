@@ -21,7 +21,7 @@ class Offsets(NamedTuple):
 
 
 def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> Offsets:
-    """Return arrays, which may be memory-mapped, in the form for which kernels are compiled."""
+    """Return offsets in the form for which kernels are compiled; arrays may be memory-mapped."""
     views = [np.asarray(values).view(np.ndarray) for values in (x, y, z)]
     for view in views:
         view.flags.writeable = False
@@ -56,15 +56,15 @@ class OffsetPoints(Protocol):
         """Result of `block_boxes_m` for these points; None if there are few points."""
 
 
-# Points per box, few enough for the cache of the processor.
+# Number of points per box; small enough for the processor's cache.
 BOXED_POINTS: Final = 1 << 16
 
 
 def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
     """Return bounding boxes (blocks, 2, 3) of `BOXED_POINTS` points each, metres.
 
-    Consecutive points of a scan are close together, so a pass over one wall need not read the
-    blocks of the other walls.
+    Consecutive points of a scan are close together, so a pass over one wall can skip the blocks of
+    other walls.
     """
     n_blocks = -(-len(points.x) // BOXED_POINTS)
     boxes_m = np.empty((n_blocks, 2, 3), dtype=np.float32)

@@ -1,7 +1,7 @@
-"""Work shared by threads, in parts whose results are returned in order.
+"""Division of work among threads, with results in order.
 
-The parts do not depend on the number of threads, or do not affect the result, so results are
-identical for any number of threads. Compiled kernels release the interpreter lock.
+Either the parts do not depend on the number of threads, or they do not affect the result; so
+results are identical for any number of threads. Compiled kernels release the interpreter lock.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def address_space() -> int | None:
 
 
 def has_room_for_threads() -> bool:
-    """Return whether threads may be started; without free memory this would block forever."""
+    """Return whether threads can be started; without free memory, a start would block forever."""
     limit = address_space()
     return limit is None or limit >= _ROOM_FOR_THREADS
 

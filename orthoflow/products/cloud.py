@@ -14,7 +14,7 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.slabs import BOXED_POINTS, block_boxes_m
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
-# A cloud with fewer blocks is always read completely.
+# A cloud with fewer blocks is always read as a whole.
 _BLOCKS_LEAST: Final = 16
 
 
@@ -22,25 +22,25 @@ _BLOCKS_LEAST: Final = 16
 class PointCloud(Product):
     """Points of one or more scans in one world frame.
 
-    The world coordinates of point i are `origin + (x[i], y[i], z[i])`. Because float32 is used for
-    offsets only, survey coordinates of 10^6 m lose no precision.
+    The world coordinates of point i are `origin + (x[i], y[i], z[i])`. Because float32 is only used
+    for offsets, survey coordinates of 10^6 m lose no precision.
 
     Attributes:
         origin: (3,) float64 metres.
         x: (n,) float32 offset from the origin in metres; y and z likewise. Separate contiguous
-            arrays can be read at the speed of memory.
+            arrays are read at full memory bandwidth.
         up: (3,) float64 unit vector in world axes.
         intensity: (n,) float32, 0 to 1, NaN if not measured; None if no point has an intensity.
         rgb: (n, 3) uint8 sRGB, or None.
-        has_rgb: (n,) bool, which points have a colour; None if `rgb` is None or applies to all.
+        has_rgb: (n,) bool, True for points with a colour; None if all have one or `rgb` is None.
         scan: (n,) uint16 index of the scan of each point, or None.
         row: (n,) uint32 row in the grid of the scan, or None; `column` likewise.
         point_id: (n,) uint32 index of each point in the cloud as read; None if it is the index in
             this cloud. See `selected`.
         stations: (s, 3) float64 metres, positions of the scanner or the viewer, or None.
         stations_source: `file`, `view_from` (given by the user), or None if there are no stations.
-        source: information on reading for users: files, unit, ranges before normalisation, numbers
-            of dropped points.
+        source: information for users on how the cloud was read: files, unit, ranges before
+            normalisation, numbers of dropped points.
     """
 
     type_name: ClassVar[str] = "cloud"
@@ -114,7 +114,7 @@ class PointCloud(Product):
     def boxes_m(self) -> NDArray[np.float32] | None:
         """Return bounding boxes (blocks, 2, 3) of consecutive points; None for small clouds.
 
-        Computed when first used.
+        They are computed when first used.
         """
         return block_boxes_m(self) if len(self) > _BLOCKS_LEAST * BOXED_POINTS else None
 
@@ -127,7 +127,7 @@ class PointCloud(Product):
         """Return a cloud of selected points with their ids and all measured values.
 
         Args:
-            chosen: (n,) bool mask of points, or their indices in the order wanted.
+            chosen: (n,) bool mask of points, or indices of points in the requested order.
         """
         fields = ("x", "y", "z", "intensity", "rgb", "has_rgb", "scan", "row", "column")
         arrays = {name: getattr(self, name) for name in fields}
@@ -149,8 +149,8 @@ class PointCloud(Product):
                 f"the cloud has {len(self)} points, but at least {n_least} are needed"
             )
         for name, values in (("x", self.x), ("y", self.y), ("z", self.z), ("origin", self.origin)):
-            # The sum is finite if and only if all terms are (float64 cannot overflow here), and
-            # needs no mask as large as the cloud.
+            # The sum is finite if and only if all terms are finite, since float64 cannot overflow
+            # here; it needs no mask as large as the cloud.
             if not np.isfinite(np.sum(values, dtype=np.float64)):
                 raise ProductError(
                     f"the cloud has coordinates in {name} that are NaN or infinite: read it with "

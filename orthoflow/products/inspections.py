@@ -1,4 +1,4 @@
-"""Data for inspections: check points, the truth of a simulated scene, and results."""
+"""Data of inspections: check points, the truth of a simulated scene, and results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from orthoflow.products.product import (
 
 @dataclass(frozen=True, kw_only=True)
 class CheckPoints(Product):
-    """Surveyed points that were not used to make the data that they check.
+    """Surveyed points that were not used to produce the data that they check.
 
     Attributes:
         names: names of the points.
@@ -34,9 +34,9 @@ class CheckPoints(Product):
         pixels_wall: (n, 2) float64 measured (column, row), NaN where not measured.
         places_m: (n, 2) float64 measured X and Y in the coordinates of the GeoTIFF of the
             orthoimage: metres in the plane of the wall, or easting and northing of a map. NaN if
-            the point was measured otherwise; None if all were.
+            the point was measured in another way; None if all points were.
         shown_world: (n, 3) float64 metres, world coordinates of the measured position; NaN if the
-            point was measured otherwise, None if all were.
+            point was measured in another way; None if all points were.
     """
 
     type_name: ClassVar[str] = "checkpoints"
@@ -125,7 +125,7 @@ class Finding:
         name: name of the metric, which contains the unit if it has one.
         value: the number.
         unit: unit; `1` for shares and counts.
-        wall: index in `Walls` of the wall that it describes, -1 for all walls together.
+        wall: index in `Walls` of the wall described, -1 for all walls together.
     """
 
     name: str

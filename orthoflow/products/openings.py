@@ -15,7 +15,7 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products.product import JsonValue, Product, Tolerance, require_shapes
 
-# The laser passed through; the back was measured; there were no returns.
+# Respectively: the laser passed through, the back was measured, there were no returns.
 OpeningKind = Literal["through", "niche", "no data"]
 
 _CORNERS_LEAST: Final = 3
@@ -26,8 +26,8 @@ class OutlineSource(IntEnum):
 
     Attributes:
         DEPTH: depths of the raster of the wall.
-        IMAGE: a photo, to a fraction of a cell.
-        UNSEEN: none, because the wall next to the side was not measured.
+        IMAGE: a photo, accurate to a fraction of a cell.
+        UNSEEN: unknown, because the wall next to the side was not measured.
     """
 
     DEPTH = 0
@@ -103,13 +103,13 @@ class Opening:
 
     @property
     def edge_sigma_m(self) -> float | None:
-        """Return the RMS of `side_sigma_m` of the sides that were seen; None if there are none."""
+        """RMS of `side_sigma_m` over the sides that were seen; None if there are none."""
         seen = self.side_sigma_m[np.isfinite(self.side_sigma_m)]
         return math.sqrt(float(np.mean(seen**2))) if len(seen) else None
 
     @property
     def said(self) -> str:
-        """Return the description for drawings, such as `niche 0.250 m deep, 0.80 x 1.86 m`."""
+        """Description for drawings, such as `niche 0.250 m deep, 0.80 x 1.86 m`."""
         deep = f" {self.depth_m:.3f} m deep" if self.kind == "niche" and self.depth_m else ""
         return f"{self.kind}{deep}, {self.width_m:.2f} x {self.height_m:.2f} m"
 
@@ -121,7 +121,7 @@ class Openings(Product):
     Attributes:
         openings: sorted by wall, then from left to right.
         walls: numbers of the searched walls, including walls without openings.
-        map_crs: coordinate system of the world, if the raster of a wall specifies it.
+        map_crs: coordinate system of the world, if the raster of a wall specifies one.
         details: further JSON results, for users only.
     """
 

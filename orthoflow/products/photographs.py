@@ -1,4 +1,4 @@
-"""Photographs, their interior orientations, ties to the walls, and exterior orientations."""
+"""Photographs, their interior and exterior orientations, and their ties to walls."""
 
 from __future__ import annotations
 
@@ -121,11 +121,11 @@ class Photo:
     folder: str = ""
 
     def lens_prior(self) -> tuple[ViewingCamera, LensFreedom]:
-        """Return the lens as known before an orientation, from a calibration, EXIF, or a default.
+        """Return the lens known before an orientation: from a calibration, EXIF, or a default.
 
         Returns:
-            A camera with the most probable lens, at the origin of the world, and which of its
-            parameters are uncertain and by how much (none if calibrated).
+            A camera with the most probable lens, at the origin of the world, and the standard
+            deviations of the uncertain lens parameters (none if calibrated).
         """
         if self.intrinsics is not None:
             return self.intrinsics.posed(), LensFreedom()
@@ -194,7 +194,7 @@ class TieWall:
         corners_world: four corners (x, y, z) of its raster in metres: top-left, then
             counter-clockwise for the viewer, as in `WallFrame.corners_world`.
         normal_world: unit vector (x, y, z) towards the viewer; photos are never taken from behind.
-        gsd_m: cell size of its raster in metres; None if it has no raster, in which case errors are
+        gsd_m: cell size of its raster in metres; None if it has no raster; in this case, errors are
             not limited in cells.
         plane_index: index of its plane in `Planes`; None if unknown.
     """
@@ -230,9 +230,9 @@ class TieWall:
 class Ties(Product):
     """Points measured in photos whose positions on walls are known.
 
-    A matcher may leave `walls` and `search_radius_px` empty, but both help to assess orientations:
-    without `walls`, the points of the ties are used instead, and neither the visible side of a wall
-    nor its cell size is known.
+    A method may leave `walls` and `search_radius_px` empty, but both help to assess orientations.
+    If `walls` is empty, walls are described by the points of the ties, and neither the visible side
+    of a wall nor its cell size is known.
 
     Attributes:
         photo_names: photos to which `photo` refers.
@@ -246,10 +246,10 @@ class Ties(Product):
         role: (n,) uint8 `TieRole`.
         residual_px: (n, 2) float64 observed minus computed; NaN before an orientation.
         walls: walls to which `wall` refers; empty if not given.
-        by_hand: (n,) uint8, 1 for ties measured by hand; None if there are none. They are never
-            withheld, and their standard deviations are not estimated.
-        search_radius_px: for each photo, maximum distance from the expected position of a tie at
-            which the photo was searched (wrong ties are also within it); None if the whole photo
+        by_hand: (n,) uint8, 1 for ties measured by hand; None if there are none. Such ties are
+            never withheld, and their standard deviations are not estimated.
+        search_radius_px: for each photo, the radius around the expected position of a tie within
+            which the photo was searched, so wrong ties are within it, too; None if the whole photo
             was searched. Empty if all photos were searched completely.
         details: further JSON results, for users only.
     """
@@ -320,7 +320,7 @@ class Ties(Product):
         _require_photos("ties", self.photo_names, others)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall shown to users: the index of its plane in `planes.json`."""
+        """Return the number of a wall that users see: the index of its plane in `planes.json`."""
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
         return wall if known is None else known
 
@@ -331,7 +331,7 @@ class Camera:
 
     Attributes:
         photo: name of the photo.
-        status: `ok`, or the reason in one sentence, in which case all following fields are None.
+        status: `ok`, or the reason in one sentence; in this case, all following fields are None.
         intrinsics: interior orientation.
         rotation_camera_from_world: (3, 3) float64, det +1; x right, y down, z forward.
         translation_camera_from_world: (3,) float64 metres.
@@ -378,7 +378,8 @@ class ResidualRow:
             the median size of a pixel on the wall).
         n: number of residuals.
         mean: mean.
-        shift_p: probability of such a mean by chance (Student's t, two-sided); None for one tie.
+        shift_p: probability that the mean is at least as large by chance (Student's t, two-sided);
+            None for one tie.
         sd: standard deviation.
         median: median.
         nmad: 1.4826 times the median absolute deviation from the median.
@@ -471,7 +472,7 @@ class Cameras(Product):
 
 
 def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:
-    """Refuse names that are not names of the photos of a step, if the step has photos."""
+    """If a step has photos, refuse names that do not belong to them."""
     for product in others.values():
         known = {photo.name for photo in product.photos} if isinstance(product, Photos) else None
         unknown = [name for name in names if known is not None and name not in known]

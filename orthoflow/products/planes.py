@@ -16,8 +16,8 @@ from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
 SideSource = Literal["stations", "photos", "guess", "given"]
-# Kind of a plane, the first part of its name. `level` and `sloping` planes are neither floors nor
-# ceilings nor walls.
+# Kind of a plane, the first part of its name. Planes of the kinds `level` and `slope` are neither
+# floors nor ceilings nor walls.
 PlaneKind = Literal["wall", "floor", "ceiling", "level", "slope"]
 
 _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
@@ -26,14 +26,14 @@ _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
     "given": "given",
     "guess": "guess",
 }
-# Value used in markiewicz2015.
+# The value of markiewicz2015.
 _USUAL_TOLERANCE_M: Final = 0.05
 
 
 def plane_name(kind: PlaneKind, place: int) -> str:
-    """Return the name of a plane and of its wall, which contains its index in `planes.json`.
+    """Return the name of a plane and its wall, which contains the plane's index in `planes.json`.
 
-    The files `wall_<number>_*` have the same number for all kinds of planes.
+    The files `wall_<number>_*` have this number for all kinds of planes.
 
     >>> plane_name("floor", 3)
     'floor 3'
@@ -65,7 +65,7 @@ class Thickness:
     """Thickness of the cloud on one plane; classes are empty if their values are unknown.
 
     Attributes:
-        sigma_m: robust standard deviation of the distances, relief removed.
+        sigma_m: robust standard deviation of the distances, without relief.
         width_95_m: width of the range that contains 95 % of the distances.
         scan_step_m: median distance between neighbouring points on the plane.
         incidence_deg: classes of the angle of incidence.
@@ -89,7 +89,7 @@ class ScanRow:
         row: number of the row.
         scan: number of the scan.
         n_points: number of points of the row on the plane.
-        sigma_m: robust standard deviation of their distances, relief removed; None if there are too
+        sigma_m: robust standard deviation of their distances, without relief; None if there are too
             few points.
         material: thickness by material.
     """
@@ -122,8 +122,8 @@ class Planes(Product):
             `guess`.
         side_from: the same for each plane, if planes differ; empty if `viewpoint` applies to all.
         tolerance_m: maximum distance of points from their plane in the detection; the default is
-            from markiewicz2015.
-        thickness: thickness of the cloud on each plane, None if the plane has too few points; empty
+            that of markiewicz2015.
+        thickness: thickness of the cloud on each plane, None for planes with too few points; empty
             if not measured.
         scan_row: scan row with the most points on the first plane, if the cloud has rows.
         details: further JSON results, for users only.
@@ -232,7 +232,7 @@ class Planes(Product):
         return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
 
     def sigma_angle_deg(self, index: int) -> float:
-        """Return the standard deviation of a plane's direction about its worst axis."""
+        """Return the largest standard deviation, over all axes, of a plane's direction."""
         largest = float(np.linalg.eigvalsh(self.covariance[index, :3, :3])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 

@@ -22,7 +22,7 @@ Array: TypeAlias = NDArray[np.generic]
 Unit = Literal["m", "px", "grey", "deg", "1"]
 
 _ARRAY: Final = "$array"
-# Larger arrays are memory-mapped for all types of products.
+# Larger arrays of all product types are memory-mapped.
 _LARGE_BYTES: Final = 1 << 30
 # Errors that the checks of a product may raise for inconsistent values.
 _NO_SENSE: Final = (
@@ -33,7 +33,7 @@ _NO_SENSE: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """Maximum difference of two values of a field that still count as equal.
+    """Maximum difference between two values of a field that count as equal.
 
     Attributes:
         limit: largest absolute difference, in `unit`.
@@ -73,10 +73,10 @@ class Product:
     Attributes:
         type_name: name in workflows, the store and records; must never change.
         encoding_version: version of the fields, incremented when they change.
-        mapped: whether arrays are always memory-mapped, for products as large as a scan; arrays of
+        mapped: whether all arrays are memory-mapped, for products as large as a scan; arrays of
             more than 1 GiB always are.
         embedded: whether records contain the arrays instead of only their digests.
-        tolerances: permitted differences of replays by field name; other fields must be equal.
+        tolerances: permitted differences in replays, by field name; all other fields must be equal.
     """
 
     type_name: ClassVar[str]
@@ -98,9 +98,9 @@ class Product:
         )
 
     def check_against(self, others: Mapping[str, Product]) -> None:
-        """Check the product against the other products of its step, when the step ends.
+        """Check the product against the other products of its step when the step ends.
 
-        Subclasses whose fields refer to other products override it.
+        Subclasses whose fields refer to other products override this method.
 
         Args:
             others: inputs and other outputs of the step, by port.

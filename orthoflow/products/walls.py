@@ -19,9 +19,9 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products.planes import plane_name
 from orthoflow.products.product import Array, JsonValue, Product, Tolerance
 
-# Percentiles of larger rasters are estimated from a part of their rows.
+# Percentiles of larger rasters are estimated from some of their rows.
 _CELLS_ASKED: Final = 1 << 25
-# Source of the intensity of a wall: the laser, the grey value of its colours, or none.
+# Source of the intensity of a wall: the laser, the grey values of its colours, or none.
 IntensitySource = Literal["laser", "luminance", "none"]
 
 
@@ -75,18 +75,19 @@ class OrthoMask(IntEnum):
     CONTRADICTED = 5
 
 
-# States of cells with a colour from a source, and of all cells with a colour.
+# States of cells with a colour from a source.
 PAINTED_STATES: Final = (OrthoMask.PAINTED, OrthoMask.CONTRADICTED)
+# States of all cells with a colour.
 SHOWN_STATES: Final = (*PAINTED_STATES, OrthoMask.FILLED)
 
 
 def is_painted(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which cells of a mask of an orthoimage have a colour from a source."""
+    """Return a mask of the cells of an orthoimage with a colour from a source."""
     return np.isin(mask, PAINTED_STATES)
 
 
 def is_shown(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which cells of a mask of an orthoimage have a colour, including filled cells."""
+    """Return a mask of the cells of an orthoimage with a colour, including filled cells."""
     return np.isin(mask, SHOWN_STATES)
 
 
@@ -138,11 +139,12 @@ class Walls(Product):
             intensity) or `none`.
         buffer_front_m: maximum distance of points in front of the planes.
         buffer_behind_m: maximum distance of points behind the planes.
-        buffers_m: distances in front and behind for each wall; empty if all walls have the above.
+        buffers_m: distances in front and behind for each wall; empty if `buffer_front_m` and
+            `buffer_behind_m` apply to all walls.
         percentiles: percentiles (0 to 100) in `Wall.percentiles_m`, in order; empty if none were
             requested.
-        included: for each wall, numbers of other planes that it shows, which have no wall of their
-            own; empty if unknown.
+        included: for each wall, the numbers of other planes that it shows and that have no wall of
+            their own; empty if unknown.
         details: further JSON results, for users only.
     """
 
@@ -203,11 +205,11 @@ class Walls(Product):
         return np.asarray(np.argmin(distances_m, axis=0), dtype=np.int32)
 
     def spacing_m(self) -> float:
-        """Return the larger of cell size and point spacing of the finest raster."""
+        """Larger value of cell size and point spacing of the finest raster."""
         return max(min(wall.frame.gsd_m for wall in self.walls), self.points_apart_m())
 
     def points_apart_m(self) -> float:
-        """Return the approximate point spacing on the finest raster."""
+        """Approximate point spacing of the finest raster."""
         wall = min(self.walls, key=lambda wall: wall.frame.gsd_m)
         n_known = n_points = 0
         for rows in row_bands(wall.depth_m.shape):
@@ -229,8 +231,8 @@ class Layer:
         rgb: (rows, cols, 3) uint8, or uint16 if any photo has 16 bits per channel; 0 in cells
             without a colour. `geometry.levels` converts between them.
         mask: uint8 `LayerMask`; cells with the value 1 have a colour.
-        quality: float32, larger is better, comparable between the layers of a wall; 0 in cells
-            without a colour.
+        quality: float32; larger values are better; comparable between the layers of a wall; 0 in
+            cells without a colour.
         filled: uint8, 1 if the colour was interpolated from neighbours; or None.
     """
 
@@ -274,7 +276,7 @@ class Layers(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall shown to users: the index of its plane in `planes.json`."""
+        """Return the number of a wall that users see: the index of its plane in `planes.json`."""
         return self.plane_indices[wall] if wall < len(self.plane_indices) else wall
 
     def name(self, wall: int) -> str:
@@ -320,7 +322,7 @@ class Orthoimage:
     def expected_mm(self) -> tuple[float, float]:
         """Return median and 95th percentile of the expected error, millimetres; NaN if unknown.
 
-        Estimated from a part of the rows if the image is large.
+        If the image is large, they are estimated from some of its rows.
         """
         if self.error_m is None:
             return math.nan, math.nan
@@ -333,7 +335,7 @@ class Orthoimage:
 
     @property
     def number(self) -> int:
-        """Number of the wall shown to users: the index of its plane in `planes.json`."""
+        """Number of the wall that users see: the index of its plane in `planes.json`."""
         return self.wall if self.plane_index is None else self.plane_index
 
 

@@ -12,9 +12,9 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.sdk import port_specs
 from orthoflow.workflow.source import shipped_workflow
 
-# The first recipe that contains a step of the kind is used; with one wall and large cells it runs
-# in seconds and without a warning.
+# The first recipe that contains a step of the kind is used.
 _RECIPES: Final = ("direct", "quickstart")
+# With one wall and large cells, a recipe runs within seconds and without warnings.
 _COARSE: Final = {
     "direct": {
         "simulate.room": {"scan_step_m": 0.02},
@@ -23,8 +23,8 @@ _COARSE: Final = {
 }
 # Maximum length of a workflow's name in characters.
 _NAME_MOST: Final = 32
-# Metrics to compare. The RMS reported by a detector is no criterion: it is low if only easy planes
-# are found.
+# Metrics to compare. The RMS that a detector reports is not a criterion, since it is low if only
+# easy planes are found.
 _JUDGED: Final = {
     "plane": [
         "check.true_planes_found",
@@ -36,7 +36,7 @@ _JUDGED: Final = {
 
 
 def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
-    """Return a shipped recipe with a new method as a variant next to the method of its kind.
+    """Return a shipped recipe in which a new method is a variant next to the existing one.
 
     Args:
         method_id: the new method.
@@ -44,8 +44,8 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         catalog: the installed plugins.
 
     Returns:
-        YAML; empty for a source, which cannot have variants, and if no recipe has a step of the
-        kind.
+        YAML; empty if the method is a source, which cannot have variants, or if no recipe has a
+        step of its kind.
     """
     kind = method_id.partition(".")[0]
     for recipe in _RECIPES:
@@ -79,7 +79,7 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
             for port in port_specs(catalog.method(node["use"]).load().Out).values():
                 given.setdefault(port.type_name, []).append(f"{name}.{port.name}")
         if kind not in document["steps"] and given.keys() >= set(takes):
-            # A cloud is read or simulated, whichever is there.
+            # The cloud is read or simulated, depending on the recipe.
             wires = {name: given[name] if name == "cloud" else given[name][-1] for name in takes}
             double = {"use": method_id, "params": {"factor": 2.0}}
             variants = {"plain": {"use": method_id}, "double": double}
@@ -91,7 +91,7 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
 def _coarse_document(recipe: str) -> dict[str, Any]:
     """Return a shipped recipe, changed so that it runs in seconds."""
     text = shipped_workflow(recipe).read_text(encoding="utf-8")
-    # `Any`: a document of nested mappings.
+    # The type is Any, since the document consists of nested mappings.
     document: dict[str, Any] = YAML(typ="safe").load(text)
     for node in document["steps"].values():
         if coarse := _COARSE.get(recipe, {}).get(node["use"]):

@@ -21,7 +21,7 @@ class Port:
     Attributes:
         name: name of the port.
         class_name: product class.
-        same_as: for an output, the input of the same type that can be returned unchanged.
+        same_as: for an output, an input of the same type, which can be returned unchanged.
     """
 
     name: str
@@ -36,7 +36,7 @@ class KindPorts:
     Attributes:
         inputs: input ports in the order of the kind.
         outputs: output ports in the order of the kind.
-        imports: module -> names of product classes.
+        imports: names of product classes by module.
         needs: requirements for other plugins that provide the kind or a product.
     """
 
@@ -74,7 +74,7 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
 
 
 def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> KindPorts:
-    """Return the ports for a method of a new kind: one per product type."""
+    """Return the ports of a method of a new kind, one per product type."""
     return _kind_ports(catalog, {name: name for name in takes}, {name: name for name in gives}, [])
 
 

@@ -32,7 +32,8 @@ class Project:
         kind: kind of its method, either one of an installed plugin or a new one.
         takes: product types of the inputs of a new kind.
         gives: existing product types of the outputs of a new kind; empty for an existing kind.
-        product: name of a new product type that a new kind also outputs; empty if there is none.
+        product: name of a new product type, which the new kind also outputs; empty if there is
+            none.
     """
 
     name: str
@@ -63,7 +64,7 @@ class Project:
 
     @property
     def product_class(self) -> str:
-        """Name of the class of its own product."""
+        """Name of the class of the new product."""
         return f"{_class_name(self.product)}Product"
 
 

@@ -6,9 +6,10 @@ Use it in the tests of a plugin:
     def test_conformance(case):
         case.run()
 
-The suite reads only what the method declares, does not need pytest itself, and reports each problem
-in one sentence. A check that a method cannot pass is listed with the reason in `expected_failures`;
-it fails as soon as the check passes, so that outdated entries are noticed.
+The suite uses only the declarations of the method, does not need pytest itself, and reports each
+problem in one sentence. List a check that a method cannot pass, with the reason, in
+`expected_failures`; the case fails as soon as the check passes, so that outdated entries are
+noticed.
 """
 
 from orthoflow.testing.cases import ConformanceCase, ConformanceError, conformance_cases

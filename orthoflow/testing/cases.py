@@ -1,4 +1,4 @@
-"""Test cases, each a method and a check; a failure is reported in one sentence."""
+"""Test cases: pairs of a method and a check, whose failures are reported in one sentence."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ConformanceCase:
         method_id: id of the method.
         check: the check.
         subject: returns the method with its runs, which are shared by its cases.
-        expected_failure: why the check is expected to fail; empty if it must pass.
+        expected_failure: the reason why the check is expected to fail; empty if it must pass.
     """
 
     method_id: str
@@ -92,13 +92,13 @@ def conformance_cases(
 
     Args:
         method_id: id of a method in the installed entry points, e.g. `plane.flat`.
-        inputs: port -> product, for ports for which the suite has no suitable example, or a
-            function that returns this mapping, called by the first case.
+        inputs: products by port, for ports for which the suite has no suitable example; or a
+            function that returns this mapping and is called by the first case.
         params: parameters that differ from the defaults, for a fast run.
-        expected_failures: name of a check -> why the method cannot pass it.
+        expected_failures: reasons why the method cannot pass a check, by name of the check.
         golden: file with golden results, which must be reproduced as long as `result_version` is
-            unchanged; missing results are added by the first run. Keep it with the tests, under
-            version control.
+            unchanged; the first run adds missing results. Keep it with the tests, under version
+            control.
 
     Raises:
         ArgumentError: `expected_failures` contains an unknown check or an empty reason.

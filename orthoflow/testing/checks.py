@@ -32,7 +32,7 @@ from orthoflow.testing.physics import (
 )
 from orthoflow.testing.subjects import Subject, output_of, require
 
-# The name of a float parameter must contain one of these: a unit, or a word for a unitless value.
+# The name of a float parameter must contain one of these units or words for unitless values.
 UNIT_SUFFIXES: Final = (*UNITS, "world", "intensity")
 
 
@@ -43,8 +43,8 @@ class Check:
     Attributes:
         run: raises AssertionError with one sentence if the method breaks the rule.
         applies: whether the rule applies to a method.
-        is_quick: whether it needs at most two runs on the example, and otherwise only inputs that
-            are refused before any computation.
+        is_quick: whether the check needs at most two runs on the example and, apart from these,
+            only inputs that are refused before any computation.
     """
 
     run: Callable[[Subject], None]
@@ -137,7 +137,7 @@ def global_state_stays_untouched(subject: Subject) -> None:
 
 def nothing_is_written_outside_scratch(subject: Subject) -> None:
     """No files are written to the working directory, the home or the temporary folder."""
-    _ = subject.first  # an error of every run is reported in the same way by all rules
+    _ = subject.first  # all rules report an error of every run in the same way
     _, strays = subject.elsewhere
     require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
 
@@ -164,7 +164,7 @@ def threads_do_not_show(subject: Subject) -> None:
     """The digest is the same with one core and with two."""
     one, two = subject.first, subject.on_two_cores
     for name, digest in one.digests.items():
-        # An output that already differs between two runs on one core is covered by the rule above.
+        # Outputs that differ between two runs on one core violate the rule above.
         is_same = two.digests[name] == digest or subject.again.digests[name] != digest
         require(is_same, f"output {name} depends on the number of cores")
 
@@ -181,7 +181,7 @@ def _check_clouds(
     may_pass: bool = False,
 ) -> None:
     """Run the method on spoilt clouds; only an OrthoflowError with a message may be raised."""
-    _ = subject.first  # what stops every run is not about these clouds
+    _ = subject.first  # an error of every run is not due to these clouds
     for port in _cloud_ports(subject.method):
         cloud = subject.trial.inputs.get(port)
         if not isinstance(cloud, PointCloud):
@@ -225,7 +225,7 @@ def a_huge_coordinate_does_no_harm(subject: Subject) -> None:
 def missing_ties_are_reported(subject: Subject) -> None:
     """Without ties, no photo is reported as oriented."""
     ties = example_ties()
-    # `Any`: arrays of all types.
+    # The type is Any, since there are arrays of all types.
     rows: dict[str, Any] = {
         name: given[:0] for name, given in vars(ties).items() if isinstance(given, np.ndarray)
     }

@@ -29,9 +29,9 @@ class ExampleError(OrthoflowError, LookupError):
 def example_inputs(
     method: type[Method], *, besides: Collection[str] = ()
 ) -> dict[str, Product | InputFiles]:
-    """Return the required inputs of a method, all from one scene: photographed wall or room.
+    """Return the required inputs of a method, all from one scene: a photographed wall or a room.
 
-    The true room is included if a method has a port for it. Types that neither scene has are
+    The true room is included if the method has a port for it. Types that neither scene contains are
     created by an installed method that outputs them.
 
     Args:
@@ -152,7 +152,7 @@ def example_room(
 
 
 def few_points(offsets_m: NDArray[np.floating], grey: int | NDArray[np.uint8] = 128) -> PointCloud:
-    """Return a grey cloud of points at offsets (n, 3) from the origin, where its station is."""
+    """Return a grey cloud of points at offsets (n, 3) from the origin, which is its station."""
     x, y, z = np.ascontiguousarray(offsets_m.T, dtype=np.float32)
     greys = np.broadcast_to(np.uint8(grey), x.shape)
     return PointCloud(

@@ -1,9 +1,9 @@
 """Golden results: recorded samples of a method's results that reveal unintended changes.
 
 The exact bits of a result also depend on the processor and on the versions of numerical libraries.
-The file therefore contains samples of the numbers, which must be reproduced within the tolerances
+Therefore, the file contains samples of the numbers, which must be reproduced within the tolerances
 of the product types. Metadata values that describe a result have no tolerance, and shares of few
-cells can change considerably with the last bits of the inputs; these are only compared if the
+cells can change considerably with the last bits of the inputs. Such values are compared only if the
 samples of the inputs are the same.
 """
 
@@ -27,16 +27,18 @@ from orthoflow.products.product import Payload, Tolerance
 from orthoflow.testing.trials import Trial
 
 _AT_MOST: Final = 32
-# Share of cells that may differ: on an edge, a cell can change sides with the last bit of a number.
+# Share of cells that may differ, since a cell at an edge can change sides with the last bit of a
+# number.
 _STRAY_SHARE: Final = 1 / 16
-# As in comparisons of records: without a declared tolerance, only the last digits may differ.
+# As in comparisons of records, only the last digits may differ if no tolerance is declared.
 _UNSTATED: Final = 1e-6
-# Metadata values, such as medians or counts, describe a result. Without wide processor
-# instructions, one of a built-in method changed by 3e-4 with all arrays within their tolerances.
+# Tolerance of metadata values that describe a result, such as medians or counts. Without wide
+# processor instructions, such a value of a built-in method changed by 3e-4, while all arrays were
+# within their tolerances.
 _METADATA_SHARE: Final = 1e-2
 _DIGITS: Final = 9
 _ROUNDING: Final = 10.0 ** (1 - _DIGITS)
-# Odd, and not a divisor of raster sizes, so that consecutive samples are far apart.
+# An odd number that does not divide raster sizes, so that consecutive samples are far apart.
 _STRIDE: Final = 2_654_435_761
 _METADATA: Final = "metadata"
 
@@ -86,7 +88,7 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
     Args:
         file: JSON file by method id, created if missing.
         trial: the method and its inputs.
-        outputs: port -> product.
+        outputs: products by port.
 
     Returns:
         One sentence if a result changed without a new `result_version`; otherwise empty.
@@ -102,7 +104,7 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
         inputs={port: sample_of(product) for port, product in inputs.items()},
         outputs={port: sample_of(product) for port, product in outputs.items()},
     )
-    # Processes that test other methods use the same file.
+    # Other processes, which test other methods, use the same file.
     with file.open("a+", encoding="utf-8") as stream:
         lock_file(file, stream.fileno(), waits=True)
         stream.seek(0)
@@ -180,7 +182,7 @@ def sample_problem(
     *,
     numbers_stated: bool = True,
 ) -> str:
-    """Return the differences between two samples that exceed the tolerances; empty if none.
+    """Return the differences between two samples that exceed tolerances; empty if there are none.
 
     Args:
         before: sample of the first product.

@@ -44,10 +44,10 @@ SIZE_M: Final = (3.0, 2.0)
 GSD_M: Final = 0.006
 DISTORTION: Final = (-0.09, 0.03, 6e-4, -4e-4, 0.0)
 RELIEF_M: Final = 0.06
-# Wavelengths of the texture; the finest is four cells, to avoid aliasing in raster and photo.
+# Wavelengths of the texture; the shortest is four cells, to avoid aliasing in raster and photo.
 _OCTAVES_M: Final = (0.024, 0.06, 0.2)
-# Ties are on the wall and on a board in front of it: control points close to a single plane do not
-# determine lens and pose together.
+# Distance of a board in front of the wall. Ties are on the wall and on the board, because control
+# points close to a single plane do not determine both lens and pose.
 _BOARD_M: Final = 0.6
 _TIE_SIGMA_PX: Final = 0.3
 _TIE_SIGMA_M: Final = 0.001
@@ -69,7 +69,7 @@ class TexturedWall:
     def depth_m(
         self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the relief towards the viewer, at metres from the top-left corner."""
+        """Return the relief towards the viewer, at positions in metres from the top-left corner."""
         wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4) + 0.4 * np.sin(
             5.0 * across_m + 1
         )
@@ -78,7 +78,7 @@ class TexturedWall:
     def grey(
         self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the grey value from 0 to 1, at metres from the top-left corner."""
+        """Return the grey value, 0 to 1, at positions in metres from the top-left corner."""
         total = np.zeros(np.broadcast(across_m, down_m).shape)
         for step, noise in zip(_OCTAVES_M, self.noises, strict=True):
             at = [down_m / step + 8.0, across_m / step + 8.0]
@@ -108,7 +108,7 @@ def textured_wall(
 
 
 def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Walls:
-    """Return the wall as scanned, with a window and another contrast curve than in the photos."""
+    """Return the scanned wall, with a window and a different contrast curve from the photos."""
     frame = scene.frame
     across, down = places_of_cells(frame)
     rng = np.random.default_rng(seed)
@@ -140,7 +140,7 @@ def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Wall
 
 
 def places_of_cells(frame: WallFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return metres across and down, each (rows, cols), of the centres of raster cells."""
+    """Return the positions of raster cell centres, metres across and down, each (rows, cols)."""
     across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
     return across * frame.gsd_m, down * frame.gsd_m
 
@@ -228,7 +228,7 @@ def camera_before(
 def photo_of(
     scene: TexturedWall, camera: ViewingCamera, *, name: str = "a.png", calibrated: bool = True
 ) -> Photo:
-    """Return the image seen by the camera, traced at pixel centres; black outside the wall."""
+    """Return the image that a camera takes, traced at pixel centres; black outside the wall."""
     return Photo(
         name=name,
         encoded=_picture(pickle.dumps((scene, camera))),
@@ -239,7 +239,7 @@ def photo_of(
     )
 
 
-# Takes half a second per image, and most tests of a method use the same few.
+# An image takes half a second, and most tests of a method use the same few images.
 @lru_cache(maxsize=32)
 def _picture(pickled: bytes) -> bytes:
     """Return the image of a pickled scene and camera; equal ones share an entry of the cache."""
@@ -365,7 +365,7 @@ def _checkpoints() -> CheckPoints:
 
 @cache
 def example_ties() -> Ties:
-    """Return ties with 0.3 px noise, every 25th of them wrong by up to 40 px."""
+    """Return ties with 0.3 px noise, of which every 25th is wrong by up to 40 px."""
     return drawn_ties(11, noise_m=0.0)
 
 
@@ -374,7 +374,8 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
 
     Args:
         seed: seed of positions, noise and wrong ties.
-        noise_m: standard deviation of the coordinates of points; by default, the one in the ties.
+        noise_m: standard deviation of the coordinates of points; by default, that stored in the
+            ties.
     """
     rng = np.random.default_rng(seed)
     scene = photographed_scene()

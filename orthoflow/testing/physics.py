@@ -1,4 +1,4 @@
-"""Physical checks of results: planes that follow a motion, poses, positions of cells."""
+"""Physical checks of results: planes after a motion, poses, and positions of cells."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from orthoflow.testing.photographed import (
 )
 from orthoflow.testing.subjects import Subject, output_of, require
 
-# Ties with 0.3 px and 1 mm at 2.5 m: a single tie is off by 1.3 mm on the wall, the mean of a
-# hundred by a tenth of that. A half-pixel error from a wrong pixel convention is 1.5 mm.
+# With errors of 0.3 px and 1 mm at 2.5 m, a single tie is off by 1.3 mm on the wall, and the mean
+# of a hundred ties by a tenth of that. The half-pixel error of a wrong pixel convention is 1.5 mm.
 _POSE_LIMIT_M: Final = 0.0008
 # The smallest side has 2,300 points, which determine its direction to 0.003 deg.
 _ROOM_POINTS: Final = 20_000
@@ -41,14 +41,14 @@ _CELL_SIZES_M: Final = (0.006, 0.01)
 _SHIFT_LIMIT_CELLS: Final = 0.2
 _PAINTED_SHARE: Final = 0.3
 _JOINED_SHARE: Final = 0.97
-# Seeds of rooms, or of sets of ties, whose errors are compared with the predicted ones.
+# Seeds of the rooms or sets of ties whose errors are compared with the predicted ones.
 _DRAWS: Final = (2, 3, 4)
 # A plane farther away than this from a true plane is treated as another plane.
 _SAME_PLANE_M: Final = 0.02
-# Replaces a variance of zero, so that the ratio of its error is far too large.
+# Replaces a variance of zero, so that the ratio of actual to predicted error is far too large.
 _NO_VARIANCE: Final = 1e-30
-# Limits of actual to predicted RMS error. The RMS is known to 1/8; built-in methods have 0.82 to
-# 0.93.
+# Limits of the ratio of actual to predicted RMS error. The RMS is accurate to 1/8; built-in methods
+# have ratios of 0.82 to 0.93.
 _STATED_LIMITS: Final = (0.1, 2.0)
 
 
@@ -56,7 +56,7 @@ def planes_follow_a_rigid_motion(subject: Subject) -> None:
     """Planes found in a room that is rotated about the vertical and shifted move with it.
 
     Tolerances are 0.02 deg and 1 mm, far above the noise of the fit (2 mm / sqrt(n)) and far below
-    the errors of a method that depends on the axes or loses digits.
+    the errors of a method that depends on the axes or loses precision.
     """
     shift = np.array([634512.347, 486215.781, 112.193])
     for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
@@ -99,7 +99,7 @@ def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
         corners = truth.corners[nearest]
         places = np.vstack([corners, corners.mean(axis=0)])
         off_m = places @ found.normal[index] - found.offset[index]
-        # Planes that are not planes of the room are ignored here.
+        # Planes that are not part of the room are ignored here.
         if np.abs(off_m).max() < _SAME_PLANE_M:
             at = np.column_stack([places, -np.ones(len(places))])
             variances = np.einsum("ij,jk,ik->i", at, found.covariance[index], at)
@@ -189,7 +189,8 @@ def _check_cells(
     require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is covered")
     gradient: list[NDArray[np.float64]] = list(np.gradient(truth_grey))
     down, across = gradient
-    # Shown minus true = gradient * displacement: one displacement per layer, by least squares.
+    # Shown minus true = gradient * displacement; solve for one displacement per layer by least
+    # squares.
     design = np.column_stack([across[painted], down[painted], np.ones(int(painted.sum()))])
     difference = image.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
     shift_cells = np.linalg.solve(design.T @ design, design.T @ difference)[:2]

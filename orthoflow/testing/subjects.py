@@ -1,4 +1,4 @@
-"""A method to be checked, with its runs: each made only once and only if needed."""
+"""A method to be checked, with its runs, each of which is made only once and only if needed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ run = run_trial(pickle.loads((world / "trial").read_bytes()), world / "scratch",
 
 
 class Subject:
-    """A method to be checked, and its runs that checks compare.
+    """A method to be checked, and its runs, which the checks compare.
 
     Args:
         trial: a trial with one core.
@@ -53,7 +53,7 @@ class Subject:
 
     @cached_property
     def first(self) -> TrialRun:
-        """The first run, whose side effects on its inputs do not reach later ones."""
+        """The first run; later runs are not affected by side effects on its inputs."""
         return _run(replace(self.trial, inputs=deepcopy(dict(self.trial.inputs))))
 
     @cached_property
@@ -72,7 +72,8 @@ class Subject:
     def elsewhere(self) -> tuple[Mapping[str, str], list[str]]:
         """Digests of the same run in a new process with another hash seed, and stray files.
 
-        These were found in its working, home or temporary folder, which are empty at first.
+        The stray files were found in its working, home or temporary folder, which are initially
+        empty.
 
         Raises:
             AssertionError: the process failed; the message ends with the last line of its output.
@@ -85,7 +86,7 @@ class Subject:
         return _run(replace(self.trial, inputs={**self.trial.inputs, **inputs}))
 
     def run_on_photographs(self, **inputs: Product) -> TrialRun:
-        """Run the method on the photographs of the suite, with other inputs on ports it has."""
+        """Run the method on the photographs of the suite, with other inputs on some ports."""
         ports = port_specs(self.method.In)
         examples = example_inputs(self.method, besides=inputs)
         used = {port: one for port, one in inputs.items() if port in ports}
@@ -99,7 +100,7 @@ class Subject:
 
 
 def _run(trial: Trial, *, is_cancelled: bool = False) -> TrialRun:
-    # Outputs may be files mapped from the scratch folder; they stay readable after its removal.
+    # Outputs may be files mapped from the scratch folder; they remain readable after its removal.
     with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
         return run_trial(trial, Path(folder), is_cancelled=is_cancelled)
 
@@ -116,9 +117,9 @@ def _run_elsewhere(trial: Trial, world: Path) -> tuple[Mapping[str, str], list[s
         "PYTHONHASHSEED": "random",
         "HOME": str(places["home"]),
         "TMPDIR": str(places["tmp"]),
-        # As for steps of the engine: matplotlib's font cache does not belong to the method.
+        # As for steps of the engine, since matplotlib's font cache does not belong to the method.
         "MPLCONFIGDIR": str(world / "matplotlib"),
-        # Two threads if this session uses one, otherwise one.
+        # Use two threads if this process uses one, otherwise one.
         "OPENBLAS_NUM_THREADS": "2" if os.environ.get("OPENBLAS_NUM_THREADS") == "1" else "1",
     }
     done = subprocess.run(

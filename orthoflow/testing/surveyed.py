@@ -1,7 +1,7 @@
 """The simulated room as an example, for methods that use a scan or the truth about it.
 
 It has the same bits on every processor: results of sums, roots and angles are rounded to far fewer
-digits than they have.
+digits than they are accurate to.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from orthoflow.sdk import StepContext
 _SCAN_STEP_M: Final = 0.08
 # The first two are the main wall and the floor.
 _N_PLANES: Final = 2
-# Decimals kept: rounding errors of metres and unit vectors are ten million times smaller.
+# Number of decimals kept; rounding errors of metres and unit vectors are ten million times smaller.
 _DECIMALS: Final = 9
 
 
 def settled(values: NDArray[np.float64], decimals: int = _DECIMALS) -> NDArray[np.float64]:
-    """Round away differences caused by the order of sums and by fused instructions."""
-    # Adding zero converts minus zero, which has other bits than zero.
+    """Remove differences due to the order of sums and to fused instructions, by rounding."""
+    # Adding zero converts minus zero, whose bits differ from those of zero.
     return np.asarray(np.round(values, decimals) + 0.0)
 
 

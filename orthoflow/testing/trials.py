@@ -1,4 +1,4 @@
-"""Running a method outside a workflow for a check: once, observed, in a known folder."""
+"""Runs of a method outside a workflow, for checks: single, observed, in a given folder."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from orthoflow.sdk.context import Drawing, DrawnFigure
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """A method with inputs and parameters to run it with.
+    """A method with the inputs and parameters for a run.
 
     Attributes:
         method: class of the method.
-        inputs: port -> product.
+        inputs: products by port.
         params: parameters that differ from the defaults.
         seed: seed of the random generator.
         cores: maximum number of threads.
@@ -39,8 +39,8 @@ class TrialRun:
     """Result of running a trial.
 
     Attributes:
-        outputs: port -> product.
-        digests: port -> digest of the product.
+        outputs: products by port.
+        digests: digests of the products by port.
         changed_inputs: ports whose input was changed.
         drew_globally: whether numpy's global random generator was used.
         metrics: metrics reported by the method.
@@ -86,11 +86,11 @@ def run_trial(
         trial: the trial.
         scratch: scratch folder, created if missing.
         is_cancelled: whether the step is cancelled before it starts.
-        draws: keep figures; drawing takes longer than many methods.
+        draws: whether to keep figures, since drawing takes longer than many methods.
 
     Raises:
         OrthoflowError: raised by the method.
-        AssertionError: the method returned something that is not its `Out`.
+        AssertionError: the method returned an object that is not its `Out`.
     """
     scratch.mkdir(parents=True, exist_ok=True)
     events: list[StepEvent] = []
@@ -105,7 +105,7 @@ def run_trial(
     method = trial.method
     inputs = {name: one for name, one in trial.inputs.items() if isinstance(one, Product)}
     before, state = {name: digest_of(one) for name, one in inputs.items()}, _global_state()
-    # `Any`: the type of the returned value is checked here.
+    # The type is Any, since the type of the returned value is checked here.
     returned: Any = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     if not isinstance(returned, method.Out):
         got = type(returned).__name__

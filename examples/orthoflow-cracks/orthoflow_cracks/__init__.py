@@ -1,1 +1,1 @@
-"""An orthoflow plugin with a kind and a product of its own: cracks in orthoimages, as lines."""
+"""An orthoflow plugin with its own kind and product: cracks in orthoimages, as lines."""

@@ -1,4 +1,4 @@
-"""`simulate.cracked-wall`: an orthoimage with cracks that are exactly known."""
+"""`simulate.cracked-wall`: an orthoimage with exactly known cracks."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from orthoflow_cracks.cracks import Cracks
 
 _SIZE_M = (2.0, 1.2)
 _GSD_M = 0.004
-# Ends of the cracks, metres across and down.
+# End points of the cracks, in metres across and down.
 _ENDS_M = (((0.2, 0.15), (0.9, 0.95)), ((1.1, 0.9), (1.8, 0.3)), ((1.3, 0.1), (1.9, 0.12)))
 
 
 class CrackedWall(Method):
-    """A grey wall with three straight cracks; `cracks` is the truth."""
+    """Simulate a grey wall with three straight cracks; `cracks` is the truth."""
 
     id = "simulate.cracked-wall"
     result_version = 1
     determinism = "seeded"
 
     class Params(MethodParams):
-        """How wide the cracks are, and how rough the wall."""
+        """Width of the cracks, and roughness of the wall."""
 
         width_m: float = Field(0.008, gt=0, description="Width of the cracks.")
         noise_grey: float = Field(4.0, ge=0, description="Standard deviation of the colours.")
 
     class In(Ports):
-        """Nothing."""
+        """No inputs."""
 
     class Out(Ports):
-        """The orthoimage and what is in it."""
+        """The orthoimage and its cracks."""
 
         orthoimages: Orthoimages
         cracks: Cracks
@@ -77,7 +77,7 @@ class CrackedWall(Method):
 
 
 def distance_to(places, start, end):
-    """Give the distance of places (rows, cols, 2) to the line between two points."""
+    """Return the distance of positions (rows, cols, 2) from the line between two points."""
     direction = end - start
     share = np.clip((places - start) @ direction / (direction @ direction), 0.0, 1.0)
     return np.linalg.norm(places - start - share[..., np.newaxis] * direction, axis=-1)

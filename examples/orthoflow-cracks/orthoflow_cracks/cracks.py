@@ -1,4 +1,4 @@
-"""The product: cracks as lines, stored, compared and published like any other product."""
+"""The product: cracks as lines, which are stored, compared and published like any other product."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from orthoflow.products import Product, Tolerance
 
 @dataclass(frozen=True, kw_only=True)
 class Cracks(Product):
-    """Cracks of all walls, each a line through some vertices.
+    """Cracks of all walls; each is a line through its vertices.
 
     Attributes:
-        vertices_world: (n, 3) float64 metres, line after line.
-        line: (n,) int32 line that a vertex belongs to, 0..k-1 without gaps.
-        wall: (k,) int32 wall of each line.
+        vertices_world: (n, 3) float64 metres, in the order of the lines.
+        line: (n,) int32 index of the line of each vertex, 0..k-1 without gaps.
+        wall: (k,) int32 index of the wall of each line.
         width_m: (k,) float64 mean width of each line.
     """
 
@@ -48,11 +48,11 @@ class Cracks(Product):
         return len(self.wall)
 
     def vertices(self, index: int) -> NDArray[np.float64]:
-        """Give the vertices (m, 3) of one line."""
+        """Return the vertices (m, 3) of one line."""
         return self.vertices_world[self.line == index]
 
     def length_m(self) -> float:
-        """Give the length of all lines together."""
+        """Return the total length of all lines."""
         return sum(
             float(np.linalg.norm(np.diff(self.vertices(index), axis=0), axis=1).sum())
             for index in range(len(self))
@@ -60,7 +60,7 @@ class Cracks(Product):
 
 
 def publish_cracks(product: Cracks, folder: Path, digest: str) -> None:
-    """Write `cracks.geojson`: a line per crack in the metres of the scan."""
+    """Write `cracks.geojson`, with a line per crack in the scan's coordinates (metres)."""
     features = [
         {
             "type": "Feature",

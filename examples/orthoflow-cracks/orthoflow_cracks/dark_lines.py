@@ -1,4 +1,4 @@
-"""`crack.dark-lines`: what is darker than both of its sides, and long."""
+"""`crack.dark-lines`: long lines that are darker than the surface on both sides."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from orthoflow_cracks.cracks import Cracks
 
 
 class DarkLines(Method):
-    """Cells darker than their surroundings (black top-hat), joined to lines that are long enough."""
+    """Join cells that are darker than their surroundings (black top-hat) into long lines."""
 
     id = "crack.dark-lines"
     result_version = 1
@@ -20,7 +20,7 @@ class DarkLines(Method):
     citations = ("Serra 1982: Image Analysis and Mathematical Morphology (top-hat)",)
 
     class Params(MethodParams):
-        """What counts as a crack."""
+        """Criteria for cracks."""
 
         darker_grey: float = Field(
             25.0, gt=0, le=255, description="A crack is so much darker than its surroundings."
@@ -30,17 +30,17 @@ class DarkLines(Method):
         vertex_step_m: float = Field(0.05, gt=0, description="Distance of a line's vertices.")
 
     class In(Ports):
-        """What the method takes."""
+        """The orthoimages."""
 
         orthoimages: Orthoimages
 
     class Out(Ports):
-        """What it gives."""
+        """The cracks."""
 
         cracks: Cracks
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Look through every orthoimage."""
+        """Search every orthoimage for cracks."""
         lines, walls, widths_m = [], [], []
         images = inputs.orthoimages.images
         for index, image in enumerate(images):
@@ -66,13 +66,13 @@ class DarkLines(Method):
 
 
 def lines_of(image, params):
-    """Give vertices (m, 3), metres, and width of every crack in an orthoimage."""
+    """Yield the vertices (m, 3) and the width of every crack in an orthoimage, in metres."""
     import cv2
 
     frame = image.frame
     shown = np.isin(image.mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
     grey = eight_bits(image.rgb).mean(axis=2)
-    # What is not shown must not look dark.
+    # Cells without a colour must not look dark.
     grey = np.where(shown, grey, grey[shown].mean() if shown.any() else 0.0).astype(np.float32)
     width = 2 * max(1, round(params.width_max_m / frame.gsd_m / 2)) + 1
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
@@ -93,7 +93,7 @@ def lines_of(image, params):
 
 
 def drawn(image, lines):
-    """Give a drawing of lines, each of vertices (m, 3), over their orthoimage."""
+    """Return a drawing of an orthoimage with lines, each given by its vertices (m, 3)."""
     from matplotlib.figure import Figure
 
     frame = image.frame
@@ -108,7 +108,7 @@ def drawn(image, lines):
 
 
 def _along(cells):
-    """Give each cell's place on the longest axis of all of them."""
+    """Return the position of each cell along the longest axis of all cells."""
     centred = cells - cells.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     axis = axes[:, 1]

@@ -1,11 +1,11 @@
-"""What the plugin announces: a kind with its ports, a product type with its files, two methods."""
+"""Hooks of the plugin: a kind with its ports, a product type with its files, and two methods."""
 
 from orthoflow.sdk import KindSpec, MethodSpec, ProductSpec, hookimpl
 
 
 @hookimpl
 def orthoflow_kinds() -> list[KindSpec]:
-    """Give the kind; any other plugin may bring methods of it."""
+    """Return the kind; any other plugin can add methods of this kind."""
     return [
         KindSpec(
             name="crack",
@@ -18,7 +18,7 @@ def orthoflow_kinds() -> list[KindSpec]:
 
 @hookimpl
 def orthoflow_products() -> list[ProductSpec]:
-    """Give the product type, and what writes its files."""
+    """Return the product type and the function that writes its files."""
     return [
         ProductSpec(
             type_name="cracks",
@@ -31,7 +31,7 @@ def orthoflow_products() -> list[ProductSpec]:
 
 @hookimpl
 def orthoflow_methods() -> list[MethodSpec]:
-    """Give the methods."""
+    """Return the methods."""
     return [
         MethodSpec(
             id="crack.dark-lines",

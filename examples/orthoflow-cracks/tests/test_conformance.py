@@ -1,4 +1,4 @@
-"""Both methods keep the rules; the simulated wall is what the detector is tried on."""
+"""Both methods follow the rules; the detector is tested on the simulated wall."""
 
 from pathlib import Path
 
@@ -34,6 +34,6 @@ def test_the_cracks_are_found_where_they_are(tmp_path):
     trial = Trial(method=DarkLines, inputs={"orthoimages": made["orthoimages"]})
     found = run_trial(trial, tmp_path / "found").outputs["cracks"]
     assert len(found) == len(made["cracks"])
-    # A line is cut short by half of its last step, and as wide as the cells it covers.
+    # A line may lack half of its last step, and it is as wide as the cells that it covers.
     assert found.length_m() == pytest.approx(made["cracks"].length_m(), abs=0.15)
     np.testing.assert_allclose(found.width_m, 0.008, atol=0.003)

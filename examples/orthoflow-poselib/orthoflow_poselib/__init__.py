@@ -1,1 +1,1 @@
-"""An orthoflow plugin: PoseLib orients the photos."""
+"""An orthoflow plugin: photos are oriented by PoseLib."""

@@ -1,4 +1,4 @@
-"""`orient.poselib`: each photo by PoseLib's `estimate_absolute_pose`."""
+"""`orient.poselib`: orient each photo with PoseLib's `estimate_absolute_pose`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import Field
 
 
 class OrientPoselib(Method):
-    """Orient each calibrated photo by itself with PoseLib's LO-RANSAC and refinement."""
+    """Orient each calibrated photo separately with PoseLib's LO-RANSAC and refinement."""
 
     id = "orient.poselib"
     result_version = 1
@@ -23,7 +23,7 @@ class OrientPoselib(Method):
     )
 
     class Params(MethodParams):
-        """What a tie may deviate, and how many must agree."""
+        """Tolerance and minimum number of ties that agree."""
 
         tolerance_px: float = Field(
             2.0, gt=0, description="Ties that deviate more from a pose do not count for it."
@@ -31,18 +31,18 @@ class OrientPoselib(Method):
         n_ties_min: int = Field(12, ge=6, description="Ties that must agree with a pose.")
 
     class In(Ports):
-        """What the method takes."""
+        """The ties and the photos."""
 
         ties: Ties
         photos: Photos
 
     class Out(Ports):
-        """What it gives."""
+        """The orientations."""
 
         cameras: Cameras
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Orient photo by photo."""
+        """Orient the photos one by one."""
         ties = inputs.ties
         names = np.array(ties.photo_names)
         cameras = []
@@ -59,12 +59,12 @@ class OrientPoselib(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """The library whose version changes results."""
+        """Return the version of the library that determines the results."""
         return {"poselib": version("poselib")}
 
 
 def oriented(photo, pixels, points, params, seed):
-    """Give the orientation of one photo, or the reason against it."""
+    """Return the orientation of one photo, or the reason why it has none."""
     import poselib
 
     lens = photo.intrinsics
@@ -73,7 +73,8 @@ def oriented(photo, pixels, points, params, seed):
     if len(pixels) < params.n_ties_min:
         return Camera(photo=photo.name, status=f"{len(pixels)} ties are too few")
     k1, k2, p1, p2, k3 = lens.distortion
-    # First pixel at (0.5, 0.5) on both sides: PoseLib only needs pixels and camera to agree.
+    # The centre of the first pixel is at (0.5, 0.5). PoseLib accepts any convention if pixels and
+    # camera have the same.
     camera = {
         "model": "FULL_OPENCV",
         "width": lens.width,

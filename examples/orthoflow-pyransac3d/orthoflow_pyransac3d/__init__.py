@@ -1,1 +1,1 @@
-"""An orthoflow plugin: pyRANSAC-3D finds the planes."""
+"""An orthoflow plugin: planes are found by pyRANSAC-3D."""

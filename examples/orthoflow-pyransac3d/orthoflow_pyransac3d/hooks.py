@@ -1,11 +1,11 @@
-"""What the plugin announces."""
+"""Hook of the plugin."""
 
 from orthoflow.sdk import MethodSpec, hookimpl
 
 
 @hookimpl
 def orthoflow_methods() -> list[MethodSpec]:
-    """Give the one method."""
+    """Return the method."""
     return [
         MethodSpec(
             id="plane.pyransac3d",

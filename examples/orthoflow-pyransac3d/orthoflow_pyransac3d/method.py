@@ -1,4 +1,4 @@
-"""`plane.pyransac3d`: pyRANSAC-3D's `Plane.fit`, plane after plane, on a sample of the points."""
+"""`plane.pyransac3d`: find planes one after the other with pyRANSAC-3D's `Plane.fit`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from pydantic import Field
 
 
 class PyRansac3d(Method):
-    """The plane with the most points of a sample, then the next among the rest.
+    """Find the plane with the most points in a sample, then the next one in the remaining points.
 
-    Each is fitted to the points near it, since three random points hold their own noise.
+    Each plane is fitted to the points near it, since a plane through three random points depends on
+    their noise.
     """
 
     id = "plane.pyransac3d"
@@ -25,7 +26,7 @@ class PyRansac3d(Method):
     citations = ("pyRANSAC-3D, doi:10.5281/zenodo.7212567",)
 
     class Params(MethodParams):
-        """How planes are looked for, and when the search ends."""
+        """Parameters of the search, and when it ends."""
 
         tolerance_m: float = Field(
             0.03, gt=0, description="Largest distance of a point to the plane it belongs to."
@@ -41,18 +42,18 @@ class PyRansac3d(Method):
         )
 
     class In(Ports):
-        """What the method takes."""
+        """The cloud."""
 
         cloud: PointCloud
 
     class Out(Ports):
-        """What it gives."""
+        """The planes and the labels of the points."""
 
         planes: Planes
         labels: PointLabels
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Find planes until they are too small."""
+        """Find planes until the next one is too small."""
         cloud = inputs.cloud
         cloud.require_points(100)
         points = np.column_stack([cloud.x, cloud.y, cloud.z]).astype(np.float64)
@@ -73,15 +74,16 @@ class PyRansac3d(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """The library whose version changes results."""
+        """Return the version of the library that determines the results."""
         return {"pyransac3d": version("pyransac3d")}
 
 
 def next_plane(points, params, ctx):
-    """Give normal and centre (3,) of the plane with the most points (n, 3), fitted to them."""
+    """Return normal and centre (3,) of the plane fitted to most of the points (n, 3)."""
     import pyransac3d
 
-    # The library draws from Python's global generator: seeded from ours, and put back afterwards.
+    # The library uses Python's global random generator; seed it from ours and restore it
+    # afterwards.
     state = random.getstate()
     random.seed(int(ctx.rng.integers(2**32)))
     try:
@@ -94,21 +96,21 @@ def next_plane(points, params, ctx):
         raise MethodError("no three of the points span a plane: are they all in one place?")
     near = points[inliers]
     normal, centre = fitted(near)
-    for share in (0.5, 0.25, 0.25):  # points of the next wall pull at a plane through all near ones
+    for share in (0.5, 0.25, 0.25):  # points of the next wall would tilt a fit to all
         distances_m = np.abs((points - centre) @ normal)
         normal, centre = fitted(points[distances_m < share * params.tolerance_m])
     return normal, centre
 
 
 def fitted(points):
-    """Give normal and centre (3,) of the plane nearest to points (n, 3)."""
+    """Return normal and centre (3,) of the plane that fits points (n, 3) best."""
     centre = points.mean(axis=0)
     _, axes = np.linalg.eigh((points - centre).T @ (points - centre))
     return axes[:, 0], centre
 
 
 def products(points, cloud, found, params, ctx):
-    """Give planes, largest first, and labels of all points."""
+    """Return planes, largest first, and labels of all points."""
     signed_m = np.array([(points - centre) @ normal for normal, centre in found])
     nearest = np.abs(signed_m).argmin(axis=0)
     nearest[np.abs(signed_m).min(axis=0) >= params.tolerance_m] = -1
@@ -144,13 +146,14 @@ def products(points, cloud, found, params, ctx):
 
 
 def covariance(points, normal, centre_world):
-    """How exact the plane is: covariance (4, 4) of its normal and its offset, in metres.
+    """Return the covariance (4, 4) of the normal and the offset (metres) of a plane.
 
-    That of least squares, as if every point were measured by itself; neighbours in a scan are not.
+    It is that of a least-squares fit and assumes independent errors, although those of neighbouring
+    points in a scan are correlated.
     """
     from_middle = points - points.mean(axis=0)
     sigma2 = np.mean((from_middle @ normal) ** 2)
-    spread, axes = np.linalg.eigh(from_middle.T @ from_middle)  # ascending: the first is across
+    spread, axes = np.linalg.eigh(from_middle.T @ from_middle)  # the first is the normal
     tilts = [
         np.append(axis, axis @ centre_world) * np.sqrt(sigma2 / max(total, 1e-12))
         for total, axis in zip(spread[1:], axes.T[1:])
@@ -160,7 +163,7 @@ def covariance(points, normal, centre_world):
 
 
 def rectangle(points, normal, centre, up):
-    """Give corners (4, 3) around points on a plane: top-left, then counter-clockwise."""
+    """Return corners (4, 3) around points on a plane: top-left, then counter-clockwise."""
     axes = wall_axes(normal, up)
     in_plane = (points - centre) @ axes.T
     (left, top), (right, bottom) = in_plane.min(axis=0), in_plane.max(axis=0)

@@ -1,4 +1,4 @@
-"""The method keeps every rule that orthoflow's own methods keep."""
+"""The method follows all rules that orthoflow's own methods follow."""
 
 from pathlib import Path
 

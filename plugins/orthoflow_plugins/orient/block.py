@@ -498,7 +498,7 @@ def _add_observations(
     joint: dict[int, NDArray[np.float64]],
     soft_limit: float,
 ) -> None:
-    """Add the observations; for a point seen only once, they include the covariance of the point."""
+    """Add the observations; those of a point seen only once include the covariance of the point."""
     import pyceres
     import pycolmap
     from pycolmap import cost_functions

@@ -633,9 +633,7 @@ def warnings_for(candidate: Candidate) -> list[Note]:
 
 
 def hull_area(pixels: NDArray[np.float64]) -> float:
-    """Return the area of the convex hull of points (n, 2); 0 for fewer than three or collinear
-    points.
-    """
+    """Return the area of the convex hull of points (n, 2); 0 if collinear or fewer than three."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(pixels) < 3:
