@@ -66,15 +66,16 @@ compare:
 HEAD = f"""\
 # The workflow file
 
-`{COMMAND}` generates this page from `orthoflow/workflow/model.py`,
-which also defines the checks and `orthoflow schema`.
+`{COMMAND}` generates this page from `orthoflow/workflow/model.py`.
+The same models define the checks and the output of `orthoflow schema`.
 
 ```yaml
 {EXAMPLE}```
 
 `orthoflow check FILE` reports all mistakes at once, each as `file:line:column: path: message`.
-Names start with a lower-case letter and have at most 32 lower-case letters, digits, `-` or `_`.
-Values follow YAML 1.2's core schema: `.5e-1` is a number, `1_000`, `0b11` and `yes` are text.
+Names start with a lower-case letter and consist of at most 32 lower-case letters, digits, `-`
+or `_`. Values follow the core schema of YAML 1.2, in which `.5e-1` is a number, but `1_000`,
+`0b11` and `yes` are text.
 """
 
 

@@ -203,14 +203,14 @@ class FileSection(BaseModel):
 
 
 class InputSection(FileSection):
-    """A folder stands for all files in it and its subfolders; a pattern stands for the files that
-    it matches (`**`: folders at any depth). The files of an input must exist unless it is optional.
+    """A folder stands for all files in it and in its subfolders. A pattern stands for the files
+    that it matches (`**`: folders at any depth). The files must exist unless the input is optional.
     """  # noqa: D205 - the text of the reference
 
     files: _Files = Field(
         (),
         description="A file, a folder, a pattern, or a list of these, relative to the workflow. "
-        "If it is missing, pass `--input NAME=PATH`.",
+        "Without this key, pass `--input NAME=PATH`.",
         examples=["data/photos/*.jpg"],
     )
     optional: _Flag = Field(
@@ -235,10 +235,10 @@ class SweepSection(FileSection):
     """A parameter can have several values: `tolerance_m: {sweep: [0.02, 0.05]}` makes the variants
     `tolerance_m-0_02` and `tolerance_m-0_05` of the step. A sweep inside a variant adds the name of
     that variant (`ransac-tolerance_m-0_02`); `baseline` and `exclude` accept `ransac` for all of
-    them. If values cannot be part of a name, variants are numbered (`sweep-1`); `orthoflow plan`
-    lists them. Sweeps of several parameters make all combinations. The report plots the metrics
-    against the parameter. `--set STEP.PARAM=VALUE` replaces a sweep;
-    `--set 'STEP.PARAM={sweep: [...]}'` makes one.
+    them. If a value cannot be part of a name, the variants are numbered (`sweep-1`), and
+    `orthoflow plan` lists them. Sweeps of several parameters give all combinations of their values.
+    The report plots the metrics against the parameter. `--set STEP.PARAM=VALUE` replaces a sweep
+    with a value, and `--set 'STEP.PARAM={sweep: [...]}'` replaces a value with a sweep.
     """  # noqa: D205
 
     sweep: Annotated[list[Any], Field(min_length=2, max_length=MOST_SWEPT)] = Field(
@@ -252,8 +252,8 @@ class CallSection(FileSection):
 
     use: _Text | None = Field(
         None,
-        description="The method, as `kind.method`; `orthoflow plugins list` shows all. It is "
-        "required unless the step has variants.",
+        description="The method, as `kind.method`; `orthoflow plugins list` shows all methods. "
+        "This key is required unless the step has variants.",
         examples=["plane.hough2d"],
     )
     params: dict[str, Any] = Field(
@@ -263,9 +263,10 @@ class CallSection(FileSection):
     )
     repeat: _Repeats = Field(
         1,
-        description="Number of runs with different seeds; for a method without randomness, "
-        "repeats measure times. Steps listed in `compare.metrics` (by default all inspections) "
-        "and the steps in between run once per repeat; all others use the first repeat.",
+        description="Number of runs with different seeds. For a method without randomness, "
+        "repeats only measure times. Steps listed in `compare.metrics` (by default all "
+        "inspections) and the steps in between run once per repeat; all other steps use the first "
+        "repeat.",
         examples=[10],
     )
     resources: ResourcesSection = Field(
@@ -281,16 +282,16 @@ class CallSection(FileSection):
 
 
 class StepSection(CallSection):
-    """A step calls one method, or has variants that each call one and contain the keys of the call.
-    A step that lacks a required product because optional data is missing is skipped, together with
-    all steps that need it. Steps can be in any order.
+    """A step either calls one method or has variants, each of which calls one method and contains
+    the keys of that call. If optional data is missing, steps that need this data are skipped, as
+    are all steps that depend on them. Steps can be listed in any order.
     """  # noqa: D205
 
     in_: dict[str, _Sources] = Field(
         {},
         alias="in",
-        description="Source of the product for each port; from a list, the first available one is "
-        "used.",
+        description="Source of the product for each port. If a list is given, the first available "
+        "source is used.",
         examples=[{"cloud": "cloud.cloud", "planes": ["given.planes", "plane.planes"]}],
     )
     if_: _InputSource | None = Field(
@@ -313,11 +314,11 @@ class StepSection(CallSection):
 
 class DatasetSection(BaseModel):
     """Steps that depend on the data run once per dataset, and their addresses begin with
-    `data=<name>`; all others run once. Inputs that a dataset does not list are those of the
-    workflow. You can list the datasets in a CSV file instead, one per line: a column `name`, one
-    per input, and columns such as `room.noise_m` for parameters. An empty field leaves the
-    parameter unchanged; paths are relative to the file. `--datasets FILE` replaces the section;
-    `--only-data A,B` selects datasets.
+    `data=<name>`; all other steps run once. Inputs that a dataset does not list are taken from the
+    workflow. Alternatively, list the datasets in a CSV file, one per line, with a column `name`, a
+    column per input, and columns such as `room.noise_m` for parameters. An empty field leaves the
+    parameter unchanged. Paths are relative to the CSV file. `--datasets FILE` replaces this
+    section, and `--only-data A,B` selects datasets.
     """  # noqa: D205
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -325,8 +326,8 @@ class DatasetSection(BaseModel):
 
     set: dict[str, Any] = Field(
         {},
-        description="Parameters of this dataset, with names as in `--set`, which overrides them, "
-        "and `seed`, a number or a sweep.",
+        description="Parameters of this dataset, named as in `--set`, and `seed` (a number or a "
+        "sweep). `--set` overrides them.",
         examples=[{"room.noise_m": 0.004, "plane.ransac.tolerance_m": 0.03, "seed": 7}],
     )
 
@@ -338,10 +339,10 @@ class DatasetsSection(FileSection):
 
 
 class Comparison(FileSection):
-    """Every step after variants runs once per combination that affects it. Tables list each of
-    these cells by its address: step, dataset, seed, variants and repeat, such as
-    `ortho@plane=ransac,orient=pnp#2`. Without `compare`, only the baseline runs: the first variant
-    of each step.
+    """A step that depends on variants runs once per combination that affects it. Each of these runs
+    is a cell. Its address consists of step, dataset, seed, variants and repeat, such as
+    `ortho@plane=ransac,orient=pnp#2`. Without `compare`, only the baseline runs, which is the first
+    variant of each step.
     """  # noqa: D205
 
     design: Design = Field(
@@ -352,8 +353,8 @@ class Comparison(FileSection):
     )
     baseline: _Assignment = Field(
         {},
-        description="The variant of each step that the report shows and compares with the others; "
-        "by default the first.",
+        description="The variant of each step that the report shows and with which it compares "
+        "the others; by default the first.",
         examples=[{"plane": "hough2d", "orient": "bundle"}],
     )
     exclude: tuple[Annotated[_Assignment, Field(min_length=1)], ...] = Field(
@@ -364,8 +365,8 @@ class Comparison(FileSection):
     )
     metrics: _Metrics = Field(
         (),
-        description="Metrics in the report's tables, as `step.metric`, with `*` as wildcard; "
-        "by default all quality metrics.",
+        description="Metrics in the tables of the report, as `step.metric`, with `*` as a "
+        "wildcard; by default all quality metrics.",
         examples=[["plane.rms_mm", "*.wall_s"]],
     )
 
@@ -390,8 +391,8 @@ class SeedSection(FileSection):
 
 
 class WorkflowFile(FileSection):
-    """A workflow file is YAML 1.2 and contains only data: no templates, expressions, environment
-    variables or tags. Duplicate keys and names are errors.
+    """A workflow file is a YAML 1.2 file that contains only data. Templates, expressions,
+    environment variables and tags are not supported. Duplicate keys and names are errors.
     """  # noqa: D205
 
     orthoflow: Annotated[
@@ -401,13 +402,13 @@ class WorkflowFile(FileSection):
     ] = Field(FORMAT, description="Version of this format.", examples=[FORMAT])
     name: _Name | None = Field(
         None,
-        description="Name of the workflow, which is the prefix of the names of run folders; by "
-        "default the file name.",
+        description="Name of the workflow, with which the names of run folders begin; by default "
+        "the file name.",
         examples=["palace-room"],
     )
     seed: _Seed | SeedSweep = Field(
         0,
-        description="Seed from which the seeds of steps are derived, with the method and the "
+        description="The seed of each random step is derived from this seed, the method and the "
         "repeat. A sweep runs every random step once per seed.",
         examples=[1729],
     )
