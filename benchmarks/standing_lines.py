@@ -91,7 +91,7 @@ class Stillness:
 
 
 def record(command: list[str], frames: Path | None) -> tuple[dict[str, Stillness], int]:
-    """Run a command in its own terminal; observe the lines of running steps, and the whole screen.
+    """Run a command in a terminal; observe the lines of running steps and the whole screen.
 
     Returns:
         The observations by line, and the exit code.

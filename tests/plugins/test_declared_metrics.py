@@ -1,7 +1,7 @@
-"""Every metric that a method of ours may report is declared, so that comparisons can be checked.
+"""All metrics of the built-in methods are declared, so that comparisons can be checked.
 
-The conformance suite holds it for what the methods report on its examples; here their sources are
-read, for what they report at other times.
+The conformance suite checks metrics reported on its examples; here, the sources are searched for
+all others.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ _PLUGINS = Path(orthoflow_plugins.__file__).parent
 _GIVEN = re.compile(
     r"""ctx\.metric\(\s*f?"([^"]+)"|Finding\(\s*name=f?"([^"]+)"|\bsay\(f?"([^"]+)\""""
 )
-# What stands in braces in a source, by what it may become.
+# Possible values of expressions in braces in the sources.
 _PARTS = {"axis": "x", "reach": "1", "unit": "mm", "kind": "iou", "score": "iou"}
-# Names that are put together of parts: what reports them is held by the conformance suite.
+# Names composed of parts, whose metrics the conformance suite checks.
 _PUT_TOGETHER = {
     *(
         "{prefix}{name}",
@@ -61,7 +61,7 @@ def test_every_metric_in_the_sources_of_a_kind_is_declared_by_a_method_there(kin
     methods = [m for m in our_methods() if m.__module__.startswith(f"orthoflow_plugins.{kind}.")]
     sources = "".join(path.read_text() for path in sorted((_PLUGINS / kind).glob("*.py")))
     names = {next(filter(None, found)) for found in _GIVEN.findall(sources)} - _PUT_TOGETHER
-    # Those of one true plane or one photo stay in the record.
+    # Metrics of a single true plane or photo are only in the record.
     names = {name for name in names if "[" not in name}
     whole = {re.sub(r"\{(\w+)\}", lambda part: _PARTS.get(part[1], "x"), name) for name in names}
     unknown = {name for name in whole if not any(method.may_report(name) for method in methods)}

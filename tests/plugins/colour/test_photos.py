@@ -1,4 +1,4 @@
-"""`colour.photos`: points take the colours of photos that really see them."""
+"""`colour.photos`: points get the colours of photos that show them."""
 
 from __future__ import annotations
 
@@ -38,21 +38,22 @@ def test_points_take_the_colour_of_what_the_photo_sees_there(tmp_path: Path) -> 
     )
     assert cloud.rgb is not None
     points = cloud.points_world()
-    # Each point keeps its number in the given cloud, by which labels are compared with the truth.
+    # Each point keeps its index in the given cloud, which is needed to compare labels with the
+    # truth.
     assert cloud.point_id is not None
     given = ortho_scenes.cloud(where)
     np.testing.assert_array_equal(given.points_world()[cloud.point_id], points)
     truth = ortho_scenes.cast(
         where, np.broadcast_to(viewer.centre_world, points.shape), points - viewer.centre_world
     )
-    # What the photo cannot see is left out: all but a rim of half a depth pixel.
+    # Points that the photo does not show are omitted, except along edges of half a depth pixel.
     off_m = 0.004 * np.linalg.norm(
         where.wall_from_world(points)[:, :2] - truth.places[:, :2], axis=1
     )
     seen = off_m < 0.01
     assert seen.mean() > 0.97
     assert 0.5 < metrics["coloured_share"] < 1.0
-    # Blue tells the surface; a few points lie at its rims, between two pixels.
+    # Blue identifies the surface; a few points are at its edges, between two pixels.
     wanted = BLUE[truth.surface]
     same = np.abs(cloud.rgb[:, 2].astype(int) - wanted) <= 3
     assert same[seen].mean() > 0.97
@@ -89,7 +90,7 @@ def test_photos_that_are_not_oriented_or_look_elsewhere_are_refused(tmp_path: Pa
 
 def test_the_box_holds_the_cameras_and_the_cloud_but_for_outliers() -> None:
     viewer = ortho_scenes.camera(ortho_scenes.frame())
-    # A floor of four metres square with a point per centimetre, and a few stray points.
+    # A floor of 4 m x 4 m with a point per centimetre, and a few stray points.
     x, y = np.meshgrid(np.arange(400) / 100.0, np.arange(400) / 100.0)
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     stray = np.tile([[500.0, 500.0, 500.0]], (5, 1))
@@ -97,7 +98,7 @@ def test_the_box_holds_the_cameras_and_the_cloud_but_for_outliers() -> None:
     box = module._box_of(cloud, [viewer])
     centre, offsets = viewer.centre_world - cloud.origin, cloud.points_world()[:-5] - cloud.origin
     low, high = np.minimum(offsets.min(axis=0), centre), np.maximum(offsets.max(axis=0), centre)
-    # A cube more on each side.
+    # The box has a margin of one cube on each side.
     assert (np.abs(box.low - low) < 0.15).all()
     assert (np.abs(box.high - high) < 0.15).all()
     assert box.spacing_m == pytest.approx(0.01, rel=0.1)

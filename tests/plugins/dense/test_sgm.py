@@ -1,4 +1,4 @@
-"""`dense.sgm`: points of oriented photos lie on the surface that these show."""
+"""`dense.sgm`: points of oriented photos are on the surface that the photos show."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ def test_points_lie_on_the_surface(tmp_path: Path, room: SimulateRoom.Out) -> No
     assert cameras is not None
     assert room.cameras == cameras
     cloud, metrics = matched(tmp_path, DenseSgm.In(photos=room.photos, cameras=room.cameras))
-    # Three rows of six photos, whose last ones have nothing to their right.
+    # There are three rows of six photos; the last photo of a row has no neighbour to its right.
     assert metrics["n_pairs"] == 15
     assert metrics["n_points"] == len(cloud)
-    # Of the 70 % that overlap, without a rim as wide as the range of disparities.
+    # 70 % overlap, but a margin as wide as the range of disparities is not matched.
     assert metrics["matched_share"] > 0.3
     assert cloud.stations is not None
     assert cloud.scan is not None
     assert cloud.rgb is not None
     chosen = np.random.default_rng(1).choice(len(cloud), 5_000, replace=False)
     points, stations = cloud.points_world(chosen), cloud.stations[cloud.scan[chosen]]
-    # The first surface on the ray from the station through the point, by the exact scene.
+    # Distance of the first surface of the scene on the ray from the station through the point.
     views = SceneCameras(room.truth.scene, cores=1)
     share = np.concatenate(
         [
@@ -71,9 +71,9 @@ def test_points_lie_on_the_surface(tmp_path: Path, room: SimulateRoom.Out) -> No
         ]
     )
     off_m = np.abs(share - 1.0) * distance
-    # A pixel of 8 mm at a base of a third of the distance: 0.3 px of disparity are 8 mm.
+    # With 8 mm pixels and a base of a third of the distance, 0.3 px of disparity are 8 mm.
     assert np.median(off_m) < 0.008
-    # The others lie at edges, of which one photo shows what the other does not.
+    # The other points are at edges, where one photo shows areas that the other does not show.
     assert np.mean(off_m < 0.03) > 0.85
 
 
@@ -83,7 +83,7 @@ def test_of_points_in_one_cube_one_is_kept(tmp_path: Path, room: SimulateRoom.Ou
     coarse, _ = matched(tmp_path / "coarse", inputs, spacing_m=0.05)
     assert coarse.scan is not None
     cubes = np.column_stack([coarse.scan, np.floor(coarse.points_world() / 0.05 + 1e-6)])
-    # Offsets are float32: a few points at the sides of cubes fall into the next one.
+    # Offsets are float32, so a few points at the sides of cubes are in the next cube.
     assert len(np.unique(cubes, axis=0)) > 0.99 * len(coarse)
     assert len(coarse) < 0.2 * len(dense)
     given = {tuple(row) for row in np.round(dense.points_world(), 4)}
@@ -102,7 +102,7 @@ def test_photos_without_a_neighbour_and_surfaces_elsewhere_are_refused(
             tmp_path / "refused",
             DenseSgm.In(photos=room.photos, cameras=Cameras(cameras=tuple(refused))),
         )
-    # The first and the one above it: their base runs along columns.
+    # The first photo and the one above it, whose base is along the columns.
     above = Cameras(cameras=(room.cameras.cameras[0], room.cameras.cameras[6]))
     with pytest.raises(MethodError, match="among 2 oriented photos"):
         matched(tmp_path / "above", DenseSgm.In(photos=room.photos, cameras=above))

@@ -1,4 +1,4 @@
-"""Errors of cells and of their sources, from displacements, depths and colours that are known."""
+"""Errors of cells and of their sources, from known displacements, depths and colours."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ SHAPE = (12, 20)
 
 
 def scene() -> tuple[Any, Any, Any]:
-    """An orthoimage, its wall and their truth: a step of two columns' depth at column 10.
+    """Return an orthoimage, its wall and their truth, with a depth step at column 10.
 
-    Rows 0 and 1 of the image are right; row 5 is off by 10 grey, row 7 filled and off by 20.
+    The colours are right except in row 5, wrong by 10 grey levels, and in row 7, filled and wrong
+    by 20.
     """
     rgb = np.full((*SHAPE, 3), 100.0, dtype=np.float32)
     depth = np.zeros(SHAPE, dtype=np.float32)
@@ -61,7 +62,7 @@ def test_cells_are_compared_away_from_steps_and_by_what_they_are() -> None:
     lattice = np.zeros(SHAPE, dtype=np.bool_)
     lattice[1::2, 1::2] = True
     steps = depth_step_band(true.depth_m)
-    # Two cells on either side of the step, and two rows at the rim of the surface.
+    # Two cells on either side of the step, and two rows at the border of the surface.
     expected = np.zeros(SHAPE, dtype=np.bool_)
     expected[:, 8:12] = expected[9:] = True
     np.testing.assert_array_equal(steps[:11], expected[:11])
@@ -74,7 +75,7 @@ def test_cells_are_compared_away_from_steps_and_by_what_they_are() -> None:
     assert len(samples.depth_m) == len(samples.sigma_m) == n_away
     assert len(samples.step_depth_m) == 10 * 20 - n_away
     assert np.isnan(errors.depth_m[[0, 11]]).all()
-    # Per row of sixteen cells away from steps: six rows right, one off by 10.
+    # Sixteen cells per row are away from steps; six rows are right, one is wrong by 10.
     assert np.count_nonzero(samples.colour == 100.0) == 16
     assert len(samples.colour) == 8 * 16
     np.testing.assert_allclose(errors.grey[5, :8], 10.0)
@@ -146,13 +147,13 @@ def test_numbers_follow_their_definitions() -> None:
 
 
 def test_patches_further_off_than_the_rest_are_displaced() -> None:
-    """A quarter of a cell is always allowed, else four robust deviations."""
+    """A quarter of a cell is always allowed, and otherwise four robust standard deviations."""
     still = np.zeros((9, 2))
     for far, share in ((0.24, 0.0), (0.26, 0.1)):
         cells = np.vstack([still, [0.0, far]])
         found = numbers_of(samples_of(shift_cells=cells, shift_m=0.01 * cells))
         assert found["displaced_share"] == pytest.approx(share)
-    # Of these ten and one more the median is 1/45, the median distance from it 2/15.
+    # With an eleventh value, the median is 1/45 and the median distance from it 2/15.
     spread = np.column_stack([np.linspace(-0.2, 0.2, 10), np.zeros(10)])
     limit = 1.0 / 45.0 + 4.0 * 1.4826 * 2.0 / 15.0
     for far, share in ((limit - 0.01, 0.0), (limit + 0.01, 1.0 / 11.0)):
@@ -162,14 +163,14 @@ def test_patches_further_off_than_the_rest_are_displaced() -> None:
 
 
 def source_errors() -> SourceErrors:
-    """Ten cells in a row: four traced on the wall, two at steps, ghosts, one of nothing."""
+    """Return errors of ten cells: four on the wall, two at steps, two ghosts, one off target."""
     displacement_m = np.full((1, 10, 2), np.nan)
     displacement_m[0, :4] = [[0.001, 0.0], [-0.002, 0.001], [0.003, 0.0], [0.004, -0.005]]
     displacement_m[0, 4:6] = [[0.01, 0.02], [-0.03, 0.02]]
     displacement_m[0, 6:8] = 0.001
     mask = np.zeros((1, 10), dtype=np.bool_)
     traced, ghosts = mask.copy(), mask.copy()
-    # The ninth looks at nothing.
+    # The pixel of the ninth cell has no target.
     traced[0, :9] = True
     ghosts[0, 6:8] = True
     return SourceErrors(
@@ -179,7 +180,7 @@ def source_errors() -> SourceErrors:
 
 
 def source_numbers_of(*errors: SourceErrors) -> dict[str, float]:
-    """Findings of walls, or of bands of one, together."""
+    """Return the findings of walls, or of bands of a wall, together."""
     steps = np.zeros((1, 10), dtype=np.bool_)
     steps[0, 4:6] = True
     samples = pooled([item.samples(steps) for item in errors])
@@ -190,8 +191,8 @@ def test_shares_within_what_the_orthoimage_states_are_of_both_coordinates() -> N
     errors = source_errors()
     stated = np.full(errors.traced.shape, 0.002, np.float32)
     known = replace(errors, expected_m=stated)
-    # Of 1, -2, 3, 4 mm along u and 0, 1, 0, -5 mm along v, five are within 2 mm and all but 5 mm
-    # within 4 mm. Cells at steps, ghosts and those without a place do not count.
+    # Of 1, -2, 3, 4 mm along u and 0, 1, 0, -5 mm along v, five are within 2 mm, and all except -5
+    # mm within 4 mm. Cells at steps, ghosts and cells without a target are not included.
     found = source_numbers_of(known)
     assert found["within_1_sigma_share"] == pytest.approx(5 / 8)
     assert found["within_2_sigma_share"] == pytest.approx(7 / 8)
@@ -206,7 +207,8 @@ def test_walls_are_summed_up_together_and_those_without_painted_cells_left_out()
     assert source_numbers_of(empty) == {}
     twice, once = source_numbers_of(errors, empty, errors), source_numbers_of(errors)
     for name, value in once.items():
-        # Percentiles lie between other cells; what the empty band could show counts.
+        # Percentiles are interpolated between other cells; cells that the empty band could show are
+        # included.
         expected = {"n_traced": 2 * value, "n_ghost_cells": 2 * value}.get(name, value)
         if name == "completeness_seen_by_both":
             expected = 3 * errors.n_seen_painted / (3 * errors.n_seen_by_both)

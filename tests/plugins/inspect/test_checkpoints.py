@@ -1,4 +1,4 @@
-"""`inspect.checkpoints` finds points, tells how far they lie off, and doubts what cannot be."""
+"""`inspect.checkpoints` finds points, measures their errors, and reports implausible ones."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_targets_of_a_real_scan_are_found_and_carried_back_into_space(
 
 
 def _intensity_of(path: Path, scratch: Path) -> Walls:
-    """The intensity of a patch on the plane through it, scanned from the origin."""
+    """Return the intensity of a patch on its plane, scanned from the origin."""
     files = InputFiles(name="scan", paths=(path,))
     params = ReadScan.Params(view_from=(0.0, 0.0, 0.0))
     ctx = context(scratch)
@@ -186,7 +186,7 @@ def _intensity_of(path: Path, scratch: Path) -> Walls:
         normal=tuple(float(value) for value in normal), offset_m=float(normal @ middle)
     )
     planes = GivenPlane().run(GivenPlane.In(cloud=cloud), given, ctx).planes
-    # As fine as the points lie.
+    # The cell size is the point spacing.
     return rastered(cloud, planes, scratch, gsd_m=0.0013)[0]
 
 

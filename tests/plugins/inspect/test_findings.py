@@ -1,4 +1,4 @@
-"""Numbers and pictures of an inspection, each by its definition, on a handful of values."""
+"""Numbers and pictures of an inspection, compared with their definitions for a few values."""
 
 from __future__ import annotations
 
@@ -85,12 +85,13 @@ def test_check_points_are_summed_up_by_lengths_and_outliers() -> None:
 def test_a_scale_shows_in_every_length_and_a_shift_in_none() -> None:
     rng = np.random.default_rng(4)
     places_m, wall = rng.uniform(0.0, 5.0, (40, 2)), np.repeat([0, 3], 20)
-    # The walls are shifted differently, so that lengths between them mean nothing.
+    # The walls are shifted differently, so lengths between them are meaningless.
     shift_m = 0.002 * places_m + np.where(wall == 0, 0.01, -0.03)[:, None]
     found = {item.name: item.value for item in length_findings(places_m, shift_m, wall)}
     assert found["length_error_rms_share"] == pytest.approx(0.002)
     assert found["length_error_max_share"] == pytest.approx(0.002)
-    # Short lengths do not count: of 2 x 190 pairs some are shorter than a quarter of the longest.
+    # Short lengths are ignored: some of the 2 x 190 pairs are shorter than a quarter of the
+    # longest.
     assert 250 < found["n_lengths"] < 380
     one_off = np.zeros_like(shift_m)
     one_off[0, 0] = 0.01
@@ -122,7 +123,7 @@ def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: P
 
 @pytest.fixture
 def arrows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """Tails, components and colours of the arrows that are drawn, and the one of known length."""
+    """Collect tails, components and colours of drawn arrows, and the reference arrow."""
     kept: list[tuple[Any, ...]] = []
     quiver, key = Axes.quiver, Axes.quiverkey
 
@@ -146,7 +147,7 @@ def test_maps_have_the_width_of_a_column_and_a_colour_bar() -> None:
     shown = decode_image(colour_error_map(error, frame), "map").astype(int)
     assert shown.shape[1] == 1003
     middle = shown[:, 502]
-    # Unknown cells are grey, half of the span is the middle of the colours.
+    # Unknown cells are grey; half of the range has the middle colour.
     np.testing.assert_allclose(middle[200], (138, 148, 158), atol=12)
     np.testing.assert_allclose(middle[1200], (188, 55, 84), atol=12)
     square = depth_error_map(np.full((300, 300), 0.01), image_of(np.full((300, 300), 80.0)).frame)
@@ -161,17 +162,18 @@ def test_arrows_run_from_where_things_should_be_to_where_they_are(
     places = np.array([[50.0, 60.0], [150.0, 100.0], [100.0, 200.0]])
     shift_cells = np.array([[2.0, 0.0], [0.0, 2.0], [-8.0, 0.0]])
     times = enlargement(shift_cells, image)
-    # The longest usual arrow takes at most 6 % of the side: 15 cells of 7.4 give twice, not five.
+    # The 95th percentile is drawn with at most 6 % of the side: 15 cells for 7.4 give a factor of
+    # 2, not 5.
     assert times == 2.0
     vector_map(image, places, shift_cells)
     (tails, components, colours), (length, label) = arrows
     np.testing.assert_allclose(components, times * shift_cells)
     np.testing.assert_allclose(tails + components, places)
-    # Four times the median is red; the median and what equals it is green.
+    # An arrow of four times the median is red; those of the median length are green.
     assert colours[0] == colours[1] != colours[2]
     cell_mm = 1e3 * image.frame.gsd_m
     assert label == f"{length / times * cell_mm:g} mm"
-    # Of many an even part is drawn; what is longer than the median is yellow.
+    # If there are many arrows, every nth is drawn; those longer than the median are yellow.
     many = np.tile([[1.0, 0.0], [1.0, 0.0], [1.5, 0.0]], (1_100, 1))
     vector_map(image, np.full((3_300, 2), 100.0), many)
     tails, components, colours = arrows[2]

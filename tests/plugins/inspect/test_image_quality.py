@@ -1,4 +1,4 @@
-"""What counts as an edge, as shown and as stretched, from both sides of each limit."""
+"""Criteria for edges, shown cells and stretched cells, on both sides of each limit."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 SIDE, GSD_M = 20, 0.01
-# Far from the origin, as surveys are.
+# Far from the origin, as in surveys.
 FRAME = samples.facing_south(GSD_M, SIDE, SIDE, (5.0e6, 4.0e5, 100.0))
-# The edge lies on the middle of this column.
+# The edge is in the middle of this column.
 EDGE = 30
 
 
 def edge(rows: int = 40, *, contrast: float = 100.0, columns: int = 61) -> NDArray[np.float64]:
-    """An upright edge between two greys, as wide as a Gaussian of a cell makes it."""
+    """Return a vertical edge between two grey levels, blurred by a Gaussian of one cell."""
     across = np.arange(columns) - EDGE
     row = 128.0 + 0.5 * contrast * erf(across / np.sqrt(2.0))
     return np.tile(row, (rows, 1))
@@ -48,7 +48,7 @@ def image(
 
 
 def masked() -> NDArray[np.uint8]:
-    """A quarter painted, a tenth filled, the rest not."""
+    """Return a mask with a quarter of the cells painted and a tenth filled."""
     mask = np.full(FRAME.shape, OrthoMask.NO_SURFACE, dtype=np.uint8)
     mask[:5] = OrthoMask.PAINTED
     mask[5:7] = OrthoMask.FILLED
@@ -79,7 +79,10 @@ def test_the_filled_share_is_of_what_is_shown() -> None:
 
 
 def camera(cells_per_pixel: float, turn_deg: float = 0.0) -> ViewingCamera:
-    """Far away, to the right of the wall's normal; a pixel covers so many cells across a ray."""
+    """Return a distant camera to the right of the wall's normal.
+
+    A pixel covers the given number of cells across a ray.
+    """
     middle = FRAME.world_from_wall(np.array([[SIDE / 2, SIDE / 2]]))[0]
     turn = np.radians(turn_deg)
     centre = middle + 100.0 * np.array([np.sin(turn), -np.cos(turn), 0.0])
@@ -93,7 +96,7 @@ def test_a_flat_wall_is_stretched_by_the_cosine_of_the_view(turn_deg: float) -> 
     made = image(np.full(FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8), sources=("a.jpg",))
     spread = cells_per_pixel(made, wall(), ("a.jpg", camera(0.7, turn_deg)))
     assert len(spread) == SIDE * SIDE
-    # The wall is 0.2 m wide and 100 m away: 0.2 % of perspective.
+    # The wall is 0.2 m wide and 100 m away, so perspective changes the value by 0.2 %.
     np.testing.assert_allclose(spread, 0.7 / np.cos(np.radians(turn_deg)), rtol=5e-3)
 
 
@@ -105,7 +108,7 @@ def test_only_cells_that_a_photo_painted_are_asked() -> None:
     view = camera(1.5)
     depth = np.zeros(FRAME.shape, dtype=np.float32)
     depth[4] = np.nan
-    # Of the painted rows two are the other's, and one has no depth.
+    # Two of the painted rows are from the other photo, and one has no depth.
     assert len(cells_per_pixel(made, wall(depth), ("a.jpg", view))) == 2 * SIDE
     assert len(cells_per_pixel(made, wall(depth), ("b.jpg", view))) == 2 * SIDE
     assert len(cells_per_pixel(made, wall(depth), ("c.jpg", view))) == 0
@@ -125,14 +128,15 @@ def test_a_spread_that_begins_or_ends_grey_tells_nothing(
 
 @pytest.mark.parametrize("sigma", [0.8, 2.5])
 def test_blurred_edges_show_their_blur(sigma: float) -> None:
-    # Bars 40 cells wide, a little askew so that edges fall anywhere between cells.
+    # Bars 40 cells wide, slightly rotated so that edges are at any position between cells.
     rows, columns = np.mgrid[:400, :400]
     place = np.mod(columns + 0.13 * rows, 80.0)
     signed = np.where(place < 40.0, place - 20.0, 60.0 - place) / np.hypot(1.0, 0.13)
     grey = 120.0 + 60.0 * erf(signed / (sigma * np.sqrt(2.0)))
     found = numbers(grey + np.random.default_rng(1).normal(scale=1.0, size=grey.shape))
     assert found["n_edges"] >= 20
-    # A Gaussian's 10 to 90 % take 2.563 sigma; its MTF halves at sqrt(ln 2 / 2) / (pi sigma).
+    # The 10 to 90 % width of a Gaussian edge is 2.563 sigma; its MTF is 1/2 at sqrt(ln 2 / 2) / (pi
+    # sigma).
     assert found["edge_width_cells"] == pytest.approx(2.563 * sigma, rel=0.1)
     assert found["mtf50_per_cell"] == pytest.approx(0.1874 / sigma, rel=0.1)
 

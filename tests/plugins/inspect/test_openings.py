@@ -1,4 +1,4 @@
-"""Outlines of openings against a scene whose recess is known, moved by known amounts."""
+"""Outlines of openings, moved by known amounts, compared with a scene with a known recess."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_true_outline_has_no_error(tmp_path: Path) -> None:
     assert len(inspection.points_world) == 4
 
 
-# The wall has 15 000 cells; of the raster, two by two are one.
+# The wall has 15,000 cells; if fewer are allowed, 2 x 2 cells are joined.
 @pytest.mark.parametrize(("n_samples", "apart"), [(15_000, 0.0), (4_000, 0.05)])
 def test_large_walls_are_judged_in_coarser_cells_but_sides_as_exactly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_samples: int, apart: float
@@ -77,7 +77,7 @@ def test_openings_of_other_walls_are_refused(tmp_path: Path) -> None:
         InspectOpenings().run(inputs, InspectOpenings.Params(), context(tmp_path))
 
 
-# Of the recess, 0.8 m by 1.22 m.
+# Size of the recess, 0.8 m by 1.22 m.
 WIDTH_M, HEIGHT_M = RECESS[1] - RECESS[0], RECESS[3] - RECESS[2]
 
 

@@ -1,4 +1,4 @@
-"""Errors of poses and ties, from the numbers that they are made of."""
+"""Errors of poses and ties, computed from given numbers."""
 
 from __future__ import annotations
 
@@ -122,12 +122,12 @@ def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool
     shift = np.array([0.003, 0.0, 0.004])
     found = camera_at(scene.origin + shift)
     if turned:
-        # Looks away from the wall.
+        # The camera looks away from the wall.
         found = camera_at(scene.origin, FACING * [[1.0], [-1.0], [-1.0]])
     error = _error_on_walls(found, true, walls, scene, views)
-    # Root mean square of one of two coordinates.
+    # Root mean square per coordinate.
     assert error == (math.inf if turned else pytest.approx(0.005 / math.sqrt(2.0), rel=1e-9))
-    # Pixels are in the middle of 24 by 18 even parts of the photo.
+    # Pixels are in the centres of 24 x 18 equal parts of the photo.
     (pixels,) = asked
     assert pixels.shape == (24 * 18, 2)
     np.testing.assert_allclose(np.unique(pixels[:, 0]), 1000.0 * (np.arange(24) + 0.5) / 24.0)
@@ -142,7 +142,7 @@ def test_a_photo_shows_most_of_the_nearest_wall_that_faces_it() -> None:
     camera = camera_at(np.zeros(3))
     behind, before = frame_at(-3.0, 3.0, size_m=6.0), frame_at(0.2, 3.0, depth_m=2.0, size_m=6.0)
     walls: Any = [SimpleNamespace(frame=frame) for frame in (behind, before)]
-    # The near wall hides the right part, two thirds of the photo are of the far one.
+    # The near wall hides the right part; two thirds of the photo show the far wall.
     assert most_shown(camera, walls) == 0
     nearer = [walls[0], SimpleNamespace(frame=frame_at(-0.4, 3.0, depth_m=2.0, size_m=6.0))]
     assert most_shown(camera, nearer) == 1
@@ -158,7 +158,10 @@ def test_a_photo_shows_most_of_the_nearest_wall_that_faces_it() -> None:
 def ties_off(
     off_m: NDArray[np.float64], role: NDArray[np.uint8], wall: NDArray[np.int32]
 ) -> tuple[Any, Any, Any]:
-    """Ties of one photo whose pixels look beside their points by so much; walls; truth."""
+    """Return ties of one photo, walls and truth.
+
+    The pixels of the ties show points at given offsets from those of the ties.
+    """
     camera = camera_at(np.zeros(3))
     frames = [frame_at(-2.0, 1.0, size_m=4.0), frame_at(2.0, 1.0, depth_m=4.0)]
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Walls laid onto the cells of orthoimages of other programs."""
+"""Walls resampled to the cells of orthoimages from other programs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.raster_scenes import context
 
 
 def slanted() -> Walls:
-    """A wall whose depth, count and deviation tell the cell."""
+    """Return a wall whose depths, counts and deviations identify the cell."""
     given = inspect_scenes.walls()
     wall = given.walls[0]
     rows, columns = np.indices(wall.frame.shape)
@@ -45,7 +45,7 @@ def test_an_image_is_of_the_wall_of_its_plane() -> None:
         (found,) = on_walls(Orthoimages(images=(replace(image, **changed),)), walls).images
         return found.wall, found.plane_index
 
-    # The plane decides, also where the image counts walls in another way.
+    # The plane determines the wall, even if the image numbers walls differently.
     assert placed(wall=8, plane_index=8) == (1, 8)
     assert placed(wall=0, plane_index=8) == (1, 8)
     assert placed(wall=0, plane_index=None) == (0, 3)
@@ -63,7 +63,8 @@ def test_cells_take_what_the_nearest_cell_of_the_wall_holds(
     walls = slanted()
     wall = walls.walls[0]
     frame = wall.frame
-    # Coarser, begun 3.3 cells to the left and 2.2 higher, and a centimetre before the wall.
+    # The image is coarser, begins 3.3 cells to the left and 2.2 cells higher, and is 1 cm in front
+    # of the wall.
     corner = frame.world_from_wall(np.array([[-3.3, -2.2]]), 0.01)[0]
     shape = (40, 50)
     other = replace(
@@ -86,12 +87,12 @@ def test_cells_take_what_the_nearest_cell_of_the_wall_holds(
     known = inside.copy()
     known[inside] = held == SurfaceMask.MEASURED
     depth = 1e-4 * place[..., 0] + 1e-5 * place[..., 1]
-    # Counted from the image's own plane.
+    # Depths are relative to the plane of the image.
     np.testing.assert_allclose(laid.depth_m[known], depth[known] - 0.01, atol=1e-6)
     assert np.isnan(laid.depth_m[~known]).all()
     assert laid.intensity is not None
     whole = (exact >= 1.0).all(axis=-1)
-    # Between the four nearest, which OpenCV places to a 32nd of a cell.
+    # Interpolated between the four nearest cells, with positions that OpenCV rounds to 1/32 cell.
     shade = 1e-3 * (exact[..., 0] - 0.5) + 1e-4 * (exact[..., 1] - 0.5)
     np.testing.assert_allclose(laid.intensity[whole], shade[whole], atol=5e-5)
     monkeypatch.setattr(placing, "IN_MEMORY_CELLS", 1999)

@@ -1,4 +1,4 @@
-"""Where a check point is shown, as a target or by the scene, and where it lies on its wall."""
+"""Positions of check points in images, found as targets or by the scene, and on their walls."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_twelve_depths_make_a_surface(n_known: int, *, is_found: bool) -> None:
     assert (found is not None) == is_found
 
 
-# A painted wall of 1.2 m x 1 m at y = 2, cells of 5 mm, and what lies on it.
+# A textured wall of 1.2 m x 1 m at y = 2 with 5 mm cells.
 CELL_M = 0.005
 FULL: Extent = (-0.6, 0.6, -0.5, 0.5)
 
@@ -66,7 +66,7 @@ def painted() -> tuple[Truth, WallFrame]:
 
 @cache
 def shown_grey(right: float, down: float) -> GreyImage:
-    """What an image shows that lies too far to the right and too low by so many cells."""
+    """Return an image displaced by a number of cells to the right and down."""
     truth, where = painted()
     moved = -CELL_M * (right * where.u_world + down * where.v_world)
     shown = replace(where, origin_world=where.origin_world + moved)
@@ -95,13 +95,13 @@ def test_light_and_contrast_do_not_matter_and_another_picture_shows_nothing() ->
 
 @pytest.mark.parametrize(("reach", "is_found"), [(1, False), (9, True)])
 def test_the_point_counts_and_not_what_is_far_from_it(reach: int, is_found: bool) -> None:
-    # Valid within so many cells; a Gaussian of five cells weighs them.
+    # Cells within the reach are valid; a Gaussian of five cells weights them.
     there = shown_grey(0.0, 0.0)
     rows, columns = np.indices(there.grey.shape) + 0.5
     near = (np.abs(columns - 120.0) < reach + 1) & (np.abs(rows - 100.0) < reach + 1)
     found = by_truth(replace(there, valid=there.valid & near))
     assert (found is not None) == is_found
-    # What is elsewhere shown ten cells off does no harm.
+    # A displacement of ten cells elsewhere has no effect.
     far = shown_grey(10.0, 0.0)
     mixed = replace(
         there, grey=np.where(np.hypot(columns - 120, rows - 100) < 13, there.grey, far.grey)
@@ -114,7 +114,7 @@ def test_the_point_counts_and_not_what_is_far_from_it(reach: int, is_found: bool
 def finder(
     points: NDArray[np.float64], *, truth: bool = False, wall: int = -1, **known: Any
 ) -> PointFinder:
-    """A finder on two parallel walls, the second 0.1 m before the first."""
+    """Return a finder on two parallel walls, the second 0.1 m in front of the first."""
     made, where = painted()
     frames = [where, replace(where, origin_world=where.origin_world + 0.1 * where.normal_world)]
     rasters = [samples.wall(item, plane_index=4 + k) for k, item in enumerate(frames)]
@@ -142,7 +142,7 @@ def finder(
 
 
 def at(column: float, row: float, depth_m: float) -> NDArray[np.float64]:
-    """A world point (1, 3) of the first wall."""
+    """Return a world point (1, 3) on the first wall."""
     return painted()[1].world_from_wall(np.array([[column, row]]), np.array([depth_m]))
 
 
@@ -168,7 +168,7 @@ def test_a_point_is_looked_for_on_the_nearest_wall_that_holds_it(depth_m: float,
 def test_a_target_is_found_within_the_search_and_carried_back_into_space(
     off_m: float, is_found: bool
 ) -> None:
-    # Quadrants of 5 cm about the middle of the wall, which stands out by 1 cm there.
+    # Quadrants of 5 cm around the middle of the wall, where it projects by 1 cm.
     rows, columns = np.indices((200, 240)) + 0.5
     bright = np.where((columns > 120.0) == (rows > 100.0), 220.0, 40.0)
     grey = gaussian_filter(bright, 0.8)
@@ -185,7 +185,7 @@ def test_a_target_is_found_within_the_search_and_carried_back_into_space(
     assert found.how == ("target" if is_found else "not found")
     if is_found:
         np.testing.assert_allclose(found.place, [120.0, 100.0], atol=0.05)
-        # Half of the target's radius says how deep it lies.
+        # The depth is computed within half of the target's radius.
         np.testing.assert_allclose(found.point_world[None], at(120.0, 100.0, 0.01), atol=3e-4)
 
 
@@ -206,7 +206,7 @@ RADIUS = 20.0
 
 @cache
 def quadrants(turned_deg: float = 20.0) -> NDArray[np.float64]:
-    """Four quadrants about the middle, their borders a cell wide."""
+    """Return four quadrants around the middle, with borders one cell wide."""
     fine = (np.arange(4 * SIDE) + 0.5) / 4.0
     columns, rows = np.meshgrid(fine - CENTRE[0], fine - CENTRE[1])
     turn = np.radians(turned_deg)
@@ -230,7 +230,8 @@ def test_edges_discs_and_even_places_are_no_targets() -> None:
     rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5
     edge = gaussian_filter(np.where(columns < 60.0, 40.0, 220.0), 0.7)
     disc = gaussian_filter(np.where(np.hypot(columns - 60, rows - 60) < 12.0, 40.0, 220.0), 0.7)
-    # Two quadrants of four, and a saddle that half a turn leaves alone but a quarter does not.
+    # A single dark quadrant, and a saddle that is symmetric under a half turn but not under a
+    # quarter turn.
     wedge = gaussian_filter(np.where((columns > 60.0) & (rows > 60.0), 220.0, 40.0), 0.7)
     for grey in (edge, disc, wedge, np.full((SIDE, SIDE), 90.0)):
         assert crossing(grey) is None
@@ -238,7 +239,7 @@ def test_edges_discs_and_even_places_are_no_targets() -> None:
 
 @pytest.mark.parametrize(("share", "is_found"), [(0.8, True), (0.35, False)])
 def test_half_of_a_target_must_be_there_on_both_sides(share: float, is_found: bool) -> None:
-    # A strip through the middle; what lies across the middle from a void does not count either.
+    # A void strip through the middle; cells opposite void ones are not used either.
     rows = np.mgrid[:SIDE, :SIDE][0] + 0.5
     valid = np.abs(rows - 60.0) <= share * RADIUS
     assert (crossing(quadrants(), valid=valid) is not None) == is_found

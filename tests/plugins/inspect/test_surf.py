@@ -1,4 +1,4 @@
-"""Displacements that were put in are measured, by patches and by pairs of SURF key points."""
+"""Known displacements are measured by patches and by pairs of SURF key points."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_displacement_is_told_to_a_tenth_of_a_cell(
         assert metrics[f"mean_{axis}_mm"] == exact
         assert metrics[f"rmse_{axis}_mm"] * np.sign(cells) == exact
         assert metrics[f"floor_rmse_{axis}_mm"] < 0.15e3 * GSD_M
-        # SURF alone is several times coarser than what is refined.
+        # SURF alone is several times less accurate than the refined pairs.
         assert metrics[f"surf_floor_rmse_{axis}_mm"] > metrics[f"floor_rmse_{axis}_mm"]
     assert len(found.displacement_m) == metrics["n_pairs"]
     assert [figure.name for figure in context.figures] == ["wall_0_displacements"]
@@ -110,7 +110,7 @@ def test_ten_pairs_say_something(
     assert all(f"{n_pairs} pairs of SURF" in text for text in context.warnings)
     if is_inspected:
         assert metrics["surf_rmse_x_mm"] == pytest.approx(2.0 * metrics["rmse_x_mm"])
-        # What the floor was laid aside by is taken off.
+        # The shift of the copy is subtracted.
         assert metrics["floor_rmse_x_mm"] == pytest.approx(0.5e3 * GSD_M)
         assert metrics["floor_rmse_y_mm"] == pytest.approx(0.75e3 * GSD_M)
         assert metrics["surf_floor_rmse_y_mm"] == pytest.approx(1.75e3 * GSD_M)
@@ -145,7 +145,8 @@ def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
     whole = find_key_pairs(shown, true, radius_cells=40.0)
     monkeypatch.setattr(key_pairs, "_WHOLE_CELLS", 1000)
     monkeypatch.setattr(key_pairs, "_TILE_CELLS", 150)
-    # What the widest descriptors look at fits in, so that all points are those of the whole.
+    # The margin contains the support of the widest descriptors, so all points are found as in the
+    # whole image.
     monkeypatch.setattr(key_pairs, "_RIM_CELLS", 400)
     tiled = find_key_pairs(shown, true, radius_cells=40.0)
     assert len(tiled) == len(whole) >= 50
@@ -176,7 +177,7 @@ def moved(grey: NDArray[np.float64], right: float, down: float) -> NDArray[np.fl
 def test_a_displacement_is_measured_in_every_whole_patch(apart: tuple[float, float]) -> None:
     true = texture()
     found = patches.measure_shifts(image(moved(true, *apart)), image(true), reach_cells=5)
-    # Four by four patches of 32 cells in 130; two cells are left over.
+    # 130 cells contain 4 x 4 patches of 32 cells; two cells remain.
     centres = [[32 * c + 16.0, 32 * r + 16.0] for r in range(4) for c in range(4)]
     assert found.centre.tolist() == centres
     np.testing.assert_allclose(found.shift, np.tile(apart, (16, 1)), atol=0.03)

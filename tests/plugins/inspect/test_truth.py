@@ -1,4 +1,4 @@
-"""`inspect.truth` measures exactly the errors that were put in."""
+"""`inspect.truth` measures known errors exactly."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tests.raster_scenes import context
 
 GSD_M = 0.014
 
-# Rendered once for all tests, by displacement.
+# True orthoimages, rendered once for all tests, by displacement.
 _RENDERED: dict[tuple[float, float], TrueOrthoimage] = {}
 
 
@@ -48,7 +48,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
 
 
 def rendered(truth: Truth, shift_cells: tuple[float, float] = (0.0, 0.0)) -> TrueOrthoimage:
-    """The true orthoimage of the main wall, its content displaced along u and v."""
+    """Return the true orthoimage of the main wall, with its content displaced along u and v."""
     if shift_cells not in _RENDERED:
         frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=GSD_M)
         displacement = shift_cells[0] * frame.u_world + shift_cells[1] * frame.v_world
@@ -88,7 +88,7 @@ def test_the_true_orthoimage_has_no_error(tmp_path: Path, truth: Truth) -> None:
     metrics, found, ctx = inspect(tmp_path, truth, painted(image), walled(image), **both)
     nothing = ("plane_angle_deg", "plane_offset_mm", "depth_rmse_mm", "depth_step_rmse_mm")
     assert [metrics[name] for name in nothing] == pytest.approx([0.0] * 4, abs=1e-6)
-    # Rounding to whole grey levels alone: sqrt(1 / 12).
+    # Only the error of rounding to whole grey levels, sqrt(1 / 12).
     assert metrics["colour_rmse_grey"] == pytest.approx(0.289, abs=0.01)
     assert max(metrics["rmse_u_mm"], metrics["rmse_v_mm"]) < 0.05 * 1e3 * GSD_M
     for name in ("depth_within_3sigma", "completeness", "label_f1_mean", "label_iou_mean"):
@@ -106,7 +106,7 @@ def test_a_displaced_orthoimage_has_just_that_displacement(
     shown = painted(rendered(truth, shift))
     metrics, _, _ = inspect(tmp_path, truth, shown, walled(rendered(truth)))
     for axis, expected_cells in zip(("u", "v"), shift, strict=True):
-        # A twentieth of a cell: rosettes and lines are sharper than cells.
+        # A twentieth of a cell, because rosettes and lines are sharper than cells.
         tolerance = 0.05 * 1e3 * GSD_M
         expected = 1e3 * GSD_M * expected_cells
         assert metrics[f"mean_{axis}_mm"] == pytest.approx(expected, abs=tolerance)
@@ -132,7 +132,7 @@ def test_a_tilted_plane_has_its_angle_and_offset(tmp_path: Path, truth: Truth) -
 
 
 def inspect_planes(folder: Path, truth: Truth, **inputs: Any) -> tuple[dict[str, float], list[str]]:
-    """Metrics, and codes of diagnostics."""
+    """Return metrics and codes of diagnostics."""
     metrics, _, ctx = inspected(InspectTruth, folder, truth=truth, **inputs)
     return metrics, [one.code for one in ctx.diagnostics]
 
@@ -145,12 +145,12 @@ def test_labels_of_chosen_points_in_another_order_are_compared_with_theirs(
     x = np.zeros(n_points, dtype=np.float32)
     whole = PointCloud(origin=np.zeros(3), up=np.array([0.0, 0.0, 1.0]), x=x, y=x, z=x)
     labels = PointLabels(plane_index=truth.labels[chosen])
-    # A filter before the planes leaves points out, which is not the detector's loss.
+    # Points that a filter removes before the detection do not reduce the scores.
     given: dict[str, Any] = {"planes": truth.planes, "labels": labels}
     metrics, codes = inspect_planes(tmp_path, truth, **given, cloud=whole.selected(chosen))
     assert metrics["label_iou"] == metrics["label_iou_mean"] == 1.0
     assert codes == ["points-left-out-before-labels"]
-    # Without the numbers of the points the planes are judged alone.
+    # Without the indices of the points, only the planes are compared.
     metrics, codes = inspect_planes(tmp_path, truth, **given)
     assert (metrics["main_found"], "label_iou" in metrics) == (1.0, False)
     assert codes == ["labels-not-compared"]
@@ -190,7 +190,7 @@ def test_what_is_wired_and_not_compared_is_told(tmp_path: Path, truth: Truth) ->
 
 
 def finer(times: int) -> dict[str, Any]:
-    """The scene of `truth_inputs` with each cell cut into cells of a `times`th of its side."""
+    """Return the scene of `truth_inputs` with cells that are smaller by the factor `times`."""
     given = inspect_scenes.truth_inputs()
     (image,), (wall,) = given["orthoimages"].images, given["walls"].walls
     height, width = (times * size for size in image.frame.shape)
@@ -230,7 +230,7 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
     whole, at_once = outcome()
     assert whole["mean_u_mm"] == pytest.approx(3.0, abs=0.3)
     assert whole["n_traced"] > 13_000
-    # What the photo shows of the chair in front of the wall is painted on the wall behind it.
+    # The photo's image of a chair in front of the wall is painted on the wall behind it.
     image, wall = given["orthoimages"].images[0], given["walls"].walls[0]
     painted = np.argwhere((image.mask == OrthoMask.PAINTED) & np.isfinite(wall.depth_m))
     cells = image.frame.world_from_wall(painted[:, ::-1] + 0.5, wall.depth_m[tuple(painted.T)])
@@ -246,13 +246,14 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
     assert parts == {name: pytest.approx(value) for name, value in whole.items()}
     assert at_once.kinds == ("patch", "painted cell")
     for product in (at_once, in_bands):
-        # A camera believed 3 mm too far to the right paints what lies 3 mm to the left of a cell.
+        # If the camera is estimated 3 mm too far to the right, a cell shows a point 3 mm to its
+        # left.
         cells = product.kind == 1
         assert 1000 < np.count_nonzero(cells) <= 5000
         assert np.median(product.displacement_m[cells, 0]) == pytest.approx(3e-3, abs=1e-4)
     patches = [product.points_world[product.kind == 0] for product in (at_once, in_bands)]
     np.testing.assert_allclose(*patches)
-    # Of more errors than are kept every so manyth says the same.
+    # If not all errors are kept, every nth gives the same result.
     monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors._KEPT_ERRORS", 4000)
     some, _ = outcome()
     assert some["n_traced"] == whole["n_traced"]
@@ -276,7 +277,8 @@ def test_a_large_wall_takes_the_memory_of_a_band(
     tracemalloc.start()
     try:
         metrics, _, _ = inspected(InspectTruth, tmp_path, **inputs)
-        # A band with its surroundings has half of the cells; the whole took 174 bytes each.
+        # A band with its margin has half of the cells; as a whole, the wall took 174 bytes per
+        # cell.
         assert tracemalloc.get_traced_memory()[1] < 110 * n_cells
     finally:
         tracemalloc.stop()
@@ -295,7 +297,7 @@ def test_labels_are_scored_by_plane_whichever_number_they_have(tmp_path: Path) -
     truth: Any = SimpleNamespace(labels=np.array([0, 0, 0, 1, 1, -1], dtype=np.int16), planes=three)
     scores = plane_errors.label_findings(labels, None, truth, ctx)
     found = {finding.name: finding.value for finding in scores}
-    # Of the third plane there is no point.
+    # The third plane has no points.
     expected = {
         "precision": (1.0, 2.0 / 3.0, 0.0),
         "recall": (2.0 / 3.0, 1.0, 0.0),

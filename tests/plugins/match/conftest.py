@@ -1,4 +1,4 @@
-"""What the tests of matching share: key points and matches of the few pictures they look at."""
+"""Shared fixtures of the tests of matching: key points and matches of a few pictures."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from orthoflow_plugins.match import placing, ties
 
 from orthoflow.geometry import key_points
 
-# Each holds some megabytes.
+# Each result takes some megabytes.
 MAX_KNOWN: Final = 60
 
 
-# Any: whatever a function takes and returns.
+# The types are Any, since functions have any arguments and results.
 def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that looks at the same pictures or key points once."""
+    """Cache a function's results for the same pictures or key points."""
     known: dict[bytes, Any] = {}
 
     def call(*given: Any, **settings: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What of a wall is compared: pictures, channels, joined cells, and points lifted onto the wall."""
+"""Pictures, channels and joined cells of a wall, and points on its surface."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def texture(seed: int = 1, shape: tuple[int, int] = (90, 120)) -> NDArray[np.flo
 GSD_M = 0.01
 
 
-# Any: fields of the wall, each of its own type.
+# The type is Any, since the fields of the wall have different types.
 def wall(depth_m: NDArray[np.float32], **known: Any) -> Wall:
-    """A wall of four points in each cell, which spread by 2 mm."""
+    """Return a wall with four points in each cell and a spread of 2 mm."""
     usual = {
         "sigma_m": np.full(depth_m.shape, 0.002, dtype=np.float32),
         "count": np.full(depth_m.shape, 4, dtype=np.uint32),
@@ -39,7 +39,7 @@ def wall(depth_m: NDArray[np.float32], **known: Any) -> Wall:
 
 
 def grey_of(depth_m: NDArray[np.float32], *, spread_m: float = 0.001) -> NDArray[np.float32]:
-    """What is compared of a wall with three points in each cell, NaN where it is left out."""
+    """Return the grey values of a wall with three points in each cell, NaN where excluded."""
     made = wall(
         depth_m,
         sigma_m=np.full_like(depth_m, spread_m),
@@ -56,7 +56,7 @@ def test_gradients_have_six_directions_and_do_not_tell_light_from_dark() -> None
     found, negative = (channels.gradient_channels(given) for given in (grey, 200.0 - grey))
     np.testing.assert_allclose(found.values, negative.values, atol=1e-4)
     assert (found.values >= 0.0).all()
-    # Across a vertical edge the first direction is strongest, the fourth weakest.
+    # At a vertical edge, the first direction is strongest and the fourth weakest.
     edge = np.zeros((60, 60), dtype=np.float32)
     edge[:, 30:] = 100.0
     at_edge = channels.gradient_channels(edge).values[30, 30]
@@ -82,7 +82,7 @@ def test_colours_are_evened_out_as_one() -> None:
     colours = np.stack([red, 0.1 * texture(2), np.full(red.shape, 7.0, np.float32)], axis=2)
     values = channels.colour_channels(colours).values
     spreads = values[10:-10, 10:-10].std(axis=(0, 1))
-    # Weak channels stay weak beside strong ones.
+    # Weak channels remain weak next to strong ones.
     assert spreads[0] == pytest.approx(1.0, abs=0.15)
     assert spreads[1] == pytest.approx(0.1, abs=0.03)
     assert spreads[2] < 1e-3
@@ -96,7 +96,7 @@ def test_a_patch_tells_no_more_than_its_measured_cells(every: int) -> None:
     found = channels.grain_of(wall(depth_m, count=count))
     assert np.mean(found[12:48, 12:48]) == pytest.approx(every**2, rel=0.1)
     assert found.min() >= 1.0
-    # Void does not count; where nothing is known there is nothing to share.
+    # Void cells are not counted; where no cell is known, the result is 1.
     depth_m[:, 30:] = np.nan
     assert channels.grain_of(wall(depth_m, count=count))[30, 50] == 1.0
 
@@ -112,7 +112,7 @@ def test_cells_beside_a_step_are_left_out_of_what_is_compared(
 ) -> None:
     depth_m = np.full((40, 40), 0.3, dtype=np.float32)
     depth_m[:, :20] += np.float32(step_m)
-    # A window right beside the step, farther up.
+    # A window next to the step, higher up.
     depth_m[:8, 20:30] = np.nan
     turned = np.rot90(depth_m, quarters).copy()
     grey = grey_of(turned, spread_m=spread_m)
@@ -126,7 +126,7 @@ def test_where_steps_are_everywhere_they_are_compared(every: int, is_kept: bool)
     columns = np.broadcast_to(np.arange(160), (140, 160))
     depth_m = np.where(columns // every % 2 == 0, 0.03, 0.0).astype(np.float32)
     assert np.isnan(grey_of(depth_m)).sum() == (0 if is_kept else 140 * 2 * 3)
-    # Slopes are no steps.
+    # Slopes are not steps.
     assert np.isfinite(grey_of((0.03 * columns).astype(np.float32))).all()
 
 
@@ -136,7 +136,7 @@ def test_places_are_the_strongest_five_cells_around() -> None:
         strength[row, column] = value
     usable = np.ones((40, 60), dtype=np.bool_)
     found = channels.textured_places(strength, usable, 10)
-    # The second lies within two cells of the first; the third does of the second only.
+    # The second is within two cells of the first; the third is only within two cells of the second.
     assert {tuple(place) for place in found.tolist()} == {(10, 10), (50, 30)}
     usable[10, 10] = False
     found = channels.textured_places(strength, usable, 10)
@@ -152,9 +152,11 @@ STEP_M = 0.05
 
 
 def sparse_wall(spacing_cells: float, *, factor: int = 2) -> Wall:
-    """Single points anywhere, carried to the centres of their cells, as `raster.grid` does.
+    """Return a wall of single points at random positions.
 
-    It shows `scenes.waves` in cells that are so many times as wide.
+    Values refer to cell centres, as in `raster.grid`.
+
+    It shows `scenes.waves` for cells that are `factor` times as wide.
     """
     places = scenes.points_apart(SHAPE, spacing_cells, seed=3, in_rows=False)
     columns, rows = np.unique(np.floor(places).astype(np.intp), axis=0).T
@@ -179,7 +181,7 @@ def test_joined_cells_show_the_wall_where_it_is(spacing_cells: float, factor: in
     assert joined.frame.shape == tuple(-(-length // factor) for length in SHAPE)
     np.testing.assert_array_equal(joined.frame.origin_world, wall.frame.origin_world)
     assert joined.count.sum() == wall.count.sum()
-    # Most of what was void is between points now.
+    # Most of the void cells are now between points.
     assert np.isfinite(wall.depth_m).mean() < 0.25
     assert np.isfinite(joined.depth_m).mean() > 0.9
     np.testing.assert_array_equal(joined.mask == SurfaceMask.MEASURED, joined.count > 0)
@@ -203,7 +205,7 @@ def test_cells_as_wide_as_points_lie_apart_stay_and_so_does_a_wall_that_shows_no
 
 
 def ramp(rows: int = 20, columns: int = 30) -> NDArray[np.float32]:
-    """A millimetre nearer per column, half of one per row."""
+    """Return depths that increase by 1 mm per column and 0.5 mm per row."""
     r, c = np.mgrid[:rows, :columns]
     return (0.001 * c + 0.0005 * r).astype(np.float32)
 
@@ -214,7 +216,7 @@ def ramp(rows: int = 20, columns: int = 30) -> NDArray[np.float32]:
         ((5.5, 7.5), 0.005 + 0.0035),
         ((5.75, 7.5), 0.00525 + 0.0035),
         ((5.5, 7.0), 0.005 + 0.00325),
-        # Beyond the outermost centres the last one holds.
+        # Beyond the outermost centres, the value of the last cell is used.
         ((0.1, 0.1), 0.0),
         ((29.9, 19.9), 0.029 + 0.0095),
     ],
@@ -232,12 +234,12 @@ def test_between_cells_a_smooth_surface_is_interpolated(
 def test_the_accuracy_of_a_point_is_that_of_its_cell_and_its_place_in_it() -> None:
     of = wall(ramp())
     of.count[7, 5], of.sigma_m[7, 5] = 16, 0.008
-    of.count[7, 6] = 1  # a single point has no spread of its own
+    of.count[7, 6] = 1  # a single point has no spread
     of.sigma_m[7, 7], of.count[7, 7] = np.nan, 4
     of.count[7, 8] = 400
     places = np.array([[5.5, 7.5], [6.5, 7.5], [7.5, 7.5], [8.5, 7.5]])
     in_cell_m = 0.5 * GSD_M / math.sqrt(12.0)
-    # The usual spread is 2 mm; the mean of many is no better than 0.3 of it.
+    # The usual spread is 2 mm; the mean of many points is at best accurate to 0.3 of it.
     for usual_m, told_m in ((0.002, None), (0.002, 0.002), (0.005, 0.005)):
         noises_m = (0.008 / 4.0, usual_m, usual_m / 2.0, 0.3 * usual_m)
         np.testing.assert_allclose(
@@ -254,7 +256,7 @@ def test_at_an_edge_the_nearest_cell_holds_and_the_step_is_doubt(
     depth_m = np.zeros((20, 30), dtype=np.float32)
     depth_m[:, 10:] = step_m
     found = pictures.points_on_wall(wall(depth_m), np.array([[10.25, 7.5]]))
-    # A quarter of a cell before the centre of the first cell of the step.
+    # The position is a quarter of a cell in front of the centre of the step's first cell.
     expected_m = step_m if is_edge else 0.75 * step_m
     assert -found[0][0, 1] == pytest.approx(expected_m, rel=1e-5)
     doubt_m = step_m / math.sqrt(12.0) if is_edge else 0.0
@@ -267,7 +269,7 @@ def test_where_nothing_is_known_there_is_no_point() -> None:
     depth_m[7, 5] = np.nan
     found = pictures.points_on_wall(wall(depth_m), np.array([[5.5, 7.5], [6.4, 7.5]]))
     assert found[2].tolist() == [False, True]
-    # Beside a void the nearest cell holds.
+    # Next to a void, the value of the nearest cell is used.
     assert -found[0][1, 1] == pytest.approx(0.006 + 0.0035, abs=1e-6)
 
 
@@ -297,10 +299,11 @@ def test_a_wall_becomes_a_picture_of_its_inner_percentiles() -> None:
     assert (grey[0], grey[-1]) == (0, 255)
     assert (np.diff(grey) >= 0).all()
     assert grey[100] == pytest.approx(128, abs=3)
-    # Of the 5 x 5 around a cell more than 0.7 must be known: beside a straight rim 0.8 or 0.6.
+    # More than 0.7 of the 5 x 5 cells around a cell must be known; at a straight border, it is 0.8
+    # or 0.6.
     assert usable[50, [78, 79, 100]].tolist() == [True, False, False]
     assert usable[:38].all()
-    # A wall that shows nothing has no picture.
+    # A wall without intensity has no picture.
     for nothing in (None, np.full_like(depth_m, np.nan)):
         assert pictures.wall_picture(wall(depth_m, intensity=nothing), **options) is None
 

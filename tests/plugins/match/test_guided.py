@@ -1,4 +1,4 @@
-"""Guided matching: displacements to a few hundredths of a cell, from a rough pose."""
+"""Guided matching: displacements accurate to a few hundredths of a cell, from a rough pose."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def guided(photos: Photos, walls: Walls, cameras: Cameras, folder: Path, **param
 
 
 def rough(camera: ViewingCamera) -> Cameras:
-    """The pose of a photo, a few centimetres off."""
+    """Return the pose of a photo with an error of a few centimetres."""
     return ms.cameras(ms.oriented(ms.nudged(camera, ROUGH)))
 
 
@@ -61,7 +61,7 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them() -> None:
     grains = rng.normal(size=(3, 240, 300))
     smooth = [200.0 * gaussian_filter(grain, 2.0, mode="wrap") for grain in grains]
     colours = np.stack(smooth, axis=-1)
-    # The laser sees red bright to the left, red dark and green bright to the right.
+    # For the laser, red is bright on the left; on the right, red is dark and green is bright.
     response = np.where(np.arange(300)[None, :, None] < 150, [0.7, 0.1, 0.2], [-0.6, 0.5, 0.0])
     wall = (colours * response).sum(axis=2)
     later = shift(colours, (moved[1], moved[0], 0.0), order=5, mode="grid-wrap")
@@ -72,11 +72,11 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them() -> None:
     found = measure(first, channels.colour_channels(noisy), places)
     as_grey = measure(first, channels.grey_channels(noisy.mean(axis=2)), places)
     assert len(found.places) > 100
-    # In the half whose contrast is mixed, grey finds next to nothing.
+    # In the half with mixed contrast, grey finds almost nothing.
     n_right = [int((each.places[:, 0] > 150).sum()) for each in (found, as_grey)]
     assert n_right[0] > 50 > 4 * n_right[1]
     error = found.shift_cells - moved
-    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.035)  # three deviations of a mean
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.035)  # three sigmas of a mean
     assert np.sqrt(np.mean(error**2)) < 0.12
 
 
@@ -85,7 +85,7 @@ def test_a_rough_pose_suffices(tmp_path: Path, content: str) -> None:
     camera, walls = ms.camera_before(SCENE, roll=0.1), mw.walls(2)
     photo = ms.photo_of(SCENE, camera)
     if content == "colours":
-        # The laser sees red bright and green dark.
+        # For the laser, red is bright and green is dark.
         (wall,), (other,) = walls.walls, mw.walls(3).walls
         green = decode_image(ms.photo_of(ms.textured_wall(3), camera).encoded, "a.png")[..., 0]
         red = decode_image(photo.encoded, "a.png")[..., 0]
@@ -97,14 +97,14 @@ def test_a_rough_pose_suffices(tmp_path: Path, content: str) -> None:
     error = mw.off_px(ties, camera)
     assert len(error) > 200
     assert np.linalg.norm(error, axis=1).max() < 1.5
-    # 1.9 photo pixels per cell: a tenth of a cell.
+    # A cell has 1.9 photo pixels, so this is a tenth of a cell.
     assert np.sqrt(np.mean(error**2)) < 0.2
     np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.05)
 
 
 def test_cells_finer_than_points_lie_apart_do_as_well(tmp_path: Path) -> None:
     fine = ms.walls_of(replace(SCENE, frame=ms.textured_wall(2, gsd_m=0.003).frame)).walls[0]
-    # A point in every fifth cell, and no gap is filled: 6.7 mm apart.
+    # Every fifth cell has a point and no gap is filled, so points are 6.7 mm apart.
     is_void = np.random.default_rng(8).random(fine.frame.shape) > 0.2
     sparse = samples.wall(
         fine.frame,
@@ -121,12 +121,13 @@ def test_cells_finer_than_points_lie_apart_do_as_well(tmp_path: Path) -> None:
     assert np.sqrt(np.mean(error**2)) < 0.3
     np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.05)
     assert 0.3 < np.sqrt(np.mean((error / ties.sigma_px[:, None]) ** 2)) < 1.4
-    # What orients judges by the cells that are painted.
+    # Orientations are assessed with the cells of the orthoimage.
     assert ties.walls[0].gsd_m == pytest.approx(0.003)
 
 
 def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(tmp_path: Path) -> None:
-    # The scan shows how far a grey is from its middle, bright or dark alike: edges without a sign.
+    # The intensity depends on the absolute difference of grey from its median, so edges have no
+    # sign.
     (wall,) = mw.walls(2).walls
     assert wall.intensity is not None
     stripes = np.where(wall.intensity > np.nanmedian(wall.intensity), 1.0, -1.0)
@@ -147,7 +148,7 @@ def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(tmp_p
 
 
 def test_ties_on_a_part_of_the_wall_that_was_moved_are_rejected(tmp_path: Path) -> None:
-    # They agree with their neighbours, by four cells beside the others.
+    # The moved ties agree with their neighbours, but differ from the others by four cells.
     camera = ms.camera_before(SCENE)
     photo = ms.photo_of(SCENE, camera)
     rgb = decode_image(photo.encoded, "a.png").copy()
@@ -173,7 +174,8 @@ def test_no_oriented_photo_is_refused_and_a_pose_far_off_gives_hardly_any_ties(
 
 
 def test_the_papers_mask_keeps_best_matches_from_going_astray(tmp_path: Path) -> None:
-    # A photo of a quarter of the wall; without a ratio every key point of the wall has a match.
+    # The photo shows a quarter of the wall; without the ratio test, every key point of the wall has
+    # a match.
     camera = ms.camera_before(SCENE, centre=(1.0, -1.3, 1.0), towards=(1.0, 0.0, 1.0))
     inputs = {"photos": ms.photos(ms.photo_of(SCENE, camera)), "walls": mw.walls(2)}
     wrong, n_right = {}, {}
@@ -185,10 +187,11 @@ def test_the_papers_mask_keeps_best_matches_from_going_astray(tmp_path: Path) ->
             off = mw.off_px(ties, camera)
             is_wrong = ~(np.linalg.norm(off, axis=1) < 6.0)
             wrong[name, ratio], n_right[name, ratio] = is_wrong.mean(), int((~is_wrong).sum())
-    # Measured: 587 right ones of any ratio, and 542 with one, in both ways.
+    # Measured in both ways: 587 right matches without the ratio test, and 542 with it.
     assert n_right["masked", 1.0] > 0.9 * n_right["plain", 1.0] > 100
     assert n_right["masked", 0.8] > 0.9 * n_right["plain", 0.8] > 0.8 * n_right["plain", 1.0]
-    # Measured: 83 % and 33 % wrong without a ratio, 7 % and 1 % with that of openMVG.
+    # Measured: 83 % and 33 % wrong matches without the ratio test, 7 % and 1 % with that of
+    # openMVG.
     assert wrong["plain", 1.0] > 0.5
     assert wrong["masked", 1.0] < 0.6 * wrong["plain", 1.0]
     assert wrong["plain", 0.8] < 0.2 * wrong["plain", 1.0]

@@ -1,4 +1,4 @@
-"""How a photo is paired with walls, and how exact the ties of key points are."""
+"""Pairing of photos with walls, and accuracy of ties from key points."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.inspect_scenes import GSD_M
 from tests.tied_photos import photo
 
 LOOSE_PX = 20.0
-# Photo pixels from wall pixels: turned, shrunk, and seen a little from aside.
+# Photo pixels from wall pixels: rotated, reduced, and slightly oblique.
 TILTED = np.array([[0.8, -0.3, 500.0], [0.25, 0.9, 300.0], [1e-5, -2e-5, 1.0]])
 
 
-# Any: fields of the key points, each of its own type.
+# The type is Any, since the fields of key points have different types.
 def features(pixels: NDArray[np.float64], **known: Any) -> Features:
     n = len(pixels)
     usual: dict[str, Any] = {
@@ -45,7 +45,7 @@ def judged(wall: NDArray[np.float64], photo: NDArray[np.float64]) -> Pair:
     return verified(3, matches, (features(photo), features(wall)), LOOSE_PX)
 
 
-# --- what agrees ---
+# --- inliers ---
 
 
 @pytest.mark.parametrize(("n", "is_shown"), [(3, False), (7, False), (8, True), (60, True)])
@@ -58,7 +58,7 @@ def test_eight_places_that_agree_show_a_wall(n: int, is_shown: bool) -> None:
     assert (found.homography is not None) == is_shown
     if found.homography is not None:
         np.testing.assert_allclose(mapped(found.homography, wall), front, atol=0.01)
-    # Seen from behind it is not shown.
+    # A wall seen from behind is not shown.
     assert not judged(wall, front * [-1.0, 1.0] + [3000.0, 0.0]).is_shown
 
 
@@ -73,7 +73,7 @@ def test_what_lies_loosely_where_it_should_agrees_and_nothing_farther_off() -> N
 
 @pytest.mark.parametrize("is_photo", [True, False], ids=["in the photo", "on the wall"])
 def test_many_key_points_on_one_place_are_one(is_photo: bool) -> None:
-    # Nine places four pixels apart, or all within two of them.
+    # Nine positions four pixels apart, or all within two pixels.
     rows, columns = np.divmod(np.arange(9.0), 3.0)
     lattice = np.column_stack([columns, rows])
     for apart_px, is_shown in ((4.0, True), (0.5, False)):
@@ -81,7 +81,7 @@ def test_many_key_points_on_one_place_are_one(is_photo: bool) -> None:
         assert judged(*((far, near) if is_photo else (near, far))).is_shown == is_shown
 
 
-# --- the second look ---
+# --- guided matching ---
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,8 @@ def test_key_points_are_added_where_place_size_and_direction_are_as_expected(
     rng = np.random.default_rng(2)
     pixels = on_wall(12)
     descriptors = rng.integers(0, 200, (12, 128)).astype(np.float32)
-    # The photo is half as large as the wall, and turned by 170 degrees; the last is asked about.
+    # The photo is half as large as the wall and rotated by 170 degrees; the last key point is
+    # tested.
     wall = features(pixels, sizes_px=rng.uniform(3.0, 9.0, 12), descriptors=descriptors)
     sizes, turns, places = 0.5 * wall.sizes_px, np.full(12, 170.0), 0.5 * pixels
     sizes[-1] *= size
@@ -108,18 +109,18 @@ def test_key_points_are_added_where_place_size_and_direction_are_as_expected(
     photo = features(places, sizes_px=sizes, angles_deg=turns % 360.0, descriptors=descriptors)
     first = Matches(first=np.arange(10), second=np.arange(10), ratio=np.full(10, 0.5))
     agreeing = np.arange(10) < 8
-    # What did not agree says nothing of sizes and turns.
+    # Outliers do not influence sizes and rotations.
     look = partial(rematched, first, (photo, wall), agreeing=agreeing, radius_px=10.0, ratio=1.0)
     found = look(0.5 * pixels)
     np.testing.assert_array_equal(found.first[:10], first.first)
     np.testing.assert_array_equal(found.ratio[:10], 0.5)
     pairs = list(zip(found.first[10:].tolist(), found.second[10:].tolist(), strict=True))
     assert pairs == [(10, 10), (11, 11)][: 1 + is_found]
-    # Nothing that is twice as far as allowed from all of the photo is even looked at.
+    # Key points far from the photo are not considered.
     assert len(look(0.5 * pixels + 5000.0)) == 10
 
 
-# Any: fields of the piece, each of its own type.
+# The type is Any, since the fields of the piece have different types.
 def piece(
     pixels: list[tuple[float, float]],
     points: list[tuple[float, float, float]],
@@ -136,13 +137,13 @@ def piece(
 
 
 def photos_of(*masks: bytes | None) -> Photos:
-    """Photos a, b, ... with masks of used pixels or without."""
+    """Return photos a, b, ... with or without masks of usable pixels."""
     named = zip("ab", masks, strict=False)
     return ms.photos(*(photo(name=name, width=10, height=8, mask=mask) for name, mask in named))
 
 
 def kept(*pieces: TiePiece) -> list[list[float]]:
-    """Which ties stay, by their `sigma_m`."""
+    """Return the remaining ties, identified by their `sigma_m`."""
     return [item.sigma_m.tolist() for item in without_twins(pieces)]
 
 
@@ -151,10 +152,11 @@ def test_of_ties_of_one_key_point_with_one_place_the_most_exact_stays() -> None:
     second = piece([(5.0, 7.0), (9.0, 9.0)], [(0, 0, 0.005), (1, 1, 1.005)], [0.003, 0.001])
     assert kept(first, second) == [[0.002], [0.001]]
     assert kept(second, first) == [[0.001], [0.002]]
-    # Alone, nothing is looked at.
+    # A single piece is unchanged.
     assert kept(first) == [[0.002, 0.004]]
     assert without_twins([]) == []
-    # Other places, beyond four times the sum of both deviations, and other pixels are no twins.
+    # Ties are not duplicates if their points differ by more than four times the sum of both sigmas,
+    # or if their pixels differ.
     first = piece([(5.0, 7.0)], [(0, 0, 0)], [0.002])
     for du_px, dz_m, is_twin in (
         *((0.0, 0.0199, True), (0.0, 0.0201, False)),
@@ -188,8 +190,8 @@ def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
 def test_ties_in_masked_pixels_are_left_out() -> None:
     used = np.full((8, 10), 255, dtype=np.uint8)
     used[5:7, 3] = used[:, 0] = used[0] = 0
-    # In the mask; right beside it; on the rim of the photo, which is nowhere; and in the first
-    # column and row, which begin at 0.
+    # In the mask; next to it; on the border of the photo, which is outside; and in the first column
+    # and row, which begin at 0.
     pixels = [(3.2, 5.9), (4.01, 5.9), (10.0, 8.0), (0.4, 3.3), (3.3, 0.4), (1.2, 1.2)]
     every = piece(pixels, [(k, k, k) for k in range(6)], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     ties = ties_of([every], photos_of(encode_png(used)), inspect_scenes.walls(), {})
@@ -200,7 +202,7 @@ def test_ties_in_masked_pixels_are_left_out() -> None:
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_large_key_points_are_less_exact_and_those_of_voids_left_out(scale: float) -> None:
     wall = inspect_scenes.walls().walls[0]
-    # The second lies in a void; the last is so large that it is known to no three cells.
+    # The second is in a void; the last is so large that its standard deviation exceeds three cells.
     pixels = np.array([[50.5, 40.5], [220.5, 110.5], [300.5, 200.5], [60.5, 60.5]])
     on_wall = features(pixels, sizes_px=np.array([2.0, 2.0, 40.0, 1e4]))
     sizes_px = np.array([2.0, 4.0, 100.0, 8.0])
@@ -210,9 +212,9 @@ def test_large_key_points_are_less_exact_and_those_of_voids_left_out(scale: floa
     np.testing.assert_array_equal(found.pixels_photo, in_photo.pixels[[0, 2]])
     expected = wall.frame.world_from_wall(on_wall.pixels[[0, 2]], 0.0)
     np.testing.assert_allclose(found.points_world, expected, atol=1e-6)
-    # Key points of a hundred pixels are known to six of them, small ones to a third of one.
+    # Key points of 100 pixels are accurate to 6 pixels, small ones to a third of a pixel.
     assert found.sigma_px * scale == pytest.approx([0.35, 6.0 * scale])
     on_raster = GSD_M * np.array([0.35, 2.4])
-    # The surface's own deviation comes on top.
+    # The standard deviation of the surface is added.
     assert (found.sigma_m >= on_raster).all()
     assert found.sigma_m[0] < found.sigma_m[1] < 3.0 * GSD_M

@@ -1,4 +1,4 @@
-"""Compiled matching of patches against plain formulations of the same."""
+"""Compiled matching of patches, compared with simple implementations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def channels(*layers: NDArray[np.float64]) -> Channels:
 
 
 def moved(layer: NDArray[np.float64], right: float, down: float) -> NDArray[np.float64]:
-    """The same content so many cells farther right and down."""
+    """Return the same content, shifted to the right and down by a number of cells."""
     return np.asarray(shift(layer, (down, right), order=3, mode="nearest"))
 
 
@@ -44,7 +44,7 @@ def test_noise_is_told_by_the_standard_deviation() -> None:
         noisy = channels(other + 0.4 * noise(seed=seed))
         found = measure(channels(first), noisy, PLACES)
         ratios.append(np.abs(found.shift_cells - [1.0, 0.0]) / found.sigma_cells[:, None])
-    # Of a normal distribution half lies within 0.67 standard deviations.
+    # Half of a normal distribution is within 0.67 standard deviations.
     assert np.median(np.concatenate(ratios)) == pytest.approx(0.67, abs=0.2)
 
 
@@ -53,7 +53,7 @@ HALF = 5
 
 
 def texture(columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(..., 2) two channels of waves longer than a patch is fine."""
+    """Return two channels (..., 2) of waves that are longer than a patch."""
     a, b = np.random.default_rng(7).uniform(-0.5, 0.5, (2, 2, 6))
     phases = np.random.default_rng(8).uniform(0.0, 6.0, (2, 6))
     at = a * columns[..., None, None] + b * rows[..., None, None]
@@ -79,12 +79,12 @@ def test_the_shift_of_highest_correlation_is_found_with_its_lead(seed: int) -> N
     places = rng.integers(half + radius, [34 - half - radius, 30 - half - radius], (6, 2))
 
     def patch(of: NDArray[np.float32], column: int, row: int) -> NDArray[np.float64]:
-        """Every second cell of a patch, less the mean of each channel."""
+        """Return every second cell of a patch, minus the mean of each channel."""
         steps = np.arange(-half, half + 1, 2)
         part = of[np.ix_(row + steps, column + steps)].astype(np.float64)
         return part - part.mean(axis=(0, 1))
 
-    # The last one has its best place on the rim.
+    # The best position of the last picture is at the border.
     edge = np.roll(first, (0, radius), axis=(0, 1))
     for other, wanted in ((second, shift), (edge, (radius, 0))):
         found = np.zeros((6, 4))
@@ -128,7 +128,7 @@ def known(value: float = 1.0) -> NDArray[np.float32]:
 
 
 def keys(t: float) -> NDArray[np.float64]:
-    """Weights of cubic convolution by its definition: of distances 1 + t, t, 1 - t, 2 - t."""
+    """Return weights of cubic convolution by definition, for distances 1 + t, t, 1 - t, 2 - t."""
     away = np.array([1.0 + t, t, 1.0 - t, 2.0 - t])
     near = 1.5 * away**3 - 2.5 * away**2 + 1.0
     far = -0.5 * away**3 + 2.5 * away**2 - 4.0 * away + 2.0
@@ -177,7 +177,7 @@ def test_deviation_and_correlation_are_those_of_weighted_least_squares() -> None
     noise = (saa - sab**2 / sbb) / (2.0 * total)
     expected = math.sqrt(noise * 0.5 * np.trace(np.linalg.inv(normal)))
     assert sigma == pytest.approx(expected, rel=0.01)
-    # Nothing is left to gain: the residual has no part along the slopes.
+    # The residual has no component along the slopes, so no improvement is possible.
     residual = sab / sbb * b - a
     pull = np.linalg.solve(normal, [(w * residual * slope).sum() for slope in slopes])
     assert np.abs(pull).max() < 0.002
@@ -185,7 +185,7 @@ def test_deviation_and_correlation_are_those_of_weighted_least_squares() -> None
 
 def test_patches_that_fix_no_shift_have_no_deviation() -> None:
     first, second = Channels(picture(), known()), Channels(picture((0.5, 0.25)), known())
-    # Too near to the border, in either picture.
+    # Patches too close to the border of either picture.
     reach = HALF + 3
     for least, is_fine in ((reach, True), (reach - 1, False)):
         for at in (least, SIDE - least - 1):
@@ -217,7 +217,7 @@ def test_gains_are_ridge_regression_and_the_score_is_corrected_for_what_they_fit
 ) -> None:
     rng = np.random.default_rng(14)
     colours = rng.normal(3.0, 1.0, (SIDE, SIDE, 3))
-    # Channels that follow each other.
+    # Correlated channels.
     colours[..., 2] = 0.7 * colours[..., 0] + 0.5 * colours[..., 2]
     wall = colours @ [0.8, -0.5, 0.3] + noise * rng.normal(size=(SIDE, SIDE)) + 7.0
     first, second = wall[..., None].astype(np.float32), colours.astype(np.float32)
@@ -230,9 +230,9 @@ def test_gains_are_ridge_regression_and_the_score_is_corrected_for_what_they_fit
     a, x = a - a.mean(), x - x.mean(axis=0)
     products = x.T @ x
     gains = np.linalg.solve(products + 1e-3 * np.trace(products) * np.eye(3), x.T @ a)
-    # Products are of single precision.
+    # Products have single precision.
     np.testing.assert_allclose(found[0, 4:], gains, atol=2e-4)
-    # Of the cells, two in three are independent; three gains and a mean fit four of these.
+    # Two of three cells are independent; three gains and a mean use four of these.
     free = len(a) / 1.5
     left = (1.0 - gains @ x.T @ a / (a @ a)) * (free - 1.0) / (free - 4.0)
     assert found[0, 2] == pytest.approx(np.sqrt(max(0.0, 1.0 - left)), abs=1e-4)

@@ -1,4 +1,4 @@
-"""Photos are placed by where edges run, and confirm each other's places."""
+"""Photos are located by the positions of edges, and confirm each other's positions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PHOTO = ms.photo_of(SCENE, ms.camera_before(SCENE), calibrated=False)
 
 
 def patchy_wall() -> Wall:
-    """The wall as a laser sees it that inverts contrast in every second of many fields."""
+    """Return the wall with an intensity whose contrast is inverted in every second field."""
     (wall,) = mw.walls(1).walls
     assert wall.intensity is not None
     rows, columns = np.indices(wall.frame.shape) * 5 // min(wall.frame.shape)
@@ -43,16 +43,17 @@ def placed(photo: Photo) -> Placed | None:
 
 
 def test_a_photo_is_placed_whatever_its_lens_and_however_it_was_held() -> None:
-    """The wall inverts contrast here and there, and neither is known."""
+    """The contrast of the wall is inverted in places; the photo's lens and rotation are unknown."""
     camera = ms.camera_before(SCENE, centre=(3.4, -1.9, 1.2), towards=(1.6, 0.0, 1.0))
     upright = decode_image(ms.photo_of(SCENE, camera).encoded, "a.png")
     turned = np.ascontiguousarray(np.rot90(upright))
     found = placed(Photo(name="a.png", encoded=encode_png(turned), width=640, height=900))
     assert found is not None
     u, v = camera.project(found.piece.points_world)[:, :2].T
-    # 44 degrees from square, a quarter turned, a focal length of 0.93 instead of 0.8 of its width.
+    # The photo is oblique by 44 degrees and rotated by a quarter turn; its focal length is 0.93
+    # instead of 0.8 of its width.
     off_px = np.linalg.norm(np.column_stack([v, 900.0 - u]) - found.piece.pixels_photo, axis=1)
-    # In the coarse cells that ties were found in.
+    # In coarse cells, in which the ties were found.
     off = off_px / (2.0 * found.piece.sigma_px)
     assert np.median(off) < 1.0
     assert (off < 3.0).mean() > 0.85
@@ -64,7 +65,7 @@ def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
     assert placed(replace(PHOTO, encoded=encode_png(mirrored))) is None
     other = ms.textured_wall(2)
     assert placed(ms.photo_of(other, ms.camera_before(other), calibrated=False)) is None
-    # Nor is any on a wall that shows nothing.
+    # On a wall without intensity, there are no positions.
     blind = replace(patchy_wall(), intensity=None)
     assert places_of(0, PHOTO, [structures.wall_structure(blind)]) == []
 
@@ -88,7 +89,7 @@ NEAR = pytest.approx(0.0, abs=1e-9)
 def place(
     photo: int, *, aside_m: float = 0.0, share: float = 0.3, is_clear: bool = False
 ) -> Placed:
-    """A place of a photo, the right one or so far to the right of it."""
+    """Return a position of a photo: the right one, or displaced to the right."""
     camera = CAMERAS[photo].shifted(-aside_m * SCENE.frame.u_world)
     frame = SCENE.frame
     cells = np.stack(np.meshgrid(np.arange(100.0, 400.0, 30.0), np.arange(60.0, 280.0, 30.0)), -1)
@@ -107,7 +108,7 @@ def place(
 
 
 def paired(photo: int) -> PhotoPairs:
-    """What key points of a photo show of the wall."""
+    """Return key point matches of a photo with the wall."""
     features = [wall_features(WALLS.walls[0], PairingParams().max_features)]
     return pair_photo(photo_grey(PHOTOS.photos[photo]), features, PairingParams())
 
@@ -115,7 +116,7 @@ def paired(photo: int) -> PhotoPairs:
 def chosen(
     places: dict[int, Sequence[Placed]], recognised: Mapping[int, PhotoPairs] | None = None
 ) -> dict[int, float]:
-    """Metres that the chosen places are aside, by photo."""
+    """Return the displacements of the chosen positions in metres, by photo."""
     found = confirmed(PHOTOS, places, recognised or {}, ON_WALLS)
     return {
         k: float((place.camera.centre_world - CAMERAS[k].centre_world)[0])
@@ -127,7 +128,7 @@ def test_places_that_agree_are_taken_if_one_of_them_is_clear() -> None:
     assert chosen({0: [place(0, is_clear=True)], 1: [place(1)]}) == {0: NEAR, 1: NEAR}
     assert chosen({0: [place(0)], 1: [place(1)]}) == {}
     assert chosen({k: [place(k)] for k in range(3)}) == {0: NEAR, 1: NEAR, 2: NEAR}
-    # A place that no photo confirms is not taken however clear it is.
+    # A position that no photo confirms is not accepted, however clear it is.
     assert chosen({0: [place(0, is_clear=True)]}) == {}
     wrong = place(0, aside_m=0.3, share=0.6, is_clear=True)
     assert chosen({0: [wrong], 1: [place(1, is_clear=True)]}) == {}
@@ -150,14 +151,14 @@ def test_key_points_that_agree_by_chance_do_not_keep_a_photo_from_its_place() ->
     wrong = replace(right, pairs=(replace(pair, homography=shift @ pair.homography),))
     places = {k: [place(k)] for k in range(3)}
     assert chosen(places, {2: wrong}) == dict.fromkeys(range(3), NEAR)
-    # Where the others confirm its key points, these stay.
+    # If the others confirm its key points, these are used.
     assert chosen(places, {2: right}) == {0: NEAR, 1: NEAR}
-    # Where no photo has a place there is nothing to choose.
+    # If no photo has a position, none is chosen.
     assert chosen({0: (), 2: ()}, {1: right}) == {}
 
 
 def picture(height: int, width: int) -> NDArray[np.float32]:
-    """Blocks of 7 pixels in greys of their own."""
+    """Return blocks of 7 pixels with random grey values."""
     blocks = np.random.default_rng(3).uniform(0.0, 1.0, (height // 7 + 1, width // 7 + 1))
     wide = np.kron(blocks, np.ones((7, 7)))[:height, :width, None]
     return np.ascontiguousarray(wide, dtype=np.float32)
@@ -170,10 +171,11 @@ def test_edges_are_the_same_whichever_side_is_brighter_and_turn_with_the_picture
         structures.structure_of(1.0 - grey, known).values, upright, atol=1e-4
     )
     turned = structures.structure_of(np.ascontiguousarray(np.rot90(grey)), known).values
-    # A quarter turn is half a turn of doubled angles, and a whole one of fourfold ones.
+    # A quarter turn is half a turn of doubled angles and a full turn of fourfold angles.
     signs = np.array([-1.0, -1.0, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(turned, np.rot90(upright) * signs, atol=1e-4)
-    # Each place tells where edges run, not how strong they are: vectors of length one at most.
+    # Each cell contains the direction of edges, not their strength, so vectors are at most one unit
+    # long.
     lengths = np.linalg.norm(upright, axis=2)
     assert lengths.max() < 1.0
     assert np.median(lengths) == pytest.approx(1.0 / 1.3, abs=0.01)
@@ -195,19 +197,19 @@ def test_a_piece_of_the_wall_lies_where_it_was_taken_from() -> None:
     structure = structures.wall_structure(wall)
     assert structure is not None
     assert wall.intensity is not None
-    # A half of both sides of it.
+    # A part with half of both sides.
     corner = np.array([wall.frame.width // 3, wall.frame.height // 4])
     size = np.array([wall.frame.width // 2, wall.frame.height // 2])
     (left, top), (right, bottom) = corner, corner + size
     grey = np.rint(255 * np.clip(np.nan_to_num(wall.intensity, nan=0.5), 0.0, 1.0)).astype(np.uint8)
-    # Inverted: edges stay where they are.
+    # Inverted, so that edges keep their positions.
     cut = 255 - grey[top:bottom, left:right]
     places = structures.likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=3)
     assert 1 < len(places) <= 3
     for one, other in itertools.combinations(places, 2):
         assert one.lead >= other.lead
         apart_m = np.hypot(*(one.centre_m - other.centre_m))
-        # The same place at a neighbouring scale is no other one.
+        # The same position at a neighbouring scale is not another position.
         assert apart_m > 0.25 * one.width_m or abs(math.log(one.width_m / other.width_m)) > 0.25
     best, fine_m = places[0], wall.frame.gsd_m
     # Sizes are tried in steps of a tenth, and parts may slip by 3 % of the width.

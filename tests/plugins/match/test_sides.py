@@ -1,4 +1,4 @@
-"""Asking photos from which side a wall is seen: turned where the guess was wrong, else left."""
+"""Sides of walls from photos: planes are turned if the guess was wrong, and otherwise unchanged."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CLOUD = ms.cloud_of(SCENE)
 
 
 def planes(viewpoint: str = "guess") -> Planes:
-    """The wall, rightly faced, and a floor before it."""
+    """Return the wall with the correct side, and a floor in front of it."""
     frame = SCENE.frame
     corners = frame.corners_world()
     below = corners[[1, 1, 2, 2]]
@@ -83,7 +83,7 @@ def test_a_plane_between_two_that_face_the_other_way_is_turned(
 ) -> None:
     normal = SCENE.frame.normal_world
     offset_m = SCENE.frame.plane.offset_m
-    # The facade, a step turned towards it by the guess, and an object farther in front.
+    # The facade, a step that the guess turned towards it, and an object farther in front.
     places_m = np.array([0.0, moved_m, 2.0])
     corners = SCENE.frame.corners_world() + places_m[:, None, None] * normal
     corners[1] = corners[1][[3, 2, 1, 0]]

@@ -1,4 +1,4 @@
-"""Matching photos with walls: unbiased ties, colours that the laser sees otherwise, hand ties."""
+"""Matching photos with walls: unbiased ties, colours with other reflectances, ties by hand."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCENE = ms.textured_wall(1)
 def sift(
     folder: Path, photo: Photo, walls: Walls | None = None, hand: Ties | None = None
 ) -> tuple[Ties, list[str]]:
-    """Ties of a photo, and the codes of what was reported."""
+    """Return the ties of a photo and the codes of diagnostics."""
     ctx = mw.context(folder)
     inputs = {"photos": ms.photos(photo), "walls": walls or mw.walls(1), "hand": hand}
     return run(MatchSift, ctx, inputs).ties, [each.code for each in ctx.diagnostics]
@@ -43,9 +43,9 @@ def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: 
     right = error[length < 3.0]
     assert len(right) > 1000
     assert np.mean(length >= 3.0) < 0.05
-    # A quarter of a pixel is what OpenCV's default would give.
+    # With OpenCV's default, it would be a quarter of a pixel.
     np.testing.assert_allclose(right.mean(axis=0), 0.0, atol=0.05)
-    # The stated deviation is that of the ties, within a factor.
+    # The predicted standard deviation is approximately that of the ties.
     depth = camera.project(ties.points_world)[:, 2]
     stated = np.hypot(ties.sigma_px, ties.sigma_m * camera.fx / depth)[length < 3.0]
     assert 0.3 < np.sqrt(np.mean((right / stated[:, None]) ** 2)) < 1.5
@@ -80,7 +80,8 @@ def test_a_mirrored_photo_is_recognised_as_such(tmp_path: Path) -> None:
 def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertainty(
     n_even: int,
 ) -> None:
-    # Cells half as wide as points lie apart: several fall into one on the step, hardly elsewhere.
+    # Cells are half as wide as the point spacing, so hardly any cell except at the step has several
+    # points.
     (wall,) = mw.walls(1).walls
     depth, sigma = wall.depth_m.copy(), np.full_like(wall.sigma_m, np.nan)
     depth[:, 300:] += 0.2
@@ -90,7 +91,7 @@ def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertaint
     sigma[rows, columns], count[rows, columns] = 0.0015, 2
     sparse = replace(wall, depth_m=depth, sigma_m=sigma, count=count)
     flat = points_on_wall(sparse, np.array([[100.3, 80.7]]))
-    # Half a cell where nothing else is known; else a tenth of what the step holds.
+    # Half a cell if nothing else is known; otherwise a tenth of the step.
     assert flat[1][0] < (0.01 if n_even else 0.7 * ms.GSD_M)
     edge = points_on_wall(sparse, np.array([[300.1, 80.7]]))
     assert edge[1][0] > 0.05
@@ -161,14 +162,14 @@ def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
         assert [each.code for each in ctx.diagnostics] == ["scan-without-texture"]
 
 
-# The middle of its picture, which holds key points enough.
+# The middle of the picture, which contains enough key points.
 CAMERA = replace(
     ms.camera_before(ms.textured_wall(1)), width=630, height=448, cx=0.5 * 630, cy=0.5 * 448
 )
 
 
 def grey_of(seed: int) -> NDArray[np.uint8]:
-    """The wall of one texture as a camera sees it; all textures lie on the same relief."""
+    """Return a photo of the wall with one texture; the relief is the same for all textures."""
     return decode_image(ms.photo_of(ms.textured_wall(seed), CAMERA).encoded, "a.png")[:, :, 0]
 
 
@@ -177,7 +178,7 @@ def photo_with(rgb: NDArray[np.uint8]) -> Photo:
 
 
 def wall_with(red: float, green: float) -> Walls:
-    """The wall as a laser sees it that answers so to the textures 1 (red) and 2 (green)."""
+    """Return the wall with an intensity combined from the textures 1 (red) and 2 (green)."""
     first, second = (mw.walls(seed).walls[0] for seed in (1, 2))
     intensity = 0.5 + red * (first.intensity - 0.45) + green * (second.intensity - 0.45)
     return replace(mw.walls(1), walls=(replace(first, intensity=intensity.astype(np.float32)),))
@@ -205,17 +206,17 @@ def test_a_photo_of_something_else_gets_no_ties_in_any_mixture(tmp_path: Path) -
 
 
 def right(ties: Ties) -> int:
-    """Ties within two cells of where the true camera sees their points."""
+    """Count the ties within two cells of the true pixels of their points."""
     kept = ties.role != TieRole.REJECTED
     return int((np.linalg.norm(mw.off_px(ties, CAMERA)[kept], axis=1) < 4.0).sum())
 
 
 def picture_of(ties: Ties) -> str:
-    """Which picture of the photo was matched."""
+    """Return the name of the matched picture."""
     return ties.details["photos"]["a.png"]["picture"]  # type: ignore[call-overload,index,return-value]
 
 
-# --- which mixtures are tried, and which one is taken ---
+# --- choice of mixtures ---
 
 
 @pytest.mark.parametrize(("levels", "shows"), [(7, False), (9, True)])
@@ -243,5 +244,5 @@ def test_photos_of_repeating_windows_are_oriented_where_they_are(
     assert n_facades == 4
     assert [error.status for error in errors] == ["ok"] * 4
     assert not any(error.is_wrong for error in errors)
-    # A window farther would be 1.9 m.
+    # A shift by one window would be 1.9 m.
     assert max(error.centre_m for error in errors) < 0.05

@@ -1,4 +1,4 @@
-"""Photos projected onto walls by a pose, and photos found by what others show."""
+"""Photos projected onto walls with a pose, and poses found from other photos."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ GSD_M = 0.01
 
 
 def wall_at(y_m: float, *, width: int = 100, height: int = 80, x_m: float = -0.5) -> Wall:
-    """A wall that looks to -y, its middle at z = 0."""
+    """Return a wall that faces -y, with its middle at z = 0."""
     frame = samples.facing_south(GSD_M, width, height, (x_m, y_m, 0.5 * height * GSD_M))
     return samples.wall(frame, name="wall")
 
 
 def camera_at(x_m: float = 0.0, y_m: float = -2.0, *, size: int = 800) -> ViewingCamera:
-    """Looks along y, with 400 px per radian; a wall's cell is 2 px wide 2 m away."""
+    """Return a camera that looks along y with 400 px per radian; a cell at 2 m is 2 px wide."""
     centre = np.array([x_m, y_m, 0.0])
     rotation = looking_at(centre, centre + samples.NORTH, samples.UP)
     half = 0.5 * size
@@ -44,9 +44,10 @@ def camera_at(x_m: float = 0.0, y_m: float = -2.0, *, size: int = 800) -> Viewin
 
 
 def hidden_by_screen(inner_m: float, outer_m: float) -> tuple[NDArray[np.bool_], ...]:
-    """Columns that a screen 0.5 m before the wall, from x = -0.35 to -0.05, hides; and others.
+    """Return the columns that a screen 0.5 m in front of the wall hides, and visible ones.
 
-    Seen from 2 m it hides its place enlarged by 2 / 1.5, but for so much inside and outside.
+    The screen extends from x = -0.35 to -0.05. Seen from 2 m, it hides its extent enlarged by 2 /
+    1.5; margins inside and outside are excluded.
     """
     x_m = -0.5 + GSD_M * (np.arange(100) + 0.5)
     left, right = -0.35 * 4 / 3, -0.05 * 4 / 3
@@ -56,29 +57,29 @@ def hidden_by_screen(inner_m: float, outer_m: float) -> tuple[NDArray[np.bool_],
 
 @pytest.mark.parametrize("y_m", [0.0, 100.0])
 def test_cells_appear_where_their_centres_are_seen(y_m: float) -> None:
-    """However far the wall is from where coordinates begin."""
+    """The distance of the wall from the origin of coordinates does not matter."""
     (projection,) = warping.project_walls(camera_at(y_m=y_m - 2.0), [wall_at(y_m)])
     assert projection is not None
     assert projection.part == (slice(0, 80), slice(0, 100))
     assert projection.corner.tolist() == [0, 0]
-    # The middle of the wall is the middle of the photo; two pixels a cell.
+    # The middle of the wall is in the middle of the photo; a cell has two pixels.
     columns, rows = np.arange(100) + 0.5, np.arange(80) + 0.5
     np.testing.assert_allclose(projection.u[0], 400.0 + 2.0 * (columns - 50.0), atol=1e-3)
     np.testing.assert_allclose(projection.v[:, 0], 400.0 + 2.0 * (rows - 40.0), atol=1e-3)
     np.testing.assert_allclose(projection.distance, 2.0, atol=1e-6)
     assert projection.pixels_per_cell == pytest.approx(2.0, abs=1e-4)
-    # From behind it is not shown.
+    # A wall seen from behind is not shown.
     assert warping.project_walls(camera_at(y_m=y_m + 2.0), [wall_at(y_m)]) == [None]
 
 
 def test_only_the_part_in_the_photo_is_projected_and_a_little_round_it() -> None:
-    # The photo shows 1 m about its axis: columns 100 to 200 of a wall of 3 m.
+    # The photo shows 1 m around its axis: columns 100 to 200 of a 3 m wall.
     wide = wall_at(0.0, width=300, x_m=-1.5)
     (projection,) = warping.project_walls(camera_at(size=200), [wide])
     assert projection is not None
     rows, columns = projection.part
     assert (rows.start, rows.stop) == (0, 80)
-    # Every eighth cell is asked, and one of these more is taken on both sides.
+    # Every eighth cell is tested, and one such step is added on both sides.
     assert (columns.start, columns.stop) == (96, 208)
     assert projection.corner.tolist() == [96, 0]
     seen = np.flatnonzero(np.isfinite(projection.u[0])) + columns.start
@@ -87,13 +88,13 @@ def test_only_the_part_in_the_photo_is_projected_and_a_little_round_it() -> None
 
 def test_walls_that_a_photo_does_not_show_have_no_projection() -> None:
     assert warping.project_walls(camera_at(x_m=20.0), [wall_at(0.0)]) == [None]
-    # Too few cells.
+    # There are too few cells.
     assert warping.project_walls(camera_at(), [wall_at(0.0, width=9, height=11)]) == [None]
 
 
 @pytest.mark.parametrize(("cosine", "is_shown"), [(0.14, False), (0.16, True)])
 def test_views_flatter_than_one_in_seven_show_too_little(cosine: float, is_shown: bool) -> None:
-    # From far to the side: all cells are seen under nearly one angle.
+    # From far away, all cells are seen at almost the same angle.
     away_m = 40.0
     centre = away_m * np.array([math.sqrt(1.0 - cosine**2), -cosine, 0.0])
     rotation = looking_at(centre, np.zeros(3), samples.UP)
@@ -105,7 +106,7 @@ def test_views_flatter_than_one_in_seven_show_too_little(cosine: float, is_shown
 
 
 def test_what_another_surface_hides_is_left_out() -> None:
-    # A screen half a metre before the left half of the wall.
+    # A screen half a metre in front of the left half of the wall.
     screen = wall_at(-0.5, width=30, x_m=-0.35)
     behind, before = warping.project_walls(camera_at(), [wall_at(0.0), screen])
     assert behind is not None
@@ -125,7 +126,7 @@ def test_six_cells_behind_a_surface_are_hidden(apart_cells: float, is_hidden: bo
 
 
 def board_before(wall: Wall, camera: ViewingCamera) -> warping.Before:
-    # A board half a metre before the left half of the wall, in no wall's raster.
+    # A board half a metre in front of the left half of the wall, which is in no raster.
     across, down = np.meshgrid(np.arange(-0.35, -0.05, 0.005), np.arange(-0.5, 0.5, 0.005))
     x = across.ravel().astype(np.float32)
     cloud = PointCloud(
@@ -169,7 +170,7 @@ def test_what_only_the_cloud_holds_hides_the_wall_and_cells_near_it() -> None:
 
 
 def test_a_cell_that_rounds_onto_the_far_border_of_the_photo_is_in_it() -> None:
-    # The last row of cells lies 79 px below the middle, a millionth of a pixel inside the photo.
+    # The last row of cells is 79 px below the middle, a millionth of a pixel inside the photo.
     camera, wall = replace(camera_at(), cy=721.0 - 1e-6), wall_at(0.0)
     shown = warping.view_of(0, PHOTO, camera, [wall], board_before(wall, camera))
     assert shown.projections[0] is not None
@@ -206,13 +207,13 @@ def test_a_displacement_agrees_with_the_median_of_its_neighbours() -> None:
         shifts[12] = at
         off = np.flatnonzero(~tracing.agrees_around(displacements(shifts))).tolist()
         assert off == [12] * is_far
-    # Where neighbours do not agree nothing is believed; a spread of half a cell lets more than a
-    # cell pass.
+    # If neighbours disagree with each other, no displacement is accepted; a spread of half a cell
+    # allows deviations of more than one cell.
     rng = np.random.default_rng(2)
     assert not tracing.agrees_around(displacements(rng.uniform(-20, 20, (25, 2)))).any()
     loose = np.random.default_rng(3).uniform(-0.9, 0.9, (25, 2))
     assert tracing.agrees_around(displacements(loose)).sum() >= 24
-    # Three are too few.
+    # Three neighbours are too few.
     assert not tracing.agrees_around(displacements(np.zeros((3, 2)))).any()
     assert tracing.agrees_around(displacements(np.zeros((4, 2)))).all()
     assert tracing.agrees_around(displacements(np.zeros((0, 2)))).shape == (0,)
@@ -244,7 +245,7 @@ def test_a_lens_is_taken_from_a_photo_of_the_same_size_and_nearly_the_same_focal
     old, new = (photo(name=name, exif_focal_px=exif_px) for name in ("old.png", "new.png"))
     found = tracing.lens_of(new, OLD, ms.photos())
     assert (found.fx if found else None) == (1000.0 if is_known else None)
-    # If EXIF contradicts it, it is that of photos with the same EXIF.
+    # If EXIF contradicts the lens, that of photos with the same EXIF is used.
     found = tracing.lens_of(new, OLD, ms.photos(old, new))
     assert found is not None
     assert found.fx == 1000.0
@@ -253,7 +254,7 @@ def test_a_lens_is_taken_from_a_photo_of_the_same_size_and_nearly_the_same_focal
 def view_of(
     grey: float, part: tuple[slice, slice], size: float, *, unknown: tuple[int, int] | None = None
 ) -> Any:
-    """A photo that shows one grey in a part of the first of two walls, so large."""
+    """Return a photo that shows one grey value in a part of the first of two walls."""
     projection = SimpleNamespace(part=part, pixels_per_cell=size)
     shown = np.full((part[0].stop - part[0].start, part[1].stop - part[1].start), grey, np.float32)
     if unknown is not None:
@@ -271,7 +272,7 @@ def test_of_photos_the_one_that_shows_a_place_largest_paints_it() -> None:
     expected = np.full((20, 30), 100.0)
     expected[5:15] = 50.0
     expected[:10, 5:15] = 200.0
-    # What the largest does not know is the next one's.
+    # Cells missing in the photo of highest resolution come from the next one.
     expected[3, 7] = 100.0
     for order in ((small, middle, large), (large, small, middle)):
         first, second = tracing.painted_walls(order, walls)  # type: ignore[arg-type]
@@ -283,7 +284,7 @@ def test_of_photos_the_one_that_shows_a_place_largest_paints_it() -> None:
         assert np.isnan(second[0].intensity).all()
 
 
-# The lens of the view, its pose forgotten.
+# The lens of the view, without its pose.
 LENS = replace(VIEW, rotation=np.eye(3), translation=np.zeros(3))
 
 

@@ -1,4 +1,4 @@
-"""How colours of photos are balanced: steps vanish, detail stays of one photo, parallax is kept."""
+"""Colour balancing of photos: steps vanish, and detail always comes from a single photo."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHAPE = (120, 240)
 
 
 def texture(seed: int = 5) -> NDArray[np.float64]:
-    """Light (rows, cols, 3) of a wall, 0.1 to 0.5, with detail of a cell and of many cells."""
+    """Return the light (rows, cols, 3) of a wall, 0.1 to 0.5, with fine and coarse detail."""
     import cv2
 
     rng = np.random.default_rng(seed)
@@ -34,12 +34,12 @@ def texture(seed: int = 5) -> NDArray[np.float64]:
 
 
 def levels_of(light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares of the highest level, as IEC 61966-2-1 has it."""
+    """Return shares of the highest level, as in IEC 61966-2-1."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
 
 
 def layer(name: str, columns: slice, light: NDArray[np.float64], quality: float) -> Layer:
-    """A layer of 16 bits that paints some columns."""
+    """Return a 16-bit layer with some painted columns."""
     rgb = np.rint(65535.0 * levels_of(light)).astype(np.uint16)
     return inspect_scenes.painted_layer(name, columns, rgb, quality)
 
@@ -47,7 +47,7 @@ def layer(name: str, columns: slice, light: NDArray[np.float64], quality: float)
 def two_photos(
     right: NDArray[np.float64] | float, wall: NDArray[np.float64] | None = None
 ) -> tuple[Layer, Layer]:
-    """Two photos that overlap in the middle; the second has another light. Seam at column 160."""
+    """Return two photos of different brightness that overlap in the middle; seam at column 160."""
     light = texture() if wall is None else wall
     return (
         layer("left", slice(0, 160), light, 2.0),
@@ -64,7 +64,7 @@ def mosaic(
 
 
 def factors(images: Orthoimages, layers: tuple[Layer, ...]) -> NDArray[np.float64]:
-    """Logarithm (rows, cols, 3) of what became of the light of each cell of its own layer."""
+    """Return the logarithm (rows, cols, 3) of the factor on the light of each cell."""
     (image,) = images.images
     light = light_of_levels(65535)
     own = np.choose(image.source[..., None], [item.rgb for item in layers])
@@ -81,12 +81,12 @@ def test_steps_along_seams_vanish_and_colours_are_those_of_one_exposure(tmp_path
     assert set(gains["wall 0"]) == {"left", "right"}
     images, _ = mosaic(tmp_path, two_photos(1.3 + 0.05 * columns))
     ratio = np.log(light_of_levels(65535)[images.images[0].rgb] / texture()).mean(axis=2)
-    # What no overlap shows of a field, a few hundredths at the far rim, stays as it is.
+    # Parts of a field that no overlap shows, a few hundredths at the far border, remain.
     assert np.abs(ratio - np.median(ratio)).max() < 0.04
 
 
 def test_detail_is_of_one_photo_everywhere(tmp_path: Path) -> None:
-    # What was done to a photo's light is smooth: nothing of the other photo's detail is in it.
+    # The correction of a photo is smooth and contains no detail of the other photo.
     rng = np.random.default_rng(8)
     layers = two_photos(0.7 * rng.uniform(0.9, 1.1, (*SHAPE, 1)))
     images, metrics = mosaic(tmp_path, layers)
@@ -95,7 +95,8 @@ def test_detail_is_of_one_photo_everywhere(tmp_path: Path) -> None:
     for axis in (0, 1):
         steps = np.abs(np.diff(done, axis=axis))
         is_seam = np.diff(images.images[0].source, axis=axis)[..., None] != 0
-        # A hundredth from cell to cell, where the photos' own detail differs by a fifth.
+        # It changes by a hundredth from cell to cell, while the detail of the photos differs by a
+        # fifth.
         assert steps[~np.broadcast_to(is_seam, steps.shape)].max() < 0.01
 
 
@@ -105,7 +106,7 @@ def test_photos_that_agree_stay_untouched(tmp_path: Path) -> None:
     assert not factors(images, layers).any()
     assert "gain_max" not in metrics
     assert images.details == {}
-    # One layer needs no balance.
+    # A single layer needs no balancing.
     pair, cameras = two_photos(0.5), [photographed(900.0)] * 2
     assert balancing.balance_of(pair[:1], None, [None]) is None
     found = balancing.balance_of(pair, None, cameras)
@@ -118,7 +119,7 @@ def surface(depth_m: NDArray[np.float32]) -> Walls:
 
 
 def test_what_parallax_separates_is_not_taken_for_light(tmp_path: Path) -> None:
-    # At the seam stands a post that the second photo shows elsewhere: there, it sees the wall.
+    # At the seam there is a post in one photo, where the second photo shows the wall.
     wall = texture()
     post = np.s_[40:80, 150:170]
     one, other = wall.copy(), 0.8 * wall
@@ -131,7 +132,8 @@ def test_what_parallax_separates_is_not_taken_for_light(tmp_path: Path) -> None:
         images, _ = mosaic(tmp_path, layers, walls)
         beside, _ = mosaic(tmp_path, plain, walls)
         pulled = np.abs(factors(images, layers) - factors(beside, plain))
-        # Taken for light, the post would pull by half the logarithm of 4, 0.7.
+        # If the post were treated as a difference in light, it would change the correction by half
+        # of ln 4, 0.7.
         assert pulled.max() < 0.06
 
 
@@ -174,14 +176,14 @@ def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> No
     for i, j, shared in pairs(lights):
         one, other = (balanced[k][inside(shared, lights[k].box)] for k in (i, j))
         assert np.median(np.abs(one - other)) < 0.02
-    # Where nothing overlaps nothing is changed.
+    # Without overlaps, nothing is changed.
     alone = balancing.estimate(lights[:1], radii[:1])
     assert not alone.exposures.any()
     assert not alone.nodes.any()
     assert (alone.lenses.shape, alone.nodes.shape) == ((1, 2), (1, 4, 4, 3))
 
 
-# --- the pieces ---
+# --- functions ---
 
 
 @pytest.mark.parametrize(
@@ -201,7 +203,7 @@ def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slic
     rows, columns = (grid.ravel() for grid in np.indices((48, 70)))
     found = balance.log_gains(0, rows, columns)
     middles = [centres[part] for centres, part in zip(blocks.centres(), box, strict=True)]
-    # Beyond the outermost middles nothing changes any more.
+    # Beyond the outermost block centres, values are constant.
     places = [
         np.interp(cells + 0.5, at, np.arange(len(at)))
         for cells, at in zip((rows, columns), middles, strict=True)
@@ -217,7 +219,7 @@ def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slic
 def test_photos_differ_where_either_has_to_change_by_two_percent(
     factor: float, *, differs: bool
 ) -> None:
-    # Each goes half of the way.
+    # Each photo is corrected by half of the difference.
     pair = two_photos(factor)
     found = balancing.balance_of(pair, None, [None, None])
     assert (found is not None) is differs
@@ -248,8 +250,8 @@ def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
     apart: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(balancing, "_FEATHER_CELLS", 40)
-    # Two layers all over a wall of 16 x 24 blocks, whose seam lies in the middle; what the second
-    # shows beyond the fourth block after the seam is not known.
+    # Two layers cover a wall of 16 x 24 blocks, with the seam in the middle; the second is unknown
+    # beyond the fourth block after the seam.
     shape = (16, 24)
     logs = np.zeros((2, *shape, 3), dtype=np.float32)
     logs[1] = apart
@@ -263,7 +265,8 @@ def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
     )
     source = np.repeat([[0, 1]], 120, axis=1).repeat(160, axis=0).astype(np.int16)
     one, other = balancing.with_seams(found, source, None).logs
-    # As far as both show one thing, and as far as that is known within a block and a half.
+    # Weighted by the probability that both show the same object, and by the known share within 1.5
+    # blocks.
     alike = 1.0 / (1.0 + (apart / 0.15) ** 2) ** 2
     offsets = np.arange(-5, 6)
     bell = np.exp(-0.5 * (offsets / 1.5) ** 2)
@@ -273,14 +276,14 @@ def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
         np.testing.assert_allclose(
             one[8, column] - other[8, column], apart * known / (known + 0.02), rtol=1e-4
         )
-    # Half of the width of four blocks is the deviation of who paints about a block.
+    # The standard deviation of the shares around a block is half of the width of four blocks.
     offsets = np.arange(-6, 7)
     bell = np.exp(-0.5 * (offsets / 2.0) ** 2)
     for column in (8, 11, 12, 14):
         share = bell[column + offsets >= 12].sum() / bell.sum()
         taken = one[8, column] / (one[8, column] - other[8, column])
         np.testing.assert_allclose(taken, share, rtol=1e-4)
-    # Farther from the seam each stays as it is.
+    # Farther from the seam, nothing is changed.
     assert not one[:, :6].any()
     assert not other[:, 18:].any()
 
@@ -302,7 +305,8 @@ def test_photos_of_one_lens_lose_light_alike_however_it_was_adjusted() -> None:
     frame = inspect_scenes.frame(shape=SHAPE)
     found = balancing._radii(frame, None, cameras, Blocks.over(SHAPE, 8), lights)
     lenses = [None if one is None else one.lens for one in found]
-    # A hundredth more is the same lens, a fifth more is zoomed, other sizes are of another camera.
+    # A focal length larger by 1 % is the same lens, by 20 % a zoomed one; other sizes are another
+    # camera.
     assert lenses == [0, 0, 1, 2, None, 0]
 
 
@@ -322,7 +326,8 @@ def test_radii_are_told_from_the_middle_of_the_photo(*, has_depths: bool) -> Non
         at = np.array([[right[column], down[row]]])
         depth = 0.4 if has_depths and down[row] >= 40 else 0.0
         pixel = camera.viewing().project(frame.world_from_wall(at, np.array([depth])))[0, :2]
-        # 400 x 300 pixels: 250 from the middle to a corner, beyond which nothing is painted.
+        # With 400 x 300 pixels, the distance from the middle to a corner is 250; beyond, nothing is
+        # painted.
         wanted = min(1.0, float(np.hypot(*(pixel - [200.0, 150.0]))) / 250.0)
         assert found.values[row, column] == pytest.approx(wanted, abs=1e-5)
 
@@ -371,13 +376,13 @@ def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_tak
     assert sum(len(item.apart) for item in overlaps) == n_taken
     if n_taken:
         columns = overlaps[0].places[0][:, 1]
-        # Evenly, from end to end.
+        # Evenly distributed from end to end.
         assert (columns[0], columns[-1]) == (0, n_shared - 1)
         assert set(np.diff(columns)) <= {n_shared // n_taken, -(-n_shared // n_taken)}
 
 
 def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
-    # From left to right by a tenth, once as much on either side of the middle.
+    # A slope of a tenth from left to right, symmetric about the middle.
     slope = np.broadcast_to(np.linspace(-0.05, 0.05, 40)[None, :, None], (10, 40, 3))
     first = light(slice(0, 10), slice(0, 40), 3)
     lights = [first, replace(first, log_light=first.log_light + slope.astype(np.float32))]
@@ -405,7 +410,7 @@ def test_light_is_multiplied_and_clipped(dtype: type[np.unsignedinteger], gain: 
     found = lit(colours, logs)
     assert found.dtype == dtype
     level = levels_of(np.clip(gain * light_of(colours, highest), 0.0, 1.0))
-    # Rounded to whole levels, of 16 bits to about one.
+    # Rounding errors of whole levels; with 16 bits, about one level.
     limit = 0.51 if dtype is np.uint8 else 1.5
     assert np.abs(found - highest * level).max() <= limit
     np.testing.assert_allclose(lit_shares(colours / highest, logs), level, atol=2e-5)
@@ -419,7 +424,7 @@ def test_blocks_have_the_mean_light_of_what_a_layer_paints_wholly(
     rng = np.random.default_rng(2)
     rgb = rng.integers(highest // 4, highest // 2, (*SMALL_SHAPE, 3)).astype(dtype)
     mask = np.full(SMALL_SHAPE, LayerMask.PAINTED, np.uint8)
-    # Nothing in the outermost blocks, and a cell is missing in one within.
+    # The outermost blocks are empty, and a cell is missing in an inner block.
     mask[:10] = mask[:, 50:] = LayerMask.OCCLUDED
     mask[25, 15] = LayerMask.NO_SURFACE
     found = block_light(samples.layer(mask, rgb=rgb), BLOCKS)
@@ -442,7 +447,7 @@ def test_black_and_white_say_nothing(
     level: int, channel: int, scale: int, *, is_said: bool
 ) -> None:
     rgb = np.full((*SMALL_SHAPE, 3), 100, np.uint16 if scale > 1 else np.uint8) * scale
-    # One channel is enough.
+    # A single channel is sufficient.
     rgb[..., channel] = level * scale
     found = block_light(samples.layer(SMALL_SHAPE, rgb=rgb), BLOCKS)
     assert found.is_known.all() == found.is_known.any() == is_said
@@ -451,7 +456,7 @@ def test_black_and_white_say_nothing(
 @pytest.mark.parametrize(("n_white", "is_said"), [(5, True), (6, False)])
 def test_a_twentieth_of_a_block_may_be_white(n_white: int, *, is_said: bool) -> None:
     rgb = np.full((*SMALL_SHAPE, 3), 100, np.uint8)
-    # Of the hundred cells of the first block.
+    # Some of the hundred cells of the first block.
     rgb[0, :n_white] = 255
     found = block_light(samples.layer(SMALL_SHAPE, rgb=rgb), BLOCKS)
     assert found.is_known[0, 0] == is_said
@@ -465,7 +470,7 @@ def test_boxes_share_what_lies_in_both() -> None:
     for other, shared in (
         ((3, 8, 0, 4), box(3, 5, 2, 4)),
         ((1, 2, 3, 4), box(1, 2, 3, 4)),
-        # Beside each other, or in a corner, they share nothing.
+        # Boxes next to each other or touching at a corner have no intersection.
         *(((5, 8, 2, 9), None), ((0, 5, 9, 12), None)),
     ):
         assert common(box(0, 5, 2, 9), box(*other)) == shared

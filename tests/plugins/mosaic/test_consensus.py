@@ -1,4 +1,4 @@
-"""Who passes by in a photo: drawn onto photos of a known wall, with and without a scan."""
+"""Passers-by drawn onto photos of a known wall, with and without a scan."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ IS_PERSON[PERSON] = True
 
 
 def painted_wall(seed: int = 3) -> NDArray[np.float64]:
-    """Levels (rows, cols, 3) of a wall with stains and joints."""
+    """Return levels (rows, cols, 3) of a wall with stains and joints."""
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(90.0, 200.0, (12, 20, 3))
     wall = cv2.resize(coarse, (SHAPE[1], SHAPE[0]), interpolation=cv2.INTER_CUBIC)
@@ -40,7 +40,7 @@ def painted_wall(seed: int = 3) -> NDArray[np.float64]:
 def photo(
     name: str, levels: NDArray[np.float64], *, seed: int, columns: slice | None = None
 ) -> Layer:
-    """A photo of all or some columns of the wall, a third of a cell aside, noisy."""
+    """Return a noisy photo of all or some columns of the wall, displaced by a third of a cell."""
     rng = np.random.default_rng(seed)
     moved = levels + (1 / 3) * (np.roll(levels, 1, axis=1) - levels)
     rgb = np.clip(moved + rng.normal(0.0, 2.0, levels.shape), 0, 255).astype(np.uint8)
@@ -58,7 +58,7 @@ def with_person(levels: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def scanned(levels: NDArray[np.float64] | None, *, intensity: bool = False) -> Wall | None:
-    """The wall as the scan has it, darker, in colour or as the laser sees it."""
+    """Return the wall as scanned: darker, with colours or laser intensity."""
     if levels is None:
         return None
     wall = samples.wall(FRAME, depth_m=np.zeros(SHAPE, np.float32))
@@ -89,7 +89,7 @@ def test_a_passer_by_yields_to_what_others_show(witness: str, place: int) -> Non
         if k != place:
             assert not lost.any()
             continue
-        # At most a cell in a thousand still shows him, and little beside him is lost.
+        # At most one cell in a thousand still shows the person, and few other cells are lost.
         assert np.count_nonzero(IS_PERSON & ~lost) <= 1e-3 * IS_PERSON.size
         assert np.count_nonzero(lost & ~IS_PERSON) < 0.5 * np.count_nonzero(IS_PERSON)
     assert n_outvoted == np.count_nonzero(outvoted(photos[place], kept[place]))
@@ -112,10 +112,11 @@ def test_what_one_photo_alone_shows_stays_in_a_class_of_its_own(tmp_path: Path) 
     _, n_outvoted, contradicted = found(photos, scanned(levels))
     assert n_outvoted == 0
     assert contradicted is not None
-    # Regions are of whole blocks, so its border may be missing.
+    # Regions consist of whole blocks, so the border of the person may be missing.
     assert contradicted[IS_PERSON].mean() > 0.85
     assert np.count_nonzero(contradicted & ~IS_PERSON) < 0.5 * np.count_nonzero(IS_PERSON)
-    # In the mask of the orthoimage they are a class of their own, and its share is reported.
+    # Contradicted cells have a separate value in the mask of the orthoimage, and their share is
+    # reported.
     inputs = {"layers": Layers(layers=tuple(photos)), "walls": samples.walls(scanned(levels))}
     ctx = context(tmp_path)
     (image,) = run(MosaicSeams, ctx, inputs).orthoimages.images

@@ -1,4 +1,4 @@
-"""Expected errors of orthoimages: as large as drawn errors of poses and depths make them."""
+"""Expected errors of orthoimages, compared with random errors of poses and depths."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def stated_m(
     overlaps: Overlaps | None = None,
     spread_m: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Errors of an orthoimage whose cells are all of the first photo, unless others are named."""
+    """Return the errors of an orthoimage whose cells are all from the first photo by default."""
     wall = samples.wall(
         FRAME,
         sigma_m=np.full(FRAME.shape, spread_m, np.float32),
@@ -51,7 +51,7 @@ LENS = Intrinsics(
 
 
 def oblique() -> ViewingCamera:
-    """A camera 3 m before the wall and 2 m beside its middle, that looks at the middle."""
+    """Return a camera 3 m in front of the wall and 2 m beside its middle, aimed at the middle."""
     middle = FRAME.world_from_wall(np.array([[75.0, 50.0]]))[0]
     centre = middle + 3.0 * FRAME.normal_world - 2.0 * FRAME.u_world
     rotation = looking_at(centre, middle, samples.UP)
@@ -59,7 +59,7 @@ def oblique() -> ViewingCamera:
 
 
 def camera(viewing: ViewingCamera, **known: Any) -> Camera:
-    # The translation is that of a camera which turns about its own centre.
+    # The translation is that of a camera that rotates about its centre.
     by_turn = np.vstack([np.eye(3), -cross_matrix(viewing.translation)])
     covariance = TURN_RAD**2 * by_turn @ by_turn.T
     covariance[3:, 3:] += SHIFT_M**2 * np.eye(3)
@@ -77,7 +77,7 @@ def camera(viewing: ViewingCamera, **known: Any) -> Camera:
 def shown_m(
     viewing: ViewingCamera, drawn: ViewingCamera, places: NDArray[np.float64], depth_m: float
 ) -> NDArray[np.float64]:
-    """How far from its cell a place lies that a drawn camera shows there, at a drawn depth."""
+    """Return the distance between a cell and the point that a random camera shows there."""
     near, other = viewing.shifted(SURVEY), drawn.shifted(SURVEY)
     points = FRAME.world_from_wall(places, depth_m) - SURVEY
     pixels = near.project(points)[:, :2]
@@ -100,7 +100,7 @@ def test_errors_are_as_large_as_drawn_poses_and_depths_make_them(spread_m: float
         rotation = turn @ viewing.rotation
         translation = turn @ viewing.translation + rng.normal(0.0, SHIFT_M, 3)
         moved = replace(viewing, rotation=rotation, translation=translation)
-        # A median of four points errs by half of what they spread.
+        # The error of a median of four points is half of their spread.
         drawn_m.append(shown_m(viewing, moved, places, rng.normal(0.0, 0.5 * spread_m)))
     scattered = np.sqrt(np.mean(np.array(drawn_m) ** 2, axis=(0, 2)))
     columns, rows = places.T.astype(int)
@@ -115,7 +115,7 @@ def test_a_lens_that_was_estimated_adds_what_its_photo_states() -> None:
 
 
 def overlaps(shifts_m: NDArray[np.float64], photos: tuple[str, str]) -> Overlaps:
-    """Displacements at places all over the wall."""
+    """Return displacements at positions distributed over the wall."""
     rng = np.random.default_rng(3)
     centres = rng.uniform((10.0, 10.0), (140.0, 90.0), (len(shifts_m), 2))
     return Overlaps(
@@ -135,7 +135,7 @@ def test_overlaps_tell_errors_of_depths_from_those_of_poses(
     position_m: float, depth_m: float
 ) -> None:
     left = oblique()
-    # The same from the other side.
+    # A camera on the other side.
     centre = left.centre_world + 4.0 * FRAME.u_world
     right = replace(left, translation=-left.rotation @ centre)
     cameras = [
@@ -144,11 +144,11 @@ def test_overlaps_tell_errors_of_depths_from_those_of_poses(
     ]
     rng = np.random.default_rng(4)
     place = overlaps(np.zeros((200, 2)), ("a.jpg", "b.jpg"))
-    # Tangents differ by 4 m of 3 m to the right.
+    # The tangents differ by 4/3 to the right.
     shifts_m = rng.normal(0.0, depth_m, (200, 1)) * [4.0 / 3.0, 0.0]
     shifts_m += rng.normal(0.0, position_m, (200, 2)) - rng.normal(0.0, position_m, (200, 2))
     shifts_m += rng.normal(0.0, 0.1 * GSD_M, (200, 2))
-    # Some are matches of something else.
+    # Some are false matches.
     shifts_m[::20] = 1.0
     stated = stated_m(*cameras, overlaps=replace(place, shifts_cells=shifts_m / GSD_M))
     for column, row in ((30, 20), (120, 80)):

@@ -1,4 +1,4 @@
-"""Who paints each cell: states, preferences, islands and cuts, and how well photos agree."""
+"""Choice of the layer of each cell: states, preferences, islands and cuts; agreement of photos."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.long_loops import seeds
 
 SHAPE = (23, 17)
 PLAIN = MosaicSeams.Params(island_cells_min=1)
-# A cell takes the highest of these that any layer gives it.
+# A cell takes the highest of these states in any layer.
 ORDER = [
     *(OrthoMask.NONE, OrthoMask.NO_SURFACE, OrthoMask.OCCLUDED),
     *(OrthoMask.FILLED, OrthoMask.PAINTED),
@@ -37,7 +37,7 @@ def layer(seed: int, *, source: str = "", painted: float = 0.4, has_filled: bool
     states = [LayerMask.OUTSIDE, LayerMask.OCCLUDED, LayerMask.NO_SURFACE]
     mask = np.where(rng.random(SHAPE) < painted, LayerMask.PAINTED, rng.choice(states, SHAPE))
     is_painted = mask == LayerMask.PAINTED
-    # Few values, so that some are equal.
+    # There are few values, so that some are equal.
     quality = np.where(is_painted, rng.integers(1, 4, SHAPE) / 3.0, 0.0).astype(np.float32)
     filled = (is_painted & (rng.random(SHAPE) < 0.3)).astype(np.uint8)
     known = {"source": source or f"{seed}.jpg", "quality": quality}
@@ -45,7 +45,7 @@ def layer(seed: int, *, source: str = "", painted: float = 0.4, has_filled: bool
 
 
 def states_of(layers: Sequence[Layer]) -> NDArray[np.intp]:
-    """Place (n, rows, cols) of each layer's state in the order."""
+    """Return the rank (n, rows, cols) of each layer's state."""
     order = {LayerMask.OUTSIDE: 0, LayerMask.NO_SURFACE: 1, LayerMask.OCCLUDED: 2}
     table = np.array([order.get(one, 4) for one in LayerMask])
     return np.array(
@@ -60,11 +60,11 @@ def test_a_cell_is_painted_by_the_best_of_those_that_know_most_of_it() -> None:
     rank, source = joining.best_views(LAYERS, [one.quality for one in LAYERS])
     states = states_of(LAYERS)
     np.testing.assert_array_equal(rank, states.max(axis=0))
-    # The first of equals.
+    # The first of equal layers is used.
     quality = np.where(states == states.max(axis=0), [one.quality for one in LAYERS], -1.0)
     wanted = np.where(states.max(axis=0) >= ORDER.index(OrthoMask.FILLED), quality.argmax(0), -1)
     np.testing.assert_array_equal(source, wanted)
-    # Ranks become states of the orthoimage.
+    # Ranks are converted to states of the orthoimage.
     options = {"drawn": None, "wall": None, "balance": None, "allocate": in_memory}
     mask, painted = joining.joined(LAYERS[:3], LAYERS[3:], PLAIN, **options)  # type: ignore[arg-type]
     np.testing.assert_array_equal(mask, np.array(ORDER, dtype=np.uint8)[rank])
@@ -85,7 +85,7 @@ def test_preferences_are_the_same_row_by_row(rule: str) -> None:
         elif rule == "best-view":
             np.testing.assert_array_equal(values, one.quality)
         elif rule == "voronoi":
-            # As far as the nearest cell that it does not paint, or the rim, is.
+            # The distance to the nearest cell that is not painted, or to the border.
             padded = np.pad(one.mask == LayerMask.PAINTED, 1)
             others = np.argwhere(~padded)
             for cell in [(0, 0), (4, 7), (11, 3), (22, 16)]:
@@ -100,7 +100,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
 ) -> None:
     rng = np.random.default_rng(seed)
     layers = [layer(10 + seed + k, painted=0.9, has_filled=False) for k in range(3)]
-    # Large areas with specks in them.
+    # Large areas with specks.
     wanted = np.where(np.arange(SHAPE[1])[None] < 9, 0, 1) * np.ones(SHAPE, dtype=int)
     specks = rng.random(SHAPE) < 0.15
     wanted[specks] = rng.integers(0, 3, specks.sum())
@@ -110,7 +110,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
     owner = source.astype(np.int16)
     island = np.zeros(SHAPE, dtype=bool)
     for index in range(3):
-        # Cells of one source that are connected over sides.
+        # Cells of one source that are connected by their sides.
         patch, _ = ndimage.label(owner == index)
         island |= (patch > 0) & (np.bincount(patch.ravel())[patch] < cells_min)
     assert 5 < island.sum() < 0.5 * island.size
@@ -122,7 +122,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
         counts = [np.count_nonzero((owner[about] == k) & ~island[about]) for k in range(3)]
         counts = np.where(is_known[:, row, column], counts, 0)
         if counts.max():
-            # The first of equals.
+            # The first of equal sources is used.
             expected[row, column] = int(np.argmax(counts))
     np.testing.assert_array_equal(joining.without_islands(rank, owner, layers, cells_min), expected)
 
@@ -132,7 +132,7 @@ def test_without_a_small_patch_nothing_changes() -> None:
     source = np.zeros(SHAPE, dtype=np.int16)
     source[:3, :3] = 1
     rank = np.full(SHAPE, ORDER.index(OrthoMask.PAINTED), dtype=np.uint8)
-    # Nine cells are a patch of nine.
+    # Nine cells are not fewer than nine.
     assert joining.without_islands(rank, source, layers, 9) is source
     assert (joining.without_islands(rank, source, layers, 10) == 0).all()
 
@@ -171,7 +171,7 @@ def test_each_cell_has_the_colour_of_its_layer(
     assert rgb.dtype == (np.uint16 if is_deep else np.uint8)
     assert not rgb[source == joining.NOBODY].any()
     np.testing.assert_array_equal(rgb[source == 1], layers[1].rgb[source == 1])
-    # 8 bits become 16 so that white stays white.
+    # 8 bits are converted to 16 bits in such a way that white remains white.
     scale = 257 if is_deep else 1
     np.testing.assert_array_equal(rgb[source == 0], scale * layers[0].rgb[source == 0].astype(int))
 
@@ -180,7 +180,7 @@ def test_layers_of_a_wall_share_its_raster() -> None:
     one, other = layer(40, source="a.jpg"), layer(41, source="b.jpg")
     joining.require_one_raster([one, other], "wall 0")
     moved = replace(other, frame=replace(other.frame, gsd_m=0.02))
-    # Any of them, not only the second.
+    # This applies to any of the layers.
     for layers in ([one, moved], [one, other, moved]):
         with pytest.raises(MethodError, match=r"a\.jpg and b\.jpg of wall 0 have different"):
             joining.require_one_raster(layers, "wall 0")
@@ -203,7 +203,7 @@ def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
     monkeypatch.setattr(joining, "_BAND_CELLS", shape[0] * shape[1] // 8)
     (reduced,) = joining.preferences([large], options)
     rows = slice(0, shape[0])
-    # Every third cell: what is painted may end two cells beside.
+    # With every third cell, the border of the painted area may be off by two cells.
     np.testing.assert_allclose(reduced(rows), whole(rows), atol=3.0)
     np.testing.assert_array_equal(reduced(slice(31, 60)), reduced(rows)[31:60])
 
@@ -231,7 +231,7 @@ def test_a_depth_edge_is_a_step_of_more_than_three_centimetres_right_or_down() -
 
 
 def scene(edges: tuple[float, float] = (0.0, 0.0)) -> graph_cut._Scene:
-    """Two layers of two cells: grey 0.2 and 0.5 in the first, 0.2 and 0.9 in the second cell."""
+    """Return two layers of two cells: grey 0.2 and 0.5 in the first, 0.2 and 0.9 in the second."""
     colours = np.array([[[0.2, 0.2]], [[0.5, 0.9]]], dtype=np.float32)
     return graph_cut._Scene(
         colours=np.repeat(colours[..., None], 3, axis=3),
@@ -250,35 +250,36 @@ def test_a_seam_costs_differences_on_both_sides_its_length_and_depth_edges() -> 
     plain = cost(scene(), 0, 1)
     assert plain == cost(scene(), 1, 0) == pytest.approx(1000 * (0.3 + 0.7 + 0.01))
     assert cost(scene(), 0, 0) == cost(scene(), 1, 1) == 0.0
-    # A depth edge on either side makes it dear.
+    # A depth edge on either side increases the cost.
     for edges in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
         assert cost(scene(edges=edges), 0, 1) == plain + 1000 * sum(edges)
-    # Where only one layer paints no difference is seen.
+    # Where only one layer is painted, there is no visible difference.
     half = scene()
     half.views[1, 0, 0] = graph_cut._FORBIDDEN
     assert cost(half, 0, 1) == pytest.approx(1000 * (0.7 + 0.01))
 
 
 def test_a_layer_takes_over_what_it_shows_better_for_less_than_the_seam() -> None:
-    # Both show the same; the second is the better one in the right half of a row of ten.
+    # Both layers have the same colours; the second is better in the right half of a row of ten
+    # cells.
     colours = np.full((2, 1, 10, 3), 0.5, dtype=np.float32)
     views = np.zeros((2, 1, 10))
     views[0, 0, 5:], views[1, 0, :5] = 0.1, 0.1
     flat = graph_cut._Scene(colours=colours, views=views, edges=np.zeros((1, 10)))
     labels = graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1)
     assert labels.tolist() == [[0] * 5 + [1] * 5]
-    # For one cell that is better by less than the length of its two seams nothing moves.
+    # If a single cell is better by less than the cost of its two seams, nothing changes.
     views[0] = 0.0
     views[0, 0, 4], views[1] = 0.015, 0.1
     views[1, 0, 4] = 0.0
     assert not graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1).any()
 
 
-# --- the smaller picture ---
+# --- reduced scale ---
 
 
 def two_layers(shape: tuple[int, int]) -> list[Layer]:
-    """Two black layers, the second half as good, with nothing in its first two columns."""
+    """Return two black layers; the second is half as good and empty in its first two columns."""
     masks = np.full((2, *shape), LayerMask.PAINTED, dtype=np.uint8)
     masks[1, :, :2] = LayerMask.OUTSIDE
     return [
@@ -299,7 +300,7 @@ def test_blocks_have_the_mean_colour_of_what_is_painted_as_it_is_balanced(
         rgb = rng.integers(0, highest // 2, (4, 6, 3)).astype(dtype)
         rgb[each.mask != LayerMask.PAINTED] = 0
         layers.append(replace(each, rgb=rgb))
-    # Each in the cell in the middle of its block.
+    # Sampled at the middle cell of each block.
     balance: Any = SimpleNamespace(
         log_gains=lambda k, rows, columns: (
             (0.1 * k + 0.2 * rows - 0.1 * columns)[:, None] * np.ones(3)
@@ -331,7 +332,7 @@ def test_cuts_are_made_on_some_ten_thousand_cells_that_a_layer_paints(
         each.mask[:, -2:] = LayerMask.OUTSIDE
     labels = graph_cut.cut_labels(layers, None)
     assert labels.small.shape == small
-    # What is left where nothing moves: the better one everywhere, none where none paints.
+    # If no cell changes, the better layer is used everywhere, and none where none is painted.
     assert not labels.small[:, :-2].any()
     assert (labels.in_rows(slice(0, 2)).shape, labels.small[0, -1]) == ((2, shape[1]), -1)
 
@@ -359,11 +360,11 @@ def test_the_two_best_layers_of_a_patch_are_those_that_paint_all_of_it() -> None
     layers = []
     for _ in range(4):
         mask = np.full(PATCHED, LayerMask.PAINTED, dtype=np.uint8)
-        # A single cell of some patches is missing.
+        # In some patches, a single cell is missing.
         for row, column in rng.integers(0, (128, 192), (3, 2)):
             mask[row, column] = LayerMask.OCCLUDED
         layers.append(plain_layer(rng.uniform(0.5, 1.0, PATCHED), mask=mask))
-    # Patches of 64 cells, as many as there is room for.
+    # As many patches of 64 cells as fit.
     wanted = []
     for row in (0, 64):
         for column in (0, 64, 128):
@@ -385,7 +386,7 @@ def test_the_two_best_layers_of_a_patch_are_those_that_paint_all_of_it() -> None
 
 
 def texture(spread_grey: float) -> NDArray[np.float64]:
-    """Blurred noise of 64 x 64 cells whose standard deviation is given, and some cells beside."""
+    """Return blurred noise of 64 x 64 cells and a margin, with a given standard deviation."""
     noise = np.random.default_rng(2).normal(size=(64, 70))
     blurred = cv2.GaussianBlur(noise, (0, 0), 1.0)
     part = blurred[:, :64]
@@ -408,7 +409,7 @@ def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
     one = rng.integers(0, 256, (64, 64))
     window = cv2.createHanningWindow((64, 64), cv2.CV_32F)
     sources: dict[str, int] = {}
-    # The same patch with more and more of others mixed in.
+    # The same patch, mixed with others to an increasing degree.
     for weight in np.linspace(0.5, 1.0, 41):
         mixed = np.rint((1.0 - weight) * one + weight * rng.integers(0, 256, one.shape))
         peak = cv2.phaseCorrelate(one.astype("f4"), mixed.astype("f4"), window)[1]

@@ -1,4 +1,4 @@
-"""`mosaic.seams`: one layer passes through, of several the best paints each cell, by each rule."""
+"""`mosaic.seams`: one layer is unchanged; of several, each rule chooses one per cell."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.raster_scenes import context, numbers
 from tests.turns import OTHER_TURNS, TURNS, Turn
 
 
-# Any: inputs and parameters, each of its own type.
+# The type is Any, since inputs and parameters have different types.
 def joined(
     folder: Path,
     *layers: Layer,
@@ -47,7 +47,7 @@ def joined(
     inputs: Mapping[str, Any] | None = None,
     **params: Any,
 ) -> tuple[Orthoimages, StepContext]:
-    """Orthoimages of layers, whose colours and patches stay unless that is asked for."""
+    """Return orthoimages of layers, by default without balancing and removal of islands."""
     ctx = context(folder)
     given = {"layers": Layers(layers=layers, names=names), **(inputs or {})}
     chosen = {"island_cells_min": 1, "gains": "none", **params}
@@ -107,7 +107,7 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
     metrics = numbers(ctx)
     n_seam, _ = count_seams(image.source, None)
     assert n_seam > 0
-    # Colours of chance: their differences have a standard deviation of 70 grey levels.
+    # Differences of random colours have a standard deviation of 70 grey levels.
     assert 20.0 < metrics.pop("seam_step_rms_grey") < 150.0
     assert metrics.pop("seam_step_mean_delta_e") > 10.0
     assert metrics == pytest.approx(
@@ -117,7 +117,7 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
             "n_orthoimages": 1,
             "n_sources": 2,
             "n_overlap_patches": 0,
-            # Colours of chance contradict each other nowhere over a region.
+            # Random colours do not contradict each other over a region.
             "outvoted_share": 0.0,
             "contradicted_share": 0.0,
         }
@@ -127,7 +127,7 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
 def layer(
     name: str, mask: NDArray[np.uint8], quality: NDArray[np.floating] | float = 1.0, *, rgb: int = 7
 ) -> Layer:
-    """A layer of one grey."""
+    """Return a layer with a single grey value."""
     is_painted = mask == LayerMask.PAINTED
     return samples.layer(
         mask,
@@ -138,7 +138,7 @@ def layer(
 
 
 def two_halves() -> tuple[Layer, Layer]:
-    """The first is better on the left of 40 columns, the second on the right, both a bit noisy."""
+    """Return two noisy layers; the first is better on the left half, the second on the right."""
     shape = (30, 40)
     columns = np.indices(shape)[1]
     noise = np.random.default_rng(3).normal(0.0, 4.0, shape)
@@ -187,7 +187,7 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
     assert (image.mask[:5] == OrthoMask.NONE).all()
     assert (image.mask[5:9] == OrthoMask.NO_SURFACE).all()
     assert (image.mask[9:] == OrthoMask.OCCLUDED).all()
-    # Beside a layer with paint it is no source, but tells what is hidden.
+    # Next to a painted layer, it is not a source, but shows which cells are hidden.
     mask[:, :20] = LayerMask.PAINTED
     blind = layer("blind", np.full_like(mask, LayerMask.OCCLUDED))
     image = image_of(tmp_path, blind, layer("left", mask))
@@ -199,10 +199,10 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("missing", "n_rows", "no_surface", "causes"),
     [
-        # Causes of a hundredth of the cells are named.
+        # Causes of at least 1 % of the cells are listed.
         (LayerMask.OUTSIDE, 10, 15, ["25% are in no oriented photo"]),
         (LayerMask.OCCLUDED, 10, 17, ["25% are hidden in all photos", "1% have no surface"]),
-        # A tenth at least is missing, apart from what has no surface.
+        # At least 10 % of the cells must be missing, without those that have no surface.
         (LayerMask.OUTSIDE, 3, 800, []),
     ],
     ids=["no photo", "hidden", "no surface"],
@@ -248,7 +248,7 @@ def test_the_map_of_sources_has_a_colour_for_each(tmp_path: Path) -> None:
     for middle, index in ((0.3, 0), (0.7, 1)):
         shown = top[:, round(middle * top.shape[1])].mean(axis=0)
         ink = np.array(plane_ink(index))
-        # The tint lies on grey: its channels keep their order.
+        # The tint is applied to grey, so the order of its channels is the same.
         np.testing.assert_array_equal(np.argsort(shown), np.argsort(ink, kind="stable"))
 
 
@@ -276,7 +276,7 @@ def test_an_orthoimage_of_one_tone_is_reported(tmp_path: Path, rgb: int, tone: s
     assert (found.values["tone"], found.values["sources"]) == (tone, "dark.jpg")
 
 
-# --- where seams lie by each rule ---
+# --- positions of seams by rule ---
 
 WIDE = (40, 120)
 
@@ -284,7 +284,7 @@ WIDE = (40, 120)
 def left_and_right(
     one: NDArray[np.uint8] | int, other: NDArray[np.uint8] | int
 ) -> tuple[Layer, Layer]:
-    """Layers of the columns up to 100 and from 20 on."""
+    """Return layers of the columns up to 100 and from 20 on."""
     colours = [np.broadcast_to(np.asarray(rgb, np.uint8), (*WIDE, 3)) for rgb in (one, other)]
     return (
         inspect_scenes.painted_layer("left", slice(0, 100), colours[0], 1.0),
@@ -293,7 +293,7 @@ def left_and_right(
 
 
 def test_a_graph_cut_runs_where_the_photos_agree(tmp_path: Path) -> None:
-    # Two pictures that agree in columns 64 to 67 only.
+    # Two pictures that agree only in columns 64 to 67.
     rng = np.random.default_rng(4)
     one, other = (rng.integers(0, 256, (*WIDE, 3)).astype(np.uint8) for _ in range(2))
     other[:, 64:68] = one[:, 64:68]
@@ -310,7 +310,7 @@ def test_a_graph_cut_runs_where_the_photos_agree(tmp_path: Path) -> None:
 
 def test_a_graph_cut_keeps_off_depth_edges(tmp_path: Path) -> None:
     layers = left_and_right(10, 10)
-    # The first photo is better up to where it ends, and that is where the second edge is.
+    # The first photo is better up to its end, where the second edge is.
     for rule, edge, share in (
         ("graph-cut", slice(60, 63), 0.0),
         ("best-view", slice(100, 120), 1.0),
@@ -322,11 +322,11 @@ def test_a_graph_cut_keeps_off_depth_edges(tmp_path: Path) -> None:
         assert numbers(ctx)["seam_on_depth_edge_share"] == share
 
 
-# --- no direction is favoured ---
+# --- no preferred direction ---
 
 
 def three_discs(shape: tuple[int, int], turn: Turn = TURNS[0]) -> tuple[tuple[Layer, ...], Walls]:
-    """Layers that each paint a disc about a place of its own, and a wall with a round recess."""
+    """Return layers with one disc each, at different positions, and a wall with a round recess."""
     rng = np.random.default_rng(3)
     frame = inspect_scenes.frame(shape=turn.shape(shape))
     rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
@@ -354,7 +354,7 @@ def three_discs(shape: tuple[int, int], turn: Turn = TURNS[0]) -> tuple[tuple[La
     ("rule", "shape"),
     [
         *(("best-view", (41, 58)), ("voronoi", (41, 58)), ("priority", (41, 58))),
-        # Cut at the size of the wall; and at half and a third, which does not go into the sides.
+        # Cut at full scale, and at half and a third, which do not divide the sides evenly.
         *(("graph-cut", (41, 58)), ("graph-cut", (205, 170))),
     ],
 )
@@ -373,7 +373,7 @@ def test_turned_layers_are_joined_along_turned_seams(
         np.testing.assert_array_equal(getattr(turned, name), turn.raster(getattr(image, name)))
 
 
-# --- seams that a person drew ---
+# --- seams drawn by hand ---
 
 DISCS, _ = three_discs((41, 58))
 
@@ -424,10 +424,10 @@ def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
     shown = after.mask == OrthoMask.PAINTED
     own = np.choose(after.source[..., None].clip(0), [layer.rgb for layer in DISCS])
     np.testing.assert_array_equal(after.rgb[shown], own[shown])
-    # Bands do not show.
+    # Bands do not affect the result.
     monkeypatch.setattr(joining, "_BAND_CELLS", 1)
     np.testing.assert_array_equal(along(path, folder=tmp_path).source, after.source)
-    # Another wall's polygons change nothing.
+    # Polygons of another wall have no effect.
     other = drawn(tmp_path, "photo 1", [[0.0, 0.0], [1.0, 0.0], [1.0, -1.0]], wall=3)
     np.testing.assert_array_equal(along(other, folder=tmp_path).source, before.source)
 

@@ -1,4 +1,4 @@
-"""What the tests of orientation share."""
+"""Fixtures of the tests of orientation."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from tests.undrawn_charts import blank_charts
 
 @pytest.fixture(autouse=True)
 def _small_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw ties on a tenth of the photo, or to encode it takes longer than to orient it.
+    """Draw ties on a reduced photo, since encoding it would take longer than orienting it.
 
-    How pictures look at their own size is for the tests of these.
+    Other tests check pictures at full size.
     """
     if request.path.stem != "test_figures":
         monkeypatch.setattr(report, "_SIDE_PX", 90)

@@ -1,4 +1,4 @@
-"""The adjustment of a block and its covariance against independent solutions of the same."""
+"""The adjustment of a block and its covariance, compared with independent solutions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FREEDOM = LensFreedom(focal_sigma=0.02, k1_sigma=0.05)
 def block_of(
     *, freedoms: tuple[LensFreedom, ...] = (FREEDOM,), lens_of: tuple[int, ...] = (0, 0, 0)
 ) -> adjustment.Block:
-    """Three photos; of the points a third is seen once, a third is not in the scan."""
+    """Return three photos; a third of the points is seen once, a third is not in the scan."""
     rng = np.random.default_rng(0)
     cameras = bs.viewers()[:3]
     points = rng.uniform([0.6, -0.1, 0.4], [2.4, 0.1, 1.6], (90, 3))
@@ -53,7 +53,7 @@ def block_of(
 
 
 def predicted(block: adjustment.Block, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels of all observations after a step of poses and lenses, and of all points."""
+    """Return the pixels of all observations after a step of poses, lenses and points."""
     places = np.where(block.is_joint[:, None], block.points.now, block.points.known)
     places = places + unknowns[block.lens_starts[-1] :].reshape(-1, 3)
     pixels = np.empty_like(block.seen.pixels)
@@ -67,9 +67,10 @@ def predicted(block: adjustment.Block, unknowns: NDArray[np.float64]) -> NDArray
 def by_differences(
     block: adjustment.Block, soft_limit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cofactors of poses and lenses, and residuals, from all unknowns at once, by differences.
+    """Return cofactors of poses and lenses, and residuals, by differences of all unknowns at once.
 
-    Residuals beyond `soft_limit` count as Huber has it; of points seen once, none may be.
+    Residuals beyond `soft_limit` are weighted as by Huber; points seen once must not have such
+    residuals.
     """
     n_free, points = int(block.lens_starts[-1]), block.points
     sigma_m = np.repeat(points.sigma_m, 3)
@@ -84,7 +85,7 @@ def by_differences(
     rows = rows[:, rows.any(axis=0)]
     moved = np.where(block.is_joint[:, None], points.known - points.now, 0.0).ravel() / sigma_m
     residuals = np.concatenate([(weights * off).ravel(), np.zeros(n_free), moved])
-    # Points take up what they can.
+    # Subtract the part of the residuals that the points absorb.
     residuals -= rows[:, n_free:] @ np.linalg.lstsq(rows[:, n_free:], residuals, rcond=None)[0]
     return np.linalg.inv(rows.T @ rows)[:n_free, :n_free], residuals
 
@@ -102,20 +103,20 @@ def test_cofactors_and_sigma0_are_those_of_all_unknowns_at_once(soft_limit: floa
     expected, residuals = by_differences(block, soft_limit)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found.cofactors / scale, expected / scale, atol=1e-5)
-    # Points that the scan does not know cost three observations each.
+    # Each point that is not in the scan reduces the redundancy by three.
     prior = np.concatenate([1.0 / freedom.sigmas**2 for freedom in freedoms])
     learnt = float((np.diag(expected)[18:] * prior).sum())
     n_new = np.count_nonzero(counts[60:])
     redundancy = 2 * len(block.seen) - 3 * n_new - len(expected) + learnt
     assert found.redundancy == pytest.approx(redundancy, rel=1e-5)
     assert found.sigma0 == pytest.approx(np.sqrt((residuals**2).sum() / redundancy), rel=1e-4)
-    # No direction is more exact than least squares say.
+    # In no direction is the variance smaller than that of least squares.
     least = np.linalg.eigvals(np.linalg.solve(found.sigma0**2 * found.cofactors, found.matrix))
     assert least.real.min() > 1.0 - 1e-6
 
 
 def minimised(block: adjustment.Block, soft_limit: float) -> list[NDArray[np.float64]]:
-    """Centres of the cameras that SciPy finds for the same problem, written down anew."""
+    """Return the camera centres that SciPy finds for the same problem, implemented separately."""
     joint = np.flatnonzero(block.is_joint)
     whitening = np.linalg.inv(np.linalg.cholesky(adjustment.pixel_covariances(block)))
 
@@ -125,7 +126,7 @@ def minimised(block: adjustment.Block, soft_limit: float) -> list[NDArray[np.flo
         off = block.seen.pixels - predicted(block, np.append(unknowns[:18], moves))
         off = np.einsum("nij,nj->ni", whitening, off)
         lengths = np.linalg.norm(off, axis=1)
-        # The square of this is Huber's loss.
+        # Its square is Huber's loss.
         large = lengths > soft_limit
         shrunk = np.sqrt(2.0 * soft_limit * lengths[large] - soft_limit**2) / lengths[large]
         off[large] *= shrunk[:, None]
@@ -145,7 +146,7 @@ def test_the_adjustment_finds_the_least_sum_of_huber_losses() -> None:
     block = block_of(freedoms=(LensFreedom(),))
     # Every fifteenth observation is off by ten standard deviations.
     block.seen.pixels[::15] += [8.0 * SIGMA_PX, -6.0 * SIGMA_PX]
-    # Few are joint: SciPy differentiates by each of their coordinates.
+    # Use few joint points, because SciPy differentiates by each of their coordinates.
     few = ~block.is_joint[block.seen.point] | (block.seen.point % 6 == 0)
     block = replace(block, seen=block.seen.take(few))
     solved = adjustment.solve(block, soft_limit=1.5)
@@ -153,7 +154,7 @@ def test_the_adjustment_finds_the_least_sum_of_huber_losses() -> None:
         3, 6
     )
     for camera, sigma, expected in zip(solved.cameras, sigmas, minimised(block, 1.5), strict=True):
-        # It stops at a hundredth of a standard deviation.
+        # The solver stops at a hundredth of a standard deviation.
         off = np.linalg.norm(camera.centre_world - expected)
         assert off < 0.05 * np.linalg.norm(sigma[3:])
 
@@ -165,7 +166,7 @@ def test_too_few_observations_determine_no_block() -> None:
         adjustment.block_covariance(few, soft_limit=3.0)
 
 
-# --- what is said of lenses ---
+# --- reports on lenses ---
 
 
 def photos() -> list[Photo]:
@@ -184,7 +185,7 @@ def test_lenses_are_told_with_their_photos_and_deviations() -> None:
         "centre_px": [camera.cx, camera.cy],
         "distortion": camera.distortion.tolist(),
         "free": ["focal", "k1"],
-        # The nineteenth and the twentieth unknown; focal lengths are logarithms.
+        # The 19th and the 20th unknown; focal lengths are logarithms.
         "sigmas": {"focal": pytest.approx(19.0 * camera.fx), "k1": pytest.approx(20.0)},
     }
     assert (second["photos"], second["free"], second["sigmas"]) == (["b.png"], [], {})
@@ -224,7 +225,7 @@ def test_lenses_that_all_photos_confuse_with_their_pose_are_named() -> None:
 
 TRUE = {"fx": 840.0, "fy": 882.0, "cx": 457.0, "cy": 315.0}
 DISTORTION = np.array([-0.09, 0.03, 6e-4, -4e-4, 0.01])
-# Loose: what the observations say outweighs it by far.
+# Loose priors, which the observations outweigh by far.
 LOOSE = {"focal": 0.2, "aspect": 0.2, "centre_px": 60.0, "k1": 0.5, "k2": 0.5, "tangential": 0.05}
 
 
@@ -245,11 +246,11 @@ def freedom(*names: str, times: float = 1.0) -> LensFreedom:
 def lens_block(
     believed: dict[str, float], distortion: np.ndarray, free: LensFreedom, *, moved_m: float = 0.01
 ) -> adjustment.Block:
-    """Exact observations, by cameras of one lens that is believed to be another, stood aside."""
+    """Return exact observations by displaced cameras with a wrong lens."""
     true = true_cameras()
     points = np.random.default_rng(3).uniform([0.4, -0.6, 0.3], [2.6, 0.1, 1.7], (90, 3))
     photo, point, pixels = bs.observed(true, points)
-    # Each point of the scan is seen once: a point of its own for every observation.
+    # Each point of the scan is seen once, so there is a separate point for each observation.
     own = np.arange(len(photo))
     cameras = tuple(
         replace(
@@ -275,7 +276,7 @@ def lens_block(
     ("names", "off", "distortion_off"),
     [
         ((), {}, (0.0,) * 4),
-        # The ratio of both focal lengths stays as it is believed.
+        # The ratio of the focal lengths does not change.
         (("focal",), {"fx": 1.02, "fy": 1.02}, (0.0,) * 4),
         (("k1",), {}, (0.02, 0.0, 0.0, 0.0)),
         (

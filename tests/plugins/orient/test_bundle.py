@@ -1,4 +1,4 @@
-"""All photos at once: never worse than one by one, lenses found, errors stated as they are."""
+"""Bundle adjustment: never worse than single photos; lenses and predicted errors are correct."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def sigmas_m(cameras: Cameras) -> np.ndarray:
 def test_ties_between_photos_make_them_more_exact_and_a_photo_with_random_ones_harms_none(
     tmp_path: Path,
 ) -> None:
-    """EXIF states their focal length 2 % too long."""
+    """The EXIF focal length is 2 % too long."""
     ties, photos = bs.scan_ties(0), bs.photos(calibrated=False)
     pixels, bad = ties.pixels_photo.copy(), ties.photo == 3
     pixels[bad] = np.random.default_rng(0).uniform([0, 0], [900, 640], (bad.sum(), 2))
@@ -65,7 +65,7 @@ def test_ties_between_photos_make_them_more_exact_and_a_photo_with_random_ones_h
     together = bundle(spoilt, photos, context(tmp_path), max_features=700)
     for cameras in (single, together):
         assert [camera.status == "ok" for camera in cameras.cameras] == [True] * 3 + [False]
-    # Measured: 0.2 mm instead of 0.6.
+    # Measured: 0.2 mm instead of 0.6 mm.
     errors = errors_m(together)
     assert rms(errors) < 0.75 * rms(errors_m(single))
     assert rms(errors / sigmas_m(together)) < 2.0
@@ -80,7 +80,7 @@ def without_exif() -> Photos:
 
 
 def with_errors_that_reach_far(ties: Ties, seed: int, sigma_m: float) -> Ties:
-    """Ties whose points are off as those of a stereo cloud, neighbours by nearly the same."""
+    """Return ties with correlated errors of neighbouring points, as in a stereo cloud."""
     rng = np.random.default_rng(200 + seed)
     nodes = rng.uniform(ties.points_world.min(axis=0), ties.points_world.max(axis=0), (80, 3))
     near = np.exp(-np.linalg.norm(ties.points_world[:, None] - nodes[None], axis=2) / 0.4)
@@ -99,7 +99,7 @@ def test_errors_of_the_scan_do_not_split_one_camera_into_several_lenses(
 
 
 def with_errors_of_places(ties: Ties, seed: int) -> Ties:
-    """Ties whose points are off by what the scan is at their place, 2 mm, in whichever photo."""
+    """Return ties with 2 mm errors that depend on the position and are the same in all photos."""
     cubes = np.floor(ties.points_world / 0.4).astype(int)
     cubes -= cubes.min(axis=0)
     off = 0.002 * np.random.default_rng(100 + seed).normal(size=(*(cubes.max(axis=0) + 1), 3))
@@ -109,7 +109,7 @@ def with_errors_of_places(ties: Ties, seed: int) -> Ties:
 @pytest.mark.parametrize(
     ("error", "n_seeds", "least", "most"),
     [
-        # Measured: 0.80; with cells of single photos as groups alone 1.08.
+        # Measured: 0.80; if only points of the same photo shared errors, 1.08.
         pytest.param("of places", 3, 0.7, 1.0),
         pytest.param("independent", 8, 0.7, 1.5, marks=pytest.mark.long),
         pytest.param("that reaches far", 8, 0.7, 1.4, marks=pytest.mark.long),
@@ -118,7 +118,7 @@ def with_errors_of_places(ties: Ties, seed: int) -> Ties:
 def test_stated_errors_are_those_of_repeated_orientations(
     tmp_path: Path, error: str, n_seeds: int, least: float, most: float
 ) -> None:
-    """In survey coordinates; how far the scan is off on the average, nothing in it can show."""
+    """In survey coordinates, without the mean offset of the scan, which cannot be detected."""
     ratios = []
     for seed in range(n_seeds):
         exact = ties = bs.scan_ties(seed, shift_m=SURVEY_SHIFT_M)
@@ -151,7 +151,7 @@ def test_exif_that_the_photos_contradict_is_not_used_and_that_is_reported(tmp_pa
 def test_a_photo_whose_exif_the_others_contradict_is_tried_again_with_their_focal_length(
     tmp_path: Path, method: type[OrientPnp | OrientColmapBundle], own: dict[str, bool]
 ) -> None:
-    """Of 24 ties nobody asks whether EXIF is right; with half the focal length none is oriented."""
+    """EXIF is not tested with 24 ties; with half the focal length, no photo is oriented."""
     ties = bs.scan_ties(2, n=96, wrong_share=0.0)
     few = samples.taken(ties, (ties.photo < 3) | (np.arange(len(ties.photo)) % 4 == 0))
     ctx, photos = context(tmp_path), with_exif(840.0, 840.0, 840.0, 1680.0)
@@ -167,7 +167,7 @@ def test_a_photo_whose_exif_the_others_contradict_is_tried_again_with_their_foca
 def test_photos_that_zoomed_share_no_lens_where_it_matters(
     tmp_path: Path, zoom: float, n_lenses: int
 ) -> None:
-    """One of four photos: what its ties cannot tell does not make the stated errors too small."""
+    """One of four photos is zoomed; even if unnoticed, its predicted error is not too small."""
     ties, true = bs.scan_ties(2), [*bs.viewers()]
     middle, pixels = np.array([true[3].cx, true[3].cy]), ties.pixels_photo.copy()
     pixels[ties.photo == 3] = middle + zoom * (pixels[ties.photo == 3] - middle)
@@ -182,7 +182,7 @@ def test_photos_that_zoomed_share_no_lens_where_it_matters(
 
 
 def test_the_noise_of_ties_between_photos_is_found() -> None:
-    """Points take up a part of it: of two photos three quarters, of three a half."""
+    """Points absorb a part of the noise: three quarters with two photos, a half with three."""
     rng, params, n_seeing = np.random.default_rng(3), OrientColmapBundle.Params(), 3
     scan, shots = bs.scan_ties(0, n=60), bs.photos(calibrated=True).photos
     trusted = [
@@ -191,7 +191,7 @@ def test_the_noise_of_ties_between_photos_is_found() -> None:
     points = rng.uniform([0.6, -0.1, 0.4], [2.4, 0.1, 1.6], (500, 3))
     pixels = np.array([camera.project(points)[:, :2] for camera in bs.viewers()])
     seen = np.array([c.sees(p) for c, p in zip(bs.viewers(), pixels, strict=True)])
-    # The photos that see a point, the first few of them in an order of its own.
+    # The photos that see each point; a few of them in random order.
     order = np.argsort(np.where(seen, rng.uniform(size=seen.shape), 2.0), axis=0)[:n_seeing]
     kept = np.flatnonzero(seen.sum(axis=0) >= n_seeing)
     photo, point = order[:, kept].ravel(), np.tile(np.arange(len(kept)), n_seeing)
@@ -224,7 +224,7 @@ PAIRS = list(itertools.combinations(range(4), 2))
 
 
 def described(count: int, seed: int = 0) -> NDArray[np.float32]:
-    """Descriptors (n, 128), each far from all others."""
+    """Return descriptors (n, 128) that are far from each other."""
     return np.random.default_rng(seed).integers(0, 60, (count, 128)).astype(np.float32)
 
 
@@ -242,7 +242,7 @@ def scene_points(count: int = 30) -> NDArray[np.float64]:
 def seen_in(
     points: NDArray[np.float64], moved: dict[tuple[int, int], tuple[float, float]] | None = None
 ) -> list[Features]:
-    """Key points of all points in all photos, in an order of its own in each; some moved."""
+    """Return key points of all points in all photos, in random order; some are moved."""
     found = []
     for photo, view in enumerate(CAMERAS):
         pixels = view.project(points)[:, :2]
@@ -255,7 +255,7 @@ def seen_in(
 
 
 def observed(ties: photo_ties.PhotoTies, points: NDArray[np.float64]) -> list[list[int]]:
-    """Which photos see each tied point, by the point's number in the scene."""
+    """Return the photos that see each tied point, by the point's index in the scene."""
     found: list[list[int]] = [[] for _ in points]
     for photo, point in zip(ties.photo, ties.point, strict=True):
         apart = np.linalg.norm(points - ties.points_world[point], axis=1)
@@ -264,7 +264,7 @@ def observed(ties: photo_ties.PhotoTies, points: NDArray[np.float64]) -> list[li
 
 
 def residuals_px(ties: photo_ties.PhotoTies) -> NDArray[np.float64]:
-    """How far observations are from where their photos see the points."""
+    """Return the distances of observations from the projections of their points."""
     pairs = zip(ties.photo, ties.points_world[ties.point], strict=True)
     seen = [CAMERAS[photo].project(point[None])[0, :2] for photo, point in pairs]
     return np.linalg.norm(np.array(seen) - ties.pixels, axis=1)
@@ -286,7 +286,7 @@ def test_points_are_tied_in_all_photos_that_see_them_where_they_are() -> None:
 def test_of_many_points_those_that_most_photos_see_are_kept() -> None:
     points = scene_points()
     known_to = seen_in(points)
-    # The last two photos know the first ten points alone.
+    # The last two photos show only the first ten points.
     for photo in (2, 3):
         order = np.random.default_rng(photo).permutation(30)
         known_to[photo] = known_to[photo].take(order < 10)
@@ -297,7 +297,7 @@ def test_of_many_points_those_that_most_photos_see_are_kept() -> None:
 
 
 def across_line(point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Direction in the second photo square to the picture of a point's ray from the first."""
+    """Return the direction in the second photo perpendicular to a point's epipolar line."""
     first, second = CAMERAS[0], CAMERAS[1]
     beyond = first.centre_world + 1.1 * (point - first.centre_world)
     along = np.diff(second.project(np.array([point, beyond]))[:, :2], axis=0)[0]
@@ -311,7 +311,7 @@ def across_line(point: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_matches_within_six_pixels_of_the_line_and_eight_of_the_point_are_tied(
     *, is_along: bool, off_px: float, is_tied: bool
 ) -> None:
-    # Along the line of the first photo, which does not see it, the third one does.
+    # The first photo does not reveal an error along its epipolar line, but the third photo does.
     points, n_photos = scene_points(), 2 + is_along
     across = across_line(points[4])
     way = (across[1], -across[0]) if is_along else tuple(across)
@@ -334,7 +334,8 @@ def test_rays_must_meet_at_two_degrees(angle_deg: float, is_tied: bool) -> None:
 
 @pytest.mark.parametrize(("share", "is_pair"), [(0.35, True), (0.45, False)])
 def test_pairs_show_enough_of_each_others_walls(share: float, is_pair: bool) -> None:
-    # The second sees four of the ten points of the first, the first all of the second's.
+    # The second photo shows four of the ten points of the first; the first shows all points of the
+    # second.
     points = np.tile([0.2, 5.0, 0.3], (10, 1))
     behind = points.copy()
     behind[:6, 1] = -500.0
@@ -349,7 +350,7 @@ def test_pairs_show_enough_of_each_others_walls(share: float, is_pair: bool) -> 
 
 
 def test_key_points_are_in_pixels_of_the_photo_when_it_was_reduced() -> None:
-    """Bright discs on grey, the first pixel's centre at (0.5, 0.5)."""
+    """Bright discs on grey; the centre of the first pixel is at (0.5, 0.5)."""
     width, height = 2400, 150
     centres = np.array([[0.2, 0.5], [0.45, 0.4], [0.7, 0.6]]) * (width, height)
     rows, columns = np.mgrid[:height, :width] + 0.5
@@ -359,13 +360,14 @@ def test_key_points_are_in_pixels_of_the_photo_when_it_was_reduced() -> None:
     photo = Photo(name="a.png", encoded=encode_png(soft), width=width, height=height)
     for n_most, limit_px in ((100, 0.5), (3, 20.0)):
         found = photo_ties.photo_features(photo, n_most).pixels
-        # The strongest are one of each part of the photo, before a second of any.
+        # The strongest key points include one in each part of the photo before a second in any
+        # part.
         assert np.linalg.norm(found[:, None] - centres, axis=2).min(axis=0).max() < limit_px
     assert len(found) == 3
 
 
 def test_points_behind_a_camera_are_none() -> None:
-    """Rays that come together meet before both photos, rays that go apart behind them."""
+    """Converging rays intersect in front of both photos, diverging rays behind them."""
     views = [camera(-1.0, 0.0, 0.0), camera(1.0, 0.0, 0.0)]
     for inwards, n_points in ((0.3, 2), (-0.3, 0)):
         found = []

@@ -1,4 +1,4 @@
-"""Ties that a person measured, and poses of another program: taken, checked or corrected."""
+"""Ties measured by hand, and poses from other programs: used, checked or corrected."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.tied_photos import context, known_ties, photo
 SCENE = tp.SCENE
 CAMERA = ms.camera_before(SCENE, centre=(1.3, -2.6, 1.1))
 SIGMA_PX = 1.0
-# Two rows of clicks as a person spreads them, in shares of the photo; the points lie on a relief.
+# Two rows of typical clicks, as shares of the photo; the points are on relief.
 SPREAD = ((0.12, 0.15), (0.5, 0.12), (0.88, 0.16), (0.13, 0.86), (0.52, 0.88), (0.87, 0.84))
 MORE = ((0.3, 0.5), (0.7, 0.45))
 
@@ -44,12 +44,12 @@ def clicked(
     blunder: NDArray[np.float64] | None = None,
     places: tuple[tuple[float, float], ...] = (),
 ) -> Ties:
-    """Ties that a person measured with the noise that is stated, the last one off by a blunder."""
+    """Return ties by hand with the noise of their sigmas; the last one has a blunder."""
     rng = np.random.default_rng(seed)
     shares = np.array(places or (*SPREAD, *MORE)[:n])
     n = len(shares)
     pixels = (shares + rng.uniform(-0.03, 0.03, (n, 2))) * [CAMERA.width, CAMERA.height]
-    # The wall point behind a pixel: along the ray to the plane, then onto the relief.
+    # The wall point of a pixel: along the ray to the plane, then onto the relief.
     rays = CAMERA.rays_world(pixels)
     points = CAMERA.centre_world + rays * (-CAMERA.centre_world[1] / rays[:, 1:2])
     cells = SCENE.frame.wall_from_world(points)[:, :2]
@@ -69,7 +69,7 @@ def clicked(
 
 
 def joined(first: Ties, second: Ties) -> Ties:
-    """All ties of both, the second ones measured by hand."""
+    """Return the ties of both, with the second ones marked as measured by hand."""
     pair = (replace(first, by_hand=np.zeros(len(first.photo), np.uint8)), second)
     arrays = (name for name, value in vars(second).items() if isinstance(value, np.ndarray))
     both = {name: np.concatenate([getattr(ties, name) for ties in pair]) for name in arrays}
@@ -94,7 +94,7 @@ CALIBRATED = ms.photos(tp.photo(CAMERA))
 
 
 def error_share(found: Camera) -> float:
-    """Error on the wall over the standard deviation that is stated."""
+    """Return the error on the wall divided by the predicted standard deviation."""
     assert found.sigma_wall_m is not None
     return ms.wall_error_m(SCENE, found.viewing(), CAMERA) / found.sigma_wall_m
 
@@ -107,7 +107,7 @@ def test_six_ties_orient_a_photo_within_what_their_sigma_says(orient: Orient) ->
         shares.append(error_share(cameras.cameras[0]))
         assert cameras.ties is not None
         assert (cameras.ties.role == TieRole.CONTROL).all()
-    # Of a chi distribution with about as many degrees of freedom, the mean square is near 1.
+    # For a chi distribution with about as many degrees of freedom, the mean square is close to 1.
     assert 0.4 < np.sqrt(np.mean(np.square(shares))) < 1.6
     assert max(shares) < 3.0
 
@@ -126,13 +126,13 @@ def test_a_gross_blunder_among_eight_is_left_out_or_refused(orient: Orient, size
             assert any("contradict the others and were left out" in text for text in warnings)
         else:
             assert "measured by hand contradict" in found.status
-    # Far off, the blunder is plain.
+    # Large blunders are always recognised.
     assert size_px < 50.0 or found.status == "ok"
 
 
 def test_ties_that_hang_on_one_of_them_are_refused(orient: Orient) -> None:
-    # Five in a corner and one far away: the error that they predict is small, but were that one
-    # wrong, the pose without it would be worth little.
+    # Five ties are in a corner and one is far away. The predicted error is small, but if that tie
+    # is wrong, the pose without it is poor.
     corner = ((0.06, 0.1), (0.2, 0.1), (0.06, 0.3), (0.2, 0.3), (0.13, 0.2))
     hanging = orient(clicked(3, places=(*corner, (0.95, 0.9))), CALIBRATED)[0].cameras[0]
     # The reason names the pixel of that tie.
@@ -153,13 +153,13 @@ def test_ties_by_hand_join_those_that_matching_found(orient: Orient) -> None:
     assert found.sigma_wall_m < 0.5 * alone.sigma_wall_m
     assert error_share(found) < 3.0
     assert both.ties is not None
-    # Never withheld.
+    # Ties by hand are never withheld.
     assert (both.ties.role[-6:] == TieRole.CONTROL).all()
     assert (both.ties.role == TieRole.CHECK).sum() >= 15
 
 
 def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
-    # Matching took the next window for this one: 120 ties agree with a pose 0.4 m beside.
+    # Matching confused a window with the next one: 120 ties agree with a pose that is off by 0.4 m.
     beside = known_ties(CAMERA, 5, n=120, shift_m=np.array([0.4, 0.0, 0.0]))
     wrong = orient(beside, CALIBRATED)[0].cameras[0]
     assert wrong.status == "ok"
@@ -172,7 +172,7 @@ def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
 def by_hand(
     points: NDArray[np.float64], noise_px: float = 0.0, **sigmas: NDArray[np.float64]
 ) -> tuple[Estimate, Start] | str:
-    """The pose by exact ties to points, but for noise."""
+    """Return the pose by ties to points that are exact except for the given noise."""
     n = len(points)
     noise = noise_px * np.random.default_rng(3).normal(size=(n, 2))
     seen = SeenPoints(
@@ -187,12 +187,12 @@ def by_hand(
 def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
     chance: float, fits: bool
 ) -> None:
-    # Of six none may be left out.
+    # With six ties, none may be omitted.
     points = np.random.default_rng(2).uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (6, 3))
     exact = {"sigma_m": np.zeros(6)}
     found = by_hand(points, 1.0, sigma_px=np.full(6, 3.0), **exact)
     assert not isinstance(found, str)
-    # In pixels, as none of the residuals is so small by luck that it is taken as larger.
+    # In pixels, since no residual is so small by chance that a larger one is assumed.
     squares = float((found[0].fit.residuals_px ** 2).sum())
     sigma_px = np.full(6, np.sqrt(squares / stats.chi2.isf(chance, 6)))
     assert isinstance(by_hand(points, 1.0, sigma_px=sigma_px, **exact), str) != fits
@@ -200,8 +200,8 @@ def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
 
 @pytest.mark.parametrize("relief_m", [0.0, 0.0004])
 def test_a_small_plate_seen_from_afar_may_be_turned_either_way(relief_m: float) -> None:
-    # 12 cm of a plate that stands 35 degrees oblique, from 2.9 m: perspective tells which way
-    # it is turned by a quarter of a pixel.
+    # A plate of 12 cm, rotated by 35 degrees, seen from 2.9 m: perspective distinguishes the two
+    # rotations by only a quarter of a pixel.
     across, up = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-0.06, 0.06, 3)] * 2))
     relief = relief_m * (np.arange(9) % 2 - 0.5)
     turn = np.deg2rad(35.0)
@@ -279,7 +279,7 @@ def test_ties_by_hand_orient_a_photo_without_a_pose(tmp_path: Path) -> None:
     (found,) = given(tmp_path, lost, clicked(4), ms.photos(photo(CAMERA)))[0].cameras
     assert found.status == "ok"
     assert error_share(found) < 3.0
-    # Fewer than six are ordinary ties, of which eight are needed.
+    # Fewer than six ties are treated as ordinary ties, of which eight are needed.
     few = samples.taken(clicked(4), slice(5))
     (found,) = tp.oriented(OrientPnp, few, CALIBRATED, context(tmp_path)).cameras
     assert found.status.startswith("only 5 ties to the walls")

@@ -1,4 +1,4 @@
-"""The direct linear transform: exact for exact points, wrong at the corners without distortion."""
+"""The direct linear transform: exact for exact points; wrong at the corners without distortion."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from tests.long_loops import seeds
 from tests.tied_photos import context
 
 SIZE_PX = (4000, 3000)
-# A grey photo: what it shows is in the ties.
+# A grey photo, since only the ties are used.
 ENCODED = encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
 CENTRE = np.array([0.15, -2.6, 0.1])
 orient = partial(tp.oriented, dlt.OrientDlt)
 
 
 def camera(*coefficients: float, skew: float = 0.0) -> ViewingCamera:
-    """A wide camera 2.6 m before the middle of a wall in the plane y = 0."""
+    """Return a wide-angle camera 2.6 m in front of the middle of a wall in the plane y = 0."""
     return samples.camera(
         looking_at(CENTRE, np.zeros(3), samples.UP),
         CENTRE,
@@ -60,14 +60,14 @@ def photo(exif_focal_px: float = 3150.0) -> Photo:
 def points_behind(
     viewer: ViewingCamera, pixels: NDArray[np.float64], depth_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Points at pixels, so far before the wall."""
+    """Return the points of pixels at given distances in front of the wall."""
     rays = viewer.rays_world(pixels)
     reach = (-depth_m - viewer.centre_world[1]) / rays[:, 1]
     return viewer.centre_world + reach[:, None] * rays
 
 
 def ties_of(viewer: ViewingCamera, seed: int, *, noise_px: float = 1.5) -> Ties:
-    """Three hundred ties all over the photo, on 12 cm of relief of the wall."""
+    """Return 300 ties distributed over the photo, on 12 cm of relief."""
     rng = np.random.default_rng(seed)
     pixels = rng.uniform([0.0, 0.0], SIZE_PX, (300, 2))
     points = points_behind(viewer, pixels, 0.12 * rng.random(300))
@@ -82,7 +82,7 @@ def ties_of(viewer: ViewingCamera, seed: int, *, noise_px: float = 1.5) -> Ties:
 
 
 def frame_errors_px(found: ViewingCamera, true: ViewingCamera) -> NDArray[np.float64]:
-    """Where the wall's points of a grid over the frame go, found less true: (21 x 21,) lengths."""
+    """Return lengths (21 x 21,) of pixel errors of wall points on a grid over the photo."""
     steps = [np.linspace(0.0, side, 21) for side in SIZE_PX]
     pixels = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
     rays = true.rays_world(pixels)
@@ -109,7 +109,7 @@ def test_with_distortion_the_corners_are_right_and_without_off_by_ten_pixels(
     if distortion == "none":
         assert errors.max() >= 10.0
         remedies = {each.code: each.remedy or "" for each in ctx.diagnostics}
-        # What it says to set can be set.
+        # The value that the remedy suggests is valid.
         value = remedies["dlt-without-distortion"].split('"')[1]
         assert dlt.OrientDlt.Params.model_validate({"distortion": value})
     else:
@@ -132,8 +132,8 @@ def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
         errors_m = frame_errors_px(found.resection.camera, true) * 2.6 / 3200.0 / np.sqrt(2.0)
         rms_m = np.sqrt(np.mean(errors_m**2))
         ratios.append([rms_m / stated.rms_m, errors_m.max() / stated.worst_m])
-    # Measured: 1.37 and 1.28, at the worst place 1.54 and 1.53; unless the fuller model is asked,
-    # 8 and 3.3.
+    # Measured: 1.37 and 1.28, at the worst position 1.54 and 1.53; without the complete model, 8
+    # and 3.3.
     everywhere, at_worst = np.sqrt(np.mean(np.square(ratios), axis=0))
     assert 0.5 < everywhere < 1.8
     assert at_worst < 2.5
@@ -151,13 +151,13 @@ def test_without_a_prior_what_exif_says_does_not_matter(tmp_path: Path) -> None:
     assert frame_errors_px(first.viewing(), DISTORTED).max() <= 4.0
 
 
-# --- eleven parameters and how much control they need ---
+# --- control points that eleven parameters need ---
 
 
 def seen_by(
     viewer: ViewingCamera, n: int, *, relief_m: float = 0.3, sigma_m: float = 1e-5
 ) -> SeenPoints:
-    """Exact ties all over the photo, on two planes so far apart."""
+    """Return exact ties distributed over the photo, on two planes at the given distance."""
     pixels = np.random.default_rng(1).uniform([100.0, 100.0], [3900.0, 2900.0], (n, 2))
     depth = np.where(np.arange(n) % 2 == 0, 0.0, relief_m)
     return SeenPoints(
@@ -181,7 +181,7 @@ def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
     rotation = rotation_from_vector(rng.normal(size=3))
     translation = rng.normal(size=3)
     lens = np.array([[3000.0, 25.0, 2010.0], [0.0, 2800.0, 1480.0], [0.0, 0.0, 1.0]])
-    # In front of the camera, five metres away and more.
+    # Points at least five metres in front of the camera.
     local = rng.uniform([-2.0, -2.0, 5.0], [2.0, 2.0, 9.0], (12, 3))
     points = (local - translation) @ rotation
     matrix = lens @ np.column_stack([rotation, translation])
@@ -193,7 +193,7 @@ def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
     assert (found.fx, found.fy) == pytest.approx((3000.0, 2800.0))
     assert (found.cx, found.cy, found.skew) == pytest.approx((2010.0, 1480.0, 25.0))
     assert (found.width, found.height) == SIZE_PX
-    # Mirrored in the projection centre, the points have the same pixels, and lie behind it.
+    # Mirrored at the projection centre, the points have the same pixels but are behind the camera.
     behind = (-local - translation) @ rotation
     with pytest.raises(GeometryError, match="puts the points behind the camera"):
         dlt.direct_linear(pixels, behind, SIZE_PX)
@@ -209,7 +209,7 @@ def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
 def test_a_richer_lens_needs_more_control(
     distortion: dlt.Distortion, skew: bool, least: int
 ) -> None:
-    # Check points are no control points.
+    # Check points are not control points.
     for n, n_check, is_enough in ((least, 0, True), (least - 1, 0, False), (least, 1, False)):
         seen = seen_by(camera(), n)
         found = estimated(camera(), seen, n_check, distortion=distortion, skew=skew)
@@ -218,7 +218,7 @@ def test_a_richer_lens_needs_more_control(
 
 @pytest.mark.parametrize(("sigma_m", "is_enough"), [(0.0048, True), (0.0053, False)])
 def test_relief_must_be_ten_deviations_of_the_points(sigma_m: float, is_enough: bool) -> None:
-    # Two planes 10 cm apart: 5 cm from the one between them, nearly.
+    # Two planes 10 cm apart are about 5 cm from the plane between them.
     seen = seen_by(camera(), 80, relief_m=0.1, sigma_m=sigma_m)
     assert dlt.relief(seen.points_world)[0] == pytest.approx(0.05, rel=0.02)
     found = estimated(camera(), seen)

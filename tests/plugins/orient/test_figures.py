@@ -1,4 +1,4 @@
-"""Pictures of an orientation: ties on photos, predicted errors on walls, residuals of photos."""
+"""Figures of an orientation: ties on photos, predicted errors on walls, residuals of photos."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_ties_are_marked_on_a_dimmed_photo_in_the_colour_of_their_role(
     assert shown.shape == (300, 900, 3)
     colours = [(40, 200, 60), (250, 220, 40), (220, 40, 40)]
     for (u, v), colour in zip(((100, 50), (400, 100), (700, 250)), colours, strict=True):
-        # Discs of two pixels about their centres.
+        # Discs with a radius of two pixels.
         for du, dv in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
             assert tuple(shown[v + dv, u + du]) == colour
         for du, dv in ((4, 0), (-4, 0), (0, 4), (0, -4)):
@@ -74,7 +74,7 @@ def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
 
 
 def wall_of(left: float, right: float, *, number: int = 0) -> KnownWall:
-    """A wall of two metres in the plane y = 0."""
+    """Return a 2 m high wall in the plane y = 0."""
     corners = [[left, 0.0, 2.0], [left, 0.0, 0.0], [right, 0.0, 0.0], [right, 0.0, 2.0]]
     return KnownWall(
         index=number,
@@ -103,25 +103,26 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
         SimpleNamespace(known=(wall, hidden), estimate=SimpleNamespace(resection=k)) for k in (0, 1)
     ]
     report.draw_wall_errors(context(tmp_path), candidates)
-    # Nobody sees the other wall.
+    # No photo shows the other wall.
     assert list(drawings) == ["wall_8_predicted_error"]
     best = np.fmin(*np.where(np.isfinite(sigmas), sigmas, np.nan))
     assert np.isnan(best).any()
     drawn = drawings["wall_8_predicted_error"]
     np.testing.assert_array_equal(drawn.args[0], 1e3 * best)
-    # 1, 2 or 5 times a power of ten above it, so that maps that are compared have one scale.
+    # The limit is 1, 2 or 5 times a power of ten, so that maps to be compared have the same scale.
     assert drawn.keywords == {"low": 0.0, "high": 10.0}
     assert 5.0 < 1e3 * np.nanpercentile(best, 98.0) <= 10.0
     assert decode_image(drawn(), "map").shape[1] == 1003
 
 
-# --- where photos were taken ---
+# --- positions of photos ---
 
 
 def test_photos_stand_before_the_wall_and_look_at_it(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
-    # Seen along -n from 3 m before the wall, 3 m along it and half a metre below its upper edge.
+    # From 3 m in front of the wall, 3 m along it and 0.5 m below its upper edge, in the direction
+    # -n.
     looks = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     camera = SimpleNamespace(centre_world=np.array([4.0, -3.0, 1.5]), rotation=looks)
     points = np.array([[2.0, 0.0, 1.0], [3.0, -0.1, 0.5], [8.0, 0.0, 1.9]])
@@ -138,7 +139,7 @@ def test_photos_stand_before_the_wall_and_look_at_it(
     assert (name.get_text(), *name.xy) == ("a.jpg", pytest.approx(3.0), pytest.approx(0.5))
     for panel, control in ((above, [[1, 0], [2, 0.1]]), (facing, [[1, 1], [2, 1.5]])):
         np.testing.assert_allclose(panel.lines[1].get_xydata(), control, atol=1e-12)
-    # Down in the view from above.
+    # The arrow points down in the view from above.
     (arrow,) = above.patches
     assert arrow.get_xy()[:, 1].min() < 2.65
     assert facing.yaxis_inverted()
@@ -151,13 +152,13 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
     photos = [residuals(f"{k}.jpg", 300, k, shift_px=k - 1.0) for k in range(3)]
-    # Unknown ones are left out.
+    # Unknown residuals are omitted.
     photos[0].residuals_px[1] = np.nan
     report.draw_residuals(context(tmp_path), photos)
     pooled = drawings["residuals"]
     assert pooled.get_size_inches()[0] == pytest.approx(COLUMN_INCHES)
     panels = np.array(pooled.axes).reshape(2, 2)
-    # One scale for all panels.
+    # All panels have the same scale.
     reach = panels[0, 0].patches[0].get_data()[1][-1]
     for row, kind, n in zip(panels, (TieRole.CONTROL, TieRole.CHECK), (716, 180), strict=True):
         values = np.vstack([photo.residuals_of(kind) for photo in photos])

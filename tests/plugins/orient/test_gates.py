@@ -1,4 +1,4 @@
-"""Every gate of an orientation, on either side of its bound, and the error predicted on walls."""
+"""Every gate of an orientation, on both sides of its limit, and the predicted error on walls."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SIZE_PX = (800, 600)
 
 
 def camera(*, turn_deg: float = 0.0) -> ViewingCamera:
-    """Before the middle of the wall y = 0, at y = -3, turned to the right."""
+    """Return a camera at y = -3 in front of the middle of the wall y = 0, turned to the right."""
     centre = np.array([0.0, -DISTANCE_M, 0.0])
     turn = math.radians(turn_deg)
     ahead = centre + np.array([math.sin(turn), math.cos(turn), 0.0])
@@ -59,7 +59,7 @@ def wall(half_m: tuple[float, float] = (1.0, 0.5)) -> gates.KnownWall:
 def posed(
     shift_sigma_m: tuple[float, float, float], viewer: ViewingCamera | None = None
 ) -> Resection:
-    """A pose of which nothing but the place of the camera is uncertain, along its own axes."""
+    """Return a pose of which only the camera position is uncertain, along the camera's axes."""
     covariance = np.zeros((6, 6))
     covariance[3:, 3:] = np.diag(np.square(shift_sigma_m))
     return Resection(
@@ -76,14 +76,14 @@ PARAMS = OrientParams(min_hull_ratio=0.2, max_sigma_wall_cells=0.5, max_sigma_co
 
 
 def grid(n: int = 10) -> np.ndarray:
-    """(n * n, 2) pixels all over a photo of 1000 x 800, in an order that mixes its quarters."""
+    """Return pixels (n * n, 2) distributed over a photo of 1000 x 800, in random order."""
     places = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2) + 0.5
     pixels = places / n * (1000.0, 800.0)
     return pixels[np.random.default_rng(3).permutation(n * n)]
 
 
 def candidate(**changes: Any) -> gates.Candidate:
-    """A good orientation: 80 of 100 ties agree, of 20 withheld ones 16."""
+    """Return a good orientation: 80 of 100 ties agree, including 16 of 20 withheld ones."""
     is_check = np.arange(N_TIES) % 5 == 0
     agreeing = np.arange(N_TIES) % 25 >= 5
     lengths = np.where(agreeing, 0.5, 8.0)
@@ -133,7 +133,7 @@ def candidate(**changes: Any) -> gates.Candidate:
 
 
 def gated(some: Sequence[gates.Gate] | None = None, /, **changes: Any) -> str | None:
-    """Name of the gate that refuses a candidate."""
+    """Return the name of the gate that refuses a candidate."""
     found = gates.refusal(candidate(**changes), some)
     return found and found[0]
 
@@ -144,9 +144,9 @@ def test_a_good_orientation_is_ok_without_a_note() -> None:
     assert gates.warnings_for(good) == []
     assert (good.control.sum(), good.checked.sum(), good.gsd_m) == (64, 16, 0.002)
     assert sum(good.quadrant_counts) == 80
-    # 8 of 10 cells' distance in each direction of a grid, over 19 of 20.
+    # The points extend over 0.9 of each side, the footprint over 0.95.
     assert good.hull_ratio == pytest.approx((0.9 / 0.95) ** 2, rel=0.05)
-    # What is control once more checks nothing.
+    # A withheld tie that duplicates a control tie checks nothing.
     pixels = grid()
     pixels[10] = pixels[11]  # withheld, and control
     twice = candidate(pixels=pixels)
@@ -166,7 +166,7 @@ def params(**changes: Any) -> OrientParams:
 
 
 def agreeing(n_control: int, n_check: int) -> np.ndarray:
-    """Whether ties agree: so many control ties, all over the photo, and so many withheld."""
+    """Return a mask of inliers with given numbers of control and withheld ties."""
     is_check = candidate().is_check
     found = np.zeros(N_TIES, dtype=np.bool_)
     found[np.flatnonzero(~is_check)[:n_control]] = True
@@ -191,7 +191,7 @@ def test_each_gate_refuses_what_is_beyond_its_bound(
 ) -> None:
     assert gated(**good) is None
     assert gated(**bad) == name
-    # The reason can be stated.
+    # There is a reason.
     assert gates.refusal(candidate(**bad))[1]
 
 
@@ -199,10 +199,10 @@ def test_each_gate_refuses_what_is_beyond_its_bound(
 def test_check_ties_must_agree_half_as_often_as_the_control(
     n_agree: int, refused_by: str | None
 ) -> None:
-    # 80 % of the control points agree: of 20 check points 8 must.
+    # 80 % of the control points agree, so 8 of 20 check points must agree.
     agrees = agreeing(64, n_agree)
     assert gated(agreeing=agrees, normalised=np.where(agrees, 0.5, 8.0)) == refused_by
-    # Eight ties are needed to begin with.
+    # At least eight ties are needed in any case.
     assert (gates.too_few(n_agree) == "") == (refused_by is None)
 
 
@@ -213,30 +213,30 @@ def test_check_ties_may_deviate_twice_as_much_as_the_control(
     good = candidate()
     lengths = np.where(good.is_check, 0.5 * factor, 0.5)
     assert gated(normalised=np.where(good.estimate.agreeing, lengths, 8.0)) == refused_by
-    # Four are too few to compare.
+    # Four are too few for a comparison.
     few = np.isin(np.arange(N_TIES), [6, 7, 8, 9])
     loose = np.where(good.estimate.agreeing, np.where(few, 2.0, 0.5), 8.0)
     assert gated(is_check=few, normalised=loose) != "check-rms"
 
 
 def six_agree(length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Whether ties agree, of twenty withheld ones six, with residuals of so many deviations."""
+    """Return a mask of inliers with six of twenty withheld ties, and normalised residuals."""
     good = candidate()
     agrees = good.estimate.agreeing.copy()
     agrees[good.is_check] = np.arange(20) < 6
     return agrees, np.where(agrees, length, 8.0)
 
 
-# Four shares of the limit are tried, each with the chance of so many of twenty, or more.
+# Four shares of the limit are tested, each with the probability of at least six of twenty.
 BY_CHANCE = optimize.brentq(lambda p: 4.0 * stats.binom.sf(5, 20, p) - 1e-5, 1e-4, 0.5)
 
 
 @pytest.mark.parametrize("share", [0.2, 0.35, 0.6, 1.0])
 def test_one_wrong_pose_in_a_hundred_thousand_may_look_right(share: float) -> None:
-    # Six of twenty agree so closely that this share of the limit of three holds them all.
+    # Six of twenty residuals are within this share of the limit, which is three.
     length = 0.999 * 3.0 * share
     agrees, lengths = six_agree(length)
-    # Residuals of half a pixel are so long.
+    # Radius for residuals of half a pixel.
     radius_px = 3.0 * share * 0.5 / length
     searched_px = math.sqrt(math.pi * radius_px**2 / BY_CHANCE) / 2.0
     for factor, is_fine in ((1.02, True), (0.98, False)):
@@ -245,7 +245,7 @@ def test_one_wrong_pose_in_a_hundred_thousand_may_look_right(share: float) -> No
 
 
 def in_quarter(quarter: int, n: int) -> np.ndarray:
-    """Whether ties agree: all but those of a quarter, of which only so many."""
+    """Return a mask of inliers with only n in a given quarter."""
     good = candidate()
     columns, rows = (good.seen.pixels_photo >= (500.0, 400.0)).T
     mine = np.flatnonzero((2 * rows + columns == quarter) & good.estimate.agreeing)
@@ -267,7 +267,7 @@ def test_quarters_without_ties_must_be_known_from_the_others(quarter: int) -> No
 
     assert found(2) is None
     assert found(1) == "quarters"
-    # Half a cell of 2 mm; a quarter without a wall needs nothing.
+    # The limit is half a cell of 2 mm; a quarter without a wall needs no ties.
     assert found(1, 0.00099) is found(0, 0.0) is None
     assert found(1, 0.00101) == "quarters"
     strict = params(quadrants="strict")
@@ -325,11 +325,10 @@ def test_one_tie_in_twenty_five_must_agree(n_agree: int, is_enough: bool) -> Non
 
 
 def test_wrong_ties_gather_on_a_quarter_of_what_has_texture() -> None:
-    # They agree so closely that a fifth of the limit of three, 30 px, holds them all; the matcher
-    # looked everywhere.
+    # All six residuals are within a fifth of the limit, 30 px; the whole photo was searched.
     agrees, lengths = six_agree(0.01)
     radius_px = 0.2 * 3.0 * 0.5 / 0.01
-    # The ties lie on a grid of ten by ten places, the hull of which is 0.9 by 0.9 of the photo.
+    # The ties are on a grid of 10 x 10, whose hull is 0.9 x 0.9 of the photo.
     scale = math.sqrt(4.0 * math.pi * radius_px**2 / BY_CHANCE / (900.0 * 720.0))
     for factor, is_fine in ((1.02, True), (0.98, False)):
         pixels = (500.0, 400.0) + factor * scale * (grid() - (500.0, 400.0))
@@ -338,7 +337,7 @@ def test_wrong_ties_gather_on_a_quarter_of_what_has_texture() -> None:
 
 
 def test_the_area_of_a_hull_is_that_of_its_polygon() -> None:
-    # Points within a triangle whose corners are among them.
+    # Points in a triangle, including its corners.
     corners = np.array([[0.0, 0.0], [20.0, 5.0], [4.0, 30.0]])
     inside = np.random.default_rng(0).dirichlet(np.ones(3), 60) @ corners
     assert gates.hull_area(np.vstack([inside, corners])) == pytest.approx(0.5 * (20 * 30 - 5 * 4))
@@ -347,7 +346,7 @@ def test_the_area_of_a_hull_is_that_of_its_polygon() -> None:
 
 
 def centres(shape: tuple[int, int], half_m: tuple[float, float]) -> NDArray[np.float64]:
-    """Middles (rows, cols, 2) of a grid over a wall: right and down from its middle, metres."""
+    """Return cell centres (rows, cols, 2) of a grid, metres right of and below its middle."""
     down, right = (
         half * (2.0 * (np.arange(n) + 0.5) / n - 1.0)
         for n, half in zip(shape, half_m[::-1], strict=True)
@@ -363,11 +362,11 @@ def error_of(sigmas_m: tuple[float, float, float], half_m: tuple[float, float]) 
 
 def test_a_camera_that_may_stand_aside_shows_the_wall_as_much_aside() -> None:
     found = error_of((0.003, 0.004, 0.0), (1.0, 0.5))
-    # Of a coordinate: the root of the mean of both.
+    # RMS of both coordinates.
     expected = math.sqrt(0.5 * (0.003**2 + 0.004**2))
     np.testing.assert_allclose(found.sigmas_m, expected, rtol=1e-6)
     assert (found.rms_m, found.worst_m) == pytest.approx((expected, expected))
-    # The photo is 4 m x 3 m wide there: its corners show nothing of 2 m x 1 m.
+    # The photo covers 4 m x 3 m of the plane, so its corners do not show the wall of 2 m x 1 m.
     assert np.isnan(found.corners_m).all()
     assert len(found.footprint_px) == len(found.sigmas_m) == 15 * 15
     pixels = SIZE_PX / np.array([2.0, 2.0]) + 200.0 * centres((15, 15), (1.0, 0.5)).reshape(-1, 2)
@@ -379,7 +378,7 @@ def test_a_camera_that_may_stand_nearer_is_worst_far_from_the_middle() -> None:
     grid = gates.sigmas_on_wall(posed(nearer), wall(), (4, 6))
     aside = np.linalg.norm(centres((4, 6), (1.0, 0.5)), axis=2)
     np.testing.assert_allclose(grid, 0.006 * aside / DISTANCE_M / math.sqrt(2.0), rtol=1e-6)
-    # Corners of the photo count where they show a wall: 2 m and 1.5 m from the middle, but for
+    # Corners of the photo are included where they show a wall: 2 m and 1.5 m from the middle, minus
     # half a pixel.
     for half_m in ((1.0, 0.5), (2.5, 1.3), (1.7, 2.0)):
         found = error_of(nearer, half_m)
@@ -403,7 +402,7 @@ def test_a_photo_that_shows_no_wall_has_no_error() -> None:
 
 @pytest.mark.parametrize(("aside_m", "is_shown"), [(29.0, True), (31.0, False)])
 def test_places_seen_flatter_than_one_in_ten_are_not_shown(aside_m: float, is_shown: bool) -> None:
-    # A cosine of 0.1 is a slope of 9.95 to one.
+    # A cosine of 0.1 corresponds to a ratio of 9.95 to 1.
     corners = np.array([[0, 0, 0.1], [0, 0, -0.1], [0.2, 0, -0.1], [0.2, 0, 0.1]])
     strip = replace(wall(), corners_world=corners + np.array([aside_m - 0.1, 0, 0]))
     sideways = camera(turn_deg=84.0)
@@ -431,7 +430,7 @@ def test_walls_are_as_ties_describe_them_or_through_their_points() -> None:
     assert (first.index, first.number, first.gsd_m, first.has_side) == (0, 6, 0.004, True)
     np.testing.assert_array_equal(first.corners_world, wall().corners_world)
     np.testing.assert_array_equal(first.normal, [0.0, -1.0, 0.0])
-    # Two points make no wall; of the twenty, the rectangle about them in their plane.
+    # Two points do not define a wall; twenty points define their bounding rectangle.
     assert (second.index, second.number, second.gsd_m, second.has_side) == (1, 1, None, False)
     own = points[15:35]
     across = np.cross(along, samples.UP)
@@ -442,5 +441,5 @@ def test_walls_are_as_ties_describe_them_or_through_their_points() -> None:
     np.testing.assert_allclose(
         [shares.min(axis=0), shares.max(axis=0)], [[0, 0], [1, 1]], atol=1e-9
     )
-    # Only chosen ties count.
+    # Only the chosen ties are used.
     assert [item.index for item in gates.known_walls(ties, number == 1)] == [1]

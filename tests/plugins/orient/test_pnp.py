@@ -1,4 +1,4 @@
-"""Orienting photos: right and honest about it, or refused with the reason; never wrongly ok."""
+"""Orientation of photos: correct with the right predicted error, or refused with a reason."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def calibrated(camera: ViewingCamera) -> Photos:
 
 @pytest.mark.parametrize("known", [True, False], ids=["calibrated", "exif"])
 def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known: bool) -> None:
-    # The lens has its centre 5 px aside, and distortion of all kinds; EXIF is 1 % off.
+    # The principal point is off by 5 px, there is distortion of all kinds, and EXIF is off by 1 %.
     ratios = []
     for seed in range(10):
         camera = ms.camera_before(tp.SCENE, centre=(0.4 + 0.24 * seed, -2.5, 0.9))
@@ -40,12 +40,12 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known:
         sigma = found.cameras[0].sigma_wall_m
         assert sigma is not None
         ratios.append(ms.wall_error_m(tp.SCENE, found.cameras[0].viewing(), camera) / sigma)
-    # Measured over 16 seeds: 0.96 and 1.26; with only focal length and k1 free, EXIF gave 2.26.
+    # Measured with 16 seeds: 0.96 and 1.26; if only focal length and k1 are free, EXIF gives 2.26.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
 def test_a_common_factor_of_all_sigmas_of_ties_changes_no_pose(tmp_path: Path) -> None:
-    """Ties deviate four times as much as stated: the weight of large residuals follows sigma0."""
+    """Errors of ties are four times their sigmas; the weight of residuals depends on sigma0."""
     camera = ms.camera_before(tp.SCENE)
     ties = known_ties(camera, 3, n=300, wrong_share=0.0)
     bold = replace(ties, sigma_px=ties.sigma_px / 4.0, sigma_m=ties.sigma_m / 4.0)
@@ -54,7 +54,8 @@ def test_a_common_factor_of_all_sigmas_of_ties_changes_no_pose(tmp_path: Path) -
         for given in (ties, bold)
     )
     away_m = ms.wall_error_m(tp.SCENE, same.viewing(), right.viewing())
-    # Rounds end where sigma0 has settled to a share; with a limit in given sigmas it is 0.4.
+    # Iterations end when sigma0 has almost converged; with a limit in a priori sigmas, this would
+    # be 0.4.
     assert away_m < 0.2 * (right.sigma_wall_m or 0.0)
     assert same.sigma_wall_m == pytest.approx(right.sigma_wall_m, rel=0.02)
 
@@ -66,7 +67,7 @@ def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None
     assert cameras.ties is not None
     check = cameras.ties.role == TieRole.CHECK
     assert check.mean() >= 0.2 - 1e-9
-    # Moving check ties by a pixel leaves the pose as it is, to the last bit.
+    # If check ties are moved by a pixel, the pose does not change by a single bit.
     pixels = ties.pixels_photo.copy()
     pixels[check] += [0.6, -0.4]
     again = orient(replace(ties, pixels_photo=pixels), calibrated(camera), context(tmp_path))
@@ -90,7 +91,7 @@ def test_opencvs_pose_is_the_least_squares_of_ties_that_count_alike(
     n = len(seen)
     best = adjust(replace(seen, sigma_px=np.ones(n), sigma_m=np.zeros(n)), oriented.viewing())
     away_m = np.linalg.norm(best.camera.centre_world - oriented.viewing().centre_world)
-    # solvePnP stops when a step changes the parameters by 1e-7 or so.
+    # solvePnP stops when a step changes the parameters by about 1e-7.
     assert away_m < 1e-5
     assert ms.wall_error_m(tp.SCENE, oriented.viewing().shifted(SURVEY_SHIFT_M), camera) < 3.0 * (
         oriented.sigma_wall_m or 0.0
@@ -112,7 +113,7 @@ def test_opencvs_pose_leaves_the_lens_as_it_is_known(tmp_path: Path) -> None:
 def test_ties_searched_within_a_small_radius_prove_less(tmp_path: Path) -> None:
     camera = ms.camera_before(tp.SCENE)
     ties = known_ties(camera, 1, n=120)
-    # Wrong everywhere, but within the 12 px that the matcher looked around a wrong place.
+    # All ties are wrong, within 12 px of wrong expected positions.
     jitter = np.random.default_rng(0).uniform(-12.0, 12.0, ties.pixels_photo.shape)
     guessed = replace(ties, pixels_photo=ties.pixels_photo + jitter, search_radius_px=(12.0,))
     assert orient(guessed, calibrated(camera), context(tmp_path)).cameras[0].status != "ok"
@@ -121,7 +122,7 @@ def test_ties_searched_within_a_small_radius_prove_less(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", seeds(10))
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_photo_in_trouble_is_right_or_refused(tmp_path: Path, kind: str, seed: int) -> None:
-    """A photo is ok with a true error within five of the stated ones only."""
+    """A photo is only `ok` if its true error is at most five times the predicted one."""
     case, is_solvable = adverse_case(kind, seed)
     (found,) = orient(case.ties, ms.photos(case.photo), context(tmp_path)).cameras
     if found.status == "ok":

@@ -1,4 +1,4 @@
-"""Lens, ties and pose of a single photo: what is known before, withheld, rejected, refused."""
+"""Lens, ties and pose of a single photo: priors, withheld ties, rejection and refusal."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def camera() -> ViewingCamera:
 
 
 def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone() -> None:
-    """What counts less as too far off follows how far ties are off, not what they state."""
+    """Large residuals get less weight relative to the actual errors of ties, not their sigmas."""
     viewer = camera()
     rng = np.random.default_rng(7)
     seen = seen_by(viewer, 200, sigma_px=0.5)
-    # Longer tails than normal ones: many are beyond the limit.
+    # The errors have longer tails than a normal distribution, so many exceed the limit.
     off_px = 0.35 * rng.standard_t(3, size=(200, 2))
     seen = replace(seen, pixels_photo=seen.pixels_photo + off_px)
     scaled = replace(seen, sigma_px=2.5 * seen.sigma_px, sigma_m=2.5 * seen.sigma_m)
     check = np.arange(200) % 5 == 0
-    # The same ties are sampled first.
+    # With this threshold, the same ties are sampled first.
     params = lenses.OrientParams(threshold_px=4.0)
     found, other = (
         lenses.estimate_pose(tied(photo(viewer), each, is_check=check), params)
@@ -59,22 +59,22 @@ def test_the_unit_deviation_is_that_of_normal_vectors(scale: float) -> None:
     lengths = np.hypot(*rng.normal(0.0, scale, (2, 40_000)))
     assert lenses.unit_deviation(lengths) == pytest.approx(scale, rel=0.02)
     lengths[:15_000] = 1e6
-    # A good third of wrong ones leaves it within reason.
+    # With over a third of outliers, it remains plausible.
     assert lenses.unit_deviation(lengths) <= 3.0
 
 
 def ring(inner: float, outer: float, count: int) -> NDArray[np.float64]:
-    """Lengths of vectors that lie evenly over a ring."""
+    """Return lengths of vectors that are uniformly distributed over a ring."""
     shares = (np.arange(count) + 0.5) / count
     return np.sqrt(inner**2 + shares * (outer**2 - inner**2))
 
 
 def test_a_limit_holds_where_hardly_any_tie_within_it_is_there_by_chance() -> None:
     right = np.full(100, 0.5)
-    # Eighty wrong ones from one to three times the limit stand for ten within it: a tenth.
+    # Eighty outliers between one and three times the limit imply ten within it, a tenth.
     assert lenses.without_chance(np.append(right, ring(3.6, 10.4, 80)), 3.5) == 3.5
     assert lenses.without_chance(np.append(right, ring(3.6, 10.4, 81)), 3.5) < 3.5
-    # Farther off, or not known at all, they tell nothing.
+    # Farther or unknown residuals have no effect.
     beyond = np.append(right, [10.6] * 500 + [np.nan] * 500 + [np.inf] * 500)
     assert lenses.without_chance(beyond, 3.5) == 3.5
 
@@ -91,7 +91,7 @@ def test_a_limit_is_tightened_until_chance_is_a_tenth(n_wrong: int) -> None:
         return around / 8.0 / inside
 
     assert share(found) <= 0.1
-    # One step before it was not: a fifth less each time.
+    # In the previous step it was not; each step reduces the limit by a fifth.
     if found < 3.5:
         assert share(found / 0.8) > 0.1
         steps = np.log(found / 3.5) / np.log(0.8)
@@ -99,7 +99,7 @@ def test_a_limit_is_tightened_until_chance_is_a_tenth(n_wrong: int) -> None:
 
 
 def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
-    # A square of 2 m seen as 1000 px: 500 px for a metre.
+    # A 2 m square has 1000 px, so a metre has 500 px.
     rng = np.random.default_rng(5)
     places = rng.uniform(-1.0, 1.0, (4000, 2))
     points = np.column_stack([places[:, 0], np.zeros(4000), places[:, 1]])
@@ -112,8 +112,8 @@ def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
     known = replace(seen, sigma_m=np.zeros(4000))
     assert lenses.expected_px(known) == pytest.approx(0.6)
     in_space = np.sqrt(lenses.expected_px(seen) ** 2 - 0.6**2)
-    # Half a metre lies in the middle of the places, seven tenths of it in that of the farther
-    # coordinate: 500 px become 707.
+    # The median is half a metre for a coordinate and 0.7 of a metre for the larger one of both, so
+    # 500 px become 707.
     assert in_space == pytest.approx(0.002 * 500.0 * np.sqrt(2.0), rel=0.03)
     for change, factor in (
         ({"pixels_photo": 3.0 * seen.pixels_photo + 40.0}, 3.0),
@@ -137,18 +137,18 @@ def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
 ) -> None:
     true = camera()
     claimed = replace(true, fx=(1.0 + off) * true.fx, fy=(1.0 + off) * true.fy)
-    # Wide enough that no tie is rejected for the wrong focal length.
+    # Wide enough that no tie is rejected because of the wrong focal length.
     seen = seen_by(true, n_ties, sigma_px=6.0)
     found = lenses.estimate_pose(tied(photo(claimed), seen), PARAMS)
     assert isinstance(found, str) == is_contradicted
     if isinstance(found, str):
-        # The reason states the focal length by the ties.
+        # The reason contains the focal length from the ties.
         by_ties = float(found.split("focal length of ")[1].split(" px")[0])
         assert by_ties == pytest.approx(true.fx, rel=0.01)
 
 
 def test_opencv_refuses_a_lens_with_skew() -> None:
-    """Which solvePnP cannot model."""
+    """solvePnP cannot model skew."""
     of = tied(photo(replace(camera(), skew=2.5)), seen_by(camera(), 40))
     assert isinstance(estimate_by_opencv(of, PARAMS), str)
 
@@ -172,7 +172,8 @@ def test_withheld_ties_have_no_say_in_the_start_and_four_places_make_none() -> N
 @pytest.mark.parametrize("times", [0.5, 2.0])
 def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: float) -> None:
     true = camera()
-    # They say half a pixel each, and deviate by so many times as much; a tenth of them is wrong.
+    # The sigma of each tie is half a pixel, but errors are `times` as large; a tenth of the ties is
+    # wrong.
     seen = seen_by(true, 300, noise_px=0.5 * times, seed=3)
     wrong = np.arange(300) % 10 == 0
     pixels = seen.pixels_photo + wrong[:, None] * np.array([0.5 * times * 6.5, 0.0])
@@ -222,7 +223,7 @@ def test_exif_is_believed_to_a_twentieth_and_without_it_lenses_from_wide_to_long
     }
     assert prior.source == ("none" if exif_px is None else "exif")
     assert prior.freedom.names == FREE
-    # The principal point to a hundredth of the longer side.
+    # The sigma of the principal point is a hundredth of the longer side.
     assert prior.freedom.sigmas.tolist() == [0.35 if exif_px is None else 0.05, *OF_EXIF[1:]]
 
 
@@ -231,7 +232,7 @@ def test_exif_is_believed_to_a_twentieth_and_without_it_lenses_from_wide_to_long
     [
         ("per-photo", (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5)),
         ("shared", (0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 1, 2)),
-        # Two of one focal length; a third of another, which is no index; two of none known; another
+        # Two photos with one focal length, one with another, two without any, and one of another
         # size.
         ("focal-group", (0, 0, 1, 2, 2, 3), (0, 0, 1, 2, 3, 4)),
     ],
@@ -260,7 +261,7 @@ def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
     ):
         _, (lens,) = lenses.lens_groups(photos[:n_photos], cameras[:n_photos], "shared")
         assert (lens.source, lens.prior.fx) == (source, focal_px)
-        # Calibrated lenses are held.
+        # Calibrated lenses are fixed.
         assert lens.freedom.sigmas.tolist() == sigmas
 
 
@@ -268,7 +269,7 @@ def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:
     camera = replace(
         ms.camera_before(ms.photographed_scene()), distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0])
     )
-    # With k1 = -0.5 no ray comes out farther than 0.54 focal lengths from the axis.
+    # With k1 = -0.5, no distorted ray is farther than 0.54 focal lengths from the axis.
     rays = lenses.camera_rays(
         camera,
         np.array([[camera.cx + 0.5 * camera.fx, camera.cy], [camera.cx + camera.fx, camera.cy]]),
@@ -278,7 +279,7 @@ def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:
 
 
 def ties(n: int = 12) -> Ties:
-    """Ties of two photos in turn, their pixels numbered."""
+    """Return ties of two photos, alternately, with numbered pixels."""
     at = np.arange(n)
     return samples.ties(
         np.column_stack([at, 10.0 * at]).astype(np.float64),
@@ -317,7 +318,7 @@ def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:
     of.role[[0, 4]], of.role[2] = TieRole.REJECTED, TieRole.CHECK
     params = lenses.OrientParams()
     tied = photos.tied_photo(small_photo("a"), of, params, np.random.default_rng(1))
-    # What matching rejected is not used; its check points are.
+    # Ties that matching rejected are not used; its check points are.
     np.testing.assert_array_equal(tied.chosen, [2, *range(6, 400, 2)])
     np.testing.assert_array_equal(tied.by_hand, by_hand[tied.chosen] > 0)
     assert not (tied.is_check & tied.by_hand).any()
@@ -339,7 +340,7 @@ def test_check_points_are_withheld_evenly(share: float, n_check: int) -> None:
     assert chosen.sum() == n_check
     counts = np.bincount(lenses.image_cells(pixels[chosen], (600, 600), 6), minlength=36)
     assert np.abs(counts - share * 20).max() <= 1.0
-    # Which ones is left to chance.
+    # They are chosen at random.
     other = photos.withheld(pixels, (600, 600), share, rng)
     assert n_check == 0 or (other != chosen).any()
     assert photos.withheld(pixels[:0], (600, 600), 0.5, rng).shape == (0,)
@@ -350,7 +351,8 @@ CAMERA = ms.camera_before(SCENE)
 
 def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:
     ahead = CAMERA.rotation[2]
-    # 2 mm and 2 m before the camera, known to 3 mm: the first may be anywhere in the image.
+    # Points 2 mm and 2 m in front of the camera, with a sigma of 3 mm: the first may be anywhere in
+    # the image.
     points = CAMERA.centre_world + np.array([[0.002], [2.0]]) * ahead
     seen = SeenPoints(
         pixels_photo=CAMERA.project(points)[:, :2] + [1.0, 0.0],
@@ -375,7 +377,8 @@ def test_survey_coordinates_lose_nothing() -> None:
     np.testing.assert_allclose(
         predicted_covariances(far, at + SURVEY_SHIFT_M),
         predicted_covariances(near, at),
-        # The lever of 10^6 m costs eleven digits of sixteen; 1e-5 square pixels remain.
+        # Coordinates of 10^6 m cost eleven of sixteen digits, which leaves an error of 1e-5 square
+        # pixels.
         atol=1e-5,
     )
 
@@ -391,7 +394,8 @@ def test_the_stated_covariance_is_the_scatter_of_repeated_adjustments() -> None:
         error = result.camera.project(at)[:, :2] - exact
         covariances = predicted_covariances(result, at)
         ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariances), error))
-    # Chi-squared with 2 degrees of freedom has mean 2; 60 runs of correlated triples leave 15 %.
+    # The mean of chi-squared with 2 degrees of freedom is 2; with 60 runs of correlated triples, it
+    # is accurate to 15 %.
     assert np.mean(ratios) == pytest.approx(2.0, rel=0.3)
 
 

@@ -1,4 +1,4 @@
-"""The table of residuals: every number against its definition, worked out by hand."""
+"""The table of residuals: every number compared with its definition, computed by hand."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_an_orientation_is_recorded_with_its_lens_its_errors_and_its_residuals(
     assert (entry["lens"], entry["focal_px"]) == ("exif", viewing.fx)
     assert entry["k1"] == viewing.distortion[0]
     assert entry["sigma_wall_mm"] == 1000.0 * oriented.sigma_wall_m < entry["sigma_wall_worst_mm"]
-    # Its ties stand for the variance that they have in common, too.
+    # The factor includes the common errors of the ties.
     assert entry["variance_factor"] > entry["sigma0"] ** 2
     assert abs(viewing.fx / camera.fx - 1.0) < 4.0 * entry["focal_sigma_px"] / viewing.fx < 0.1
     table = {(row.role, row.axis, row.unit): row for row in found.residual_table}

@@ -1,4 +1,4 @@
-"""`ortho.dsm-backward`: which cells a photo paints, from which of its pixels, and with what."""
+"""`ortho.dsm-backward`: the cells that a photo paints, their pixels and colours."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_cells_show_their_own_place_where_they_are_seen_and_nothing_where_they_a
     is_raised = scenes.depth_m() > 0.0
     expected = np.where(is_raised, scenes.BLUE[scenes.RAISED], scenes.BLUE[scenes.BASE])
     np.testing.assert_array_equal(layer.rgb[..., 2][shown], expected[shown])
-    # Half a cell, and half of the quarter cell that a grey level is.
+    # Half a cell, plus half of a grey level, which corresponds to a quarter of a cell.
     assert np.abs(scenes.places_off(layer)[shown]).max() <= 0.5 + 0.125
     is_visible, is_behind_board = scenes.visible(viewer)
     assert is_behind_board.any()
@@ -95,7 +95,7 @@ def test_nearest_paints_the_source_pixel_itself(tmp_path: Path, distorted: bool)
         np.column_stack([columns, rows]) + 0.5, scenes.depth_m()[rows, columns].astype(np.float64)
     )
     pixels = viewer.project(points)[:, :2]
-    # Within a thousandth of a pixel of its border, rounding decides which pixel it is.
+    # Within a thousandth of a pixel from the border of a pixel, rounding decides.
     clear = (np.abs(pixels - np.rint(pixels)) > 1e-3).all(axis=1)
     assert clear.mean() > 0.99
     u, v = np.floor(pixels[clear]).astype(int).T
@@ -115,7 +115,7 @@ def test_what_is_finer_than_a_cell_gives_its_mean_grey(tmp_path: Path, resamplin
     assert shown.sum() > 3000
     assert np.abs(layer.rgb[shown].astype(float) - 120.0).max() < 0.1 * 80.0
     raw = layer_of(tmp_path, given, resampling="nearest")
-    assert raw.rgb[shown].astype(float).std() > 20.0  # what it protects from
+    assert raw.rgb[shown].astype(float).std() > 20.0  # the raw colours vary
 
 
 def test_survey_coordinates_change_nothing(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_survey_coordinates_change_nothing(tmp_path: Path) -> None:
     known = {"walls": scenes.walls(where), "cloud": scenes.cloud(where)}
     given = scenes.inputs(viewers=[scenes.camera(where)], **known)
     local, survey = layer_of(tmp_path), layer_of(tmp_path, given)
-    # Positions of 10^6 m carry 1e-10 m, so a cell in a hundred thousand may fall on the other side.
+    # Positions of 10^6 m have a precision of 1e-10 m, so one cell in 100,000 may change sides.
     assert np.mean(local.mask != survey.mask) < 1e-4
     same = (local.mask == PAINTED) & (survey.mask == PAINTED)
     assert np.mean(local.rgb[same] != survey.rgb[same]) < 1e-3
@@ -137,7 +137,7 @@ def test_threads_and_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.Monke
     for layer in (*others, tiled):
         np.testing.assert_array_equal(layer.mask, first.mask)
         np.testing.assert_array_equal(layer.quality, first.quality)
-        # Each tile has a filter of its own.
+        # Each tile has a separate filter.
         if layer is not tiled:
             np.testing.assert_array_equal(layer.rgb, first.rgb)
 
@@ -149,7 +149,7 @@ def test_erosion_takes_the_cells_beside_hidden_patches(
     monkeypatch.setattr(painting, "_EROSION_CELLS", 0)
     plain = layer_of(tmp_path)
     hidden = (plain.mask == HIDDEN).astype(np.uint8)
-    # Each patch here is wide; a cell alone would not count.
+    # Each patch here is wide; a single cell would be ignored.
     _, labels, stats, _ = cv2.connectedComponentsWithStats(hidden)
     assert stats[:, cv2.CC_STAT_WIDTH].min() >= 2
     assert labels.max() == 1
@@ -193,7 +193,7 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
     where = scenes.frame()
     walls = scenes.walls(where)
     (wall,) = walls.walls
-    # A wall behind the camera that faces it, out of its sight.
+    # A wall behind the camera that faces it but is not visible.
     behind = replace(
         where,
         origin_world=where.world_from_wall(np.array([[where.width, 0.0]]), 4.0)[0],
@@ -204,7 +204,7 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
     pictures = scenes.rendered(), scenes.rendered(aside_m=0.0)
     viewers = scenes.camera(where), turned_away(where, 0.0)
     layers, ctx = laid(tmp_path, scenes.inputs(*pictures, viewers=viewers, walls=both))
-    # The turned camera paints the other wall: both walls have a layer.
+    # The turned camera paints the other wall, so both walls have a layer.
     assert [(layer.wall, layer.source) for layer in layers] == [(0, "1.png"), (1, "0.png")]
     assert ctx.warnings == []
     _, ctx = laid(tmp_path, scenes.inputs(*pictures, viewers=viewers))
@@ -214,20 +214,21 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
 
 
 def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
-    # A clock that goes on by a second when it is asked.
+    # A clock that advances by one second per call.
     clock = count()
     ctx = replace(context(tmp_path), clock_s=lambda: float(next(clock)))
     inputs = DsmBackward.In(**scenes.inputs())
     (layer,) = DsmBackward().run(inputs, DsmBackward.Params(), ctx).layers.layers
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["n_layers"] == 1
-    # What stands about is gathered once, and looked at from each photo.
+    # Occluders are collected once and used for each photo.
     seconds = [metrics[f"{name}_s"] for name in ("occluders", "decoding", "painting")]
     assert seconds == [2.0, 1.0, 1.0]
     assert ctx.warnings == []
     assert metrics["painted_share"] == np.mean(layer.mask == PAINTED)
     assert metrics["occluded_share"] == np.mean(layer.mask == HIDDEN)
-    # 2.1 m along the axis, a focal length of 1505 pixels; 0.7 m aside of 2 m before the wall.
+    # The distance along the axis is 2.1 m (0.7 m to the side, 2 m in front), the focal length 1505
+    # pixels.
     assert metrics["photo_gsd_mm"] == pytest.approx(1e3 * 2.1 / 1505, rel=0.02)
     assert metrics["obliquity_deg"] == pytest.approx(np.degrees(np.arctan2(0.7, 2.0)), abs=2.0)
 
@@ -265,7 +266,7 @@ def test_masked_pixels_paint_nothing_and_others_what_they_did(tmp_path: Path, me
     used[300:420, 400:600] = 0
     before = painted(photos)
     after = painted(Photos(photos=(replace(photos.photos[0], mask=encode_png(used)),)))
-    # A bright picture of the mask says which cells show masked pixels.
+    # A picture of the inverted mask shows which cells have masked pixels.
     seen = painted(scenes.photos(np.dstack([255 - used] * 3))).rgb[..., 0]
     shows, near = (
         cv2.morphologyEx((seen == 255).astype(np.uint8), way, np.ones((side, side))) > 0
@@ -274,7 +275,7 @@ def test_masked_pixels_paint_nothing_and_others_what_they_did(tmp_path: Path, me
     was, is_painted = (layer.mask == PAINTED for layer in (before, after))
     assert (was & shows).sum() > 500
     assert not is_painted[shows].any()
-    # Farther off than the rim of the mask nothing changes.
+    # Away from the border of the mask, nothing changes.
     np.testing.assert_array_equal(after.mask[~near], before.mask[~near])
     np.testing.assert_array_equal(after.rgb[~near & was], before.rgb[~near & was])
 
@@ -282,7 +283,7 @@ def test_masked_pixels_paint_nothing_and_others_what_they_did(tmp_path: Path, me
 @pytest.mark.parametrize(
     ("turns_deg", "sign", "opposite"),
     [
-        # As many photos are upside down as show that up of the scan is down.
+        # The number of photos that are upside down decides whether up seems inverted.
         ((0.0, 10.0, -20.0, 180.0), -1.0, "z"),
         ((180.0,), 1.0, "-z"),
         *(((0.0, 0.0), 1.0, None), ((90.0, -90.0), 1.0, None)),
@@ -329,7 +330,7 @@ def three_walls() -> Walls:
 
 
 def mask_of(*rows: LayerMask) -> np.ndarray:
-    """States of the first rows; the last one is void."""
+    """Return a mask with given states of the first rows; the last row is void."""
     return np.repeat(np.array([[*rows, VOID]], dtype=np.uint8).T, SHAPE[1], axis=1)
 
 
@@ -382,6 +383,6 @@ def test_cells_are_counted_once_however_many_photos_show_them() -> None:
         names=("wall 0", "wall 1", "wall 2"),
         plane_indices=(4, 5, 6),
     )
-    # Three of four rows have a depth; two are painted on the first wall, one hidden, and two on
-    # the second one.
+    # Three of four rows have a depth; on the first wall, two are painted and one is hidden; on the
+    # second wall, two are painted.
     assert count_shown(three_walls(), layered) == (3 * 18, 12, 6 + 12)

@@ -1,4 +1,4 @@
-"""Photos of 16 bits: what their pixels hold comes to the GeoTIFF as it is."""
+"""16-bit photos: pixel values are written unchanged to the GeoTIFF."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIDE_PX = (1000, 800)
 
 
 def ramp() -> NDArray[np.uint16]:
-    """Red grows by 60 levels per column, green by 80 per row; blue is odd, in its lowest bits."""
+    """Return an image: red rises by 60 levels per column, green by 80 per row, and blue is odd."""
     rows, columns = np.mgrid[: SIDE_PX[1], : SIDE_PX[0]]
     deep = np.dstack([60 * columns + 7, 80 * rows + 11, np.full_like(rows, 12345)])
     return deep.astype(np.uint16)
@@ -46,7 +46,7 @@ def joined(folder: Path, layers: tuple[Layer, ...], **params: object) -> Orthoim
 
 
 def seen_at(viewer: ViewingCamera) -> NDArray[np.float64]:
-    """Photo places (rows, cols, 2) of the cells of the wall."""
+    """Return photo positions (rows, cols, 2) of the cells of the wall."""
     rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
     places = np.column_stack([columns.ravel(), rows.ravel()])
     depths = scenes.depth_m().ravel().astype(np.float64)
@@ -69,7 +69,7 @@ def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> Non
             assert file.dtypes == ("uint16",) * 3
             written = np.moveaxis(file.read(), 0, 2)
             assert (file.dataset_mask()[shown] == 255).all()
-        # The photo's own pixels, all but those between two of which a rounding decides.
+        # The cells have the photo's pixels, except where rounding decides between two.
         same = (written[shown] == ramp()[v, u]).all(axis=1)
         assert same.mean() > 0.999
         assert np.isin(written[shown][:, 0], ramp()[0, :, 0]).all()
@@ -87,7 +87,7 @@ def test_forward_paints_the_photos_own_levels(tmp_path: Path) -> None:
     assert np.isin(layer.rgb[own][:, 0], ramp()[0, :, 0]).all()
     filled = layer.filled > 0
     assert filled.any()
-    # What is filled lies between its neighbours, in their levels.
+    # Filled cells have levels between those of their neighbours.
     assert (np.abs(layer.rgb[filled][:, 2].astype(int) - 12345) <= 1).all()
 
 

@@ -1,4 +1,4 @@
-"""`ortho.pointcloud-direct`: which point paints a cell, which gaps are filled, and from what."""
+"""`ortho.pointcloud-direct`: the point that colours a cell, and the gaps that are filled."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def bare_walls(known: scenes.KnownWall, *, buffer_m: float = 0.15) -> Walls:
 def laid(
     cloud: PointCloud, walls: Walls, ctx: StepContext, **params: object
 ) -> tuple[Layer, dict[str, Mapping[str, Any]]]:
-    """The layer of the wall, and the values of what was reported, by code."""
+    """Return the layer of the wall, and the values of diagnostics by code."""
     chosen = PointcloudDirect.Params.model_validate(params)
     layers = PointcloudDirect().run(PointcloudDirect.In(walls=walls, cloud=cloud), chosen, ctx)
     assert layers.layers.names == (walls.walls[0].name,)
@@ -113,11 +113,11 @@ def test_only_gaps_are_filled_and_they_are_marked(tmp_path: Path, method: str) -
     np.testing.assert_array_equal(layer.mask == LayerMask.NO_SURFACE, is_void & ~expected)
     np.testing.assert_array_equal(layer.rgb[~is_void], before.rgb[~is_void])
     assert not layer.rgb[layer.mask != LayerMask.PAINTED].any()
-    # Less than a point in the corner of its cell is worth.
+    # The quality is less than that of a point in the corner of its cell.
     assert layer.quality[expected].max() < min(0.5, layer.quality[~is_void].min())
     assert not layer.quality[layer.mask != LayerMask.PAINTED].any()
-    # No black of the large void creeps into the gaps beside it: Telea rounds an even grey by 2
-    # grey levels; black would pull by 50 and more.
+    # The black of the large void does not bleed into adjacent gaps: Telea changes a uniform grey by
+    # 2 levels; black would change it by 50 or more.
     even = dataclasses.replace(cloud, rgb=np.full_like(cloud.rgb, 180))
     layer = painted(even, walls, tmp_path, inpaint=method)
     shown = layer.rgb[layer.mask == LayerMask.PAINTED].astype(int)
@@ -155,7 +155,7 @@ def test_points_of_pure_black_are_told(tmp_path: Path, n_black: int) -> None:
     layer, by_code = laid(dark, walls, scenes.context(tmp_path), inpaint="none")
     found = [(code, of["n_black"], of["grey"]) for code, of in by_code.items()]
     assert found == [("points-black", n_black, 10)] * (n_black > 0)
-    # Nothing black is void.
+    # Black points do not make cells void.
     assert (layer.mask == LayerMask.PAINTED).all()
 
 
@@ -167,7 +167,7 @@ def test_specks_of_pure_black_paint_no_cell_and_are_reported(tmp_path: Path) -> 
     layer, by_code = laid(specked, walls, scenes.context(tmp_path))
     assert (layer.rgb[layer.mask == LayerMask.PAINTED] == 120).all()
     assert by_code["black-points-left-out"]["n_points"] == 10
-    # They are painted where that is asked for.
+    # They are painted if requested.
     layer = painted(specked, walls, tmp_path, skip_below_grey=0)
     assert (layer.rgb == 0).all(axis=2).any()
 
@@ -181,7 +181,7 @@ def test_points_without_a_colour_are_skipped_where_that_is_asked_for(
     rgb = scenes.checker(columns, rows) // 2 + 100
     least = 10
     rgb[7] = (0, 0, least)
-    # Over every other cell, and alone in the last one, lies a point that is too dark.
+    # Points that are too dark are above every other cell, and the only points in the last cell.
     flat = np.zeros(columns.size)
     points = np.vstack(
         [
@@ -221,7 +221,7 @@ def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:
     is_void = np.zeros((10, 20), dtype=bool)
     is_void[4, 4] = True
     is_void[:, 10:] = True
-    # A clock that goes on by a second when it is asked.
+    # A clock that advances by one second per call.
     clock = count()
     lines: list[str] = []
     ctx = dataclasses.replace(
@@ -249,7 +249,7 @@ def test_what_is_painted_from_a_cloud_is_where_it_is(
     layer = painted(cloud, bare_walls(known), tmp_path, inpaint=inpaint)
     is_painted = layer.mask == LayerMask.PAINTED
     shown = np.where(is_painted, layer.rgb[..., 0] / 255.0, np.nan)
-    # OpenCV's fronts begin at the top left, and shift what they paint: by 0.15 cells here.
+    # OpenCV's fronts begin at the top left and shift the inpainted colours, here by 0.15 cells.
     limit_cells = 0.02 if inpaint == "between" or cells < 1.0 else 0.2
     assert np.abs(scenes.shift_of_waves(shown)).max() < limit_cells
 
@@ -260,7 +260,7 @@ N_TOP = 5
 def painted_by_rule(
     folder: Path, colouring: str, inpaint: str = "none"
 ) -> tuple[Layer, dict[int, list[int]]]:
-    """A wall with two layers of random colours, and what its cells with points should show."""
+    """Return a painted wall with two layers of random colours, and the expected colours."""
     known = scenes.leaning_wall(shape=(20, 30))
     rng = np.random.default_rng(8)
     n_points = 6000
@@ -301,7 +301,7 @@ def test_colours_follow_their_rule(tmp_path: Path, colouring: str) -> None:
     shown = layer.mask.ravel() == LayerMask.PAINTED
     np.testing.assert_array_equal(np.flatnonzero(shown), sorted(expected))
     colours = np.array([expected[cell] for cell in sorted(expected)])
-    # One grey level: positions went through float32 offsets.
+    # One grey level, since positions are float32 offsets.
     assert np.abs(layer.rgb.reshape(-1, 3)[shown].astype(int) - colours).max() <= 1
 
 
@@ -313,26 +313,26 @@ def test_bands_do_not_show_in_colours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, colouring: str, inpaint: str
 ) -> None:
     whole, _ = painted_by_rule(tmp_path, colouring, inpaint=inpaint)
-    # Fronts of this wall are short.
+    # Fronts on this wall are short.
     monkeypatch.setattr("orthoflow_plugins.ortho.filling._FRONT_CELLS", 2)
     monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", 30 * 24)
     monkeypatch.setattr("orthoflow_plugins.ortho.point_colours._POINTS_AT_ONCE", 100)
     banded, _ = painted_by_rule(tmp_path, colouring, inpaint=inpaint)
     for name in ("rgb", "mask", "filled"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name), err_msg=name)
-    # Places are counted from the band's own corner: the last digit of float32.
+    # Positions are relative to the corner of the band, which changes the last digit of float32.
     np.testing.assert_allclose(whole.quality, banded.quality, atol=1e-6)
 
 
 def test_a_gap_is_fillable_where_no_window_has_too_many_void_cells() -> None:
     is_void = np.random.default_rng(2).random((30, 40)) < 0.35
-    # Outside all are void.
+    # Cells outside are void.
     padded = np.pad(is_void, 3, constant_values=True)
     counts = [
         sliding_window_view(padded[3 - k : 33 + k, 3 - k : 43 + k], (2 * k + 1,) * 2).sum((2, 3))
         for k in (1, 2, 3)
     ]
-    # Each of the three limits counts.
+    # Each of the three limits matters.
     for limits in ((4, 10, 19), (1, 25, 49), (9, 1, 49), (9, 25, 1)):
         pairs = zip(counts, limits, strict=True)
         wanted = is_void & np.logical_and.reduce([n <= limit for n, limit in pairs])
@@ -341,13 +341,13 @@ def test_a_gap_is_fillable_where_no_window_has_too_many_void_cells() -> None:
     assert fillable_gaps(is_void, (9, 25, 49)).sum() == is_void.sum()
 
 
-# Factors on the light of one scan: yellowish.
+# Factors on the light of one scan, yellowish.
 CAST = np.array([1.3, 1.0, 0.7])
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[PointCloud, Walls]:
-    """A simulated room, scanned in colour twice from two stations, and its largest wall."""
+    """Return a simulated room, scanned in colour from two stations, and its largest wall."""
     ctx = context(tmp_path_factory.mktemp("room"))
     params = SimulateRoom.Params(scan_step_m=0.018, panorama_step_m=0.012)
     simulated = SimulateRoom().run(SimulateRoom.In(), params, ctx)
@@ -359,7 +359,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[PointCloud, Walls]:
 def light_painted(
     cloud: PointCloud, walls: Walls, folder: Path, **params: object
 ) -> tuple[NDArray[np.float64], Mapping[str, Any] | None]:
-    """Logarithm of the light of each cell (rows, cols, 3), NaN without; what was reported."""
+    """Return the logarithm of the light of each cell (rows, cols, 3), NaN if void; diagnostics."""
     layer, by_code = laid(cloud, walls, scenes.context(folder), inpaint="none", **params)
     light = np.log(np.maximum(light_of_levels(255)[layer.rgb], 1e-3).astype(np.float64))
     light[(layer.mask != LayerMask.PAINTED) | (layer.rgb.min(axis=2) < 20)] = np.nan
@@ -391,7 +391,7 @@ def test_a_cast_of_one_scan_is_taken_away(tmp_path: Path, room: tuple[PointCloud
     assert by_code["share"] == pytest.approx(1.0 / CAST.min() - 1.0, abs=0.05)
     apart, before = found - expected, left - expected
     known = np.isfinite(apart).all(axis=2) & np.isfinite(before).all(axis=2)
-    # Where that scan paints, its cast is visible, and afterwards no cell differs.
+    # Where this scan paints, its cast is visible; after balancing, no cell differs.
     is_cast = known & (np.abs(before - np.log(CAST)).max(axis=2) < 0.1)
     assert is_cast.mean() > 0.05
     for cells in (is_cast, known):

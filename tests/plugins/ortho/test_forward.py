@@ -1,4 +1,4 @@
-"""`ortho.dsm-forward`: each pixel paints the cell that it shows, and nothing behind it."""
+"""`ortho.dsm-forward`: each pixel paints the cell that it shows, and no cell behind it."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ def test_every_pixel_paints_the_cell_that_it_shows_and_nothing_that_is_hidden(
     is_raised = scenes.depth_m() > 0.0
     expected = np.where(is_raised, scenes.BLUE[scenes.RAISED], scenes.BLUE[scenes.BASE])
     assert np.mean(layer.rgb[..., 2][taken] == expected[taken]) > 0.999
-    # Half a cell, half of the quarter cell that a grey level is, and a hundredth of a pixel.
+    # Half a cell, half of a grey level (a quarter of a cell), and a hundredth of a pixel.
     assert np.quantile(np.abs(scenes.places_off(layer)[taken]), 0.999) <= 0.5 + 0.125 + 0.01
     is_visible, is_behind_board = scenes.visible(scenes.camera(scenes.frame(), aside_m=aside_m))
     assert not (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).any()
-    # A gap of one cell at a rim is filled.
+    # A gap of one cell at an edge is filled.
     assert np.mean(layer.mask[is_behind_board] == LayerMask.OCCLUDED) > 0.99
     assert np.mean(layer.mask[is_visible] == LayerMask.PAINTED) > 0.96
     assert (layer.quality[layer.mask != LayerMask.PAINTED] == 0.0).all()
@@ -81,10 +81,10 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
     assert "occluders-unknown" in [one.code for one in ctx.diagnostics]
     assert holed.filled is not None
     assert not holed.filled.any()
-    # Pixels of 5 mm and more on cells of 4 mm.
+    # Pixels of at least 5 mm on 4 mm cells.
     gsd_m = 2.0 / (1.5 * 300)
     assert np.mean(holed.mask == LayerMask.PAINTED) <= 1.1 * (scenes.GSD_M / gsd_m) ** 2
-    # Of a clock that goes on when it is asked: once for all photos, and for each.
+    # The clock advances with each call: once for all photos, and once for each photo.
     clock = count()
     ctx = replace(context(tmp_path), clock_s=lambda: float(next(clock)))
     (closed,) = run(DsmForward, ctx, coarse, fill_gap_cells=2).layers.layers
@@ -108,7 +108,7 @@ TOLERANCE_M: Final = 0.008
 
 
 def boxes(seed: int) -> tuple[WallView, Relief]:
-    """A wall with boxes on it, steps of millimetres, and holes, before a camera."""
+    """Return a camera and a wall with boxes, steps of millimetres, and holes."""
     rng = np.random.default_rng(seed)
     depths = rng.choice([0.0, 0.002, 0.005], scenes.SHAPE).astype(np.float32)
     for row, column in rng.integers(0, scenes.SHAPE, (60, 2)):
@@ -125,16 +125,16 @@ def boxes(seed: int) -> tuple[WallView, Relief]:
     params = VisibilityParams(incidence_max_deg=80.0)
     camera = scenes.camera(where, aside_m=rng.uniform(-0.5, 0.5))
     view = view_of(camera, surface, params)
-    # So near that rays graze: they fall by less over a cell than boxes are high.
+    # The camera is so close that rays descend by less than the height of a box within a cell.
     return view._replace(height_m=surface.relief.highest_m + 0.3), surface.relief
 
 
 def met(
     view: WallView, relief: Relief, ray: NDArray[np.float64], lowest: float
 ) -> tuple[float, str]:
-    """Distance at which a ray meets a patch or, by little, a side; what it meets.
+    """Return the distance at which a ray hits a patch or the top of a side, and what it hits.
 
-    All borders of cells are crossed in order, whichever way the ray goes.
+    The ray crosses all borders of cells in order, in any direction.
     """
     rows, columns = relief.depth.shape
     eye = np.array([view.column + 0.5, view.row + 0.5, view.height_m])
@@ -143,7 +143,7 @@ def met(
     lines = [(np.arange(-400, 800) - eye[k]) / ray[k] for k in range(2)]
     crossed = np.concatenate(lines)
     at = np.sort(np.concatenate([[first, last], crossed[(crossed > first) & (crossed < last)]]))
-    # A ray may be below a surface by as much as it falls over a cell.
+    # A ray may be below a surface by its descent within a cell.
     fall = -ray[2] * min(*(1.0 / np.abs(ray[:2])), last - first)
     for begin, end in itertools.pairwise(at):
         column, row = (math.floor(value) for value in (eye + 0.5 * (begin + end) * ray)[:2])
@@ -166,7 +166,7 @@ def test_rays_meet_the_first_patch_on_their_way_and_no_sides(seed: int) -> None:
     lowest = float(np.nanmin(relief.depth))
     seen = set()
     for _ in range(150):
-        # From near its foot, to beyond the wall's ends, in all four directions.
+        # From near the camera's foot to beyond the ends of the wall, in all four directions.
         goal = rng.uniform(-60.0, [scenes.SHAPE[1] + 60.0, scenes.SHAPE[0] + 60.0])
         way = np.append(goal, lowest) - [view.column + 0.5, view.row + 0.5, view.height_m]
         ray = way / rng.uniform(1.0, 3.0)

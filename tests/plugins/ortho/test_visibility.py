@@ -1,4 +1,4 @@
-"""Where the projection finds cells in a photo, what hides them, how colours are sampled."""
+"""Positions of cells in a photo, their occlusion, and sampling of colours."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def wall_of(depths: NDArray[np.floating]) -> Wall:
 def surface_of(
     depths: NDArray[np.floating], *, hides: bool = True, where: WallFrame | None = None
 ) -> surfaces.Surface:
-    """The scene's wall with other depths, unless another frame is given."""
+    """Return the scene's wall with other depths, or with another frame."""
     where = where or scenes.frame()
     relief = surfaces.relief_of(samples.wall(where, depth_m=depths.astype(np.float32)), hides=hides)
     return surfaces.Surface(frame=where, relief=relief, front_m=scenes.BUFFER_M, tolerance_m=0.008)
@@ -94,9 +94,9 @@ def test_places_and_quality_are_those_of_the_camera(aside_m: float, hides: bool)
 
 
 def are_hidden(view: WallView, relief: Relief, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Follow rays to the camera: the surface between two cells is linear, void hides nothing.
+    """Trace rays to the camera; the surface between two cells is linear, and voids hide nothing.
 
-    They rise, so that nothing of the relief meets a ray that is above all of it.
+    Rays rise, so a ray above the whole relief is not hit.
     """
     heights, highest = relief.occluding.astype(np.float64), float(relief.occluding.max())
     assert view.height_m > highest
@@ -112,7 +112,7 @@ def are_hidden(view: WallView, relief: Relief, cells: NDArray[np.intp]) -> NDArr
         at = np.where(is_main[followed], np.round(at), at)
         inside = (np.floor(at) >= 0).all(axis=1) & (np.ceil(at) < heights.shape).all(axis=1)
         followed, way, at = followed[inside], way[inside], at[inside]
-        # A void on either side makes it unknown, however near the other cell is.
+        # If one side is void, the surface is unknown, however near the other cell is.
         with np.errstate(invalid="ignore"):
             surface = map_coordinates(heights, at.T, order=1)
         ray = depths[followed] + way * (view.height_m - depths[followed])
@@ -132,7 +132,7 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
     surface, camera = surface_of(depths), scenes.camera(scenes.frame(), aside_m=aside_m)
     visible = seen_of(surface, camera)
     asked = (visible.mask == PAINTED) | (visible.mask == OCCLUDED)
-    # Each ray is followed to the camera, whatever bounds say.
+    # Trace each ray to the camera, regardless of bounds.
     view = surfaces.view_of(camera, surface, PARAMS)
     followed = are_hidden(view, surface.relief, np.argwhere(asked))
     assert 200 < followed.sum() < 0.5 * len(followed)
@@ -152,7 +152,8 @@ def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(aside_m: flo
     heights = depths[free].astype(np.float64)
     points = where.world_from_wall(np.column_stack([columns, rows]) + 0.5, heights)
     towards = camera.centre_world - points
-    # Where the ray to the camera passes the front of the slab, and its depth along the axis there.
+    # The position at which the ray to the camera passes the front of the slab, and its depth along
+    # the axis.
     share = (surface.front_m - heights) / (towards @ where.normal_world)
     leaves_m = camera.project(points + share[:, None] * towards)[:, 2]
     for nearest_m in np.quantile(leaves_m, [0.1, 0.5, 0.9]):
@@ -161,7 +162,7 @@ def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(aside_m: flo
         )
         mask = seen_of(surface, camera, buffer).mask
         hidden = nearest_m < leaves_m - surface.tolerance_m
-        # The buffer is float32: at 2 m it knows a quarter of a micrometre.
+        # The buffer is float32; at 2 m, its precision is a quarter of a micrometre.
         is_clear = np.abs(nearest_m - (leaves_m - surface.tolerance_m)) > 1e-6
         assert 0.05 < hidden.mean() < 0.95
         np.testing.assert_array_equal((mask[free] == OCCLUDED)[is_clear], hidden[is_clear])
@@ -194,7 +195,7 @@ def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full() -
         expected = np.where(highest - opened > np.float32(edge_m), highest, opened)
     np.testing.assert_array_equal(occluding, expected)
     assert occluding[70, 40] < 0.02  # the spike
-    assert occluding[19, 15] > 0.08  # beside the edge
+    assert occluding[19, 15] > 0.08  # next to the edge
 
 
 def test_visibility_none_paints_the_board_and_says_so(tmp_path: Path) -> None:
@@ -216,7 +217,7 @@ def test_cells_at_the_border_of_a_photo_ask_the_last_pixel_of_the_buffer() -> No
         tolerance_m=0.001, cosine_least=0.1, border_px=1.0,
     )  # fmt: skip
     relief = surfaces.relief_of(samples.wall(samples.facing_south(gsd_m, 512, 1)), hides=False)
-    # What lies behind the buffer in memory hides everything.
+    # The memory behind the buffer contains values that hide everything.
     memory = np.array([[np.inf, 0.0]], dtype=np.float32)
     buffer = DepthBuffer(nearest=memory[:, :1], reduction=float(size))
     mask = surfaces.cells_seen(view, relief, buffer, slice(0, 1), slice(0, 512)).mask
@@ -229,7 +230,7 @@ GSD_M = 0.01
 
 
 def rough(shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Depths with a void block, void cells, and a raised part."""
+    """Return depths with a void block, void cells, and a raised part."""
     rng = np.random.default_rng(5)
     depths = rng.normal(0.0, 0.003, shape)
     depths[rng.random(shape) < 0.02] = np.nan
@@ -257,7 +258,7 @@ def test_bounds_of_blocks_are_those_of_their_cells(
     for prepared in (relief, clear):
         np.testing.assert_array_equal(prepared.bottoms, of_blocks(low, BLOCK_CELLS, np.minimum))
         np.testing.assert_array_equal(prepared.depth, depths)
-        # For others kernels would be compiled once more.
+        # For writable arrays, kernels would be compiled again.
         assert not prepared.depth.flags.writeable
         assert not prepared.occluding.flags.writeable
     tops = of_blocks(relief.occluding, BLOCK_CELLS, np.maximum)
@@ -268,7 +269,7 @@ def test_bounds_of_blocks_are_those_of_their_cells(
     assert relief.highest_m == tops.max()
     assert clear.occluding.size == 0
     assert clear.highest_m == clear.tops.max() == -np.inf
-    # Bands of a large wall do not show.
+    # Bands of a large wall do not affect the result.
     monkeypatch.setattr(surfaces, "_BAND_CELLS", 20 * shape[1])
     np.testing.assert_array_equal(surfaces.relief_of(wall_of(depths)).occluding, relief.occluding)
 
@@ -285,7 +286,7 @@ def test_a_camera_is_the_same_in_the_axes_of_a_wall() -> None:
     assert (view.gsd_m, view.front_m, view.tolerance_m) == (where.gsd_m, scenes.BUFFER_M, 0.008)
     assert view.cosine_least == pytest.approx(math.cos(math.radians(80.0)))
     assert view.border_px == 0.05 * min(camera.width, camera.height)
-    # Points in metres right, down and before the wall are seen where the camera sees them.
+    # Points in metres right, down and in front have the same pixels as with the camera.
     at = np.random.default_rng(2).uniform([0.0, 0.0, -0.1], [1.2, 0.9, 0.1], (20, 3))
     world = where.world_from_wall(at[:, :2] / where.gsd_m, at[:, 2])
     flat = view.camera
@@ -322,14 +323,14 @@ def test_surfaces_tolerate_their_noise_and_what_cells_cannot_hold(tmp_path: Path
     assert first.relief.occluding.size == second.relief.occluding.size == 3600
     (clear, _) = surfaces.surfaces_of(walls, ctx, hides=False)
     assert clear.relief.occluding.size == 0
-    assert clear.tolerance_m == 0.5 * GSD_M  # nothing to tell from noise
+    assert clear.tolerance_m == 0.5 * GSD_M  # no noise
 
 
 @pytest.mark.parametrize("reach", [0, 3])
 def test_cells_near_hidden_patches_are_those_within_reach_of_two_by_two(reach: int) -> None:
     hidden = np.random.default_rng(0).random((23, 31)) < 0.12
     hidden[5:7, 20:22] = hidden[0:2, 0:2] = hidden[21:23, 29:31] = True
-    hidden[12, 3:12] = True  # one row is no patch
+    hidden[12, 3:12] = True  # one row is not a patch
     hidden[11, 3:12] = hidden[13, 3:12] = False
     near = np.zeros(hidden.shape, dtype=np.bool_)
     for row in range(22):
@@ -346,7 +347,7 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
     where = scenes.frame()
     camera = scenes.camera(where, aside_m=aside_m)
     surface = surface_of(np.full(scenes.SHAPE, 0.03))
-    # Nine cells about column 31, row 14, of a tile whose margin begins two cells before it.
+    # Nine cells around column 31, row 14, in a tile with a margin of two cells.
     painted = np.zeros((20, 40), dtype=np.bool_)
     painted[13 - 10 : 16 - 10, 30 - 18 : 33 - 18] = True
     tile, inner = (slice(12, 30), slice(20, 58)), (slice(2, 20), slice(2, 40))
@@ -355,7 +356,7 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
     )
     points = where.world_from_wall(np.array([[31.5, 14.5], [35.5, 14.5], [31.5, 18.5]]), 0.03)
     pixels = camera.project(points)
-    # Over four cells.
+    # Measured over four cells.
     across, down = np.linalg.norm(pixels[1:, :2] - pixels[0, :2], axis=0) / 4.0
     ray = camera.centre_world - points[0]
     cosine = float(ray @ where.normal_world) / np.linalg.norm(ray)
@@ -375,7 +376,7 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
 def test_bilinear_colours_are_those_of_the_formula(depth: int, size: tuple[int, int]) -> None:
     rng = np.random.default_rng(5)
     photo = rng.integers(0, 2**depth, (*size, 3), dtype=np.uint8 if depth == 8 else np.uint16)
-    # From the centre of the first pixel of a part that begins at column 7 and row 3.
+    # Relative to the centre of the first pixel of a part that begins at column 7 and row 3.
     u, v = rng.uniform(-4.0, 66.0, (2, 30, 40)).astype(np.float32)
     is_painted = rng.random(u.shape) < 0.9
     last_u, last_v = size[1] - 1, size[0] - 1
@@ -389,13 +390,13 @@ def test_bilinear_colours_are_those_of_the_formula(depth: int, size: tuple[int, 
     visible = TileVisibility(u + 7.5, v + 3.5, is_painted.astype(np.uint8), np.ones_like(u))
     inner, colours = (slice(2, 29), slice(3, 40)), np.empty((27, 37, 3), dtype=photo.dtype)
     painting.sample_bilinear(photo, (7, 3), visible, inner, colours)
-    # Positions are float32: a millionth of a pixel is a sixteenth of a level of 16 bits.
+    # Positions are float32; a millionth of a pixel is a sixteenth of a 16-bit level.
     tolerance = 0.5 + (1e-3 if depth == 8 else 0.5)
     assert np.abs(colours - expected[inner]).max() <= tolerance
 
 
 def places_of(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Positions of cells in a photo."""
+    """Return positions of cells in a photo."""
     rows, columns = np.indices((16, 24))
     u = 41.0 + 2.3 * columns + 0.1 * rows + rng.uniform(0, 0.2, rows.shape)
     v = 37.0 + 1.9 * rows - 0.2 * columns + rng.uniform(0, 0.2, rows.shape)
@@ -430,14 +431,14 @@ def test_what_is_cut_out_of_a_photo_does_not_show(
         np.testing.assert_array_equal(found, expected)
         return
     if max(pixels) > 1.0:
-        # A cell of n pixels is their mean: a Gauss of half of sqrt(n^2 - 1) pixels.
+        # A cell of n pixels is their mean, like a Gaussian of half of sqrt(n^2 - 1) pixels.
         sigmas = [0.5 * math.sqrt(n**2 - 1.0) for n in pixels]
         photo = cv2.GaussianBlur(
             photo, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1], borderType=cv2.BORDER_REPLICATE
         )
     flag = {"bilinear": 1, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}[resampling]
     apart = np.abs(found.astype(int) - cv2.remap(photo, u - 0.5, v - 0.5, flag))
-    # OpenCV knows places to a 32nd of a pixel, and its own kernel is a little wider than ours.
+    # OpenCV rounds positions to 1/32 pixel, and its kernel is slightly wider than ours.
     assert apart.mean() < 0.6
     assert apart.max() <= 6
 
@@ -446,7 +447,7 @@ def test_what_is_cut_out_of_a_photo_does_not_show(
 def test_cells_of_hardly_more_than_a_pixel_are_not_averaged(
     pixels: float, is_blurred: bool
 ) -> None:
-    """Eight bits do not show a Gauss of less than a fifth of a pixel."""
+    """With 8 bits, a Gaussian of less than a fifth of a pixel has no effect."""
     photo = np.random.default_rng(1).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     plain, filtered = (sampled(photo, (1.0, down), "cubic") for down in (1.0, pixels))
     assert (plain != filtered).any() == is_blurred

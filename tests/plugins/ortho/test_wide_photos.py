@@ -1,4 +1,4 @@
-"""A room painted from a panorama, against its exact colours."""
+"""A room painted from a panorama, compared with its exact colours."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from tests.wide_lenses import directions_of_panorama
 
 ROOM = BoxRoom(size_m=(2.4, 1.8, 1.6), middle=SURVEY, gsd_m=0.008)
 CENTRE = SURVEY + np.array([0.2, -0.1, 0.75])
-# World from the camera, whose axes are x right, y down, z forward: looks north, tilted and rolled.
+# Rotation from camera axes (x right, y down, z forward) to the world: north, tilted and rolled.
 WORLD_FROM_CAMERA = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) @ rotation_from_vector(
     np.array([0.11, -0.16, 0.2])
 )
 PANORAMA = (1600, 800)
-# Of fewer the displacement is not known to a fiftieth of a cell.
+# With fewer cells, the displacement is less accurate than a fiftieth of a cell.
 FEWEST_CELLS = 500
 RIM = 2
 
@@ -35,9 +35,9 @@ def words(values: object) -> str:
 
 
 def panorama(folder: Path) -> tuple[Path, tuple[Path, ...]]:
-    """A panorama of the whole sphere, and its camera as Metashape has it."""
+    """Return a panorama of the whole sphere, and its camera as exported by Metashape."""
     photo, xml = folder / "360.png", folder / "cameras.xml"
-    # Metashape's axes are those of a camera; the directions' x forwards, y left, z up.
+    # Metashape uses camera axes; directions have x forward, y left, z up.
     camera_from_panorama = np.array([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
     rays = directions_of_panorama(*PANORAMA) @ (WORLD_FROM_CAMERA @ camera_from_panorama).T
     photo.write_bytes(encode_png(ROOM.seen(CENTRE, rays)))
@@ -63,14 +63,14 @@ def painted(folder: Path, photo: Path, cameras: tuple[Path, ...]) -> tuple[Layer
 
 
 def away_from_corners(layer: Layer) -> NDArray[np.bool_]:
-    """Cells that are painted, but not where pixels show two walls of the room at once."""
+    """Return a mask of painted cells, except where pixels show two walls of the room."""
     inner = np.zeros(layer.mask.shape, dtype=bool)
     inner[RIM:-RIM, RIM:-RIM] = True
     return inner & (layer.mask == LayerMask.PAINTED)
 
 
 def displacement_cells(layer: Layer, wall: int) -> NDArray[np.float64]:
-    """By how much the colours of a layer lie right and down of where they are, cells."""
+    """Return the displacement of a layer's colours to the right and down, in cells."""
     cells = ROOM.cell_centres(wall)
     there = away_from_corners(layer)
     right, down = (
@@ -84,7 +84,7 @@ def displacement_cells(layer: Layer, wall: int) -> NDArray[np.float64]:
 
 def test_a_room_is_painted_where_it_is(tmp_path: Path) -> None:
     layers = painted(tmp_path, *panorama(tmp_path))
-    # All but the floor.
+    # All surfaces except the floor.
     for wall in range(5):
         truth, mine = ROOM.colours(wall, ROOM.cell_centres(wall)), []
         for layer in (each for each in layers if each.wall == wall):
@@ -92,7 +92,7 @@ def test_a_room_is_painted_where_it_is(tmp_path: Path) -> None:
             there = away_from_corners(layer)
             if there.sum() < FEWEST_CELLS:
                 continue
-            # A cell to the side is 13 levels at the median.
+            # A displacement of one cell changes colours by 13 levels (median).
             assert np.abs(displacement_cells(layer, wall)).max() < 0.02, (layer.source, wall)
             wrong = np.abs(layer.rgb - truth)[there]
             assert np.percentile(wrong, 99) < 4.0, (layer.source, wall)

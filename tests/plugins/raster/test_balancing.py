@@ -1,4 +1,4 @@
-"""Intensities of scans brought together: what was put into them comes out again."""
+"""Balanced intensities of scans: known effects are removed again."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ORIGIN = (1000.0, 2000.0, 100.0)
 
 
 def slab() -> Slab:
-    """The wall y = 0 of 4 x 3 m, seen from the south."""
+    """Return the slab of the wall y = 0, 4 m x 3 m, seen from the south."""
     frame = samples.facing_south(0.01, 400, 300, np.array([-2.0, 0.0, 1.5]) + ORIGIN)
     return Slab(frame=frame, front_m=0.05, behind_m=0.03)
 
@@ -32,12 +32,12 @@ def albedo(points: np.ndarray) -> np.ndarray:
 
 
 def cloud(n_scans: int = 3, n_points: int = 40_000) -> tuple[PointCloud, np.ndarray]:
-    """A wall seen by several scans, with a tenth of the points off it; and what each should be."""
+    """Return a wall in several scans, with some points off the wall, and true intensities."""
     rng = np.random.default_rng(0)
     points = np.column_stack(
         [rng.uniform(-2.3, 2.3, n_points), np.zeros(n_points), rng.uniform(-1.8, 1.8, n_points)]
     )
-    # Before the slab, behind it, and just within.
+    # In front of the slab, behind it, and just inside.
     points[::10, 1], points[1::10, 1], points[2::10, 1] = -0.06, 0.04, -0.04
     scan = rng.integers(0, n_scans, n_points)
     rays = STATIONS[scan] - points
@@ -66,9 +66,9 @@ def test_scale_range_and_incidence_are_told_from_places_that_several_scans_see(
     on_wall = (np.abs(points[:, 0]) < 2.0) & (np.abs(points[:, 2]) < 1.5)
     on_wall &= (points[:, 1] < 0.03) & (points[:, 1] > -0.05)
     assert 0.3 < on_wall.mean() < 0.9
-    # What does not lie on the wall stays.
+    # Points that are not on the wall are unchanged.
     np.testing.assert_array_equal(found.intensity[~on_wall], known.intensity[~on_wall])
-    # As the first scan would see all from three metres, straight on.
+    # As seen by the first scan from three metres at perpendicular incidence.
     ratio = found.intensity[on_wall] / true[on_wall]
     spread_before = np.std(known.intensity[on_wall] / true[on_wall])
     assert np.std(ratio) < 0.05 * spread_before
@@ -83,7 +83,7 @@ def test_without_scans_that_are_known_nothing_changes_and_that_is_said(
     plain = replace(known, **{name: None})
     ctx = scenes.context(tmp_path)
     assert balanced(plain, [slab()], ctx) is plain
-    # Nor where no two scans overlap.
+    # Nor if no scans overlap.
     alone, _ = cloud(n_scans=1, n_points=4_000)
     assert balanced(alone, [slab()], ctx) is alone
     assert len(ctx.warnings) == 2

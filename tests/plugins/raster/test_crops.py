@@ -1,4 +1,4 @@
-"""Parts of walls: the cells of a crop are those of the whole wall, and void beyond its outline."""
+"""Parts of walls: a crop has the cells of the whole wall, and is void outside its outline."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ def test_a_crop_holds_the_cells_of_the_whole_wall(
 
 def test_cells_beyond_a_polygon_are_void(tmp_path: Path) -> None:
     whole, _ = rastered(tmp_path)
-    # A triangle: right of the line from (1, 3) to (3, 1), below v = 1.
+    # A triangle to the right of the line from (1, 3) to (3, 1), below v = 1.
     wall, _ = rastered(tmp_path, crop=[[1.0, 3.0], [3.0, 1.0], [3.0, 3.0]])
     assert wall.frame.shape == (16, 16)
     rows, columns = np.mgrid[8:24, 8:24] + 0.5
-    # The cells on the diagonal have their centres on it and belong to neither side for certain.
+    # Cells with their centres on the diagonal may be on either side.
     inside, on = columns + rows > 32.0, columns + rows == 32.0
     kept = wall.mask == SurfaceMask.MEASURED
     np.testing.assert_array_equal(kept[~on], inside[~on])

@@ -1,4 +1,4 @@
-"""Why cells are empty: walls with openings, things before them and sparse points, all known."""
+"""Causes of empty cells: walls with known openings, objects in front and sparse points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests import samples
 
 CODES = {"wall-behind-buffer", "wall-front-left-out", "wall-hidden", "wall-sparse", "wall-unseen"}
 CAUSES = ("behind", "before", "hidden", "sparse", "unseen")
-# A wall of 4 m x 3 m seen along +y, points 8 mm apart, cells of 2 cm; depth is -y.
+# A wall of 4 m x 3 m seen along +y, with points 8 mm apart and 2 cm cells; depth is -y.
 WALL = scenes.KnownWall(
     normal=np.array([0.0, -1.0, 0.0]),
     top_left=np.array([0.0, 0.0, 3.0]),
@@ -26,7 +26,7 @@ WALL = scenes.KnownWall(
     shape=(150, 200),
 )
 STEP_M = 0.008
-# Half a tile on each side of what is empty, 5 cm, of openings of 0.8 m and more.
+# Tolerance: half a 5 cm tile on each side of openings of 0.8 m or more.
 SHARE = 0.015
 
 
@@ -49,7 +49,7 @@ def without(
 def causes(
     cloud: PointCloud, folder: Path, **params: object
 ) -> tuple[dict[str, float], list[Diagnostic]]:
-    """Share of empty cells by cause, and the codes that are reported."""
+    """Return the shares of empty cells by cause, and diagnostics."""
     _, ctx = scenes.rastered(cloud, WALL.planes(), folder, **{"gsd_m": WALL.gsd_m, **params})
     named = scenes.numbers(ctx)
     shares = {cause: named[f"void_{cause}_share"] for cause in CAUSES}
@@ -70,7 +70,7 @@ def test_what_lies_behind_the_buffer_is_told_with_its_depth(tmp_path: Path) -> N
     (one,) = said
     assert (one.code, one.values["behind_m"]) == ("wall-behind-buffer", 1.3)
     assert "buffer_behind_m=1.3" in one.remedy
-    # An opening that shows nothing has no setting.
+    # For an opening that shows nothing, there is no setting to suggest.
     shares, said = causes(scenes.cloud_of(wall), tmp_path)
     assert shares == only("unseen", 1.5 * 1.5 / 12.0)
     assert [(one.code, one.remedy) for one in said] == [("wall-unseen", "")]
@@ -85,7 +85,7 @@ def test_cells_finer_than_the_scan_are_told_from_holes(tmp_path: Path) -> None:
     assert "gsd_m" in said[0].remedy
 
 
-# A wall of 40 x 40 cells of 2 cm, void in the middle: four by four tiles of three cells each.
+# A wall of 40 x 40 cells of 2 cm, with a void of 4 x 4 tiles (3 x 3 cells each) in the middle.
 VOID = slice(9, 21)
 VOID_SHARE = 144 / 1600
 
@@ -96,7 +96,7 @@ def stated(
     station: tuple[float, float, float] | None = None,
     free_m: float = 1.0,
 ) -> dict[str, float]:
-    """Why the void is empty, by points (n, 3): metres right, down and before the wall."""
+    """Return the causes of the void, given points (n, 3): metres right, down and in front."""
     frame = samples.facing_south(0.02, 40, 40)
     count = np.ones(frame.shape, dtype=np.uint32)
     count[VOID, VOID] = 0
@@ -127,7 +127,7 @@ def stated(
 
 
 def in_each_tile(depth_m: float, count: int = 2) -> NDArray[np.float64]:
-    """So many points at one depth in each tile of the void."""
+    """Return a number of points at one depth in each tile of the void."""
     middles = 0.02 * (np.arange(VOID.start, VOID.stop, 3) + 1.5)
     right, down = (axis.ravel() for axis in np.meshgrid(middles, middles))
     tiles = np.column_stack([right, down, np.full(right.size, depth_m)])
@@ -155,7 +155,7 @@ def test_two_points_behind_or_before_a_tile_tell_why_it_is_empty(
     depth_m: float, count: int, cause: str
 ) -> None:
     assert stated(in_each_tile(depth_m, count)) == {cause: pytest.approx(1.0)}
-    # Porticoes stand five metres before a wall at most.
+    # Objects count up to five metres in front of a wall.
     assert stated(in_each_tile(4.9), free_m=np.inf) == {"before": pytest.approx(1.0)}
     assert stated(in_each_tile(5.1), free_m=np.inf) == {"unseen": pytest.approx(1.0)}
 
@@ -164,7 +164,7 @@ def test_what_stands_before_counts_before_what_lies_behind() -> None:
     both = np.vstack([in_each_tile(-1.0), in_each_tile(0.5)[:16]])
     both[:24:2, 2] -= 0.3
     both[-12:, 2] += 0.2
-    # The first half of the tiles.
+    # Half of the tiles have points in front.
     assert stated(both) == {"before": pytest.approx(0.5), "behind": pytest.approx(0.5)}
 
 
@@ -174,25 +174,25 @@ def test_what_stands_before_counts_before_what_lies_behind() -> None:
 def test_a_screen_hides_what_lies_between_it_and_the_station_but_for_their_ends(
     along_m: float, cause: str
 ) -> None:
-    # Seen at half a right angle from 4.24 m away; the screen stands square to the rays.
+    # The void is seen at 45 degrees from 4.24 m; the screen is perpendicular to the rays.
     middle, station = np.array([0.3, 0.3, 0.0]), np.array([3.3, 0.3, 3.0])
     way = (station - middle) / np.linalg.norm(station - middle)
     across = np.array([way[2], 0.0, -way[0]])
     off = 0.02 * np.arange(-25, 26)
     side, up = (axis.ravel() for axis in np.meshgrid(off, off))
     screen = middle + along_m * way + side[:, None] * across + up[:, None] * [0.0, 1.0, 0.0]
-    # Nothing right before the void.
+    # Remove points directly in front of the void.
     screen = screen[(screen[:, 2] > 1.0) | (screen[:, 0] > 0.45) | (screen[:, 2] < 0.15)]
     room = np.array([[-3.0, -3.0, -1.0], [5.0, 4.0, 5.0]])
     points = np.vstack([screen, np.repeat(room, 40, axis=0)])
     found = stated(points, station=(3.3, 0.3, 3.0))
     assert found.get(cause, 0.0) > 0.8
-    # Nobody looks from behind the wall.
+    # No station sees the wall from behind.
     assert stated(points, station=(3.3, 0.3, -3.0)) == {"hidden": pytest.approx(1.0)}
 
 
 def screened(station: tuple[float, float, float], *stray: tuple[float, float, float]) -> float:
-    """Share of the void that a screen 2 m before it hides from a station."""
+    """Return the share of the void that a screen 2 m in front of it hides from a station."""
     off = 0.05 * np.arange(-40, 41) + 0.3
     right, down = (axis.ravel() for axis in np.meshgrid(off, off))
     screen = np.repeat(np.column_stack([right, down, np.full(right.size, 2.0)]), 2, axis=0)
@@ -202,9 +202,9 @@ def screened(station: tuple[float, float, float], *stray: tuple[float, float, fl
 
 @pytest.mark.parametrize("far_m", [5.0, 5e6, 5e12])
 def test_a_station_may_stand_anywhere(far_m: float) -> None:
-    # Two points at the origin of a survey grid may be taken for one.
+    # A station may be at the origin of a survey grid.
     assert screened((0.3, 0.3, far_m)) == pytest.approx(1.0)
-    # From the side its rays pass beside the screen.
+    # From the side, the rays pass the screen.
     assert screened((4.0 * far_m, 0.3, far_m)) == 0.0
-    # Stray points far away cost no voxels.
+    # Distant stray points do not enlarge the voxels.
     assert screened((0.3, 0.3, 5.0), (far_m, far_m, far_m)) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""How far walls reach: rooms and facades of known corners, with and without what bounds them."""
+"""Extents of walls: rooms and facades with known corners, with and without adjoining planes."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from tests import raster_scenes as scenes
 from tests import samples
 from tests.long_loops import long_only
 
-# The wall is seen along +y at y = 0, 4 m wide and 3 m high; depth is -y.
+# The wall is at y = 0, seen along +y, 4 m wide and 3 m high; depth is -y.
 WIDTH_M, HEIGHT_M = 4.0, 3.0
 STEP_M = 0.006
 NOISE_M = 0.001
 GSD_M = 0.01
-# Points beside a corner are left out by three sigmas of the adjoining surface, then whole cells.
+# Near a corner, points within three sigmas of the adjoining surface are omitted, then whole cells.
 CORNER_M = 3.0 * NOISE_M + GSD_M
 
 
 def patch(x: tuple[float, float], depth: tuple[float, float], z: tuple[float, float]) -> NDArray:
-    """Points (n, 3) of a rectangle along two axes; the third has both ends alike."""
+    """Return points (n, 3) of a rectangle along two axes; both limits of the third are equal."""
     ranges = [x, (-depth[1], -depth[0]), z]
     along = [np.arange(low, high + 1e-9, STEP_M) for low, high in ranges]
     grids = np.meshgrid(*along, indexing="ij")
@@ -50,7 +50,7 @@ def wall(
 def planes_of(
     x: tuple[float, float], z: tuple[float, float], *adjoining: tuple[NDArray, NDArray]
 ) -> Planes:
-    """The wall's plane with the rectangle of its points, and planes as (normal, corners)."""
+    """Return the wall's plane with the rectangle of its points, and adjoining planes."""
     outline = np.array([[x[0], 0, z[1]], [x[0], 0, z[0]], [x[1], 0, z[0]], [x[1], 0, z[1]]])
     normals = np.array([[0.0, -1.0, 0.0], *(normal for normal, _ in adjoining)])
     corners = np.array([outline, *(rectangle for _, rectangle in adjoining)])
@@ -83,7 +83,7 @@ ROOM = (
     level(0.0, (0.0, 3.0), towards=1.0),
     level(HEIGHT_M, (0.0, 3.0), towards=-1.0),
 )
-# Of what adjoins a wall its nearest metre counts; half as much again is scanned.
+# Adjoining surfaces are scanned up to 1.5 m; only the nearest metre is used.
 SCANNED_M = (0.0, 1.5)
 SIDES = (
     patch((0.0, 0.0), SCANNED_M, (0.0, HEIGHT_M)),
@@ -91,21 +91,22 @@ SIDES = (
     patch((0.0, WIDTH_M), SCANNED_M, (0.0, 0.0)),
     patch((0.0, WIDTH_M), SCANNED_M, (HEIGHT_M, HEIGHT_M)),
 )
-# A cornice 12 cm before the wall over its topmost 30 cm, and a pilaster 10 cm before its left end.
+# A cornice 12 cm in front of the wall on its topmost 30 cm, and a pilaster 10 cm in front of its
+# left end.
 CORNICE = patch((0.0, WIDTH_M), (0.12, 0.12), (2.7, HEIGHT_M))
 PILASTER = patch((0.0, 0.25), (0.1, 0.1), (0.0, 2.7))
-# What of the plane's own points is left beside them.
+# The part of the plane that these leave uncovered.
 BESIDE_X, BESIDE_Z = (0.25, WIDTH_M), (0.0, 2.7)
 
 
 def extent(cloud: PointCloud, planes: Planes, stations: Any = None, **reach: Any) -> Extent:
-    """How far the first wall reaches."""
+    """Return the extent of the first wall."""
     sought = {"front_m": None, "behind_m": None, "least_m": 0.15, **reach}
     return extent_of(sampled(cloud), planes, 0, Reach(**sought), stations=stations, threads=1)
 
 
 def assert_reaches(found: Extent, planes: Planes, *, atol: float = CORNER_M) -> None:
-    """The raster of the first wall is that of the room, in world x and z."""
+    """Assert that the raster of the first wall ends at the room's corners, in world x and z."""
     frame = found.widened(frame_of(planes, 0, gsd_m=GSD_M, margin_m=0.0))
     edges_m = frame.corners_world()[[1, 3]][:, [0, 2]]
     np.testing.assert_allclose(edges_m, [[0.0, 0.0], [WIDTH_M, HEIGHT_M]], atol=atol)
@@ -119,16 +120,16 @@ def test_a_wall_reaches_over_cornice_and_pilaster_to_what_adjoins_it(tmp_path: P
         for rectangle in ("room", "points")
     )
     (one,), (other,) = found.walls, points.walls
-    # Growth adds whole cells and moves none.
+    # Growth adds whole cells without moving the others.
     moved = one.frame.wall_from_world(other.frame.corners_world()[:1])[0, :2]
     np.testing.assert_allclose(moved, np.rint(moved), atol=1e-6)
     assert other.frame.shape == (270, 375)
     edges_m = one.frame.corners_world()[[1, 3]][:, [0, 2]]
     np.testing.assert_allclose(edges_m, [[0.0, 0.0], [WIDTH_M, HEIGHT_M]], atol=CORNER_M)
-    # 3 mm: the median of a few points, and half a step between rows of a scan.
+    # 3 mm for the median of a few points and half a step between rows of a scan.
     assert np.nanmedian(one.depth_m[2:20]) == pytest.approx(0.12, abs=0.003)
     assert np.nanmedian(one.depth_m[60:200, 2:20]) == pytest.approx(0.10, abs=0.003)
-    # Nothing of the adjoining walls is taken for the wall's relief.
+    # No part of the adjoining walls is treated as relief.
     assert np.nanmax(one.depth_m) < 0.13
 
 
@@ -156,13 +157,12 @@ def test_where_no_plane_ends_it_a_wall_ends_with_its_points() -> None:
     planes = planes_of(BESIDE_X, BESIDE_Z)
     found = extent(scanned(wall(BESIDE_X, BESIDE_Z), CORNICE, PILASTER, *SIDES), planes)
     assert_reaches(found, planes)
-    # A ceiling seen along is no relief: the buffer stays that of cornice and pilaster.
+    # A ceiling in edge view is not relief; the buffer is that of cornice and pilaster.
     assert found.front_m == pytest.approx(0.15, abs=0.03)
 
 
 def test_a_facade_without_anything_about_it_keeps_the_rectangle_of_its_points() -> None:
-    # Ground that rises slowly towards the viewer, stray points about the wall, and a cable that
-    # leaves it.
+    # Ground that rises slowly towards the viewer, stray points around the wall, and a cable.
     ground = patch((-2.0, 6.0), (0.0, 2.0), (0.0, 0.0))
     ground[:, 2] -= 0.03 * ground[:, 1]
     rng = np.random.default_rng(8)
@@ -170,13 +170,13 @@ def test_a_facade_without_anything_about_it_keeps_the_rectangle_of_its_points() 
     cable = patch((WIDTH_M, WIDTH_M + 0.9), (0.02, 0.02), (1.5, 1.52))
     planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M))
     found = extent(scanned(wall(), ground, stray, cable), planes)
-    # Ground 1 m and more before the wall lies 3 cm lower than its foot at most.
+    # Ground at least 1 m in front of the wall is at most 3 cm lower than its foot.
     assert_reaches(found, planes, atol=0.03)
     assert (found.front_m, found.behind_m) == (0.15, 0.15)
 
 
 def test_the_buffer_follows_a_door_that_stands_back() -> None:
-    # Its jamb on one side seen, and a room 3 m behind a window.
+    # A jamb is visible on one side, and a room 3 m behind a window.
     whole = wall()
     in_door = (abs(whole[:, 0] - 1.0) < 0.4) & (whole[:, 2] < 2.0)
     in_window = (abs(whole[:, 0] - 3.0) < 0.4) & (abs(whole[:, 2] - 1.5) < 0.4)
@@ -185,13 +185,13 @@ def test_the_buffer_follows_a_door_that_stands_back() -> None:
     outside = patch((2.6, 3.4), (-3.0, -3.0), (1.1, 1.9))
     cloud = scanned(whole[~in_door & ~in_window], jamb, leaf, outside)
     found = extent(cloud, planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)))
-    # A step in depth, and what is added beyond the relief.
+    # With a depth step, and the margin beyond the relief.
     assert (found.front_m, found.behind_m) == (0.15, pytest.approx(0.36, abs=0.06))
 
 
 def test_the_cornice_of_an_adjoining_wall_is_no_relief_of_this_one() -> None:
-    # Two steps, as cornices have them, run along the left wall towards the viewer, and a cupboard
-    # that is deeper than any relief stands beside the right wall.
+    # Two steps of a cornice run along the left wall towards the viewer, and a cupboard deeper than
+    # any relief is next to the right wall.
     beside = [
         patch((0.08, 0.08), (0.0, 3.0), (2.7, 2.84)),
         patch((0.0, 0.08), (0.0, 3.0), (2.7, 2.7)),
@@ -203,13 +203,14 @@ def test_the_cornice_of_an_adjoining_wall_is_no_relief_of_this_one() -> None:
     ]
     planes = planes_of((0.0, WIDTH_M), BESIDE_Z, *ROOM)
     found = extent(scanned(wall(z=BESIDE_Z), CORNICE, *beside, *SIDES), planes)
-    # Of the wall's own cornice: half a step in depth, and what is added beyond the relief.
+    # From the wall's own cornice: half a depth step, and the margin beyond the relief.
     assert found.front_m == pytest.approx(0.15, abs=0.03)
     assert_reaches(found, planes)
 
 
 def test_the_underside_of_a_cornice_does_not_end_the_wall() -> None:
-    # A cornice of 0.2 m: its underside and that of the left wall's make one plane, found as such.
+    # A cornice of 0.2 m, whose underside forms one detected plane with that of the left wall's
+    # cornice.
     cornice = patch((0.0, WIDTH_M), (0.2, 0.2), (2.6, HEIGHT_M))
     under = patch((0.0, WIDTH_M), (0.0, 0.2), (2.6, 2.6))
     beside = patch((0.0, 0.2), (0.2, 3.0), (2.6, 2.6))
@@ -220,7 +221,7 @@ def test_the_underside_of_a_cornice_does_not_end_the_wall() -> None:
 
 
 def quiet(*patches: NDArray, **reach: float | None) -> Extent:
-    """How far the wall of a cloud without noise, of a fourth of the points, reaches."""
+    """Return the extent of a wall from a quarter of the points, without noise."""
     cloud = scenes.cloud_of(np.vstack(patches)[::4])
     return extent(cloud, planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)), **reach)
 
@@ -232,12 +233,12 @@ def part(x: tuple[float, float], depth_m: float, z: tuple[float, float]) -> NDAr
 def test_a_wall_grows_by_a_metre_at_most_where_a_fifth_of_a_line_of_cells_is_covered() -> None:
     strips = (
         part((-0.8, 0.0), 0.0, (0.0, HEIGHT_M)),
-        # Of 3 m a fifth is 0.6.
+        # A fifth of 3 m is 0.6 m.
         part((WIDTH_M, WIDTH_M + 0.5), 0.0, (1.0, 1.45)),
         part((0.0, WIDTH_M), 0.0, (HEIGHT_M, HEIGHT_M + 1.4)),
         part((1.0, 2.2), 0.0, (-0.4, 0.0)),
     )
-    # But for a fiftieth of the outermost points, which may be stray.
+    # Without a fiftieth of the outermost points, which may be stray points.
     found = quiet(wall(), *strips)
     np.testing.assert_allclose(found.growth_m, [0.8, 0.0, 1.0, 0.4], atol=0.03)
 
@@ -246,10 +247,10 @@ def test_a_wall_grows_by_a_metre_at_most_where_a_fifth_of_a_line_of_cells_is_cov
     ("depths_m", "front_m"),
     [
         ((0.12,), 0.14),
-        # Of 2.5 cm each, five steps hang together and six do not.
+        # Five steps of 2.5 cm are bridged, six are not.
         ((0.16,), 0.1),
         ((0.1, 0.2, 0.3, 0.4), 0.42),
-        # Where a column ends beyond reach, nothing of it is relief.
+        # A column that extends beyond the limit is not relief.
         ((0.1, 0.2, 0.3, 0.4, 0.5, 0.58), 0.1),
         ((0.1, 0.3), 0.12),
     ],
@@ -260,7 +261,7 @@ def test_relief_hangs_together_over_steps_of_a_tenth_of_a_metre(
 ) -> None:
     steps = [part((1.0, 2.0), depth, (1.0, 2.0)) for depth in depths_m]
     found = quiet(wall(), *steps, least_m=0.1)
-    # A step in depth of 2.5 cm, and 2 cm beyond the relief.
+    # A depth step of 2.5 cm, and 2 cm beyond the relief.
     assert found.front_m == pytest.approx(front_m, abs=0.03)
     assert found.front_m == round(found.front_m, 3)
     assert found.behind_m == 0.1
@@ -271,10 +272,10 @@ def test_what_is_set_is_not_looked_for() -> None:
     found = quiet(wall(), step, front_m=0.07)
     assert (found.front_m, found.behind_m) == (0.07, 0.15)
     back = part((1.0, 2.0), -0.11, (1.0, 2.0))
-    # Of steps of 2.5 cm the farther end, and 2 cm beyond.
+    # The farther end of a depth step of 2.5 cm, and 2 cm beyond.
     found = quiet(wall(), back, least_m=0.06)
     assert (found.front_m, found.behind_m) == (0.06, pytest.approx(0.14, abs=0.03))
-    # Tiny relief decides no buffer.
+    # Tiny relief does not influence the buffer.
     boss = part((1.5, 1.59), 0.11, (1.5, 1.59))
     assert quiet(wall(), boss, least_m=0.05).front_m < 0.1
     elsewhere = part((0.0, WIDTH_M), 0.8, (0.0, HEIGHT_M))
@@ -288,7 +289,7 @@ def test_a_frame_is_widened_by_whole_cells() -> None:
     np.testing.assert_allclose(grown.origin_world, frame.origin_world - [0.2, 0.0, 0.0])
 
 
-# --- surfaces next to a wall, and their reports ---
+# --- adjoining surfaces and their reports ---
 
 
 def rectangle_of(planes: Planes) -> Any:
@@ -313,7 +314,7 @@ def beside(side: str, beyond_m: float, towards: float) -> tuple[NDArray, NDArray
 def test_a_plane_bounds_the_side_that_it_lies_beside(
     side: str, beyond_m: float, towards: float
 ) -> None:
-    # Neither what stands on the wall nor what lies farther off.
+    # Neither planes on the wall nor planes farther away.
     for far_m in (-0.11, 1.01):
         assert bound_by(beside(side, far_m, towards)) is None
     place = beside(side, beyond_m, towards)
@@ -321,15 +322,15 @@ def test_a_plane_bounds_the_side_that_it_lies_beside(
     assert found.side == side
     assert found.beyond_m == pytest.approx(beyond_m)
     assert found.askew_m == pytest.approx(0.0, abs=1e-9)
-    # Three deviations of its points, 2 cm at most.
+    # Three sigmas of its points, at most 2 cm.
     assert found.noise_m == pytest.approx(3.0 * NOISE_M)
     assert found.line_m == pytest.approx(beyond_m - 3.0 * NOISE_M)
     assert bound_by(place, rms_m=np.full(2, 0.01)).noise_m == 0.02
-    # Of what the plane is thick by, relief apart, where that is known.
+    # Based on the thickness of the plane without relief, if known.
     thick = Thickness(sigma_m=0.002, width_95_m=0.008, scan_step_m=0.01)
     for thickness, noise_m in (((None, thick), 0.006), ((thick, None), 3.0 * NOISE_M)):
         assert bound_by(place, thickness=thickness).noise_m == pytest.approx(noise_m)
-    # Positive inside: at the middle of the wall by as much as that is away.
+    # Distances are positive inside, here at the middle of the wall.
     middle = found.offset_m + found.slopes @ [0.5 * WIDTH_M, 0.5 * HEIGHT_M, 0.2]
     away = 0.5 * (WIDTH_M if side in ("left", "right") else HEIGHT_M) + beyond_m
     assert middle == pytest.approx(away)
@@ -338,12 +339,12 @@ def test_a_plane_bounds_the_side_that_it_lies_beside(
 @pytest.mark.parametrize("turn_deg", [0.0, -5.0, 24.0, 28.0])
 def test_a_plane_that_runs_askew_is_farther_at_one_end(turn_deg: float) -> None:
     turn = np.radians(turn_deg)
-    # Through the left side's middle, turned about the wall's normal.
+    # Through the middle of the left side, rotated about the wall's normal.
     normal = np.array([np.cos(turn), 0.0, np.sin(turn)])
     corners = upright(0.0, (0.0, 3.0), towards=1.0)[1]
     point = np.array([-0.7, 0.0, 0.5 * HEIGHT_M])
     found = bound_by((normal, corners), offset=np.array([0.0, normal @ point]))
-    # Beyond a sine of nine tenths it is neither beside nor above.
+    # If the sine is less than 0.9, the plane is neither beside nor above the wall.
     if abs(np.cos(turn)) < 0.9:
         assert found is None
         return
@@ -356,11 +357,11 @@ def test_a_plane_that_runs_askew_is_farther_at_one_end(turn_deg: float) -> None:
 @pytest.mark.parametrize(
     ("share", "off_m", "depth_m", "left_m"),
     [
-        # Of the wall's own points between the planes at 0.1 and 0.3 m, along most of the side.
+        # The wall's own points are between the planes at 0.1 and 0.3 m, along most of the side.
         (0.4, 0.2, 0.01, 0.3),
         (0.28, 0.2, 0.01, 0.1),
         (0.4, 0.35, 0.01, 0.1),
-        # On its relief, too; what stands farther before the wall is not its own.
+        # Relief is included; points farther in front are not part of the wall.
         (0.4, 0.2, 0.14, 0.3),
         (0.4, 0.2, 0.16, 0.1),
     ],
@@ -382,12 +383,12 @@ def test_a_plane_ends_no_wall_that_goes_on_behind_it_to_the_next(
     assert found.beyond_m == pytest.approx(left_m)
 
 
-# A basin 2.4 m deep and 0.9 m high that stands before the middle of the wall, and hides that part.
+# A basin 2.4 m deep and 0.9 m high that hides the middle of the wall.
 BASIN_X, BASIN_Z, BASIN_M = (1.2, 2.8), (0.3, 1.2), 2.4
 
 
 def basin(first_m: float = 0.0) -> list[NDArray]:
-    """Its top, front and sides, from a depth on, and the wall behind it."""
+    """Return its top, front and sides, from a given depth on, and the wall behind it."""
     points = wall()
     x, z = points[:, 0], points[:, 2]
     hidden = (x > BASIN_X[0]) & (x < BASIN_X[1]) & (z > BASIN_Z[0]) & (z < BASIN_Z[1])
@@ -418,7 +419,7 @@ def test_what_stands_far_before_a_wall_belongs_to_it_where_it_hangs_together_wit
     if case == "joined by the ground":
         patches.append(patch((0.0, WIDTH_M), (0.0, 2.9), (0.0, 0.0)))
         patches.append(patch(BASIN_X, (BASIN_M, BASIN_M), (0.0, BASIN_Z[0])))
-    # The other side of a room, or the step of a basin that was turned the wrong way.
+    # The opposite side of a room, or the step of a basin with a wrong side.
     y, height_m = (-0.5, 0.2) if "guessed" in case else (-3.0, HEIGHT_M)
     facing = np.array([[0, y, height_m], [0, y, 0], [WIDTH_M, y, 0], [WIDTH_M, y, height_m]])
     others = [(np.array([0.0, 1.0, 0.0]), facing)] if "faces" in case else []

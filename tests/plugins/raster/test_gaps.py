@@ -1,4 +1,4 @@
-"""Missing points are recovered between their neighbours in the scan's own grid, and no others."""
+"""Only missing points between neighbours in the scan's grid are interpolated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthoflow.products import PointCloud, SurfaceMask, Wall
 from tests import raster_scenes as scenes
 
 KNOWN = scenes.upright_wall(shape=(40, 60))
-# Per cell: steep, but points two steps apart still lie within layer_m.
+# Slope per cell: steep, but points two steps apart differ by less than layer_m.
 SLOPE_M = 0.004
 
 
@@ -29,7 +29,7 @@ def depth_m(columns: NDArray[np.float64]) -> NDArray[np.float64]:
 def scanned(
     step_cells: float, *, missing: NDArray[np.bool_] | None = None, depths: str = "slope"
 ) -> PointCloud:
-    """A scan whose rows and columns lie so far apart on the wall, turned by a few degrees."""
+    """Return a scan with given row and column spacing on the wall, rotated by a few degrees."""
     n = int(120 / step_cells)
     row, column = (grid.ravel() for grid in np.mgrid[:n, :n])
     turned = np.radians(7.0)
@@ -45,7 +45,7 @@ def scanned(
         intensity=(0.2 + 0.01 * u).astype(np.float32),
         rgb=np.repeat(np.rint(2.0 * v)[:, None], 3, axis=1).astype(np.uint8),
     )
-    # Twelve thousand and more: grids start anywhere.
+    # Row and column numbers may begin with any number, here above 12,000.
     return dataclasses.replace(
         cloud, row=(row + 12_000).astype(np.uint32), column=column.astype(np.uint32)
     )
@@ -54,7 +54,7 @@ def scanned(
 def test_a_coarse_scan_is_recovered_linear_between_its_points(tmp_path: Path) -> None:
     wall = rastered(scanned(2.4), tmp_path, surface="topmost")
     recovered = wall.mask == SurfaceMask.RECOVERED
-    # The rim is not between points.
+    # The border is not between points.
     inner = np.zeros(KNOWN.shape, dtype=bool)
     inner[4:-4, 4:-4] = True
     assert (wall.mask[inner] != SurfaceMask.VOID).all()
@@ -65,7 +65,7 @@ def test_a_coarse_scan_is_recovered_linear_between_its_points(tmp_path: Path) ->
     np.testing.assert_allclose(
         wall.intensity[rows, columns], 0.2 + 0.01 * (columns + 0.5), atol=1e-6
     )
-    # Rounded where the points are coloured, and once more where they are mixed.
+    # Colours are rounded for the points, and again after interpolation.
     np.testing.assert_allclose(wall.rgb[rows, columns, 0], 2.0 * (rows + 0.5), atol=1.01)
     assert (wall.count[recovered] == 0).all()
     assert np.isnan(wall.sigma_m[recovered]).all()
@@ -85,7 +85,8 @@ def test_single_missing_points_are_recovered_on_the_slope_they_lie_on(
             np.abs(wall.depth_m[rows, columns] - depth_m(columns.astype(np.float64) + 0.5))
         )
     assert np.median(errors_m[0]) < 1e-6
-    # Cells between others on all sides lie on their slope, at the rim on that of their neighbours.
+    # Cells surrounded by others are on their slope; at the border, they are on that of their
+    # neighbours.
     assert np.median(errors_m[1]) < 0.02 * SLOPE_M
     assert errors_m[1].max() < 2.0 * SLOPE_M
 
@@ -117,5 +118,5 @@ def test_without_grid_or_reach_nothing_is_spanned(
     cloud = dataclasses.replace(scanned(2.4), **dict.fromkeys(without))
     params: dict[str, object] = {"surface": "topmost", "recover_gap_cells": 1, **reach}
     wall = rastered(cloud, tmp_path, **params)
-    # Cells in the middle between four points, too far for a gap of one cell.
+    # Cells in the middle between four points are too far away for a gap of one cell.
     assert np.mean(wall.mask[4:-4, 4:-4] == SurfaceMask.VOID) > 0.1

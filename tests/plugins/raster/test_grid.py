@@ -1,4 +1,4 @@
-"""`raster.grid`: depth, spread, intensity and colour of walls that are known to the cell."""
+"""`raster.grid`: depth, spread, intensity and colour of walls with known cells."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ def test_each_cell_gets_the_depth_intensity_and_colour_of_its_point(
     tmp_path: Path, surface: str, at_survey: bool
 ) -> None:
     known = scenes.leaning_wall(at_survey=at_survey)
-    # The mean of few points is carried to the centre of the cell; one point stands where it is.
+    # The mean of few points is extrapolated to the centre of the cell; a single point is not.
     moved_cells = 0.0 if surface in {"median", "mean"} else 0.45
     cloud, depths_m = one_point_per_cell(known, moved_cells=moved_cells)
     walls, _ = rastered(cloud, known.planes(), tmp_path, gsd_m=known.gsd_m, surface=surface)
     wall = walls.walls[0]
     assert wall.frame.shape == known.shape
-    # 0.05 mm: what a survey may lose to arithmetic; in fact float32 offsets of a metre lose less.
+    # Computations may change a survey by 0.05 mm; float32 offsets of a metre are more accurate.
     np.testing.assert_allclose(wall.depth_m, depths_m, atol=5e-5)
     columns, rows = scenes.cell_centres(known.shape)
     np.testing.assert_array_equal(wall.rgb.reshape(-1, 3), scenes.checker(columns, rows))
-    # Points are 1e-6 cells off their centres, where the slope of a checker is 1.
+    # Points are 1e-6 cells from the centres, where the slope of the pattern is 1.
     np.testing.assert_allclose(wall.intensity.ravel(), cloud.intensity, atol=1e-5)
     assert (wall.count == 1).all()
     assert (wall.mask == SurfaceMask.MEASURED).all()
@@ -64,7 +64,7 @@ def test_each_cell_gets_the_depth_intensity_and_colour_of_its_point(
 
 
 def cell_with(depths_m: ArrayLike, folder: Path, **params: object) -> Wall:
-    """The wall of a cloud whose points all lie in cell (4, 3), the first nearest to its centre."""
+    """Return the wall of a cloud with all points in cell (4, 3), the first nearest the centre."""
     known = scenes.upright_wall()
     depths_m = np.array(depths_m)
     shift = np.linspace(0.0, 0.04, len(depths_m))
@@ -80,7 +80,8 @@ def cell_with(depths_m: ArrayLike, folder: Path, **params: object) -> Wall:
     [("centre", 0.015), ("topmost", 0.25), ("mean", 0.0754), ("median", 0.012)],
 )
 def test_surfaces_choose_as_they_say(tmp_path: Path, surface: str, depth_m: float) -> None:
-    # Median: the layer at 1 cm has three points, the one at 25 cm a stray one, the one behind one.
+    # Median: the layer at 1 cm has three points, that at 25 cm a stray point, the rear one a single
+    # point.
     wall = cell_with([0.015, 0.25, 0.010, 0.012, 0.09], tmp_path, surface=surface)
     assert wall.depth_m[4, 3] == pytest.approx(depth_m, abs=1e-7)
     assert wall.count[4, 3] == 5
@@ -92,7 +93,7 @@ def test_surfaces_choose_as_they_say(tmp_path: Path, surface: str, depth_m: floa
 def test_a_median_never_lies_between_two_surfaces(tmp_path: Path) -> None:
     wall = cell_with([0.0, 0.001, 0.08, 0.081], tmp_path, surface="median")
     assert wall.depth_m[4, 3] == pytest.approx(0.0805, abs=1e-7)
-    # Intensity of the two points on that surface only: (0.3667 + 0.5) / 2.
+    # Intensity only of the two points on that surface: (0.3667 + 0.5) / 2.
     assert wall.intensity[4, 3] == pytest.approx(0.43333, abs=1e-5)
 
 
@@ -142,7 +143,7 @@ def test_narrow_gaps_are_recovered_and_windows_stay_void(tmp_path: Path) -> None
     wall = rastered(thinned, known.planes(), tmp_path, gsd_m=known.gsd_m)[0].walls[0]
     assert wall.mask[5, 7] == wall.mask[25, 33] == SurfaceMask.RECOVERED
     assert wall.depth_m[5, 7] == pytest.approx(depths_m[5, 7], abs=1e-6)
-    # It rises evenly along and across the rows.
+    # It rises linearly along and across the rows.
     assert wall.intensity[5, 7] == pytest.approx(
         cloud.intensity.reshape(known.shape)[5, 7], abs=1e-5
     )
@@ -213,7 +214,7 @@ def test_what_an_adjoining_plane_cuts_off_is_warned_of_from_5_cm(
 ) -> None:
     known, ctx = scenes.leaning_wall(), scenes.context(tmp_path)
     extent = Extent(front_m=0.1, behind_m=0.1, cut_m={"left": askew_m})
-    # Of which a margin takes two centimetres.
+    # A margin takes 2 cm of this.
     params = RasterGrid.Params(margin_m=0.02)
     grid._report_doubts([0], known.planes(), params, lambda _: extent, ctx)
     assert [one.values["cut_m"] for one in ctx.diagnostics] == [pytest.approx(0.051)] * n_warnings

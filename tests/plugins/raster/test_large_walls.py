@@ -1,4 +1,4 @@
-"""Walls too large for the memory: what is made of them lies in files, and bands are the whole."""
+"""Walls too large for memory: results are in files, and bands give the same result as the whole."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ BAND_CELLS = 1 << 17
 
 @pytest.fixture
 def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let walls of a megacell count as large."""
+    """Treat walls of a million cells as large."""
     monkeypatch.setattr(bands, "_BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.ortho.surfaces._BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.ortho.painting.TILE_CELLS", 128)
@@ -47,7 +47,7 @@ def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def peak_bytes() -> Iterator[Callable[[], int]]:
-    """The most memory that arrays took meanwhile; mapped files do not count."""
+    """Measure the peak memory of arrays, without memory-mapped files."""
     tracemalloc.start()
     try:
         yield lambda: tracemalloc.get_traced_memory()[1]
@@ -69,7 +69,7 @@ def in_files(walls: Walls, folder: Path) -> Walls:
 
 
 def large_inputs(folder: Path, n: int = 5) -> DsmBackward.In:
-    """The wall of `ortho_scenes` in cells of an nth, its rasters in files, and two photos."""
+    """Return the wall of `ortho_scenes` with n times smaller cells, in files, and two photos."""
     where = ortho_scenes.frame()
     fine = dataclasses.replace(where, gsd_m=where.gsd_m / n, width=n * 320, height=n * 240)
     depths = np.repeat(np.repeat(ortho_scenes.depth_m(), n, axis=0), n, axis=1)
@@ -89,13 +89,13 @@ def test_layers_are_painted_and_reported_without_memory_per_cell(
     (tmp_path / "small").mkdir()
     small, inputs = large_inputs(tmp_path / "small", 2), large_inputs(tmp_path)
     method, n_cells = DsmBackward, inputs.walls.walls[0].mask.size
-    method().run(small, method.Params(), context(tmp_path))  # compiled and loaded, in files too
+    method().run(small, method.Params(), context(tmp_path))  # compiled and loaded, also with files
     with peak_bytes() as peak_of_small:
         method().run(small, method.Params(), context(tmp_path))
         of_bands = peak_of_small()
     with peak_bytes() as peak:
         layers = method().run(inputs, method.Params(), context(tmp_path)).layers
-        # A layer holds eight bytes per cell, what hides cells two more.
+        # A layer has eight bytes per cell, the occluding surface two more.
         assert peak() - of_bands < 0.5 * n_cells, (peak(), of_bands)
     assert len(layers.layers) == 2
     assert all(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers.layers)
@@ -111,7 +111,7 @@ def test_walls_are_painted_from_a_cloud_without_memory_per_cell(tmp_path: Path) 
     with peak_bytes() as peak:
         found = PointcloudDirect().run(inputs, PointcloudDirect.Params(), context(tmp_path))
         (layer,) = found.layers.layers
-        # A layer holds nine bytes per cell, and the winners of a wall sixteen.
+        # A layer has nine bytes per cell, and the selected points of a wall sixteen.
         assert peak() < 4.0 * layer.mask.size, peak()
     assert holds_cells(layer.mask, LayerMask.PAINTED)
 
@@ -141,7 +141,7 @@ def tall_wall() -> tuple[raster_scenes.KnownWall, PointCloud]:
 
 
 def large_layers(folder: Path) -> tuple[Layer, ...]:
-    """Two photos whose quality falls from left to right, and the other way, in files."""
+    """Return two photos in files, with quality falling to the right and to the left."""
     shape, rng = (1500, 1000), np.random.default_rng(2)
     ramp = np.broadcast_to(np.linspace(1.0, 2.0, shape[1], dtype=np.float32), shape)
     layers = []
@@ -168,7 +168,7 @@ def test_mosaics_are_joined_and_reported_without_memory_per_cell(
     inputs = MosaicSeams.In(layers=Layers(layers=layers))
     with peak_bytes() as peak:
         MosaicSeams().run(inputs, params, context(tmp_path))
-        # The layers hold sixteen bytes per cell, the orthoimage six; a cut is that of 30 000 cells.
+        # The layers have 16 bytes per cell, the orthoimage 6; a cut has 30,000 cells.
         assert peak() < 4.0 * layers[0].mask.size + 30e6, peak()
 
 
@@ -178,7 +178,7 @@ def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path)
     params = {"gsd_m": known.gsd_m, "buffer_m": 0.3}
     with peak_bytes() as peak:
         walls, _ = raster_scenes.rastered(cloud, known.planes(), tmp_path, **params)
-        # A wall keeps 13 bytes per cell without colours, and a band has a fifteenth of the cells.
+        # A wall without colours has 13 bytes per cell, and a band has a fifteenth of the cells.
         assert peak() < 10.0 * walls.walls[0].mask.size, peak()
 
 
@@ -200,7 +200,7 @@ def test_walls_may_take_three_quarters_of_the_memory_and_large_ones_that_of_a_ba
     assert bytes_needed([huge]) == bytes_needed([larger])
     tins = [bytes_needed([shape], is_tin=True) for shape in (huge, larger)]
     assert tins[1] - tins[0] == 790 * 8000 * 20_000
-    # Whatever the memory, cells are numbered with 32 bits.
+    # With any amount of memory, cells are numbered with 32 bits.
     give_memory(1e15)
     require_memory([samples.facing_south(0.01, (1 << 16) - 1, 1 << 15)])
     with pytest.raises(MethodError, match=r"gsd_m = 0.01 m gives 2\.15e\+09 cells"):

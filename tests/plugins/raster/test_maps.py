@@ -1,4 +1,4 @@
-"""Rasters of horizontal planes as maps: which are, where they lie, and what is refused."""
+"""Rasters of horizontal planes as maps: conditions, positions and refusals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def level(tilt_rad: float = 0.0, *, down: bool = False, up: np.ndarray = UP) -> Planes:
-    """A plane 4.03 m wide and 3.01 m deep at survey coordinates."""
+    """Return a plane 4.03 m wide and 3.01 m deep at survey coordinates."""
     corners = np.array([[0, 3.01, 0], [0, 0, 0], [4.03, 0, 0], [4.03, 3.01, 0]])
     turn = rotation_from_vector(np.array([tilt_rad, 0.0, 0.0]))
     corners = corners @ turn.T + SURVEY_SHIFT_M
@@ -55,7 +55,7 @@ def test_whole_cells_reach_beyond_the_rectangle_alike_on_all_sides(tmp_path: Pat
     frame, warnings = placed(planes, tmp_path)
     assert (frame.map_crs, warnings) == ("site", [])
     off_m = frame.corners_world() - planes.corners[0]
-    # 4.03 m are 41 cells, 3.01 m are 31.
+    # 4.03 m are 41 cells, 3.01 m are 31 cells.
     np.testing.assert_allclose(np.abs(off_m), np.tile([0.035, 0.045, 0.0], (4, 1)), atol=1e-9)
 
 
@@ -67,7 +67,7 @@ def test_only_level_planes_seen_from_above_are_maps(
     assert frame.map_crs is None
     assert "floor 1 is tilted by 5.7 deg" in warnings[0]
     assert "applies to no raster" in warnings[1]
-    # Nor is a ceiling.
+    # A ceiling is not a map either.
     frame, warnings = placed(level(down=True), tmp_path)
     assert frame.map_crs is None
     assert "none of the planes is level and seen from above" in warnings[0]
@@ -93,7 +93,7 @@ def test_what_is_no_map_in_metres_is_refused(
 def test_no_address_is_asked_what_its_coordinate_system_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # GDAL takes addresses, too, and workflows and records of strangers may name any.
+    # GDAL also accepts URLs, and untrusted workflows and records may contain any.
     monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")
     with socket.create_server(("127.0.0.1", 0)) as server:
         crs = f"http://127.0.0.1:{server.getsockname()[1]}/crs"

@@ -46,12 +46,12 @@ def test_walls_are_told_in_numbers(ctx: StepContext) -> None:
     reporting.report(ctx, [first, second], 0.0042, UP)
     assert numbers(ctx) == {
         "n_walls": 2.0,
-        # The first one looks south.
+        # The first wall faces south.
         "omega_deg": pytest.approx(270.0),
         "phi_deg": pytest.approx(0.0),
         "area_m2": pytest.approx(6 * 0.005**2),
         "n_points_inside": 19.0,
-        # Of 1, 1, 2, 3, 5, 7 points; cells with a spread have 2, 3, 5 and 7 mm.
+        # Cells have 1, 1, 2, 3, 5 and 7 points, and spreads of 2, 3, 5 and 7 mm.
         "points_per_cell": 2.5,
         "scan_step_mm": pytest.approx(4.2),
         "gsd_mm": 5.0,
@@ -79,8 +79,7 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(ctx: Step
     assert [(one.subject, one.values["measured"], one.values["interpolated"]) for one in fine] == [
         ("coarse", pytest.approx(1 / 3), 0.0),
         ("close", pytest.approx(1 / 3), pytest.approx(1 / 3)),
-        # An uneven scan leaves many cells to be interpolated, however close its points lie
-        # elsewhere.
+        # In an uneven scan, many cells are interpolated, however dense points are elsewhere.
         ("gaps", pytest.approx(1 / 3), pytest.approx(1 / 6)),
     ]
     assert ["gsd_m=0.019" in fine[0].remedy, "gsd_m=0.0051" in fine[1].remedy] == [True, True]
@@ -88,7 +87,7 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(ctx: Step
 
 
 def test_cells_that_are_advised_are_no_longer_too_fine(ctx: StepContext) -> None:
-    step_m = 0.003_37  # asks for 0.005055 m, whose nearest number of two digits is what is given
+    step_m = 0.003_37  # needs 0.005055 m; the nearest number with two digits is that given
     reporting.warn(ctx, [wall([[1]])], [step_m], "laser")
     [said] = ctx.diagnostics
     [advised] = re.findall(r"gsd_m=([0-9.]+)", said.remedy)
@@ -129,7 +128,7 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(ctx: StepC
             "void_unseen_share": 0.0375,
         }
     )
-    # Less than a tenth of either is not worth words.
+    # Less than a tenth of either is not reported.
     assert ctx.warnings == []
 
 

@@ -1,4 +1,4 @@
-"""Which planes become walls: relief of a larger wall does not become a wall of its own."""
+"""Selection of walls: relief of a larger wall does not become a separate wall."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def buffer_m(_: int) -> tuple[float, float]:
 
 
 def planes(*walls: tuple[float, float, float, float]) -> Planes:
-    """Walls facing -y: (depth in front of y = 3, left, width, tilt about z in degrees)."""
+    """Return walls facing -y, given as (depth in front of y = 3, left, width, degrees about z)."""
     normals, offsets, corners = [], [], []
     for depth_m, left_m, width_m, tilt_deg in walls:
         tilt = np.radians(tilt_deg)
@@ -63,16 +63,16 @@ MAIN = (0.0, 0.0, 5.0, 0.0)
 @pytest.mark.parametrize(
     ("other", "is_covered"),
     [
-        # Pilasters before it and panels behind it, but not beyond its buffers.
+        # Pilasters in front of it and panels behind it, but not beyond its buffers.
         ((0.08, 1.0, 3.0, 0.0), True),
         ((0.11, 1.0, 3.0, 0.0), False),
         ((-0.14, 1.0, 3.0, 0.0), True),
         ((-0.16, 1.0, 3.0, 0.0), False),
-        # Inclined to it by five degrees, and its other side.
+        # Planes inclined by five degrees, and its other side.
         ((0.0, 2.0, 0.5, 4.8), True),
         ((0.0, 2.0, 0.5, -5.2), False),
         ((0.0, 0.0, 5.0, 180.0), False),
-        # 4 m wide: so much of it lies within the wall.
+        # Planes 4 m wide that are partly within the wall.
         ((0.0, 1.76, 4.0, 0.0), True),
         ((0.0, 1.84, 4.0, 0.0), False),
         ((0.0, -0.76, 4.0, 0.0), True),
@@ -94,34 +94,34 @@ def test_covered_planes_are_named_with_the_wall_that_shows_them() -> None:
     chosen = chosen_planes(four, CHOICE, buffer_m)
     assert chosen == [0, 2]
     assert covered_planes(four, CHOICE, buffer_m, chosen) == {1: 0, 3: 0}
-    # Two that are too small for a wall, or not asked for, are no riddle.
+    # Planes that are too small for a wall, or not requested, are not reported.
     assert covered_planes(four, but(CHOICE, min_area_m2=6.5), buffer_m, chosen) == {}
     assert covered_planes(four, but(CHOICE, ranks=(0, 2)), buffer_m, [0, 2]) == {}
 
 
 def test_a_plane_that_a_larger_one_of_less_support_shows_is_no_wall_of_its_own() -> None:
-    # The second is seen at one end of the third, which is larger and has fewer points.
+    # The second plane is at one end of the third, which is larger and has fewer points.
     three = planes((0.0, 0.0, 3.0, -90.0), (0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0))
     chosen = chosen_planes(three, CHOICE, buffer_m)
     assert chosen == [0, 2]
     assert covered_planes(three, CHOICE, buffer_m, chosen) == {1: 2}
-    # The best supported plane stays a wall in any case.
+    # The plane with the most points always is a wall.
     best = planes((0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0))
     assert chosen_planes(best, CHOICE, buffer_m) == [0, 1]
 
 
 def test_a_plane_is_not_covered_by_one_that_was_left_out_itself() -> None:
-    # The third lies within the second's buffer, but not within the first's.
+    # The third is within the buffer of the second, but not within that of the first.
     three = planes(MAIN, (0.10, 0.0, 5.0, 0.0), (0.20, 0.0, 5.0, 0.0))
     assert chosen_planes(three, CHOICE, buffer_m) == [0, 2]
 
 
 def test_the_wall_nearest_to_a_point_is_chosen() -> None:
-    # Facing -y: y = 3 from x = 0 to 5, y = 1 from 6 to 7, and one across at x = 5.
+    # Facing -y: y = 3 from x = 0 to 5 and y = 1 from 6 to 7; and a perpendicular one at x = 5.
     three = planes(MAIN, (2.0, 6.0, 1.0, 0.0), (0.0, 5.0, 2.0, -90.0))
     cases = {
         (2.0, 2.9, 1.0): 0,
-        (2.0, 3.4, 1.0): 0,  # behind it is as near as before it
+        (2.0, 3.4, 1.0): 0,  # points behind a wall are as near as those in front
         (6.5, 1.2, 1.0): 1,
         (5.1, 1.5, 1.0): 2,
         (5.6, 1.1, 1.0): 1,  # on the extension of 1's plane, and nearer than 2
@@ -140,7 +140,7 @@ def test_a_covered_or_small_wall_is_chosen_when_a_point_is_near_it() -> None:
 
 
 def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
-    # Two ends of one wall, and a wall in the gap between them that stands 0.4 m behind.
+    # Two ends of one wall, and a wall 0.4 m behind the gap between them.
     ends = planes(MAIN, (-0.4, 2.0, 1.0, 0.0))
     parts = planes((0.0, 0.0, 1.0, 0.0), (0.0, 4.0, 1.0, 0.0))
     known = replace(
@@ -161,7 +161,7 @@ def test_a_rank_that_no_plane_has_is_refused() -> None:
 
 
 def leaning(degrees: float) -> Planes:
-    """One plane of 4 m2 whose normal rises by so much above the horizon."""
+    """Return a plane of 4 m2 whose normal rises above the horizon by an angle."""
     rise = np.radians(degrees)
     normal = np.array([[0.0, -np.cos(rise), np.sin(rise)]])
     down = np.array([0.0, -2.0 * np.sin(rise), -2.0 * np.cos(rise)])

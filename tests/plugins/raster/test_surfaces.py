@@ -1,4 +1,4 @@
-"""The rules of `raster.grid` that look beyond one cell, what they make of steps and turns."""
+"""Rules of `raster.grid` that use several cells, at steps and for rotated walls."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rastered(cloud: PointCloud, known: scenes.KnownWall, folder: Path, **params:
 def scattered(
     known: scenes.KnownWall, *, per_cell: float, seed: int = 4, noise_m: float = 0.0
 ) -> tuple[PointCloud, NDArray[np.float64], NDArray[np.float64]]:
-    """Points all over a wall with steps, their columns and rows (n, 2), and depths."""
+    """Return random points on a wall with steps, their columns and rows (n, 2), and depths."""
     rng = np.random.default_rng(seed)
     rows, columns = known.shape
     n_points = int(per_cell * rows * columns)
@@ -50,7 +50,7 @@ def test_intensity_and_colour_are_carried_to_the_centres_of_cells_alone_and_toge
 ) -> None:
     known = scenes.leaning_wall(shape=(20, 30))
     cloud, places, _ = scattered(known, per_cell=1.5)
-    # Both rise along the wall: carried to its centre, a cell has what lies there.
+    # Both rise along the wall, so extrapolated values are those at the cell centres.
     rising = (places[:, 0] / 30.0).astype(np.float32)
     cloud = dataclasses.replace(
         cloud,
@@ -67,7 +67,7 @@ def test_intensity_and_colour_are_carried_to_the_centres_of_cells_alone_and_toge
     np.testing.assert_array_equal(no_intensity.rgb, both.rgb)
     few = (both.count == 1) & np.isfinite(both.depth_m)
     off = np.abs(both.intensity - (np.arange(30) + 0.5) / 30.0)[few]
-    # Points lie a quarter of a cell beside the centre on average.
+    # On average, points are a quarter of a cell from the centre.
     assert np.median(off) < 0.1 * 0.25 / 30.0
 
 
@@ -115,9 +115,9 @@ def test_denoising_takes_the_noise_and_leaves_the_steps(tmp_path: Path) -> None:
         measured = wall.mask == SurfaceMask.MEASURED
         errors = (wall.depth_m - true_m)[measured]
         rms_mm[surface] = 1e3 * float(np.sqrt(np.mean(errors**2)))
-        # Steps of 8 and 10 cm every ten cells stay where they are, to the cell.
+        # Steps of 8 and 10 cm every ten cells keep their positions.
         assert np.abs(errors).max() < 0.02
-    # A cell has about two points, sqrt(1/2) of 2 mm and some cells with one.
+    # A cell has about two points (sqrt(1/2) of 2 mm); some cells have one.
     assert 1.2 < rms_mm["median"] < 2.0
     assert rms_mm["denoised"] < 0.45 * rms_mm["median"]
 
@@ -194,17 +194,17 @@ def test_strays_in_the_shadow_of_an_edge_are_left_void_and_sparse_surfaces_stay(
     rng = np.random.default_rng(8)
     true_m = np.where(columns < 40, 0.07, 0.0)
     in_shadow = (columns > 40) & (columns < 60)
-    # What a scan has there: few distances, mixed of both sides of the edge, and outliers.
+    # As in a scan: few points, mixed distances from both sides of the edge, and outliers.
     is_stray = in_shadow & (rng.random(len(columns)) < 0.06)
     depths_m = np.where(is_stray, rng.uniform(0.0, 0.2, len(columns)), true_m)
-    # A dark surface that gives few points, all on one plane.
+    # A dark surface with few points, all on one plane.
     is_dark = (columns > 100) & (columns < 140)
     kept = np.where(in_shadow, is_stray, ~is_dark | (rng.random(len(columns)) < 0.25))
     cloud = scenes.cloud_of(known.world(columns[kept], rows[kept], depths_m[kept]))
     wall = rastered(cloud, known, tmp_path, buffer_m=0.3, recover_gap_cells=0).walls[0]
     measured = (wall.mask == SurfaceMask.MEASURED).ravel()
     assert np.count_nonzero(is_stray & kept) > 100
-    # Some strays lie beside each other like a slope.
+    # Some stray points form a slope.
     assert np.mean(measured[is_stray & kept]) < 0.1
     np.testing.assert_array_equal(measured[~in_shadow], kept[~in_shadow])
 
@@ -221,7 +221,7 @@ def test_a_wall_rastered_in_bands_is_the_same(
     banded = rastered(cloud, known, tmp_path, **params).walls[0]
     for name in ("count", "mask", "rgb", "percentiles_m", "intensity", "depth_m", "sigma_m"):
         one, other = getattr(whole, name), getattr(banded, name)
-        # How strongly noise is taken out follows from the noise of a band.
+        # The strength of the filter depends on the noise of each band.
         tolerance = 0.2 * NOISE_M if surface == "denoised" and name == "depth_m" else 1e-6
         np.testing.assert_allclose(one, other, atol=tolerance, err_msg=name)
     assert list(tmp_path.glob("*/allocated/*"))
@@ -240,7 +240,7 @@ def test_values_are_linear_in_the_triangles_between_points() -> None:
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]]
     has_point = rng.random(SHAPE) < 0.67
     has_point[30:180, 20:175] = False
-    # As far as a gable: beside it nothing was scanned.
+    # A gable, beside which nothing was scanned.
     has_point[rows + 60 < columns / 2] = False
     count = int(np.count_nonzero(has_point))
     places = np.column_stack([columns[has_point], rows[has_point]]) + rng.random((count, 2))
@@ -260,7 +260,7 @@ def test_values_are_linear_in_the_triangles_between_points() -> None:
     assert 0.7 < is_inside.mean() < 0.99
     np.testing.assert_array_equal(np.isfinite(found[0]), is_inside)
     apart = np.column_stack(found) - expected
-    # Coordinates in float32 may turn single triangles.
+    # float32 coordinates may change a few triangles.
     is_off = np.abs(apart[is_inside]) > [1e-5, 1e-3, 0.6, 0.6, 0.6]
     assert is_off.any(axis=1).mean() < 1e-4
     two = np.where(point < 2, point, NO_POINT).ravel()
@@ -302,7 +302,7 @@ def test_a_cell_that_fewer_than_two_around_agree_with_is_a_speck(
 
 @pytest.mark.parametrize(("n_known", "is_speck"), [(5, False), (6, True)])
 def test_fewer_than_six_known_cells_say_nothing(n_known: int, is_speck: bool) -> None:
-    # Alone in the void, so that nothing is denser around.
+    # Isolated in the void, so that no denser area is nearby.
     depth_m = np.full((40, 40), np.nan, dtype=np.float32)
     around = [(18, 18), (18, 20), (18, 22), (20, 18), (20, 22), (22, 18)][:n_known]
     for k, (row, column) in enumerate(around):
@@ -323,13 +323,13 @@ def test_cells_two_rows_or_columns_off_are_around_and_three_are_not() -> None:
 
 
 def shadow(*, agree: int, n: int = 6) -> NDArray[np.float32]:
-    """A dense wall, a shadow 10 columns wide, and in it a cell with some around it."""
+    """Return a dense wall with a shadow of 10 columns that contains a few cells."""
     depth_m = flat(40, 60)
     depth_m[:, 25:35] = np.nan
     depth_m[20, 30] = 0.5
     places = [(20, 28), (20, 32), (18, 30), (22, 30), (17, 28), (23, 32)][:n]
     for k, (row, column) in enumerate(places):
-        # Those that do not agree differ from each other, too.
+        # Cells that do not agree also differ from each other.
         depth_m[row, column] = 0.5 if k < agree else 0.7 + 0.1 * k
     return depth_m
 
@@ -350,7 +350,7 @@ def test_sparse_cells_agree_but_for_a_slope_of_one_in_two() -> None:
         depth_m[:, 25:35] = np.nan
         for row, column in ((20, 30), (20, 28), (20, 32), (20, 34)):
             depth_m[row, column] = 0.5 + slope * GSD_M * (column - 30)
-        # The farthest is four columns off.
+        # The farthest cell is four columns away.
         assert specks(depth_m)[20, 30] == is_speck, slope
 
 
@@ -363,7 +363,7 @@ def test_sparse_cells_agree_within_four_deviations_of_the_noise(
     depth_m[20, 30] = 0.5
     for row, column in ((20, 28), (20, 32), (18, 30), (22, 30)):
         depth_m[row, column] = 0.5 + 0.001 * sigmas
-    # Cells so small that the slope of a surface adds nothing.
+    # Cells are so small that the slope of a surface has no effect.
     cleaned = without_specks(depth_m, gsd_m=1e-9, layer_m=LAYER_M, threads=1)
     assert np.isnan(cleaned[20, 30]) == is_speck
 
@@ -379,7 +379,7 @@ def test_noise_of_less_than_a_fiftieth_of_a_millimetre_is_left() -> None:
 
 
 def weighed(depth_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
-    """A bilateral filter, cell by cell: neighbours in a disc, both weights those of a Gauss."""
+    """Apply a bilateral filter cell by cell, with a disc of neighbours and Gaussian weights."""
     radius, sigma = 4, 2.0
     high = np.pad(depth_m, radius, mode="edge")
     total, weights = np.zeros_like(depth_m), np.zeros_like(depth_m)
@@ -409,7 +409,7 @@ SURFACES = ("median", "denoised", "nearest", "centre", "topmost", "mean", "tin")
 
 @dataclasses.dataclass(frozen=True)
 class Scattered:
-    """Points on a wall of TURNED, with a step in depth, a slope and a window."""
+    """Points on a wall of TURNED, with a depth step, a slope and a window."""
 
     places: NDArray[np.float64]
     depths_m: NDArray[np.float64]
@@ -454,11 +454,11 @@ def rastered_turned(scattered: Scattered, turn: Turn, folder: Path, **params: ob
 def assert_turned(wall: Wall, turned: Wall, turn: Turn) -> None:
     np.testing.assert_array_equal(turned.count, turn.raster(wall.count))
     np.testing.assert_array_equal(turned.mask, turn.raster(wall.mask))
-    # Coordinates are float32 from another corner, and sums run in another order: a millionth.
+    # A millionth, since float32 coordinates have another origin and sums another order.
     for name, tolerance in (("depth_m", 2e-6), ("sigma_m", 2e-6), ("intensity", 2e-5)):
         one, other = getattr(wall, name), getattr(turned, name)
         np.testing.assert_allclose(other, turn.raster(one), atol=tolerance, err_msg=name)
-    # Rounded to whole levels.
+    # Colours are rounded to whole levels.
     off = np.abs(turned.rgb.astype(int) - turn.raster(wall.rgb).astype(int))
     assert off.max() <= 1
     assert (off > 0).mean() < 0.001
@@ -479,11 +479,11 @@ def test_a_turned_cloud_gives_the_turned_raster(tmp_path: Path, surface: str, tu
 def test_even_cells_that_are_all_equally_near_are_weighed_evenly(
     tmp_path: Path, turn: Turn
 ) -> None:
-    """Every other cell is measured, in its very centre: each gap has four that are as near."""
+    """Every other cell is measured at its centre, so each gap has four equally near points."""
     columns, rows = scenes.cell_centres(TURNED)
     places = np.column_stack([columns, rows])
     places = places[(columns + rows) % 2 > 0.5]
-    # Two surfaces side by side: each gap on their border has two that are as near on either.
+    # Two adjacent surfaces: each gap at their border has two equally near points on each.
     scattered = Scattered(places, np.where(places[:, 0] < 21.0, 0.0, 0.0625))
     wall = rastered_turned(scattered, TURNS[0], tmp_path)
     assert_turned(wall, rastered_turned(scattered, turn, tmp_path), turn)
@@ -505,6 +505,6 @@ def test_what_a_raster_shows_is_where_it_is(
     cloud = scenes.cloud_of(known.world(*places.T, np.zeros(len(places))), intensity=shade)
     params: dict[str, object] = {"gsd_m": known.gsd_m, "surface": surface}
     wall = scenes.rastered(cloud, known.planes(), tmp_path, **params)[0].walls[0]
-    # A lattice of one scan may lie on one side of many cells of rules that take a point as it is.
+    # With rules that use a single point, the points of a scan may be on one side of many cells.
     limit = 0.01 if surface == "median" else 0.02
     assert np.abs(scenes.shift_of_waves(wall.intensity)).max() < limit

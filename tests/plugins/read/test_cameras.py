@@ -1,4 +1,4 @@
-"""`read.cameras`, `read.ties` and `read.checkpoints`: what people and programs measured."""
+"""`read.cameras`, `read.ties` and `read.checkpoints`: measurements by people and other programs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def photo(path: str) -> Photo:
 def read_cameras(
     folder: Path, rows: dict[str, str], photos: list[Photo]
 ) -> tuple[Cameras, tuple[str, ...]]:
-    """Cameras that stand at x = 1, 2, 3 ... in the order of the rows."""
+    """Return cameras at x = 1, 2, 3 ... in the order of the rows."""
     text = HEAD + "".join(
         f"{name},{place},0,0,0,0,0,{lens or '24,0,0,0,0,0,0,0,0'}\n"
         for place, (name, lens) in enumerate(rows.items(), 1)
@@ -53,7 +53,8 @@ def places(cameras: Cameras) -> list[float | None]:
         (["x/a.jpg", "y/a.jpg"], ["x/a.jpg", "y/a.jpg"], [1, 2]),
         (["nadir/102MEDIA/a.jpg", "oblique/101MEDIA/a.jpg"], ["oblique/a.jpg"], [2]),
         (["C:\\x\\a.jpg", "C:\\y\\a.jpg"], ["y/a.jpg", "x/a.jpg"], [2, 1]),
-        # The only camera of a name is that of the only photo, wherever both lie.
+        # The only camera with a name belongs to the only photo with that name, whatever their
+        # folders.
         (["elsewhere/a.jpg"], ["here/a.jpg"], [1]),
         (["x/a.jpg", "b.jpg"], ["x/a.jpg", "y/a.jpg", "b.jpg"], [1, None, 2]),
         (["x/a.jpg", "y/a.jpg", "b.jpg"], ["a.jpg", "b.jpg"], [None, 3]),
@@ -112,7 +113,7 @@ def test_ties_come_out_with_our_pixels_and_the_sigmas_that_are_said(tmp_path: Pa
     ties = read_ties(tmp_path, text, "a.jpg;63;47;7;8;634512.345\n", sigma_px=2.0, sigma_m=0.005)
     assert ties.photo_names == ("a.jpg", "b c.jpg")
     np.testing.assert_array_equal(ties.photo, [1, 0, 0])
-    # OpenCV's first pixel centre is at (0, 0), ours at (0.5, 0.5).
+    # In OpenCV, the centre of the first pixel is at (0, 0), in orthoflow at (0.5, 0.5).
     np.testing.assert_array_equal(ties.pixels_photo, [[11.0, 20.75], [0.5, 0.5], [63.5, 47.5]])
     np.testing.assert_array_equal(ties.points_world, [[1, 2, 3], [4, 5, 6], [7, 8, 634512.345]])
     np.testing.assert_array_equal(ties.sigma_px, [0.4, 2.0, 2.0])

@@ -1,4 +1,4 @@
-"""`read.orthoimage`: what other programs made lies where their files say."""
+"""`read.orthoimage`: images from other programs have the positions given in their files."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def read(folder: Path, *paths: Path, wall: int = 0) -> tuple[Orthoimage, ...]:
 
 
 def foreign(folder: Path) -> list[Path]:
-    """A part of the wall's texture at twice the cell size, and the frame of the whole wall."""
+    """Return a part of the wall's texture with cells twice as large, and the frame of the wall."""
     means = inspect_scenes.texture().reshape(140, 2, 180, 2).mean(axis=(1, 3))[5:, 10:]
     values = np.repeat(np.rint(means).astype(np.uint8)[None], 3, axis=0)
     side = 2.0 * inspect_scenes.GSD_M

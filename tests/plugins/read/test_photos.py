@@ -1,4 +1,4 @@
-"""`read.photos`: files as they are, cameras, masks, and no silent damage."""
+"""`read.photos`: unchanged files, cameras, masks, and detection of damage."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CAMERA = "{width: 64, height: 48, fx: 60, fy: 61, cx: 31.5, cy: 23.5}"
 
 
 class PhotoReader(Reader):
-    """Returns the photos of files."""
+    """Function that returns the photos in files."""
 
     def __call__(
         self, *paths: Path, calibration: str | None = None, **params: object
@@ -93,20 +93,20 @@ def test_panoramas_and_fisheyes_become_the_faces_that_they_show(read: PhotoReade
     }
     text = f"cameras:\n  b.jpg: {CAMERA}\n  '*': {FISHEYE}\n"
     photos = read.files(files, calibration=text, panoramas=("360.png",))
-    # A panorama has a lens of its own, whatever the calibration says of all photos.
+    # A panorama has its own lens, even if a calibration applies to all photos.
     assert [photo.name for photo in photos] == [
         *(f"360_{face}.png" for face in ("back", "down", "front", "left", "right", "up")),
         *(f"a_{face}.png" for face in ("down", "front", "left", "right", "up")),
         "b.jpg",
     ]
-    # A right angle: half the side is the focal length, and the side a quarter of the circle.
+    # The angle of view is 90 degrees: the focal length is half the side, a quarter of the circle.
     lens = photos[0].intrinsics
     assert lens is not None
     assert (photos[0].width, lens.fx, lens.cx) == (41, 20.5, 20.5)
     by_name = {photo.name: photo for photo in photos}
     front = by_name["a_front.png"]
     assert front.intrinsics is not None
-    # 40 pixels for a right angle in the middle, of which the photo has no more than 64 x 48.
+    # A face of 90 degrees has 40 pixels; the photo has 64 x 48 pixels.
     assert (front.width, front.intrinsics.fx, front.intrinsics.cx) == (40, 20.0, 20.0)
     assert front.mask is None
     assert by_name["a_left.png"].mask is not None
@@ -141,7 +141,7 @@ def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
         return tuple(f"{camera.photo}: {camera.status}" for camera in found.cameras.cameras)
 
     assert run(given) == tuple(f"a_{face}.png: ok" for face in faces)
-    # If only the poses are connected, the missing input is named.
+    # If only the poses are connected, the error names the missing input.
     with pytest.raises(InputError, match="its lens is a fisheye or a panorama: connect the same"):
         run(None)
 
@@ -168,7 +168,7 @@ def test_other_files_are_left_out_and_counted(read: PhotoReader) -> None:
 def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
     tmp_path: Path, read: PhotoReader, developed: dict[str, bytes], suffix: str
 ) -> None:
-    # Beside its own JPEG a raw photo does no harm.
+    # A raw photo next to its JPEG is ignored.
     paths = made.write(tmp_path, {**developed, "A.CR2": b"II*\0", f"b{suffix}": b"MM\0*"})
     raw = f"photo b{suffix}" if developed else rf"2 photos \(A.CR2, b{suffix}\)"
     with pytest.raises(InputError, match=f"camera raw, .*: {raw}; develop it first to 16-bit TIFF"):
@@ -305,7 +305,7 @@ def test_the_calibration_reaches_the_photos_it_names(read: PhotoReader) -> None:
     assert "the focal length of photo c.jpg is unknown" in read.warnings
 
 
-# The rest
+# Other properties
 
 
 def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(
@@ -333,7 +333,7 @@ INSIDE = np.s_[10:20, 30:50]
 
 
 def picture() -> bytes:
-    """White, with a black rectangle."""
+    """Return a white picture with a black rectangle."""
     grey = np.full(SIZE[::-1], 255, dtype=np.uint8)
     grey[INSIDE] = 0
     return encode_png(grey)
@@ -388,7 +388,7 @@ def test_a_mask_beside_its_photo_is_no_photo(tmp_path: Path) -> None:
     assert photo.name == "a.jpg"
     np.testing.assert_array_equal(masked(photo), expected())
     assert "masks that match no photo" not in said
-    # What ends like a mask, but of no photo, is a photo.
+    # A file named like a mask, but without its photo, is a photo.
     alone, _ = read_masked(tmp_path, [file_in(tmp_path, "white_mask.png", picture())])
     assert [item.name for item in alone] == ["white_mask.png"]
 
@@ -417,7 +417,7 @@ def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
     every = file_in(tmp_path, "all.geojson", polygons("*", RING, [(35, 12), (45, 12), (40, 18)]))
     (first, second), _ = read_masked(tmp_path, files, [every])
     holed = masked(first)
-    # The hole has 30 pixels, give or take those whose centre its border passes.
+    # The hole has 30 pixels, except for those with centres on its border.
     assert not (holed & ~expected()).any()
     assert (expected() & ~holed).sum() == pytest.approx(30, abs=3)
     np.testing.assert_array_equal(masked(second), holed)

@@ -1,4 +1,4 @@
-"""`read.scan`: one cloud in metres from files in any unit, its scales and its pictures."""
+"""`read.scan`: a cloud in metres from files in any unit, its scales and figures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ POINTS = np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (400, 3)), 4)
 
 
 class ScanReader(Reader):
-    """Returns the cloud of files."""
+    """Function that returns the cloud of files."""
 
     def __call__(self, *paths: Path, **params: object) -> PointCloud:
         cloud: PointCloud = self.run(paths, params).cloud
@@ -48,7 +48,7 @@ def read(tmp_path: Path) -> ScanReader:
 
 
 def scan_of(cloud: PointCloud) -> dict[str, Any]:
-    """What is kept of the only scan of a cloud."""
+    """Return the summary of the only scan of a cloud."""
     (scan,) = cloud.source["scans"]  # type: ignore[misc]
     return scan  # type: ignore[return-value]
 
@@ -80,20 +80,20 @@ def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
     sides_m = np.ptp(world_m, axis=0)
     assert [read.metrics[f"extent_{axis}_m"] for axis in "xyz"] == pytest.approx(sides_m, abs=1e-5)
     assert not any(said in read.warnings for said in ("are rounded to", "are kept to"))
-    # Offsets of five to eight metres.
+    # Offsets are five to eight metres.
     assert cloud.source["resolution_m"] == 2.0**-21
 
 
 def test_a_box_keeps_the_points_in_it_and_on_its_faces(tmp_path: Path, read: ScanReader) -> None:
     world_m = POINTS + np.array([634512.347, 486215.781, 112.193])
-    # In feet: the box is in metres, as everything that follows.
+    # The file is in feet; the box is in metres, like all later steps.
     corner = world_m[7]
     box = [[*(corner - 4.0)], [*corner]]
     cloud = read(write_text(tmp_path / "a.xyz", world_m / 0.3048), unit="ft", box=box)
     inside = ((world_m >= corner - 4.0) & (world_m <= corner + 1e-9)).all(axis=1)
     assert 3 < inside.sum() < 300
     kept = cloud.points_world()
-    # 1e-9 m: the corner itself went through feet and back.
+    # Within 1e-9 m, since the corner was converted to feet and back.
     assert len(kept) in (inside.sum(), inside.sum() - 1)
     assert (kept >= corner - 4.00001).all()
     assert (kept <= corner + 1e-5).all()
@@ -105,7 +105,7 @@ def test_a_box_keeps_the_points_in_it_and_on_its_faces(tmp_path: Path, read: Sca
         InputError, match=r"125 are outside .* from \(1.00, 1.00, 1.00\) to \(5.00, "
     ):
         read(path, box=far)
-    # Of several files, one may lie beside the box as a whole.
+    # One of several files may be completely outside the box.
     assert len(read(path, write_text(tmp_path / "c.xyz", steps + 7.0), box=far)) == 8
 
 
@@ -118,7 +118,7 @@ def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
     )
     nodes = [{(0, 0, 0): coarse}, {(0, 0, 0): left, (1, 1, 1): right}]
     path = scan_files.write_copc(tmp_path / "a.copc.laz", nodes)
-    # The file is in feet, and points of its root are half a foot apart.
+    # The file is in feet; the points of its root are half a foot apart.
     assert len(read(path, unit="ft", gsd_m=0.5 * 0.3048)) == 400
     assert len(read(path, unit="ft", gsd_m=0.4 * 0.3048)) == 1200
     box = [[0.0, 0.0, 0.0], [3.9 * 0.3048] * 3]
@@ -195,7 +195,7 @@ def test_several_files_become_one_cloud_whose_scans_have_stations(
     np.testing.assert_array_equal(cloud.scan, np.repeat([0, 1], 400))
     assert (read.metrics["n_scans"], read.metrics["n_stations"]) == (2, 2)
     cloud = read(write_text(tmp_path / "a.xyz", POINTS), scans)
-    # Numbers that would not point to rows of the stations are worse than none.
+    # Scan numbers that are not indices of stations are not stored.
     assert cloud.scan is None
     assert len(cloud) == 1200
     np.testing.assert_allclose(cloud.points_world()[400:800], POINTS, atol=1e-6)
@@ -253,7 +253,7 @@ def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
     assert cloud.intensity is None
     assert cloud.source["intensity_source"] == "luminance"
     assert "the intensity is not laser intensity but the luminance of the colours" in read.warnings
-    # Grey colours that were made from the intensity leave it one.
+    # Grey colours computed from the intensity do not invalidate it.
     rgb = np.repeat(rgb[:, :1], 3, axis=1)
     path = scan_files.write_las(tmp_path / "b.laz", POINTS, intensity=rgb[:, 0] * 200, rgb=rgb)
     cloud = read(path)
@@ -270,7 +270,7 @@ def test_a_picture_from_above_is_drawn(tmp_path: Path, read: ScanReader) -> None
     read(write_text(tmp_path / "a.xyz", POINTS))
     (figure,) = read.ctx.figures
     assert figure.path.read_bytes().startswith(b"RIFF")  # WebP
-    # Of a scan with rows and columns, what the scanner saw as well.
+    # A scan with rows and columns also has a view from the scanner.
     places = np.indices((8, 10)).reshape(2, -1).T * 0.1
     table = np.column_stack([places, np.ones(80), np.linspace(0.0, 1.0, 80)])
     read(scan_files.write_ptx(tmp_path / "a.ptx", [(table, 10, np.eye(4))]))
@@ -324,7 +324,7 @@ def test_real_scans_come_out_whole(
     cloud = read(shared_data / name, up=up)
     assert len(cloud) == n_points
     extremes = [(float(axis.min()), float(axis.max())) for axis in (cloud.x, cloud.y, cloud.z)]
-    # The README's figures are rounded to a millimetre.
+    # The values in the README are rounded to a millimetre.
     np.testing.assert_allclose(np.array(extremes)[:, 0] + cloud.origin, bounds[0], atol=6e-4)
     np.testing.assert_allclose(np.array(extremes)[:, 1] + cloud.origin, bounds[1], atol=6e-4)
     optional = ("rgb", "intensity", "row", "column", "scan", "stations")
@@ -378,7 +378,7 @@ def assembled(
 
 
 def dirtied(clean: PointBlock) -> PointBlock:
-    """A block with each kind of point that cannot be used."""
+    """Return a block with each kind of unusable point."""
     points = clean.points.copy()
     points[3, 1] = np.nan
     points[5, 2] = np.inf
@@ -410,7 +410,7 @@ def test_what_comes_in_blocks_is_what_there_is(
     assert 0 < inside.sum() <= usable.sum() == len(points) - 4
     of_first = np.arange(len(points)) < 40
     own = inside[of_first]
-    # Whole metres near the first points that are kept.
+    # The origin is in whole metres near the first usable points.
     origin = np.floor(np.median(points[of_first][own], axis=0))
     np.testing.assert_array_equal(found.origin, origin)
     assert found.n_points == inside.sum()
@@ -463,7 +463,7 @@ def test_a_coarse_step_is_found(step: float) -> None:
     rounded = step * rng.integers(0, 1000, (3000, 3)) + 12.0 * step
     assert rounding_m(rounded, 1.0) == pytest.approx(step)
     if step in (0.005, 0.01, 0.02, 0.05, 0.1, 0.5):
-        # In millimetres as well, in which half a metre is the coarsest that is looked for.
+        # Also in millimetres, where half a metre is the coarsest step tested.
         assert rounding_m(1000.0 * rounded, 0.001) == pytest.approx(step)
 
 
@@ -475,11 +475,11 @@ Range = tuple[float, float]
     [
         ((2.0, 9.0), (0.0, 10.0), 50.0, (0.0, 50.0, "intensity_max")),
         ((2.0, 9.0), (0.0, 10.0), None, (0.0, 10.0, "stated")),
-        # A millionth beyond is rounding, more than that is another scale.
+        # An excess of a millionth is rounding; more means another scale.
         ((-0.000_005, 10.000_005), (0.0, 10.0), None, (0.0, 10.0, "stated")),
         ((0.0, 10.000_02), (0.0, 10.0), None, (0.0, 10.000_02, "data")),
         ((-0.000_02, 10.0), (0.0, 10.0), None, (-0.000_02, 10.0, "data")),
-        # Limits of which the data take less than a quarter are those of the sensor.
+        # If the data use less than a quarter of the limits, the limits are those of the sensor.
         ((0.0, 2.49), (0.0, 10.0), None, (0.0, 2.49, "data")),
         ((0.0, 2.51), (0.0, 10.0), None, (0.0, 10.0, "stated")),
         ((2.0, 9.0), None, None, (2.0, 9.0, "data")),
@@ -512,7 +512,7 @@ def test_intensities_go_from_nought_to_one_and_what_lies_beyond_is_clipped_and_c
     values = values.astype(np.float32)
     assert normalise(values, scale) == 2
     np.testing.assert_array_equal(values, [0.0, 0.5, 1.0, 0.0, 1.0, np.nan, np.nan, np.nan])
-    # A millionth beyond is not worth counting.
+    # An excess of a millionth is not counted.
     near = np.array([30.0 + 1e-5, 10.0 - 1e-5], dtype=np.float64).astype(np.float32)
     assert normalise(near, scale) == 0
     np.testing.assert_array_equal(near, [1.0, 0.0])
@@ -525,7 +525,7 @@ def test_intensity_that_is_the_grey_of_the_colours_is_told_by_either_grey() -> N
     for grey in (luma, mean.astype(np.float32), 3.0 * luma + 5.0, np.rint(luma)):
         assert (scales.correlation_with_grey(grey, rgb) or 0.0) > 0.999
     assert scales.correlation_with_grey(rng.random(500).astype(np.float32), rgb) is None
-    # A scene of two colours correlates with any intensity, but for what lies beyond roundings.
+    # A scene of two colours correlates with any intensity, so differences beyond rounding decide.
     rgb = np.where(rng.random((500, 1)) < 0.5, 200, 50).astype(np.uint8).repeat(3, axis=1)
     laser = rgb[:, 0] / 255.0 + rng.normal(0.0, 0.005, 500)
     assert scales.correlation_with_grey(laser.astype(np.float32), rgb) is None
@@ -547,11 +547,11 @@ def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
     assert stored(unit) == ([[0, 128, 255]], "0..1")
     assert stored(byte) == ([[0, 128, 255]], "8 bit")
     assert stored(word) == ([[0, 128, 255]], "16 bit")
-    # Zeros and ones are full brightness until a block says that they are of 255.
+    # Zeros and ones are full brightness until a block shows that the scale is 255.
     ones = np.array([[0.0, 1.0, 1.0]], dtype=np.float32)
     assert stored(ones) == ([[0, 255, 255]], "0..1")
     assert stored(ones, byte) == ([[0, 1, 1], [0, 128, 255]], "8 bit")
-    # What was below 256 of 65536 is all but black.
+    # Values below 256 of 65536 are almost black.
     assert stored(byte, word) == ([[0, 0, 1], [0, 128, 255]], "16 bit")
     assert stored(word, byte) == ([[0, 128, 255], [0, 0, 0]], "16 bit")
     assert stored(byte, unit) == ([[0, 128, 255], [0, 0, 1]], "8 bit")
@@ -566,7 +566,7 @@ def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
         (1023.0, None, [0, 102, 255], "10 bit"),
         (4095.0, None, [0, 102, 255], "12 bit"),
         (4095.0, 1023.0, [0, 102, 255], "12 bit"),
-        # What does not fit its limit is read as what it is.
+        # Data that do not fit the limit are scaled by their values.
         (255.0, 1.0, [0, 102, 255], "8 bit"),
         (65535.0, 255.0, [0, 102, 255], "16 bit"),
     ],
@@ -586,26 +586,26 @@ def pixels(encoded: bytes | None) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED))
 
 
-# --- from above ---
+# --- view from above ---
 
 
 def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
-    # A grid of two by one metres with one point per pixel, and a corner with seven more.
+    # A grid of 2 m x 1 m with one point per pixel, and seven more points at one position.
     x, y = np.meshgrid(np.arange(640) / 320.0, np.arange(320) / 320.0)
     grid = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     crowd = np.tile([1.6, 0.8, 3.0], (7, 1))
     shown, frame = plan_view(cloud_of(np.concatenate([grid, crowd])))
-    # The outermost thousandth is cut off.
+    # The outermost thousandth is omitted.
     assert shown.shape[1] == 640
     assert shown.shape[0] == pytest.approx(320, abs=2)
     values, counts = np.unique(shown, return_counts=True)
-    # One point, two where points share a pixel, none between; eight or nine at the crowd.
+    # Pixels have one point, or two or none because of rounding; the dense pixel has eight or nine.
     assert shown.max() == 255
     row, column = np.unravel_index(shown.argmax(), shown.shape)
     assert column / 639 == pytest.approx(0.8, abs=0.01)
-    # Row 0 is the top: four fifths up.
+    # Row 0 is at the top, so this is four fifths up.
     assert 1.0 - row / (len(shown) - 1) == pytest.approx(0.8, abs=0.01)
-    # The middle of that pixel lies at the crowd, in metres of the world.
+    # The centre of that pixel is the dense position, in world metres.
     place = frame.raster_from_wall(np.array([[column + 0.5, row + 0.5]]))[0]
     np.testing.assert_allclose(place, [1.6, 0.8], atol=0.004)
     assert frame.raster_axes == "level"
@@ -614,11 +614,11 @@ def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
     assert int(single) in crowded
 
 
-# --- as its scanner saw it ---
+# --- view from the scanner ---
 
 
 def scanned(rows: int = 20, columns: int = 30) -> PointCloud:
-    """A station in the middle of a cylinder: row 0 lowest, column 0 in the east, to the left."""
+    """Return a scan from the middle of a cylinder; row 0 is lowest, columns run left from the east."""
     row, column = (grid.ravel() for grid in np.mgrid[:rows, :columns])
     azimuth, elevation = np.radians(3.0 * column), np.radians(2.0 * (row - 9.5))
     points = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
@@ -632,7 +632,7 @@ def scanned(rows: int = 20, columns: int = 30) -> PointCloud:
 
 
 def expected_grey(cloud: PointCloud, rows: int, columns: int) -> NDArray[np.uint8]:
-    """Brightness over rows and columns as they are numbered."""
+    """Return the brightness by row and column number."""
     assert cloud.intensity is not None
     values = np.full((rows, columns), np.nan)
     values[cloud.row, cloud.column] = cloud.intensity
@@ -645,10 +645,10 @@ def expected_grey(cloud: PointCloud, rows: int, columns: int) -> NDArray[np.uint
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool) -> None:
     cloud = scanned()
-    # A place from which no point came, and a point more beside it.
+    # A cell of the grid without a point, and an additional point next to it.
     column = np.where((cloud.row == 3) & (cloud.column == 4), 5, cloud.column)
     cloud = replace(cloud, column=column.astype(np.uint32))
-    # Azimuth grows with the columns: to the left.
+    # Azimuth increases with the columns, to the left.
     truth = expected_grey(cloud, 20, 30)[::-1, ::-1]
     if mirrored:
         cloud = replace(cloud, column=29 - cloud.column)
@@ -665,7 +665,7 @@ def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool
 
 
 def wall_scan(*, station_y: float = -2.0) -> PointCloud:
-    """A wall of 4 x 2 m in y = 0 and one of 1 x 2 m beside it, scanned in 80 rows, 200 columns."""
+    """Return walls of 4 m x 2 m in y = 0 and 1 m x 2 m beside it, in 80 rows and 200 columns."""
     row, column = (grid.ravel() for grid in np.mgrid[:80, :200])
     x, z = 0.025 * column, 0.025 * row
     on_main = column < 160
@@ -679,13 +679,13 @@ def wall_scan(*, station_y: float = -2.0) -> PointCloud:
 
 def test_rows_and_columns_are_lines_over_the_fullest_wall() -> None:
     shown = pixels(scan_lines_png(wall_scan()))[..., ::-1]
-    # 3.975 m are 1200 pixels, and what is within 15 cm of the wall is drawn.
+    # 3.975 m are 1200 pixels, and points within 15 cm of the wall are drawn.
     assert shown.shape[1] == 1200
     assert shown.shape[0] == pytest.approx(1200 * 1.975 / 3.975, abs=8)
     is_row = (shown == figures._ROW_RGB).all(axis=2)
     is_column = (shown == figures._COLUMN_RGB).all(axis=2)
-    # Every third of 80 rows, every seventh of 167 columns, straight from edge to edge; the last
-    # of these lie on the other wall, one behind the other and beyond the picture.
+    # Every third of 80 rows and every seventh of 167 columns are straight from edge to edge; the
+    # last columns are on the other wall, behind each other and outside the picture.
     full_rows = (is_row | is_column).mean(axis=1) > 0.98
     full_columns = is_column.mean(axis=0) > 0.98
     assert 26 <= full_rows.sum() <= 27

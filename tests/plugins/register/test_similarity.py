@@ -1,4 +1,4 @@
-"""`register.similarity` finds the transformation that was applied, and says how well."""
+"""`register.similarity` finds a known transformation and its accuracy."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def register(
 ) -> tuple[RegisterSimilarity.Out, dict[str, float]]:
     ctx = scenes.context(folder)
     cloud = scenes.cloud_of(np.random.default_rng(1).uniform(-4.0, 4.0, (500, 3)))
-    # As from photos: its z points down.
+    # As with a cloud from photos, z points down.
     cloud = replace(cloud, up=np.array([0.0, 0.0, -1.0]), stations=STATIONS, stations_source="file")
     inputs = RegisterSimilarity.In(cloud=cloud, points=points, control=control)
     out = RegisterSimilarity().run(inputs, RegisterSimilarity.Params.model_validate(params), ctx)
@@ -90,7 +90,7 @@ def test_residuals_and_what_they_add_up_to_are_told(tmp_path: Path) -> None:
     control = replace(
         points_at(true.apply(source) + off), names=("P5", "P4", "P3", "P2", "P1", "P0")
     )
-    # Pairs go by names, in the order of the points.
+    # Pairs have the same names, in the order of the points.
     points = replace(points_at(source), names=control.names)
     out, metrics = register(tmp_path, points, replace(
         control, names=control.names[::-1], points_world=control.points_world[::-1]
@@ -108,7 +108,7 @@ def test_residuals_and_what_they_add_up_to_are_told(tmp_path: Path) -> None:
         found = [row["dx_mm"], row["dy_mm"], row["dz_mm"]]
         np.testing.assert_allclose(found, 1e3 * values, atol=6e-5)
     length = 1e3 * np.linalg.norm(residual, axis=1)
-    # 18 coordinates less seven parameters.
+    # 18 coordinates minus seven parameters.
     assert metrics["sigma0_mm"] == pytest.approx(1e3 * np.sqrt((residual**2).sum() / 11.0))
     assert metrics["rms_mm"] == pytest.approx(np.sqrt((length**2).mean()))
     assert metrics["max_mm"] == pytest.approx(length.max())

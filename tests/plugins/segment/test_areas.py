@@ -1,4 +1,4 @@
-"""Areas of a relief set cell by cell, and rays followed one by one: which are openings."""
+"""Open areas of a relief defined cell by cell, and rays traced one by one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def flat(depth_m: float = 0.0) -> NDArray[np.float32]:
 
 
 def relief(is_open: NDArray[np.bool_], **changes: object) -> Relief:
-    """A relief of which the open cells lie 0.1 m behind a face at 0."""
+    """Return a relief whose open cells are 0.1 m behind a face at 0."""
     nothing = np.zeros(is_open.shape, dtype=np.bool_)
     made = Relief(
         gsd_m=GSD_M,
@@ -59,7 +59,7 @@ def block(top: int, bottom: int, left: int, right: int) -> NDArray[np.bool_]:
 
 
 def whole(area: Area) -> NDArray[np.bool_]:
-    """An area's cells in the raster."""
+    """Return the cells of an area in the raster."""
     cells = np.zeros((SHAPE[0] + 2, SHAPE[1] + 2), dtype=np.bool_)
     top, left = area.corner[0] + 1, area.corner[1] + 1
     cells[top : top + area.cells.shape[0], left : left + area.cells.shape[1]] = area.cells
@@ -76,7 +76,7 @@ def test_cells_farther_behind_the_face_than_asked_are_open(
     depth[10:30, 20:50] = -behind_m
     found = relief_of(wall(depth), None, BEHIND_M)
     expected = block(10, 30, 20, 50) if is_behind else block(0, 0, 0, 0)
-    # Its corners are rounded by the median of 5 x 5 cells, by three cells each.
+    # The median of 5 x 5 cells rounds the corners by three cells each.
     assert np.count_nonzero(found.is_open ^ expected) == (12 if is_behind else 0)
     np.testing.assert_array_equal(found.is_face, ~expected)
     assert found.face_m == 0.0
@@ -101,9 +101,9 @@ def test_the_face_is_what_more_than_half_of_the_wall_is_on(n_deep_rows: int, fac
     depth[:n_deep_rows] = -0.2
     found = relief_of(wall(depth), None, BEHIND_M)
     assert found.face_m == pytest.approx(face_m, abs=1e-6)
-    # Open is what lies behind the face.
+    # Cells behind the face are open.
     assert found.is_open[5, 40] == (face_m == 0.0)
-    # Cells without depth are of neither half.
+    # Cells without a depth are not counted.
     depth[-10:] = np.nan
     assert relief_of(wall(depth), None, BEHIND_M).face_m == pytest.approx(-0.2, abs=1e-6)
 
@@ -125,7 +125,7 @@ def test_empty_cells_are_open_unless_hidden_and_crossed_only_where_empty() -> No
 def test_of_a_large_wall_every_nth_cell_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     depth = flat()
     depth[9:30, 21:51] = -0.25
-    # 60 x 80 cells: a fourth of them is one too many, a ninth is not.
+    # A quarter of 60 x 80 cells exceeds the limit by one; a ninth does not.
     monkeypatch.setattr(areas, "_CELLS_TOLD", 1199)
     found = relief_of(wall(depth), None, BEHIND_M)
     assert (found.step, found.gsd_m) == (3, pytest.approx(3 * GSD_M))
@@ -159,7 +159,7 @@ def test_bars_across_an_opening_are_part_of_it() -> None:
 def test_a_square_of_the_least_width_fits_into_an_opening(
     axis: int, width: int, is_opening: bool
 ) -> None:
-    # 0.2 m are ten cells; at the border of the raster, too.
+    # 0.2 m are ten cells; the rule also applies at the border of the raster.
     cells = block(0, width, 10, 50) if axis else block(10, 50, 0, width)
     assert len(list(open_areas(relief(cells), WIDTH_LEAST_M, AREA_LEAST_M2))) == is_opening
 
@@ -175,7 +175,7 @@ def test_a_square_of_the_least_width_fits_into_an_opening(
     ],
 )
 def test_the_kind_is_told_by_the_share_of_cells(n_crossed: int, n_empty: int, kind: str) -> None:
-    # 400 cells; rows beside the area tell nothing.
+    # The area has 400 cells; cells outside it have no influence.
     cells = block(10, 30, 10, 30)
 
     def first(count: int) -> NDArray[np.bool_]:
@@ -193,15 +193,15 @@ def test_the_kind_is_told_by_the_share_of_cells(n_crossed: int, n_empty: int, ki
     if n_empty == 400:
         assert area.depth_m is None
     else:
-        # The middle of what was measured, from the face.
+        # Median of the measured depths, from the face.
         assert area.depth_m == pytest.approx(0.4, abs=1e-6)
 
 
 CELL_M = 0.01
-# The wall is seen along +y, its top-left corner at (10, 20, 30): depth is 20 - y.
+# The wall is seen along +y, with its top-left corner at (10, 20, 30); depth is 20 - y.
 CORNER = np.array([10.0, 20.0, 30.0])
 FRONT_M, FAR_BEHIND_M = 0.15, 0.4
-# Cells of a tile of 5 cm.
+# Number of cells along a 5 cm tile.
 SIDE = 5
 
 
@@ -216,7 +216,7 @@ def cloud(
     scan: NDArray[np.integer] | None = None,
     source: str = "file",
 ) -> PointCloud:
-    """Points given as metres (n, 3) right, down and before the wall."""
+    """Return a cloud of points (n, 3) given in metres right, down and in front of the wall."""
     x, y, z = (
         np.ascontiguousarray(axis, dtype=np.float32) for axis in world(ends).T - CORNER[:, None]
     )
@@ -243,7 +243,7 @@ def followed(
     scan: NDArray[np.integer],
     shape: tuple[int, int],
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Crossed and stopped tiles, one ray after the other."""
+    """Return crossed and stopped tiles, computed ray by ray."""
     counts = np.zeros((3, *shape), dtype=int)
     for end, of_scan in zip(ends, scan, strict=True):
         place = end[:2]
@@ -274,14 +274,14 @@ def some_ends(count: int) -> NDArray[np.float64]:
     return np.column_stack([places, depths + 0.05 * rng.uniform(-1.0, 1.0, count)])
 
 
-# The last one stands behind the wall, as does what the scan before it saw of it.
+# The last station is behind the wall.
 STATIONS = np.array([[0.3, 0.2, 2.0], [-1.0, 0.5, 1.2], [0.2, 0.2, -1.0]])
 
 
 @pytest.mark.parametrize("is_known", [True, False], ids=["stations", "squarely"])
 def test_tiles_are_what_each_ray_says(is_known: bool) -> None:
     ends = some_ends(1500)
-    # A fourth scan has no station.
+    # The fourth scan has no station.
     scan = np.random.default_rng(5).integers(0, 4, len(ends))
     stations = STATIONS if is_known else None
     found = sight_lines(cloud(ends, stations, scan), slab())

@@ -1,4 +1,4 @@
-"""Sides of outlines beside edges that were painted at known places, finer than cells."""
+"""Sides of outlines next to edges painted at known sub-cell positions."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from orthoflow_plugins.segment.outlines import Outline, moved_to_edges
 
 SHAPE = (100, 120)
-# The left side of the outline; its edge is painted so many cells beside it.
+# Sides of the outline; an edge is painted near the left side.
 LEFT, TOP, RIGHT, BOTTOM = 40.0, 20.0, 100.0, 80.0
 CORNERS = np.array([[LEFT, TOP], [LEFT, BOTTOM], [RIGHT, BOTTOM], [RIGHT, TOP]])
 HEIGHT = 60.0
-# No side is known better than half a cell by the picture.
+# From the picture, no side is more accurate than half a cell.
 SIGMA = 0.5
 
 
@@ -31,17 +31,17 @@ def outline(
 
 
 def step_at(column: float, height: float = HEIGHT) -> NDArray[np.float64]:
-    """A row of cells (columns,): `height` right of a place, 0 left of it, its own cell in part."""
+    """Return a row of cells (columns,): `height` to the right of a position, 0 to the left."""
     return height * np.clip(np.arange(1, SHAPE[1] + 1) - column, 0.0, 1.0)
 
 
 def picture(*rows: NDArray[np.float64], grey: float = 60.0) -> NDArray[np.float32]:
-    """All rows alike, the sum of some, on a grey."""
+    """Return a picture whose rows are all the sum of given rows and a grey value."""
     return np.tile(grey + np.sum(rows, axis=0), (SHAPE[0], 1)).astype(np.float32)
 
 
 def left_side(moved: tuple[Outline, NDArray[np.bool_]]) -> float | None:
-    """How far outwards, to the left, the left side has moved; None where it stayed."""
+    """Return the outward (leftward) shift of the left side; None if it was not moved."""
     if not moved[1][0]:
         np.testing.assert_array_equal(moved[0].corners[:2], CORNERS[:2])
         return None
@@ -55,7 +55,7 @@ def left_side(moved: tuple[Outline, NDArray[np.bool_]]) -> float | None:
 def test_a_side_moves_to_where_the_edge_was_painted(place: float, way: str) -> None:
     sign = 1.0 if way == "rises" else -1.0
     moved = moved_to_edges(outline(), picture(sign * step_at(LEFT + place), grey=120.0))
-    # A tenth of a cell: of cells that are covered in part a share is lost.
+    # A tenth of a cell, because of partly covered cells.
     assert left_side(moved) == pytest.approx(-place, abs=0.1)
     assert moved[1].tolist() == [True, False, False, False]
     assert moved[0].sigma[0] == pytest.approx(SIGMA, abs=1e-9)
@@ -100,14 +100,14 @@ def test_an_edge_farther_off_than_depth_errs_and_one_of_two_are_of_something_els
         for share in (0.5, 0.7):
             second = share * step_at(LEFT + aside * side)
             assert has_moved(step_at(LEFT), second) == (share < 0.6)
-    # Beyond reach there may be any.
+    # Edges beyond the profiles have no influence.
     assert has_moved(step_at(LEFT), 3.0 * step_at(LEFT + 6.0 * side))
 
 
 def test_edges_have_four_grey_levels_and_are_three_times_as_steep_as_what_is_around() -> None:
     for height in (3.9, 4.1, -4.1):
         assert has_moved(step_at(LEFT, height)) == (abs(height) > 4.0)
-    # Ten grey levels a cell everywhere, and those of the step on top.
+    # A slope of ten grey levels per cell, plus the step.
     slope = 10.0 * np.arange(SHAPE[1])
     for height in (15.0, 25.0):
         assert has_moved(step_at(LEFT, height), slope, grey=-300.0) == (height > 20.0)
@@ -116,7 +116,7 @@ def test_edges_have_four_grey_levels_and_are_three_times_as_steep_as_what_is_aro
 @pytest.mark.parametrize(("n_pieces", "is_moved"), [(5, True), (4, True), (3, False)])
 def test_four_pieces_of_five_must_show_an_edge(n_pieces: int, is_moved: bool) -> None:
     grey = picture(step_at(LEFT))
-    # Pieces of ten rows and a half between four cells from either end.
+    # Pieces of 10.4 rows, starting four cells from each end.
     first = round(TOP + 4.0 + 10.4 * n_pieces)
     grey[first:] = 60.0
     assert (left_side(moved_to_edges(outline(), grey)) is not None) == is_moved
@@ -135,7 +135,7 @@ def test_the_ends_of_a_side_and_what_lies_beyond_do_not_count() -> None:
     grey[round(BOTTOM) - 3 :, :] = 255.0
     moved = moved_to_edges(outline(), grey)
     assert left_side(moved) == pytest.approx(-0.3, abs=0.03)
-    # All profiles are whole: nothing of the void has come into one.
+    # All profiles are complete and contain no void cells.
     assert moved[0].sigma[0] == pytest.approx(SIGMA, abs=1e-9)
 
 
@@ -145,7 +145,7 @@ def test_an_edge_that_wanders_is_as_exact_as_the_mean_of_its_pieces() -> None:
     grey = np.stack([60.0 + step_at(LEFT + slope * (row - 50.0), 100.0) for row in rows])
     moved = moved_to_edges(outline(), grey.astype(np.float32))
     assert left_side(moved) == pytest.approx(0.0, abs=0.03)
-    # Middles of five pieces, 10.4 rows from one to the next.
+    # Centres of five pieces, 10.4 rows apart.
     off = slope * 10.4 * np.arange(-2.0, 3.0)
     expected = np.hypot(SIGMA, np.std(off, ddof=1) / np.sqrt(5.0))
     assert moved[0].sigma[0] == pytest.approx(expected, abs=0.004)
@@ -155,7 +155,7 @@ def test_an_edge_that_wanders_is_as_exact_as_the_mean_of_its_pieces() -> None:
 def test_corners_lie_on_the_moved_sides_unless_these_run_on_in_one_line(
     turn_deg: float, is_met: bool
 ) -> None:
-    # The left side goes down to a corner in which it turns a little, and then on.
+    # The left side continues at a corner with a small change of direction.
     turn = np.radians(turn_deg)
     second = np.array([LEFT, 70.0]) + 10.0 * np.array([np.sin(turn), np.cos(turn)])
     corners = np.array([[LEFT, TOP], [LEFT, 70.0], second, [100.0, 70.0], [100.0, TOP]])
@@ -163,7 +163,7 @@ def test_corners_lie_on_the_moved_sides_unless_these_run_on_in_one_line(
     assert moved[1].tolist() == [True, False, False, False, False]
     shift = moved[0].corners[1] - corners[1]
     if is_met:
-        # On the moved side, and on the next one, which stayed.
+        # On the moved side, and on the next one, which was not moved.
         assert shift[0] == pytest.approx(0.3, abs=0.05)
         assert shift[0] * np.cos(turn) == pytest.approx(shift[1] * np.sin(turn), abs=1e-9)
     else:

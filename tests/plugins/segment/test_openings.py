@@ -1,4 +1,4 @@
-"""Openings of a wall whose every cell and ray is known, and their picture."""
+"""Openings of a wall with known cells and rays, and their figure."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def test_what_a_screen_hides_is_an_opening_only_for_want_of_rays(tmp_path: Path)
     hidden = openings.openings[2]
     assert OutlineSource.UNSEEN in hidden.side_source.tolist()
     assert any("without the cloud" in warning for warning in ctx.warnings)
-    # Looked at squarely, the screen stands before other places than it hides, but before some.
+    # Seen perpendicularly, the screen is in front of other areas than those it hides, but of some
+    # of them.
     square, _ = found(tmp_path, cloud=scenes.cloud(knows_stations=False))
     assert sum(opening.area_m2 for opening in square.openings) < sum(
         opening.area_m2 for opening in openings.openings
@@ -63,7 +64,7 @@ def test_an_empty_area_as_shadows_have_it_is_none(tmp_path: Path) -> None:
     walls = scenes.walls()
     (wall,) = walls.walls
     rows, columns = np.indices(scenes.SHAPE)
-    # Under the mirror, with the wall all round.
+    # Below the mirror, surrounded by the wall.
     is_shadow = (rows > 130) & (columns > 290 + (rows - 130)) & (columns < 380)
     is_plain = np.zeros(scenes.SHAPE, dtype=np.bool_)
     is_plain[110:, 285:] = True
@@ -105,10 +106,10 @@ def test_parameters_leave_out_what_is_less(
 
 
 def image(source: str, out_cells: float = 0.35) -> Orthoimages:
-    """The window dark on a grey wall, its border so much farther out than that of the depth."""
+    """Return a dark window on a grey wall, with its border farther out than that of the depth."""
     low, high = scenes.WINDOW.min(axis=0) - out_cells, scenes.WINDOW.max(axis=0) + out_cells
     places = scenes.centres()
-    # The share of a cell that is of the window.
+    # Share of the cell that the window covers.
     covered = np.minimum(places + 0.5, high) - np.maximum(places - 0.5, low)
     noise = 3.0 * np.random.default_rng(5).normal(size=scenes.SHAPE)
     grey = 170.0 - 110.0 * np.clip(covered, 0.0, 1.0).prod(axis=2) + noise
@@ -147,7 +148,7 @@ def test_an_edge_elsewhere_and_what_the_cloud_painted_move_no_side(
 
 
 def leaning(rise_deg: float) -> Walls:
-    """The wall, in a room of which it leans by so much from upright."""
+    """Return the wall in a room where it is inclined by an angle."""
     walls, rise = scenes.walls(), np.radians(rise_deg)
     frame = walls.walls[0].frame
     return replace(walls, up=np.sin(rise) * frame.normal_world - np.cos(rise) * frame.v_world)
@@ -187,6 +188,6 @@ def test_an_outline_lies_on_its_corners_in_the_colour_of_its_kind(
         part = np.s_[row - 2 : row + 3, column - 2 : column + 3]
         assert picture[part][..., channel].max() >= 140
         assert changed[part].any()
-    # Its number stands inside, at the upper left.
+    # Its number is inside, at the upper left.
     left, top = np.rint(low).astype(int)
     assert changed[top + 5 : top + 30, left + 5 : left + 30].sum() > 20

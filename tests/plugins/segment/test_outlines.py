@@ -1,4 +1,4 @@
-"""Outlines of areas whose borders are known: where corners come to lie, and how exact sides are."""
+"""Outlines of areas with known borders: positions of corners, and accuracy of sides."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from orthoflow.errors import MethodError
 
 GSD_M = 0.01
 SHAPE = (120, 160)
-# Cells: corners of one area, counter-clockwise for the viewer, rows downwards.
+# Corners of an area in cells, counter-clockwise for the viewer, rows downwards.
 LEFT, TOP, RIGHT, BOTTOM = 30, 20, 130, 90
 CORNERS = np.array([[LEFT, TOP], [LEFT, BOTTOM], [RIGHT, BOTTOM], [RIGHT, TOP]], dtype=np.float64)
-# Standard deviation of a place of which an interval of length 1 is known.
+# Standard deviation of a position that is uniformly distributed in an interval of length 1.
 UNIFORM = 12.0**-0.5
 
 
@@ -32,7 +32,7 @@ def block(
 def drawn(
     cells: NDArray[np.bool_], *, is_face: NDArray[np.bool_] | None = None, spacing_m: float = GSD_M
 ) -> Any:
-    """The outline of cells of a relief; the wall's face is all around unless given."""
+    """Return the outline of cells; by default, the wall's face surrounds them."""
     rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
     part = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     area = Area(
@@ -58,7 +58,7 @@ def drawn(
 def assert_corners(
     found: Outline, corners: NDArray[np.float64], *, within_cells: float = 1e-6
 ) -> None:
-    """Corners one by one in their order, from whichever the outline begins with."""
+    """Compare corners in order, regardless of the first one."""
     assert len(found.corners) == len(corners)
     begin = int(np.linalg.norm(found.corners - corners[0], axis=1).argmin())
     rolled = np.roll(found.corners, -begin, axis=0)
@@ -69,7 +69,7 @@ def test_sides_of_a_rectangle_are_the_borders_of_its_cells() -> None:
     found = drawn(block(), spacing_m=3.0 * GSD_M)
     assert_corners(found, CORNERS)
     np.testing.assert_allclose(np.sort(found.lengths), [70.0, 70.0, 100.0, 100.0], atol=1e-6)
-    # A border lies anywhere in two cells, and between two points, three cells apart.
+    # A border is anywhere within two cells, and between two points that are three cells apart.
     np.testing.assert_allclose(found.sigma, UNIFORM * np.hypot(2.0, 3.0), rtol=1e-9)
     np.testing.assert_array_equal(found.seen_share, 1.0)
     assert found.is_seen.all()
@@ -83,7 +83,7 @@ def turned(corners: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
 
 
 def within(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Cells whose centres lie in a convex polygon in the order of outlines."""
+    """Return cells whose centres are in a convex polygon with the orientation of outlines."""
     rows, columns = np.indices(SHAPE) + 0.5
     is_inside = np.ones(SHAPE, dtype=np.bool_)
     for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -97,7 +97,7 @@ def test_turned_sides_lie_where_they_are_to_a_fraction_of_a_cell(degrees: float)
     corners = turned(np.array([[45.2, 35.1], [45.2, 84.7], [113.9, 84.7], [113.9, 35.1]]), degrees)
     found = drawn(within(corners))
     assert_corners(found, corners, within_cells=0.45)
-    # Cells' own staircase scatters, by a third of a cell at most, and along a side that averages.
+    # The staircase of the cells causes a scatter of at most a third of a cell, which averages out.
     assert np.all(found.sigma >= UNIFORM * np.hypot(2.0, 1.0))
     assert np.all(found.sigma <= UNIFORM * np.hypot(2.0, 1.0) + 0.01)
 
@@ -120,7 +120,7 @@ def test_what_sticks_out_of_a_side_a_little_does_not_move_it() -> None:
     cells = block()
     cells[TOP - 2 : TOP, 70:80] = True
     cells[BOTTOM - 1, 50:58] = False
-    # Nor do bites of two cells out of the corners.
+    # Two missing cells at the corners have no effect either.
     for row in (TOP, TOP + 1, BOTTOM - 2, BOTTOM - 1):
         cells[row, [LEFT, LEFT + 1, RIGHT - 2, RIGHT - 1]] = False
     assert_corners(drawn(cells), CORNERS, within_cells=0.06)
@@ -140,7 +140,7 @@ def test_a_corner_cut_short_is_put_back_and_a_long_cut_is_a_side(cut: int, is_co
 
 
 def test_a_side_is_the_less_exact_the_more_it_scatters_and_the_fewer_points_it_has() -> None:
-    # Every other cell sticks out by one: middles lie at 0, 1/2, 1 and 1/2 of it.
+    # Every other cell projects by one, so midpoints are at 0, 1/2, 1 and 1/2.
     cells = block()
     cells[TOP - 1, LEFT + 1 : RIGHT - 1 : 2] = True
     for spacing in (1.0, 4.0, 25.0, 400.0):
@@ -153,7 +153,7 @@ def test_a_side_is_the_less_exact_the_more_it_scatters_and_the_fewer_points_it_h
 
 
 def test_what_is_far_off_even_for_a_rough_side_does_not_move_it() -> None:
-    # Middles scatter by half a cell, but ten cells lie one and a half off.
+    # Midpoints scatter by half a cell, but ten cells are off by one and a half.
     cells = block()
     cells[TOP - 1, LEFT + 1 : RIGHT - 1 : 2] = True
     cells[TOP - 2 : TOP, 70:80] = True
@@ -176,7 +176,7 @@ def test_cells_that_do_not_hang_together_are_no_area() -> None:
 
 @pytest.mark.parametrize("cells_off", range(1, 8))
 def test_a_side_is_seen_where_there_is_face_two_to_four_cells_beside_it(cells_off: int) -> None:
-    # The face is a ring of one cell, its inner border so many cells off.
+    # The face is a ring one cell wide, at a given distance in cells.
     grown = block(
         LEFT - cells_off - 1, TOP - cells_off - 1, RIGHT + cells_off + 1, BOTTOM + cells_off + 1
     )
@@ -184,6 +184,6 @@ def test_a_side_is_seen_where_there_is_face_two_to_four_cells_beside_it(cells_of
     found = drawn(block(), is_face=ring)
     begin = int(np.linalg.norm(found.corners - CORNERS[0], axis=1).argmin())
     left, bottom, right, top = np.roll(found.seen_share, -begin)
-    # Borders lie between cells: the cell on one is the one below or right of it.
+    # Borders are between cells; the cell at a border is the one below or to the right.
     assert {left, top} == {1.0 if 1 <= cells_off <= 3 else 0.0}
     assert {right, bottom} == {1.0 if 2 <= cells_off <= 4 else 0.0}

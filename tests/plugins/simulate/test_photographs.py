@@ -1,4 +1,4 @@
-"""The photos of `simulate.room`: plans, films, and what they show where their cameras say."""
+"""The photos of `simulate.room`: layouts, degradation, and correct positions of their content."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def simulate(folder: Path, *, seed: int = 1, cores: int = 2, **params: object) -
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
-    """Six photos of 600 x 450 pixels of 4 mm, all but free of noise."""
+    """Return six photos of 600 x 450 pixels of 4 mm, almost without noise."""
     return simulate(
         tmp_path_factory.mktemp("room"),
         photo_gsd_m=0.004,
@@ -57,13 +57,13 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
-    """Six photos of 150 x 112 pixels, each exposed in two parts, so that threads share it."""
+    """Return six photos of 150 x 112 pixels, each rendered in two parts by several threads."""
     return simulate(tmp_path_factory.mktemp("small"), photo_gsd_m=0.016)
 
 
 @pytest.fixture(scope="module")
 def wall(room: SimulateRoom.Out) -> TrueOrthoimage:
-    """The main wall as it is, in cells as large as pixels."""
+    """Return the true main wall, with cells as large as pixels."""
     planes = room.truth.planes
     frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=0.004)
     return render(
@@ -81,7 +81,7 @@ def cameras_of(truth: Truth) -> tuple[ViewingCamera, ...]:
 
 
 def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Grey levels at pixels (n, 2) whose first centre is at (0.5, 0.5)."""
+    """Return grey levels at pixels (n, 2); the first centre is at (0.5, 0.5)."""
     return np.asarray(map_coordinates(image, pixels.T[::-1] - 0.5, order=1))
 
 
@@ -112,7 +112,7 @@ def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
         reach_cells=2,
     )
     assert len(shifts.centre) > 15
-    # Cells, which are as large as pixels: patches of 32 x 32 are good to a few hundredths.
+    # In cells, which are as large as pixels; patches of 32 x 32 are accurate to a few hundredths.
     assert np.abs(np.median(shifts.shift, axis=0)).max() < 0.02
     assert np.abs(shifts.shift).max() < 0.3
 
@@ -120,7 +120,7 @@ def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
 def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> None:
     truth = room.truth
     whole = cameras_of(truth)[1]
-    # A window of the photo, of the object and its edges among other things.
+    # A section of the photo that includes the object and its edges.
     camera = replace(whole, width=160, height=120, cx=whole.cx - 200.0, cy=whole.cy - 20.0)
     views = SceneCameras(truth.scene, cores=2)
     image = views.expose(camera, supersample=8)
@@ -134,11 +134,11 @@ def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> N
     hits = cast(truth.scene, camera.centre_world, rays)
     points = camera.centre_world + hits.t[:, None] * rays
     means = colours_at(truth.scene, hits.rectangle, points).rgb.reshape(200, 256, 3).mean(axis=1)
-    # Grey levels; the means of 64 and of 256 rays over edges differ by a small part of 255.
+    # In grey levels; at edges, means of 64 and of 256 rays differ by a small part of 255.
     differences = np.abs(image[chosen[:, 1], chosen[:, 0]] - means)
     assert differences.mean() < 0.5
     assert differences.max() < 15.0
-    # Neither of one colour nor of one rectangle.
+    # The section has neither a single colour nor a single rectangle.
     assert means.std() > 10.0
     assert {SurfaceRole.OBJECT, SurfaceRole.WALL} <= set(truth.scene.role[hits.rectangle])
 
@@ -151,13 +151,13 @@ def test_check_points_are_crossings_of_painted_lines_and_corners_of_mouldings(
     assert points.names == tuple(f"{kind}{k:02d}" for kind in "FV" for k in range(8))
     off_m = truth.planes.plane(0).distances_m(points.points_world)
     np.testing.assert_allclose(off_m[:8], 0.0, atol=1e-9)
-    # Mouldings stand out by two to fifteen centimetres.
+    # Mouldings project by 2 to 15 cm.
     assert 0.015 < off_m[8:].min() < off_m[8:].max() < 0.16
     flat = points.points_world[:8]
     apart = np.linalg.norm(flat[:, None] - flat, axis=2)
     assert apart[~np.eye(8, dtype=bool)].min() > 0.3
-    # Along either line, 3 mm from the crossing, there is still paint: red minus blue tells it from
-    # the plaster 9 mm beside both.
+    # Along either line, there is still paint 3 mm from the crossing; red minus blue distinguishes
+    # it from the plaster 9 mm beside both lines.
     frame, scene = (
         frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=1e-3),
         truth.scene,
@@ -178,7 +178,7 @@ def test_variant_one_holds_each_wall_whole_in_two_photos(tmp_path: Path) -> None
     views = SceneCameras(truth.scene)
     for place, camera in enumerate(cameras_of(truth)):
         plane = truth.planes.names.index(names[place // 2])
-        # A little inside the corners, which others than this wall touch too.
+        # Slightly inside the corners, because other walls touch them, too.
         corners = truth.planes.corners[plane]
         corners = corners.mean(axis=0) + 0.85 * (corners - corners.mean(axis=0))
         assert camera.sees(camera.project(corners)[:, :2]).all(), names[place // 2]
@@ -197,7 +197,7 @@ def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int)
     for shot in planned_shots(layout, np.random.default_rng(seed), gsd_m=0.01, obliquity_deg=30.0):
         hits = views.cast(shot.camera.centre_world, ways)
         assert hits.t.min() > 0.1, shot.taken.photo
-        # Straight up there is the ceiling or a moulding, not the inside of a box.
+        # Vertically above, there is the ceiling or a moulding, not the inside of a box.
         assert scene.role[hits.rectangle[0]] != SurfaceRole.OBJECT, shot.taken.photo
 
 
@@ -212,7 +212,7 @@ def test_neither_world_nor_threads_nor_calibration_change_a_byte_of_a_photo(
     for one, other in zip(cameras_of(small.truth), cameras_of(far.truth), strict=True):
         marks_near = one.project(small.checkpoints.points_world)
         marks_far = other.project(far.checkpoints.points_world)
-        # Pixels; 800 km from the origin the camera's own translation steps by 1e-10 m.
+        # In pixels; 800 km from the origin, the precision of the camera's translation is 1e-10 m.
         np.testing.assert_allclose(marks_near, marks_far, atol=1e-5)
 
     known, unknown = small, simulate(tmp_path / "a", photo_gsd_m=0.016, calibrated=False)
@@ -248,7 +248,7 @@ def test_the_spectral_gap_parts_laser_and_photos(
 
 
 UP = np.array([0.0, 0.0, 1.0])
-# Where photos of the main wall aim: metres to the right of its foot, and above it.
+# Targets of photos of the main wall: metres to the right of its foot, and above it.
 LATTICES = {
     "quick": ((-1.75, 0.0, 1.75), (-0.65, 0.75)),
     "variant2": ((-1.8, -1.08, -0.36, 0.36, 1.08, 1.8), (-0.8, 0.1, 1.0)),
@@ -270,7 +270,7 @@ def test_light_is_lost_towards_the_corners_by_the_fourth_power(share: float) -> 
     image = np.full((60, 100, 3), 200.0)
     found = developed(image, vignetting=share).astype(np.float64)
     rows, columns = np.mgrid[:60, :100] + 0.5
-    # 1 in the corners, whatever the shape of the photo.
+    # 1 in the corners, for any shape of the photo.
     square = 0.5 * ((rows / 30.0 - 1.0) ** 2 + (columns / 50.0 - 1.0) ** 2)
     expected = 200.0 * (1.0 - share * square**2)
     np.testing.assert_allclose(found, np.repeat(expected[..., None], 3, axis=2), atol=0.51)
@@ -315,7 +315,7 @@ def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
             tilt = np.degrees(np.arccos(-camera.rotation[2] @ sides[0].normal))
             assert taken.wall == "main wall"
             assert taken.obliquity_deg == pytest.approx(tilt)
-            # The axis meets the wall where the photographer aims, so far away.
+            # The axis intersects the wall at the target, at the planned distance.
             along = (sides[0].foot - camera.centre_world) @ sides[0].normal
             reach = along / (camera.rotation[2] @ sides[0].normal)
             assert taken.gsd_m == pytest.approx(reach / camera.fx)
@@ -325,7 +325,7 @@ def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
             rolls.append(taken.roll_deg)
             tilts.append(tilt)
     assert 2.8 < np.abs(rolls).max() <= 3.0
-    # From four tenths of it on, but where one cannot stand there.
+    # At least 0.4 of it, except where the position is not free.
     assert np.quantile(tilts, 0.5) < 8.0
     assert np.mean((np.array(tilts) > 3.19) & (np.array(tilts) < 8.01)) > 0.5
     assert planned_shots("none", rng(0), gsd_m=0.01, obliquity_deg=8.0) == ()

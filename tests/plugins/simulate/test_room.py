@@ -1,4 +1,4 @@
-"""`simulate.room`: what it scans is where the truth says it is, and what it reports."""
+"""`simulate.room`: its scans agree with the truth; its reports."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CLEAN = {**COARSE, "noise_m": 0.0, "outlier_share": 0.0, "beam_m": 0.0, "colour_
 ARRAYS = ("x", "y", "z", "intensity", "rgb", "scan", "row", "column")
 
 
-# A room of the same numbers is made once.
+# Rooms are made once for each set of parameters.
 made: dict[str, SimulateRoom.Out] = {}
 
 
@@ -51,7 +51,7 @@ def test_survey_coordinates_change_nothing_but_the_origin(tmp_path: Path) -> Non
     np.testing.assert_array_equal(near.truth.labels, far.truth.labels)
     np.testing.assert_array_equal(far.cloud.origin, scenes.SURVEY_SHIFT_M)
     np.testing.assert_array_equal(near.truth.planes.normal, far.truth.planes.normal)
-    # Metres; 800 km from the origin float64 steps by 1e-10.
+    # In metres; 800 km from the origin, the precision of float64 is 1e-10 m.
     np.testing.assert_allclose(far.truth.planes.rms_m, near.truth.planes.rms_m, atol=1e-9)
 
 
@@ -71,10 +71,11 @@ def test_points_planes_and_colours_are_those_of_the_scene_in_any_world(
     np.testing.assert_allclose(hits.t, 1.0, atol=1e-5)
     np.testing.assert_array_equal(truth.scene.plane_index[hits.rectangle], truth.labels[chosen])
     rgb = colours_at(truth.scene, hits.rectangle, points).rgb
-    # A grey level for rounding; a micrometre of float32 may cross a painted edge now and then.
+    # One grey level for rounding; float32 errors of a micrometre may cross a painted edge.
     wrong = np.abs(rgb - cloud.rgb[chosen]).max(axis=1) > 1.0
     assert wrong.mean() < 0.002
-    # The panorama of the first station: columns from the room's first axis on, rows from below.
+    # The panorama of the first station: columns from the room's first axis on, rows from the
+    # bottom.
     first = np.flatnonzero(cloud.scan == 0)
     rays = cloud.points_world(first) - cloud.stations[0]
     rays = rays @ basis_from_up(cloud.up).T @ _turn_about_up(turn_deg)
@@ -88,9 +89,9 @@ def test_points_planes_and_colours_are_those_of_the_scene_in_any_world(
     assert (np.diff(counts) <= 0).all()
     np.testing.assert_allclose(planes.normal[planes.names.index("floor")], cloud.up, atol=0.002)
     for plane, normal in enumerate(planes.normal):
-        # Metres: float32 offsets of a few metres.
+        # In metres, for float32 offsets of a few metres.
         np.testing.assert_allclose(distances_m(cloud, truth, plane), 0.0, atol=2e-6)
-        # From the top left for who looks at it, counter-clockwise, about all of its points.
+        # From the top left as seen by the viewer, counter-clockwise, around all of its points.
         corner, low, _, right = planes.corners[plane]
         sides = np.array([right - corner, low - corner])
         assert np.cross(*sides) @ normal < -0.999 * np.prod(np.linalg.norm(sides, axis=1))
@@ -123,7 +124,7 @@ def test_a_drawn_geometry_moves_planes_and_stations_and_keeps_the_truth(tmp_path
         normals = [out.truth.planes.normal[at] for out, at in zip(rooms, places, strict=True)]
         offsets = [out.truth.planes.offset[at] for out, at in zip(rooms, places, strict=True)]
         leans = [np.degrees(np.arcsin(normal[2])) for normal in normals]
-        # Degrees and metres: far above rounding.
+        # In degrees and metres; far above rounding errors.
         assert np.diff(sorted(leans)).min() > 0.005, name
         assert np.diff(sorted(offsets)).min() > 0.0005, name
     stations = [out.truth.stations for out in (designed, *drawn)]
@@ -137,7 +138,7 @@ def test_plaques_give_drawn_walls_check_points_at_edges(tmp_path: Path) -> None:
     bare = simulate(tmp_path / "bare", **drawn)
     hung = simulate(tmp_path / "hung", **drawn, n_plaques=24)
     assert hung.checkpoints.classes.count("vertical edge") == 20
-    # Nothing else has moved: the same planes, and the rectangles of the bare room among others.
+    # Nothing else has moved: planes are the same, and rectangles include those of the bare room.
     np.testing.assert_array_equal(hung.truth.planes.normal, bare.truth.planes.normal)
     rectangles = [
         {tuple(row) for row in np.column_stack([room.truth.scene.centre, room.truth.scene.extent])}
@@ -157,9 +158,9 @@ def test_the_main_wall_is_reported_where_the_floor_has_more_points(tmp_path: Pat
     assert main > 0
     metrics = {metric.name: metric.value for metric in context.metrics}
     assert metrics["main_wall_points"] == truth.planes.n_points[main]
-    # Four in a thousand are drawn, and distances mix at edges.
+    # 0.4 % of the points are gross outliers, and distances are mixed at edges.
     assert 0.0035 < metrics["outlier_share"] < 0.03
-    # Panoramas and details of two stations look at most of the wall.
+    # Panoramas and detail scans of two stations cover most of the wall.
     assert 12.0 < metrics["scan_step_median_mm"] < 16.0
     assert metrics["scan_step_p90_mm"] < 20.0
     (figure,) = context.figures
@@ -190,7 +191,7 @@ def test_a_design_has_a_seed_of_its_own_and_errors_have_that_of_the_cell(tmp_pat
 def test_the_step_of_a_square_grid_is_its_spacing(step_m: float) -> None:
     at = np.arange(step_m / 2, 2.0, step_m)
     u, v = (grid.ravel() for grid in np.meshgrid(at, at))
-    # Some points of another plane before it.
+    # Some points of another plane in front of it.
     beside = np.column_stack([u[:50], np.full(50, -0.3), v[:50]])
     cloud = cloud_of(np.vstack([np.column_stack([u, np.zeros(u.size), v]), beside]))
     planes = samples.planes(

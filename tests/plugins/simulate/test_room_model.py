@@ -1,4 +1,4 @@
-"""The simulated room as a builder would check it: closed, nothing in the way, everything flush."""
+"""The simulated room: closed, without collisions, and with surfaces that meet."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def room(**changes: float) -> Room:
 
 @dataclass(frozen=True)
 class Along:
-    """What lies along a wall: depth before it (n,), extent (n, 4), role and texture."""
+    """Rectangles parallel to a wall: depth in front of it (n,), extent (n, 4), role and texture."""
 
     depth_m: NDArray[np.float64]
     extent: NDArray[np.float64]
@@ -54,7 +54,7 @@ class Along:
 
 
 def along(built: Room, name: str) -> Along:
-    """Rectangles of a room along a wall, their extents from the wall's own foot."""
+    """Return the rectangles parallel to a wall, with extents relative to its foot."""
     side = DESIGNED.sides(SceneDraft())[WALLS.index(name)]
     scene = built.scene
     parallel = np.abs(scene.normal @ side.normal) > 1.0 - 1e-9
@@ -94,7 +94,7 @@ def test_whoever_stands_in_the_room_sees_no_way_out() -> None:
         hits = cast(room().scene, np.tile(start, (4000, 1)), directions)
         assert (hits.rectangle >= 0).all()
         reached = start + hits.t[:, None] * directions
-        # A room of 5.4 m by 4.4 m by 3.1 m: nothing in it is farther off than its corners.
+        # In a room of 5.4 m x 4.4 m x 3.1 m, nothing is farther away than the corners.
         assert np.linalg.norm(reached, axis=1).max() < 4.2
 
 
@@ -119,7 +119,7 @@ def test_every_hole_of_a_wall_is_closed_by_what_lies_in_or_behind_it(name: str) 
             if np.allclose(found.extent[k], hole) and found.depth_m[k] <= 1e-9
         ]
         assert len(behind) == 1
-        # Inside the wall, over the floor's edge at most.
+        # Holes are inside the wall, except at the floor.
         assert hole[0] > -2.7
         assert hole[1] < 2.7
         assert hole[3] < CEILING_M
@@ -135,7 +135,7 @@ def test_relief_scales_mouldings_and_nothing_else() -> None:
         np.testing.assert_array_equal(one.extent, two.extent)
         moulded = (one.role == SurfaceRole.RELIEF) & (one.depth_m > 0.0)
         if name == "left wall":
-            # The fireplace and its hearth are no mouldings.
+            # The fireplace and its hearth are not mouldings.
             still = np.isclose(one.depth_m, 0.28) | np.isclose(one.depth_m, 0.03)
             moulded &= ~still
         np.testing.assert_allclose(two.depth_m[moulded], 2.0 * one.depth_m[moulded])
@@ -159,7 +159,7 @@ def test_cloth_covers_as_much_of_the_main_wall_as_asked(share: float) -> None:
     for cloth in cloths:
         assert any(np.allclose(cloth, hole) for hole in found.holes)
         assert area_m2(cloth) > 0.0
-        # Over the skirting and under the cornice.
+        # Above the skirting board and below the cornice.
         assert cloth[2] >= -1.32
         assert cloth[3] <= 1.3
 
@@ -185,14 +185,14 @@ def corners_of(surface: Surface) -> NDArray[np.float64]:
 
 
 def on_wall(side: Side, surface: Surface) -> frozenset[Corner]:
-    """Corners of a rectangle: right, up and before the wall, metres."""
+    """Return the corners of a rectangle: right, up and in front of the wall, metres."""
     off = corners_of(surface) - side.foot
     axes = np.stack([side.axis_a, side.axis_b, side.normal])
     return frozenset(tuple(np.round(corner, 9) + 0.0) for corner in off @ axes.T)
 
 
 def cuboid(extent: Extent, low_m: float, high_m: float) -> dict[str, frozenset[Corner]]:
-    """Faces of a box along a wall, each as its corners."""
+    """Return the faces of a box parallel to a wall, each as its corners."""
     a0, a1, b0, b1 = extent
     corners = list(itertools.product((a0, a1), (b0, b1), (low_m, high_m)))
     places = {"left": (0, a0), "right": (0, a1), "low": (1, b0), "high": (1, b1)}
@@ -232,7 +232,7 @@ def test_a_recess_leads_from_the_wall_to_its_back_and_needs_a_hole_of_its_size()
     assert true.name == "niche"
     np.testing.assert_allclose(true.plane.distances_m(corners_of(back)), 0.0, atol=1e-12)
     np.testing.assert_allclose(true.plane.normal, side.normal)
-    # From the top left for the viewer, counter-clockwise.
+    # From the top left, counter-clockwise as seen by the viewer.
     a0, a1, b0, b1 = EXTENT
     expected = [
         side.foot - 0.25 * side.normal + a * side.axis_a + b * side.axis_b
@@ -251,7 +251,7 @@ GROUND = Paint(TextureKind.PLAIN, (1.0, 0.0, 0.0), 0.5)
 
 @dataclass(frozen=True)
 class Drawn:
-    """A wall taken apart: depth and extent of what lies along it, by paint, and its holes."""
+    """Parts of a wall: depths and extents of its rectangles, by paint, and its holes."""
 
     side: Side
     wall: Surface
@@ -302,17 +302,17 @@ def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:
             expected = depth + float(whole.plane.distances_m(found.side.foot[None])[0])
             assert float(whole.plane.distances_m(plane.outline)[0]) == pytest.approx(expected)
             kinds[kind] += 1
-            # A door begins under the floor, a niche stands on a sill.
+            # A door begins below the floor, a niche has a sill.
             sill = extent[2] - SHOWN[2]
             assert sill == pytest.approx(-0.1) if kind == "door" else 0.3 <= sill <= 0.7
             assert extent[1] - extent[0] <= 1.3
         kinds["panel"] += len(found.panels) // 4
-        # Up to 0.3 m before the wall; panels 3 cm.
+        # Up to 0.3 m in front of the wall; panels 3 cm.
         assert all(0.0 < depth_m <= 0.3 for depth_m, _ in found.stone)
         assert all(depth_m == pytest.approx(0.03) for depth_m, _ in found.panels)
         for one, other in pairwise(holes):
             assert not overlaps(one, other)
-    # Each kind as likely; the fourth is bare.
+    # All kinds are equally likely; the fourth is empty.
     assert max(kinds.values()) < 1.6 * min(kinds.values())
 
 
@@ -322,7 +322,7 @@ def test_cornices_are_up_to_three_even_steps_below_the_ceiling() -> None:
         steps = [
             (depth_m, extent[2])
             for depth_m, extent in found.stone
-            # Along the whole wall, and no skirting.
+            # Along the whole wall, without a skirting board.
             if extent[1] - extent[0] > 5.7 and extent[3] > CEILING_M
         ]
         counts.add(len(steps))

@@ -1,4 +1,4 @@
-"""Where the simulated scanner stands and how wrong it measures, by algebra."""
+"""Stations and errors of the simulated scanner, compared with formulas."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 
 NOISE_M = 0.002
 SIDE = 200
-# Radians; all rays of a sweep meet the surface at one distance and angle, to 2e-4 of either.
+# In radians; all rays of a sweep hit the surface at the same distance and angle, within 2e-4.
 STEP = 1e-6
 NO_ERRORS = Errors(
     noise_m=0.0, outlier_share=0.0, beam_m=0.0, colour_noise=0.0, inversion=0.0, band_seed=0
@@ -39,7 +39,7 @@ def surface(
     kind: TextureKind = TextureKind.PLAIN,
     material: float = 7.0,
 ) -> Scene:
-    """A rectangle met by the x axis at a distance, turned about the vertical by an angle."""
+    """Return a rectangle on the x axis at a distance, rotated about the vertical."""
     turn = math.radians(incidence_deg)
     return Scene(
         origin=np.zeros(3),
@@ -57,7 +57,7 @@ def surface(
 
 
 def together(one: Scene, other: Scene) -> Scene:
-    """Two surfaces in one scene."""
+    """Return a scene with two surfaces."""
     names = ("centre", "axis_a", "axis_b", "extent", "plane_index", "role", "texture")
     joined = {
         name: np.concatenate([getattr(one, name), getattr(other, name)])
@@ -67,7 +67,7 @@ def together(one: Scene, other: Scene) -> Scene:
 
 
 def scanned(scene: Scene, step: float = STEP, **errors: float) -> Scanned:
-    """Scan a scene by rays about the x axis, with no errors but the given ones."""
+    """Scan a scene with rays around the x axis and only the given errors."""
     sweep = Sweep(
         station=np.zeros(3),
         azimuth=-0.5 * SIDE * step,
@@ -97,13 +97,13 @@ def distances_m(points: Scanned) -> NDArray[np.float64]:
 
 
 def azimuths(step: float = STEP) -> NDArray[np.float64]:
-    """Azimuth of each ray, column by column."""
+    """Return the azimuth of each ray, column by column."""
     return np.repeat((np.arange(SIDE) - 0.5 * SIDE) * step, SIDE)
 
 
-# Standard deviations in units of what is asked for, which holds at 3 m, square onto plaster. By
-# slope it grows with 0.45 times what the spot on the surface is longer by, four lengths at most; by
-# range as the root of half plus half the square of the range in 3 m; on cloth by 1.4.
+# Standard deviations relative to the given one, which is valid at 3 m and perpendicular to plaster.
+# They increase by 0.45 times the relative elongation of the spot, at most four; with the root of
+# half plus half the squared ratio of range and 3 m; and by a factor of 1.4 on cloth.
 @pytest.mark.parametrize(
     ("distance_m", "incidence_deg", "kind", "expected"),
     [
@@ -120,7 +120,7 @@ def test_noise_grows_with_slope_range_and_on_cloth(
 ) -> None:
     points = scanned(surface(distance_m, incidence_deg, kind), noise_m=NOISE_M)
     assert (points.rectangle == 0).all()
-    # The surface lies where x cos(turn) - y sin(turn) = distance cos(turn); all rays are near x.
+    # On the surface, x cos(turn) - y sin(turn) = distance cos(turn); all rays are close to x.
     turned = np.tan(azimuths()) * math.tan(math.radians(incidence_deg))
     errors = distances_m(points) - distance_m / (1.0 - turned)
     sigma = NOISE_M * expected
@@ -146,19 +146,19 @@ def test_gross_outliers_fall_short_four_times_in_five() -> None:
 
 def test_distances_mix_where_the_spot_falls_on_two_surfaces() -> None:
     step, beam_m = 2e-5, 0.006
-    # The near surface ends at the x axis, on the side of negative y.
+    # The near surface is at negative y and ends at the x axis.
     scene = together(surface(3.0), surface(3.5))
     scene.extent[0, 1] = 0.0
     points = scanned(scene, step, beam_m=beam_m)
     distance, azimuth = distances_m(points), azimuths(step)
     for side, own_m, other_m in ((azimuth < 0.0, 3.0, 3.5), (azimuth > 0.0, 3.5, 3.0)):
         mixed = side & (points.rectangle == SPOILT)
-        # A point of the spot's rim lies beyond the edge for those angles whose cosine says so.
+        # A point on the spot's border is beyond the edge for angles with a sufficient cosine.
         away = np.abs(azimuth[side]) / (0.5 * beam_m / own_m)
         chance = np.arccos(np.minimum(away, 1.0)) / math.pi
         limit = 5.0 * math.sqrt(float(np.sum(chance * (1.0 - chance))))
         assert np.count_nonzero(mixed) == pytest.approx(float(chance.sum()), abs=limit)
-        # Between none and half of the other surface, evenly; rays are longer by 4.1e-6 at most.
+        # Shares of the other surface are uniform from 0 to 1/2; rays are longer by at most 4.1e-6.
         share = (distance[mixed] - own_m) / (other_m - own_m)
         assert share.min() > -1e-4
         assert share.max() < 0.5 + 1e-4
@@ -177,7 +177,7 @@ def test_neighbouring_points_share_an_error_of_the_stated_size_and_reach(length_
         for apart in (0.0, length_m)
     ]
     assert found[0].std() == pytest.approx(0.004, rel=0.3)
-    # A Gaussian: exp(-1/2) at its length.
+    # For a Gaussian, exp(-1/2) at the correlation length.
     together = float((found[0] * found[1]).mean() / (found[0] ** 2).mean())
     assert together == pytest.approx(np.exp(-0.5), abs=0.25)
 
@@ -197,7 +197,7 @@ def test_a_bent_cloud_is_off_by_the_stated_bend_five_metres_from_its_middle() ->
     np.testing.assert_allclose(np.linalg.norm(off, axis=0), [0.0, 0.02, 0.02])
 
 
-# --- what the laser sees of materials ---
+# --- laser reflectance of materials ---
 
 MATERIALS = together(surface(3.0), surface(3.0, material=8.0))
 
@@ -205,7 +205,7 @@ MATERIALS = together(surface(3.0), surface(3.0, material=8.0))
 def seen(
     red: NDArray[np.float64], green: NDArray[np.float64], inversion: float = 1.0, material: int = 0
 ) -> NDArray[np.float64]:
-    """Reflectance of colours 0..255, all at one place."""
+    """Return the reflectance of colours 0..255, all at the same position."""
     n = len(red)
     points = np.tile(np.array([[3.0], [0.1], [0.1]]), n)
     colours = np.array([red, green, np.full(n, 90.0), np.full(n, 0.5)], dtype=np.float32)
@@ -218,7 +218,8 @@ def test_reflectance_falls_with_red_and_rises_with_green(material: int) -> None:
     rising, fixed = np.linspace(0.0, 255.0, 9), np.full(9, 120.0)
     assert (np.diff(seen(rising, fixed, material=material)) < 0.0).all()
     assert (np.diff(seen(fixed, rising, material=material)) > 0.0).all()
-    # Without inversion the laser sees what the textures say, and half way with half of it.
+    # Without inversion, the reflectance is that of the textures; with half of it, half of the
+    # difference.
     none, half, all_of = (seen(rising, fixed, inversion=share) for share in (0.0, 0.5, 1.0))
     np.testing.assert_array_equal(none, 0.5)
     np.testing.assert_allclose(half, 0.5 * (none + all_of), atol=1e-12)
@@ -232,12 +233,12 @@ def test_wet_patches_are_darker_and_spots_blind() -> None:
     rectangle = np.zeros(n, dtype=np.int32)
     values = laser_reflectance(MATERIALS, rectangle, points, colours, 1.0, 3)
     dry = float(np.median(values))
-    # One spot of 12 mm in every twentieth square of 0.4 m: 1.4e-4 of the area.
+    # A spot with a radius of 12 mm in every twentieth square of 0.4 m covers 1.4e-4 of the area.
     assert 0.5e-4 < np.mean(values == 1.0) < 3e-4
     wet = values < 0.8 * dry
     assert 0.05 < wet.mean() < 0.5
     assert values[wet].min() == pytest.approx(0.55 * dry, rel=0.02)
-    # What a place shows does not hang on what else is asked about.
+    # The value at a position does not depend on other positions.
     some = slice(1000, 1010)
     alone = laser_reflectance(MATERIALS, rectangle[some], points[:, some], colours[:, some], 1.0, 3)
     np.testing.assert_array_equal(alone, values[some])
@@ -251,7 +252,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.mark.parametrize("n_stations", [1, 4])
 def test_panoramas_close_and_detail_scans_just_hold_the_main_wall(n_stations: int) -> None:
     along, towards = main_wall_axes()
-    # Four metres before the origin, 6 x 3 m, off the middle.
+    # Four metres in front of the origin, 6 m x 3 m, off-centre.
     middle = 4.0 * towards + 0.3 * along
     outline = np.array(
         [middle + a * along + h * UP for a, h in ((-3, 1.6), (-3, -1.4), (3, -1.4), (3, 1.6))]
