@@ -618,7 +618,7 @@ def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
 
 
 def scanned(rows: int = 20, columns: int = 30) -> PointCloud:
-    """Return a scan from the middle of a cylinder; row 0 is lowest, columns run left from the east."""
+    """Return a scan of a cylinder from its axis; row 0 is lowest, columns run left from east."""
     row, column = (grid.ravel() for grid in np.mgrid[:rows, :columns])
     azimuth, elevation = np.radians(3.0 * column), np.radians(2.0 * (row - 9.5))
     points = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
