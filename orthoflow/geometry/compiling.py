@@ -140,9 +140,9 @@ class _KernelCache(FunctionCache):
 class _KernelFiles(IndexDataCacheFile):
     """Files with the index and the compiled versions of a kernel.
 
-    Numba numbers the files of versions. Two processes that compile different versions at the same
-    time may therefore use the same number, and an index may refer to the code of the wrong version.
-    Here all file names are unique. A file truncated by a power failure is ignored.
+    Numba numbers the files of compiled versions. Two processes that compile different versions at
+    the same time may therefore use the same number, and an index may refer to the code of the wrong
+    version. Here all file names are unique. A file truncated by a power failure is ignored.
     """
 
     def _save_index(self, overloads: dict[Any, str]) -> None:

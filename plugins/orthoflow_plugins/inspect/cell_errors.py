@@ -39,12 +39,12 @@ _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
 # A multiple of the patch size (32 cells), large enough that little is lost at the borders.
 BLOCK_CELLS: Final = 96
-# Maximum number of cells, on all walls together, whose colour is compared.
+# Maximum number of cells on all walls together whose colour is compared.
 _COLOUR_CELLS: Final = 250_000
-# Maximum number of cells, on all walls together, whose visibility is tested.
+# Maximum number of cells on all walls together whose visibility is tested.
 _SEEN_CELLS: Final = 600_000
-# Maximum number of errors kept, on all walls together (32 bytes each). The standard error of the
-# median of so many values is 1/2000 of their spread.
+# Maximum number of errors that are kept for all walls together (32 bytes each). The standard error
+# of the median of so many values is 1/2000 of their spread.
 _KEPT_ERRORS: Final = 1 << 23
 # Multiples of these numbers, modulo 1, are spread evenly (R2 sequence, Roberts 2018).
 _SPREAD: Final = (0.7548776662466927, 0.5698402909980532)
@@ -85,7 +85,7 @@ class SamplingRule:
 
     @classmethod
     def of(cls, images: Sequence[Orthoimage]) -> SamplingRule:
-        """Choose the densities so that the limits for all images together are kept."""
+        """Choose densities that meet the limits for all images together."""
         n_shown = sum(n_shown_of(image) for image in images)
         n_cells = sum(image.mask.size for image in images)
         return cls(
@@ -176,7 +176,7 @@ def wall_errors(
     inner: slice = slice(None),
     error_step: int = 1,
 ) -> WallErrors:
-    """Compare an orthoimage and its wall, both on the frame of `true`, with the truth.
+    """Compare an orthoimage and its wall, both in the frame of `true`, with the truth.
 
     Depths are compared in all cells, colours and visibility in the chosen ones.
 

@@ -168,8 +168,8 @@ def length_findings(
 ) -> list[Finding]:
     """Compute relative errors of distances between check points (markiewicz2015, 5: 0.2 %).
 
-    Only distances between points of the same wall count, if they are at least a quarter of the
-    longest one; the result is empty if there is none.
+    A distance is compared if both points are on the same wall and it is at least a quarter of the
+    longest distance; the result is empty if there is none.
 
     Args:
         surveyed_m: (n, 2) metres along u and v, surveyed positions.

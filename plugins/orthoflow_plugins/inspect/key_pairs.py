@@ -22,7 +22,7 @@ from orthoflow_plugins.inspect.patches import (
     unrefined,
 )
 
-# At most one key point is used per this many cells: weaker key points are noise.
+# At most one key point is used per this many cells, since weaker key points are noise.
 _CELLS_PER_POINT: Final = 200
 _POINTS_LEAST, _POINTS_MOST = 500, 40_000
 _SCALES_DIFFER_MOST: Final = 1.5
@@ -64,7 +64,7 @@ def find_key_pairs(
     """Find pairs of key points within a radius.
 
     The local contrast of both images is normalised first, because laser and camera record different
-    brightness. Descriptors of key points with similar scale and equal sign are matched mutually.
+    brightness. Descriptors of key points with similar scale and the same sign are matched mutually.
     Patches of 32 x 32 cells around each pair are then matched by least squares; a pair is dropped
     if its patches do not correlate or if it disagrees with its neighbours. Large images are
     processed tile by tile.

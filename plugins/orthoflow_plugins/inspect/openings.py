@@ -33,10 +33,11 @@ _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
 # An outline matches an opening if their intersection over union (IoU) is at least this.
 _SAME_IOU: Final = 0.5
-# The true border is searched for this far on both sides of an outline, at these intervals, along
-# this number of lines.
+# The true border is searched for this far on both sides of an outline.
 _REACH_CELLS: Final = 10.0
+# Sampling interval of this search.
 _STEP_CELLS: Final = 1.0 / 16.0
+# Number of lines across a side along which the border is searched for.
 _LINES: Final = 33
 # Share of a side at either end that is ignored, because corners influence it.
 _ENDS_SHARE: Final = 0.1

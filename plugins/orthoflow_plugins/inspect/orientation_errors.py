@@ -41,8 +41,8 @@ _LEAST_COSINE: Final = 0.9
 _WRONG_SIGMAS: Final = 5.0
 # A tie is wrong if its error exceeds this many cells of the wall.
 _WRONG_CELLS: Final = 1.5
-# Number of rays along the longer side of a photo with which the wall that covers most of it is
-# found.
+# To find the wall that covers most of a photo, this number of rays is used along the photo's longer
+# side.
 _RAYS: Final = 32
 
 
@@ -70,7 +70,7 @@ class PoseError:
 
     @property
     def is_wrong(self) -> bool:
-        """Return whether an accepted pose is off by over 5 predicted standard deviations."""
+        """Whether the error of an accepted pose exceeds 5 predicted standard deviations."""
         if self.status != "ok" or self.wall_m is None:
             return False
         stated = math.inf if self.sigma_wall_m is None else self.sigma_wall_m

@@ -1,4 +1,4 @@
-"""Displacements between two images by least squares matching, to hundredths of a cell."""
+"""Displacements between two images by least squares matching, accurate to 1/100 cell."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def refine_shifts(
     focus_cells: float = math.inf,
     threads: int = 1,
 ) -> PatchShifts:
-    """Refine displacements that are known to a cell or two, patch by patch.
+    """Refine displacements that are known to within a cell or two, patch by patch.
 
     Args:
         shown: the image to inspect, with about the contrast of the reference.
@@ -237,7 +237,7 @@ def refine_shifts(
 
 
 def _smoothed(image: GreyImage) -> GreyImage:
-    """Smooth by a Gaussian of one cell, over valid cells only.
+    """Smooth with a Gaussian of one cell, using only valid cells.
 
     Cells at the border of the region become invalid, since their neighbours are only on one side
     and the mean would be shifted. Scattered holes do not matter.
@@ -375,7 +375,7 @@ def correlations(
 
 
 class _Sampler:
-    """The true image interpolated by cubic B-splines (Unser 1999), with validity.
+    """The true image, interpolated by cubic B-splines (Unser 1999), with a mask of valid cells.
 
     All cells of a patch have the same fractional position, so four weights per axis are enough.
     """

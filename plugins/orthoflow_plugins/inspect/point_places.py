@@ -45,7 +45,7 @@ class ShownPoint:
         wall: index of the wall in `Walls`; -1 if the point is on no wall.
         expected: (2,) column and row of the surveyed position; NaN if the point is on no wall.
         place: (2,) column and row where the image shows it; NaN if not found.
-        point_world: (3,) metres, that position on the surface; NaN if unknown.
+        point_world: (3,) metres, the point of the surface at `place`; NaN if unknown.
     """
 
     how: How
@@ -116,7 +116,7 @@ class PointFinder:
         return self._target(picture, expected)
 
     def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
-        """Return the image of the wall with a number, or of the wall nearest to the point."""
+        """Return the image of the wall with a given number, or of the wall nearest to the point."""
         best, nearest = None, np.inf
         for picture in self.pictures:
             if wall is not None and picture.image.number == wall:
@@ -177,7 +177,7 @@ def find_by_truth(
         frame: its grid.
         expected: (2,) column and row of the surveyed position.
         truth: the simulated scene.
-        buffers_m: depths in front of and behind the wall that belong to the wall.
+        buffers_m: depths in front of and behind the plane that belong to the wall.
         search_cells: search radius.
 
     Returns:

@@ -51,12 +51,13 @@ from orthoflow_plugins.inspect.patches import GreyImage, IntensityGrey, PatchShi
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
 # To find the accuracy of the comparison, the intensity is compared with a copy shifted by this
-# much, in a tile of limited size.
+# much.
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
+# Maximum side of the tile that is compared for this purpose.
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
 _NO_PAIRS: Final = unrefined(*np.zeros((2, 0, 2)))
-# Radius within which the pair of a key point is searched for, large enough for gross errors.
+# Radius within which the counterpart of a key point is searched for, large enough for gross errors.
 _RADIUS_CELLS: Final = 40.0
 UNFIT: Final = DiagnosticSpec(
     code="surf-not-inspected",
@@ -70,13 +71,13 @@ class InspectSurf(Method):
 
     This is the inspection of markiewicz2015: SURF key points of both images are paired, and the
     displacements of the pairs are the errors (Table 2), drawn as a map (Figure 25). Both images
-    have the same grid, so the pair of a key point is searched for only within a radius. Each pair
-    is then refined by least squares, because SURF alone is accurate to about a cell, which is as
-    large as the errors to be measured. A comparison of the intensity with a shifted copy of itself
-    shows the best accuracy that can be reached (`floor_`). `x` points right along u, `y` down along
-    v; displacements are the position in the orthoimage minus that in the intensity. Metrics without
-    a prefix describe the first wall, `all_` all walls together, and `surf_` the pairs before the
-    refinement.
+    have the same grid, so the counterpart of a key point is searched for only within a radius. Each
+    pair is then refined by least squares, because SURF alone is accurate to about a cell, which is
+    as large as the errors to be measured. A comparison of the intensity with a shifted copy of
+    itself shows the best accuracy that can be reached (`floor_`). `x` points right along u, `y`
+    down along v; displacements are the position in the orthoimage minus that in the intensity.
+    Metrics without a prefix describe the first wall, `all_` all walls together, and `surf_` the
+    pairs before the refinement.
 
     Without laser intensity the comparison is meaningless, since the colours of the scan may come
     from the same photos: in this case, it is refused, or skipped with a warning.

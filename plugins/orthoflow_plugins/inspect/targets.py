@@ -1,4 +1,4 @@
-"""Find centres of black and white quadrant targets to a few hundredths of a cell."""
+"""Find centres of black and white quadrant targets, accurate to a few hundredths of a cell."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
 def _saddle(
     window: GreyImage, near: NDArray[np.float64], search: float, radius: float
 ) -> NDArray[np.float64] | None:
-    """Return column and row (2,) of the strongest saddle within the search radius, to a cell."""
+    """Return the cell (2,) = (column, row) of the strongest saddle within the search radius."""
     from scipy.ndimage import gaussian_filter
 
     width = max(1.5, 0.3 * radius)

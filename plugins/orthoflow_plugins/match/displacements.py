@@ -84,7 +84,7 @@ def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
     found[2] = scores[top]
     found[3] = -1.0
     if 0 < down < side - 1 and 0 < across < side - 1:
-        # If there are no other shifts, the lead is that over the lowest possible correlation.
+        # If there are no other shifts, the lead is relative to the lowest possible correlation.
         elsewhere = -1.0
         for k in range(side * side):
             if max(abs(k // side - down), abs(k % side - across)) > 2:
@@ -130,7 +130,7 @@ def _mixed(
     gains[1] = (kbc * sab + kcc * sac + kcd * sad) / determinant
     gains[2] = (kbd * sab + kcd * sac + kdd * sad) / determinant
     explained = gains[0] * sab + gains[1] * sac + gains[2] * sad
-    # Adjusted for the degrees of freedom, since three gains also fit some of the noise.
+    # Adjust for the degrees of freedom, since three gains also fit some of the noise.
     free = n / _INDEPENDENT
     share = explained / max(saa, 1e-20)
     return math.sqrt(max(0.0, 1.0 - (1.0 - share) * (free - 1.0) / max(free - 4.0, 1.0)))
@@ -370,8 +370,9 @@ def measure(
         second: the second picture.
         places: (column, row) cells of the first picture.
         radius_cells: search radius.
-        min_score: minimum correlation. The default of 0.35 is half that of correct positions; it
-            can be lower if there are many patches, which are checked against their neighbours.
+        min_score: minimum correlation. The default of 0.35 is half the correlation at correct
+            positions; it can be lower if there are many patches, which are checked against their
+            neighbours.
         min_distinct: minimum difference between the best correlation and the next peak.
         threads: number of threads.
     """

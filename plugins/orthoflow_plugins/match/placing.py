@@ -70,8 +70,8 @@ _OVER_NEXT: Final = 1.5
 _SIGMA_CELLS: Final = 0.5
 # Anticlockwise quarter turns that make a photo upright, by EXIF orientation.
 _QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
-# Two poses are the same position if the wall moves in the photo by less than this share of the
-# photo's longer side.
+# Two poses count as the same position if they shift the wall in the photo by less than this share
+# of the photo's longer side.
 _SAME_SHARE: Final = 0.1
 _LONGEST_SIDE_PX: Final = 1600
 _PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)

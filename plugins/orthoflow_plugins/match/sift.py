@@ -177,7 +177,7 @@ def _placed(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> dict[int, Placed]:
-    """Find, by structure, positions of photos without clear key point matches, by index."""
+    """Use structure to find positions of photos without clear key point matches, by index."""
     from orthoflow_plugins.match.placing import confirmed, places_of
     from orthoflow_plugins.match.structures import wall_structure
 

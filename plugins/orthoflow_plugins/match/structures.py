@@ -343,7 +343,7 @@ def _part_map(
 
 
 def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[np.complex64]:
-    """Transform layers (c, rows, cols) with padding; padded rows are skipped along the rows."""
+    """Transform layers (c, rows, cols) with padding; the transform along rows skips padded ones."""
     from scipy import fft
 
     along = fft.rfft(layers, padded[1], axis=2)

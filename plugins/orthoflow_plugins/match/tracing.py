@@ -78,7 +78,8 @@ _MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
 _PARAMS: Final = PairingParams()
-# A lens may be that of the same camera if it deviates by less than this from the EXIF focal length.
+# A lens may belong to the same camera if its focal length deviates from the EXIF value by less than
+# this share.
 _NEAR_FOCAL: Final = 0.1
 
 

@@ -17,7 +17,7 @@ from orthoflow.products import Photo, Wall
 if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Occluders
 
-# Parts of a wall seen at a smaller angle are not matched.
+# Minimum cosine of the angle of incidence at which parts of a wall are matched.
 _GRAZING_COSINE: Final = 0.15
 # Cell size of the depth buffer, in wall cells, so that projected surfaces have no gaps.
 _BUFFER_CELLS: Final = 2.0

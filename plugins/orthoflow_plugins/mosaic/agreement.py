@@ -91,7 +91,7 @@ def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, in
 
 
 def _patch_qualities(layer: Layer, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the mean quality of each patch; 0 if the layer does not show all of it."""
+    """Return the mean quality of each patch; 0 if the layer does not show the whole patch."""
     qualities: list[NDArray[np.float64]] = []
     columns = shape[1] * PATCH_CELLS
     for rows in row_bands((shape[0] * PATCH_CELLS, columns), multiple=PATCH_CELLS):

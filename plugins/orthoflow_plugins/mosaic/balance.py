@@ -43,15 +43,15 @@ if TYPE_CHECKING:
 _BLOCK_CELLS_MOST: Final = 16
 # Approximate number of blocks on a small wall.
 _BLOCKS_LEAST: Final = 4_000
-# Photos whose corrections are all below this (a logarithm) are left unchanged.
+# Photos are left unchanged if all their corrections, which are logarithms, are below this.
 _ALIKE: Final = 0.02
 # Smoothing radius of differences, in blocks.
 _SMOOTH_BLOCKS: Final = 1.5
 # Regularisation where few blocks are known.
 _KNOWN_LEAST: Final = 0.02
-# Larger differences between balanced photos are due to different objects, not to light.
+# Larger differences between balanced photos are due to different objects, not to lighting.
 _SAME_THING: Final = 0.15
-# Focal lengths of the same lens differ by less than about this (a logarithm).
+# Logarithms of the focal lengths of one lens differ by less than about this.
 _SAME_ZOOM: Final = 0.1
 # Overlaps with fewer blocks are ignored.
 _LEAST_BLOCKS: Final = 4
@@ -218,7 +218,7 @@ def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -
         says[edges > 0.0] = 0.0
     logs = [values.copy() for values in balance.logs]
     for i, j, shared in pairs(balance.lights):
-        # One of the two layers may end at the seam: extend the difference beyond it.
+        # One of the two layers may end at the seam, so extend the difference beyond it.
         around = _grown(shared, _reach(_SMOOTH_BLOCKS), blocks.shape)
         apart = _apart(balance, (i, j), shared, around, says)
         if apart is None:
@@ -237,7 +237,7 @@ def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -
 def _apart(
     balance: Balance, pair: tuple[int, int], shared: Box, around: Box, says: NDArray[np.float32]
 ) -> NDArray[np.float32] | None:
-    """Return the smooth difference (rows, cols, 3), second less first, of two balanced layers.
+    """Return the smooth difference (rows, cols, 3), second minus first, of two balanced layers.
 
     Args:
         balance: the colour balance of all layers.

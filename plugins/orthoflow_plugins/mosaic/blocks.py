@@ -19,7 +19,7 @@ _DARKEST: Final = 10.0 / 255.0
 _BRIGHTEST: Final = 245.0 / 255.0
 # Minimum share of pixels within this range in blocks where exposure is measured.
 _SAYING_LEAST: Final = 0.95
-# Photos differ by parallax at the depth edges of a wall.
+# Minimum height of depth edges, at which photos differ because of parallax.
 _DEPTH_EDGE_M: Final = 0.03
 
 # Rows and columns of blocks.

@@ -321,7 +321,7 @@ def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _any_left(
     painted: Sequence[NDArray[np.bool_]], is_out: Sequence[NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Return a mask of the cells that are shown by any layer that is not excluded there."""
+    """Return a mask of the cells that any layer shows without being excluded there."""
     left = [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
     return np.asarray(np.logical_or.reduce(left), dtype=np.bool_)
 

@@ -71,7 +71,7 @@ def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[Named
 def seams_of(
     polygons: Sequence[NamedPolygon], number: int, frame: WallFrame, sources: Sequence[str]
 ) -> DrawnSeams | None:
-    """Return the polygons of a wall in cell coordinates; None if it has none.
+    """Return the polygons of a wall in cell coordinates; None if there are none.
 
     Args:
         polygons: polygons of all walls, in the coordinates of their GeoTIFFs (metres).

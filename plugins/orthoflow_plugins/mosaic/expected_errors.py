@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 # Pose errors vary smoothly, so they are computed at this many nodes per side and interpolated
 # linearly.
 _NODES: Final = 48
-# Noise of phase correlation. In a simulated room with pose errors of 0.01 cells, it was 0.06 and
-# 0.07 cells.
+# Noise of phase correlation. Measurements in a simulated room with pose errors of 0.01 cells gave
+# 0.06 and 0.07 cells.
 _PARALLAX_NOISE_CELLS: Final = 0.065
 _LEAST_OVERLAPS: Final = 10
 # No cell is viewed at more than 84 degrees from the normal.
@@ -39,13 +39,13 @@ _RECOVERED_TIMES: Final = 2.0
 _SPREAD_TIMES: Final = 2.0
 # Clouds from photos have depth errors that are correlated over this distance.
 _PATCH_M: Final = 0.05
-# If depths are so correlated, those at that distance differ by more than neighbouring depths times
-# this factor. The relief of rooms explains a factor of up to 1.35 (neighbouring and distant cells
-# differ by 0.98 and 1.3 mm in the simulated room, 1.2 and 2.4 mm in a stuccoed hall, 1.7 and 5.2 mm
-# in a stereo cloud of a fountain).
+# Errors count as correlated if differences between depths at this distance exceed those between
+# neighbouring depths by this factor. The relief of rooms explains a factor of up to 1.35
+# (neighbouring and distant cells differ by 0.98 and 1.3 mm in the simulated room, 1.2 and 2.4 mm in
+# a stuccoed hall, 1.7 and 5.2 mm in a stereo cloud of a fountain).
 _PATCHY_TIMES: Final = 1.5
-# Overlaps reveal depth errors if the tangents of the views differ by this much in this many
-# patches.
+# Overlaps reveal depth errors if the tangents of the views differ by at least this much in at least
+# this many patches.
 _LEAST_TANGENTS: Final = 0.3
 _LEAST_SLANTED: Final = 20
 # Displacements of more than this many standard deviations are false matches.

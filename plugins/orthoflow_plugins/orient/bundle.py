@@ -97,7 +97,8 @@ _SAME_PLACE_M: Final = 1e-6
 _MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
 # The photo with the largest contradiction distorts the shared lens, so that other photos contradict
-# it as well. Only photos whose contradiction exceeds this share of the largest are separated first.
+# it as well. Therefore, photos whose contradiction exceeds this share of the largest are separated
+# first.
 _SHARE_OF_WORST: Final = 0.5
 NO_BLOCK: Final = DiagnosticSpec(
     code="bundle-without-result",
@@ -510,8 +511,8 @@ def _weigh_between(
     from scipy.special import chdtri  # importing scipy.stats would take seconds
 
     active = weights.tie_active
-    # m observations have 2 m coordinates, 3 of which determine the point: the sum of squares has a
-    # chi-square distribution with 2 m - 3 degrees of freedom.
+    # m observations have 2 m coordinates, 3 of which determine the point, so the sum of squares has
+    # a chi-square distribution with 2 m - 3 degrees of freedom.
     squares = np.bincount(ties.point[active], lengths[active] ** 2)
     n_seeing = np.bincount(ties.point[active])
     is_tied = n_seeing > 1

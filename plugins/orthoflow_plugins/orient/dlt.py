@@ -80,7 +80,7 @@ DLT_MISFIT: Final = DiagnosticSpec(
 
 
 class OrientDlt(Method):
-    """Orient each photo by eleven parameters, or more with distortion, from its ties only.
+    """Orient each photo by eleven parameters, or more with distortion, using only its ties.
 
     Calibration and EXIF are used only to reject wrong ties; `prior: none` does not use them at all.
     The linear solution is the start of a weighted adjustment of pose, fx, fy, principal point and,
@@ -189,7 +189,7 @@ def direct_linear(
 
 
 def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
-    """Orient a photo by a direct linear transform, or return the reason why not.
+    """Orient a photo by a direct linear transform; return the reason if this fails.
 
     With `prior: none`, neither calibration nor EXIF is used to reject wrong ties. Without `skew`,
     the adjustment assumes perpendicular pixel rows and columns.

@@ -33,7 +33,7 @@ from orthoflow_plugins.orient.pose import (
 )
 
 _GRID_SIDE: Final = 15
-# Photos that show a wall at a smaller angle are not used for its orthoimage.
+# Minimum cosine of the angle of incidence; more oblique photos are not used for orthoimages.
 _GRAZING_COSINE: Final = 0.1
 
 
@@ -133,7 +133,7 @@ def sigmas_on_wall(
 
 
 def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
-    """Return the variances (4,) at the image corners, the largest of the walls shown there."""
+    """Return variances (4,) at the image corners, each the largest of the walls shown there."""
     camera, worst = resection.camera, np.full(4, np.nan)
     # Centres of the pixels in the corners.
     corners_px = np.array(

@@ -154,7 +154,7 @@ def _located(
     rays: Sequence[NDArray[np.float64]],
     tracks: Sequence[NDArray[np.intp]],
 ) -> PhotoTies:
-    """Intersect the rays of each track, by track length, and keep the tracks that agree."""
+    """Intersect the rays of each track, and keep tracks that agree, grouped by length."""
     counts = [len(item.pixels) for item in features]
     photo_of = np.repeat(np.arange(len(cameras)), counts)
     pixels = np.vstack([item.pixels for item in features])

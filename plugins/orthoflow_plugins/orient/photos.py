@@ -75,7 +75,7 @@ the camera, and the prior of its lens.
 
 
 def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
-    """Orient a photo from its ties measured by hand, or return the reason why not.
+    """Orient a photo from its ties measured by hand; return the reason if this fails.
 
     Args:
         tied: the photo, with at least `MIN_TIES` ties measured by hand.
@@ -358,9 +358,9 @@ def with_believable_priors(
 ) -> list[Photo]:
     """Replace EXIF focal lengths that contradict the ties.
 
-    Due to digital zoom, adapters or cropping, EXIF is wrong for all photos of a lens. The photos
-    with the most ties are tested, and the resulting focal length is used for all photos of the
-    lens.
+    Due to digital zoom, adapters or cropping, EXIF may be wrong for all photos of a lens. The
+    photos with the most ties are tested, and the resulting focal length is used for all photos of
+    the lens.
     """
     believed = list(photos)
     lenses: dict[tuple[object, ...], list[int]] = {}

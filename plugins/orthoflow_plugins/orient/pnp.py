@@ -80,7 +80,7 @@ class OrientPnp(Method):
 
 
 def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo by `cv2.solvePnP` (Levenberg-Marquardt), or return the reason why not.
+    """Orient a photo by `cv2.solvePnP` (Levenberg-Marquardt); return the reason if this fails.
 
     All ties have the same weight, the lens is fixed, and solvePnP gets no initial pose. Outliers
     are rejected, and solvePnP is called again, until the set of inliers no longer changes. The

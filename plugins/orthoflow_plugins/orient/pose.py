@@ -360,7 +360,7 @@ class Start:
 
 
 def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo from its weighted control points, or return the reason why not."""
+    """Orient a photo from its weighted control points; return the reason if this fails."""
     start = robust_start(tied, params)
     if start is None:
         return no_pose(tied.seen)

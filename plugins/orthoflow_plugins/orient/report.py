@@ -237,7 +237,7 @@ def hand_over(
 
 
 def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
-    """Report the errors on the wall for cameras that have one."""
+    """Report the expected errors on the wall of cameras for which they are known."""
     sigmas = [camera.sigma_wall_m for camera in cameras if camera.sigma_wall_m is not None]
     _sum_up(ctx, "sigma_wall_mm", [1000.0 * sigma for sigma in sigmas], "mm")
 

@@ -120,7 +120,7 @@ def colours_of(
         means = totals[:, :-1] / np.maximum(totals[:, -1:], 1e-300)
         rgb[has_point] = np.rint(means[has_point])
     elif colouring == "median":
-        # Process as many cells at once as have a limited number of points, at least one.
+        # Process cells with a limited total number of points at once, but at least one cell.
         totals, first, n_before = np.cumsum(winners["n_points"], dtype=np.int64), 0, 0
         while first < totals.size:
             end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
@@ -145,9 +145,9 @@ def colours_of(
 def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> NDArray[np.float64]:
     """Find factors on the brightness of scans that remove colour casts, as logarithms (scans, 3).
 
-    Where two scans overlap they show the same surface, so differences of their mean colours are due
-    to exposure and white balance, except at edges of texture and objects; the L1 norm is robust to
-    these. In a group of overlapping scans, the median scan keeps its colours.
+    Where two scans overlap, they show the same surface, so differences of their mean colours are
+    due to exposure and white balance, except at edges of texture and objects; the L1 norm is robust
+    to these. In a group of overlapping scans, the median scan keeps its colours.
 
     Args:
         painters: coloured points with scan numbers.

@@ -42,7 +42,7 @@ _BLACK_WORTH_WORDS: Final = 0.001
 _ALMOST_BLACK_GREY: Final = 10
 # Scans that differ by less are not balanced: a cast of 3 % is hardly visible.
 _CAST_LEAST: Final = 0.03
-# If more points are pure black, black is taken for a real colour.
+# If more points are pure black, black is considered a real colour.
 _MOST_SPECKS: Final = 0.1
 
 SPECKS: Final = DiagnosticSpec(
@@ -219,7 +219,7 @@ def _left_out(
 ) -> NDArray[np.bool_] | None:
     """Return a mask (n,) of points without a colour or too dark; None if all have a colour.
 
-    These points have a depth but colour no cell. Black points that are used are reported.
+    These points contribute depths but no colours. Black points that are used are reported.
     """
     n_points, has_rgb = len(rgb), cloud.has_rgb
     counts = np.zeros(256, dtype=np.int64)

@@ -48,7 +48,7 @@ class Surface:
         frame: grid of the cells.
         relief: depths of the cells, and the surface that hides other cells.
         front_m: largest depth of the relief; the depth buffer contains only points beyond it.
-        tolerance_m: minimum height of the surface above a ray that it blocks.
+        tolerance_m: minimum height above a ray at which the surface blocks the ray.
     """
 
     frame: WallFrame

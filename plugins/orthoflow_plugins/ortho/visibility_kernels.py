@@ -38,7 +38,7 @@ class WallView(NamedTuple):
         height_m: height of the projection centre above the plane.
         gsd_m: side of a cell.
         front_m: largest depth of the relief; the depth buffer contains only points beyond it.
-        tolerance_m: minimum height of the surface above a ray that it blocks.
+        tolerance_m: minimum height above a ray at which the surface blocks the ray.
         cosine_least: smallest cosine of the angle of incidence of visible cells.
         border_px: distance from the image border over which quality decreases to 0.
     """
@@ -289,7 +289,7 @@ def _hide_low_cells(
     Args:
         surface: (cells of the wall,) occluding surface, flattened.
         eye: row, column and height of the projection centre.
-        tolerance_m: minimum height of the surface above a ray that it blocks.
+        tolerance_m: minimum height above a ray at which the surface blocks the ray.
         top: height above which nothing can hide the cells.
         place: row and first column of the cells, numbers of rows and columns of the wall.
         depths: (n,) depths of the cells.

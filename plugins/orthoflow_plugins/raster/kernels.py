@@ -395,7 +395,7 @@ def _fill(
     is_void: NDArray[np.bool_],
     sums: Sums,
 ) -> None:
-    """Add a triangle to the void cells whose centres are inside."""
+    """Add a triangle to the void cells whose centres are inside it."""
     ax, ay, bx, by = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
     cx, cy = corners[2, 0], corners[2, 1]
     area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)

@@ -63,7 +63,7 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
         chosen.append(index)
     if not params.skip_covered:
         return chosen
-    # A larger wall with fewer points may also cover one that was selected before.
+    # A larger wall with fewer points may also cover a wall that was selected before.
     return [
         index
         for index in chosen

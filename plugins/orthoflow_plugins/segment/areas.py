@@ -27,7 +27,7 @@ _FACE_LEAST: Final = 0.5
 _CELLS_TOLD: Final = 1 << 25
 # Rays are counted on tiles of about this side length, which contain many rays.
 _TILE_M: Final = 0.05
-# From larger clouds, a sample of about this many points is taken by Fibonacci hashing.
+# Larger clouds are reduced to a sample of about this many points by Fibonacci hashing.
 _POINTS_MOST: Final = 1 << 22
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 _BLOCK: Final = 1 << 18
