@@ -65,7 +65,7 @@ def _case(
     turn = rng.uniform(0.0, 2.0 * np.pi)
     aside = 2.6 * np.tan(np.radians(tilt_deg) * rng.uniform(0.7, 1.0))
     centre = (aim_m + aside * np.cos(turn), -2.6, 1.0 + aside * np.sin(turn))
-    camera = ms.camera_before(tp.SCENE, centre=centre, towards=(aim_m, 0.0, 1.0))
+    camera = ms.camera_before(centre=centre, towards=(aim_m, 0.0, 1.0))
     shift = SURVEY_SHIFT_M if survey else np.zeros(3)
     ties = tp.known_ties(
         camera,

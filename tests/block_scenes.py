@@ -28,7 +28,7 @@ def viewers() -> tuple[ViewingCamera, ...]:
     return tuple(
         replace(camera, fy=camera.fx)
         for centre, towards, roll in _VIEWS
-        for camera in [ms.camera_before(SCENE, centre=centre, towards=towards, roll=roll)]
+        for camera in [ms.camera_before(centre=centre, towards=towards, roll=roll)]
     )
 
 

@@ -16,10 +16,8 @@ from orthoflow.workflow.source import shipped_workflow
 _RECIPES: Final = ("direct", "quickstart")
 # With one wall and large cells, a recipe runs within seconds and without warnings.
 _COARSE: Final = {
-    "direct": {
-        "simulate.room": {"scan_step_m": 0.02},
-        "raster.grid": {"gsd_m": 0.06, "n_walls_max": 1},
-    }
+    ("direct", "simulate.room"): {"scan_step_m": 0.02},
+    ("direct", "raster.grid"): {"gsd_m": 0.06, "n_walls_max": 1},
 }
 # Maximum length of a workflow's name in characters.
 _NAME_MOST: Final = 32
@@ -94,7 +92,7 @@ def _coarse_document(recipe: str) -> dict[str, Any]:
     # The type is Any, since the document consists of nested mappings.
     document: dict[str, Any] = YAML(typ="safe").load(text)
     for node in document["steps"].values():
-        if coarse := _COARSE.get(recipe, {}).get(node["use"]):
+        if coarse := _COARSE.get((recipe, node["use"])):
             node["params"] = coarse
     return document
 

@@ -14,7 +14,7 @@ from orthoflow.sdk.hooks import FILES
 from orthoflow.version import DISTRIBUTION
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Port:
     """A port of the new method.
 
@@ -46,12 +46,22 @@ class KindPorts:
     needs: tuple[str, ...] = ()
 
 
-def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
-    """Derive the ports of a new method from a kind and its first installed method that loads.
+def kind_ports(
+    catalog: Catalog, kind: str, takes: Sequence[str] = (), gives: Sequence[str] = ()
+) -> KindPorts:
+    """Return the ports of a new method of a kind.
+
+    Args:
+        catalog: the installed plugins.
+        kind: an installed kind, whose first method that loads is followed; or a new one.
+        takes: product types of the inputs of a new kind, a port each.
+        gives: existing product types of the outputs of a new kind, a port each.
 
     Raises:
         PluginError: the kind cannot be used.
     """
+    if kind not in catalog.kinds:
+        return _kind_ports(catalog, {one: one for one in takes}, {one: one for one in gives}, [])
     entry = catalog.kinds[kind]
     if entry.state != "fine":
         raise PluginError(entry.problem)
@@ -71,11 +81,6 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
                 taken = {name: type_name for name, type_name in taken.items() if name in required}
             break
     return _kind_ports(catalog, taken, given, [entry.distribution])
-
-
-def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> KindPorts:
-    """Return the ports of a method of a new kind, one per product type."""
-    return _kind_ports(catalog, {name: name for name in takes}, {name: name for name in gives}, [])
 
 
 def _kind_ports(
@@ -105,16 +110,12 @@ def _kind_ports(
         for one in (*of_types, *besides)
         if one.name != DISTRIBUTION
     }
-    inputs = tuple(
-        Port(name=name, class_name=classes[type_name][1]) for name, type_name in taken.items()
-    )
-    outputs = tuple(
-        Port(name=name, class_name=classes[type_name][1], same_as=handed_on.get(type_name, ""))
-        for name, type_name in given.items()
-    )
     return KindPorts(
-        inputs=inputs,
-        outputs=outputs,
+        inputs=tuple(Port(name, classes[type_name][1]) for name, type_name in taken.items()),
+        outputs=tuple(
+            Port(name, classes[type_name][1], same_as=handed_on.get(type_name, ""))
+            for name, type_name in given.items()
+        ),
         imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
         needs=tuple(sorted(needs)),
     )

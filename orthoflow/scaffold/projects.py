@@ -16,7 +16,7 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import ArgumentError, did_you_mean
 from orthoflow.scaffold.comparing import comparison_text, own_comparison_text
-from orthoflow.scaffold.kinds import KindPorts, kind_ports, new_kind_ports
+from orthoflow.scaffold.kinds import kind_ports
 from orthoflow.version import __version__
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
@@ -88,13 +88,8 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
     """
     folder = parent / project.name
     _check(project, folder, catalog)
-    ports = (
-        new_kind_ports(catalog, project.takes, project.gives)
-        if project.is_new_kind
-        else kind_ports(catalog, project.kind)
-    )
     written: list[Path] = []
-    for name, text in _files(project, ports, catalog):
+    for name, text in _files(project, catalog):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
@@ -152,7 +147,7 @@ def _check_new_kind(project: Project, catalog: Catalog) -> None:
             )
 
 
-def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tuple[str, str]]:
+def _files(project: Project, catalog: Catalog) -> Iterator[tuple[str, str]]:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATES),
         autoescape=False,
@@ -171,28 +166,16 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         comparison = comparison_text(project.method_id, project.name, catalog)
     known = {
         "project": project,
-        "ports": ports,
+        "ports": kind_ports(catalog, project.kind, project.takes, project.gives),
         "version": __version__,
         "has_comparison": bool(comparison),
         "outputs": [*filter(None, [project.product]), *project.gives],
     }
-    sources = {
-        "pyproject.toml": "pyproject.toml.jinja",
-        "README.md": "README.md.jinja",
-        "LICENSE": "LICENSE.jinja",
-        "CITATION.cff": "CITATION.cff.jinja",
-        ".gitignore": "gitignore.jinja",
-        ".github/workflows/tests.yml": "tests.yml.jinja",
-        f"{project.package}/__init__.py": "init.py.jinja",
-        f"{project.package}/hooks.py": "own_hooks.py.jinja"
-        if project.is_new_kind
-        else "hooks.py.jinja",
-        f"{project.package}/method.py": method,
-        "tests/test_conformance.py": "test_conformance.py.jinja",
-    }
-    if project.product:
-        sources[f"{project.package}/product.py"] = "own_product.py.jinja"
-    for name, template in sources.items():
-        yield name, environment.get_template(template).render(known)
+    yield f"{project.package}/method.py", environment.get_template(method).render(known)
+    for template in environment.list_templates():
+        name = template.removeprefix("project/").removesuffix(".jinja")
+        if name != template.removesuffix(".jinja") and (project.product or "product" not in name):
+            text = environment.get_template(template).render(known)
+            yield name.replace("package/", f"{project.package}/"), text
     if comparison:
         yield "compare.yaml", comparison

@@ -18,7 +18,7 @@ from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import InputFiles, Planes, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.photographed import PHOTOGRAPHED
-from orthoflow.testing.surveyed import SURVEYED
+from orthoflow.testing.surveyed import SURVEYED, few_points
 from orthoflow.testing.trials import Trial, run_trial
 
 
@@ -27,7 +27,7 @@ class ExampleError(OrthoflowError, LookupError):
 
 
 def example_inputs(
-    method: type[Method], *, besides: Collection[str] = ()
+    method: type[Method], *, besides: Collection[str] = (), within: tuple[str, ...] = ()
 ) -> dict[str, Product | InputFiles]:
     """Return the required inputs of a method, all from one scene: a photographed wall or a room.
 
@@ -37,16 +37,11 @@ def example_inputs(
     Args:
         method: class of the method.
         besides: ports that need no example.
+        within: types whose examples are being created from this one.
 
     Raises:
         ExampleError: there is no example for a port.
     """
-    return _example_inputs(method, besides, within=())
-
-
-def _example_inputs(
-    method: type[Method], besides: Collection[str], *, within: tuple[str, ...]
-) -> dict[str, Product | InputFiles]:
     ports = port_specs(method.In)
     required = {port.type_name for port in ports.values() if port.required}
     is_photographed = bool(required & {*PHOTOGRAPHED, "orthoimages", "openings"} - {*SURVEYED})
@@ -56,22 +51,21 @@ def _example_inputs(
         is_known = port.type_name == "truth" and not is_photographed
         if name not in besides and (port.required or is_known):
             make = scene.get(port.type_name)
-            found[name] = make() if make else _example(port.type_name, within)
+            found[name] = make() if make else example(port.type_name, within=within)
     return found
 
 
-def example(type_name: str) -> Product | InputFiles:
+def example(type_name: str, *, within: tuple[str, ...] = ()) -> Product | InputFiles:
     """Return a small product of a type, identical in every process.
+
+    Args:
+        type_name: the product type.
+        within: types whose examples are being created from this one.
 
     Raises:
         ExampleError: the type belongs to a plugin, and no installed method creates it from other
             examples.
     """
-    return _example(type_name, within=())
-
-
-def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
-    """Return an example; `within` are the types whose examples are currently being created."""
     if type_name == "files":
         return _example_files()
     make = SURVEYED.get(type_name) or PHOTOGRAPHED.get(type_name)
@@ -85,7 +79,7 @@ def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
             method = entry.load()
             ports = port_specs(method.Out).values()
             name = next(port.name for port in ports if port.type_name == type_name)
-            inputs = _example_inputs(method, (), within=(*within, type_name))
+            inputs = example_inputs(method, within=(*within, type_name))
             with TemporaryDirectory(prefix="orthoflow-example-") as folder:
                 trial = Trial(method=method, inputs=inputs)
                 return run_trial(trial, Path(folder), draws=False).outputs[name]
@@ -118,64 +112,37 @@ def example_room(
     """
     rng = np.random.default_rng(seed)
     size = np.array([5.0, 3.6, 2.6])
-    normals = np.array(
-        [[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64
-    )
-    spans = np.array([[0, 2], [0, 2], [1, 2], [1, 2], [0, 1], [0, 1]])
-    areas = size[spans].prod(axis=1)
-    per_side = np.floor(n_points * areas / areas.sum()).astype(int)
+    areas = size.prod() / size  # of sides across each axis
     turn = rotation_from_vector(np.array([0.0, 0.0, math.radians(turned_deg)]))
     origin = np.zeros(3) if shift_m is None else np.asarray(shift_m, dtype=np.float64)
-    points, offsets, corners = [], [], []
-    for normal, span, count in zip(normals, spans, per_side, strict=True):
-        distance = -0.5 * size[np.argmax(np.abs(normal))]
+    points, normals, offsets, corners = [], [], [], []
+    for axis, direction in ((1, -1), (1, 1), (0, -1), (0, 1), (2, 1), (2, -1)):
+        normal = np.eye(3)[axis] * direction + 0.0  # no minus zeros
+        count = int(n_points * areas[axis] / (2.0 * areas.sum()))
         local = (rng.random((count, 3)) - 0.5) * size
-        axis = int(np.argmax(np.abs(normal)))
-        local[:, axis] = normal[axis] * (distance + 0.002 * rng.normal(size=count))
+        distance = -0.5 * size[axis]
+        local[:, axis] = direction * (distance + 0.002 * rng.normal(size=count))
         points.append(local @ turn.T)
-        offsets.append(distance + float(turn @ normal @ origin))
-        corners.append(_corners(normal, distance, size[span]) @ turn.T + origin)
-    grey = rng.integers(60, 200, per_side.sum()).astype(np.uint8)
+        normals.append(normal @ turn.T)
+        offsets.append(distance + float(normals[-1] @ origin))
+        # From the top left on: down, to the right, up.
+        u, v = (0.5 * (size @ np.abs(side)) * side for side in wall_axes(normal, up_vector("z")))
+        steps = np.array([-u - v, v - u, u + v, u - v])
+        corners.append((distance * normal + steps) @ turn.T + origin)
+    grey = rng.integers(60, 200, sum(map(len, points))).astype(np.uint8)
     cloud = few_points(np.concatenate(points), grey)
     planes = Planes(
-        normal=normals @ turn.T,
+        normal=np.array(normals),
         offset=np.array(offsets),
         corners=np.array(corners),
         covariance=np.zeros((6, 4, 4)),
-        n_points=per_side.astype(np.int64),
+        n_points=np.array([*map(len, points)], dtype=np.int64),
         rms_m=np.full(6, 0.002),
         up=up_vector("z"),
         names=("wall 0", "wall 1", "wall 2", "wall 3", "floor 4", "ceiling 5"),
         viewpoint="stations",
     )
     return replace(cloud, origin=origin, stations=origin[np.newaxis]), planes
-
-
-def few_points(offsets_m: NDArray[np.floating], grey: int | NDArray[np.uint8] = 128) -> PointCloud:
-    """Return a grey cloud of points at offsets (n, 3) from the origin, which is its station."""
-    x, y, z = np.ascontiguousarray(offsets_m.T, dtype=np.float32)
-    greys = np.broadcast_to(np.uint8(grey), x.shape)
-    return PointCloud(
-        origin=np.zeros(3),
-        x=x,
-        y=y,
-        z=z,
-        up=up_vector("z"),
-        intensity=(greys / 255.0).astype(np.float32),
-        rgb=np.repeat(greys[:, np.newaxis], 3, axis=1),
-        stations=np.zeros((1, 3)),
-        stations_source="file",
-    )
-
-
-def _corners(
-    normal: NDArray[np.float64], offset_m: float, sides_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    u, v = wall_axes(normal, up_vector("z"))
-    half_u, half_v = 0.5 * sides_m[0] * u, 0.5 * sides_m[1] * v
-    steps = [-half_u - half_v, -half_u + half_v, half_u + half_v, half_u - half_v]
-    corners: NDArray[np.float64] = offset_m * normal + np.array(steps)
-    return corners
 
 
 def _example_files() -> InputFiles:

@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from pydantic import TypeAdapter, ValidationError
 from orthoflow.engine.durability import lock_file
 from orthoflow.errors import InputError
 from orthoflow.products import JsonValue, Product
-from orthoflow.products.product import Payload, Tolerance
+from orthoflow.products.product import Tolerance
 from orthoflow.testing.trials import Trial
 
 _AT_MOST: Final = 32
@@ -42,19 +42,9 @@ _ROUNDING: Final = 10.0 ** (1 - _DIGITS)
 _STRIDE: Final = 2_654_435_761
 _METADATA: Final = "metadata"
 
-
-@dataclass(frozen=True, kw_only=True)
-class Sample:
-    """Sample of the numbers in an array.
-
-    Attributes:
-        shape: shape of the array.
-        values: up to 32 of its values with nine digits, at positions that depend only on its size;
-            None for NaN.
-    """
-
-    shape: Sequence[int]
-    values: Sequence[float | None]
+# Name and shape of an array -> up to 32 of its values with nine digits, at positions that depend
+# only on its size; None for NaN.
+Samples: TypeAlias = Mapping[str, Sequence[float | None]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +62,8 @@ class Golden:
     result_version: int
     tools: Mapping[str, str]
     params: str
-    inputs: Mapping[str, Mapping[str, Sample]]
-    outputs: Mapping[str, Mapping[str, Sample]]
+    inputs: Mapping[str, Samples]
+    outputs: Mapping[str, Samples]
 
 
 _FORMAT: Final = TypeAdapter(dict[str, Golden])
@@ -109,39 +99,42 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
         lock_file(file, stream.fileno(), waits=True)
         stream.seek(0)
         known = _parsed(stream.read(), file)
-        if (before := known.get(trial.method.id)) is None or not _is_of_the_same(
-            before, now, inputs
-        ):
+        before = known.get(trial.method.id, now)
+        is_same = replace(before, inputs={}, outputs={}) == replace(now, inputs={}, outputs={})
+        if before is now or not is_same or any(_changes(before.inputs, now.inputs, inputs)):
+            known[trial.method.id] = now
+            text = json.dumps(_FORMAT.dump_python(known), indent=1, sort_keys=True)
             stream.truncate(0)
-            stream.write(_text({**known, trial.method.id: now}))
+            # One line per list of numbers, so that version control shows which of them changed.
+            stream.write(re.sub(r"\[[^\[\]]+\]", lambda it: " ".join(it[0].split()), text) + "\n")
             return ""
-    for port in sorted({*before.outputs, *now.outputs}):
-        moved = "one of them has none"
-        if port in before.outputs and port in outputs:
-            moved = sample_problem(
-                before.outputs[port],
-                now.outputs[port],
-                outputs[port].tolerances,
-                numbers_stated=before.inputs == now.inputs,
-            )
-        if moved:
-            return (
-                f"output {port} differs from {file.name} ({moved}), but result_version is still "
-                f"{now.result_version}: increment it, or find out why the result has changed"
-            )
+    numbers_stated = before.inputs == now.inputs
+    changes = _changes(before.outputs, now.outputs, outputs, numbers_stated=numbers_stated)
+    for port, moved in changes:
+        return (
+            f"output {port} differs from {file.name} ({moved}), but result_version is still "
+            f"{now.result_version}: increment it, or find out why the result has changed"
+        )
     return ""
 
 
-def _is_of_the_same(before: Golden, now: Golden, inputs: Mapping[str, Product]) -> bool:
-    """Return whether two results are of the same method, parameters and inputs."""
-    return (
-        replace(before, inputs={}, outputs={}) == replace(now, inputs={}, outputs={})
-        and before.inputs.keys() == now.inputs.keys()
-        and not any(
-            sample_problem(before.inputs[port], now.inputs[port], product.tolerances)
-            for port, product in inputs.items()
-        )
-    )
+def _changes(
+    before: Mapping[str, Samples],
+    after: Mapping[str, Samples],
+    products: Mapping[str, Product],
+    *,
+    numbers_stated: bool = True,
+) -> Iterator[tuple[str, str]]:
+    """Yield each port whose samples differ beyond the tolerances, and how."""
+    for port in sorted({*before, *after}):
+        moved = "one of them has none"
+        if port in before and port in after:
+            tolerances = products[port].tolerances
+            moved = sample_problem(
+                before[port], after[port], tolerances, numbers_stated=numbers_stated
+            )
+        if moved:
+            yield port, moved
 
 
 def _parsed(text: str, file: Path) -> dict[str, Golden]:
@@ -154,30 +147,26 @@ def _parsed(text: str, file: Path) -> dict[str, Golden]:
         ) from error
 
 
-def _text(known: Mapping[str, Golden]) -> str:
-    text = json.dumps(_FORMAT.dump_python(dict(known)), indent=1, sort_keys=True)
-    # One line per list of numbers, so that version control shows which of them changed.
-    return re.sub(r"\[[^\[\]]+\]", lambda found: " ".join(found[0].split()), text) + "\n"
-
-
-def sample_of(product: Product) -> dict[str, Sample]:
+def sample_of(product: Product) -> Samples:
     """Return a sample of each array, and of the numbers in the metadata; bytes are omitted.
 
     A single changed pixel changes all bytes of a compressed image.
     """
     payload = product.to_payload()
-    samples = {
-        name: _sample(np.asarray(array))
+    stated = dict(_leaves(dict(payload.metadata)))
+    arrays = {
+        name: np.asarray(array)
         for name, array in payload.arrays.items()
-        if not _is_bytes(payload, name)
+        if stated[f"/{name}/$array"] != "bytes"
     }
-    stated = np.array(list(_numbers(dict(payload.metadata))), dtype=np.float64)
-    return {**samples, _METADATA: _sample(stated)}
+    numbers = [one for one in stated.values() if type(one) in (int, float)]
+    arrays[_METADATA] = np.array(numbers, dtype=np.float64)
+    return {f"{name} {list(array.shape)}": _sampled(array) for name, array in arrays.items()}
 
 
 def sample_problem(
-    before: Mapping[str, Sample],
-    after: Mapping[str, Sample],
+    before: Samples,
+    after: Samples,
     tolerances: Mapping[str, Tolerance],
     *,
     numbers_stated: bool = True,
@@ -190,58 +179,36 @@ def sample_problem(
         tolerances: tolerances of the product type.
         numbers_stated: also compare the numbers in the metadata, not only their count.
     """
-    for name in sorted({*before, *after}):
-        if name not in before or name not in after:
-            return f"only one of them has {name}"
-        old, new = before[name], after[name]
-        if list(old.shape) != list(new.shape):
-            return f"{name} had {list(old.shape)} values, now {list(new.shape)}"
+    for array in sorted(before.keys() ^ after.keys()):
+        return f"only one of them has {array}"
+    for array, values in before.items():
+        name = array.partition(" [")[0]
         if name == _METADATA and not numbers_stated:
             continue
-        amount, share = _limit(name, tolerances)
-        a, b = (np.array(sample.values, dtype=np.float64) for sample in (old, new))
+        # An absolute value, and a share of the larger number.
+        stated = tolerances.get(name.rpartition("/")[2])
+        amount, share = (_UNSTATED, _UNSTATED) if stated is None else (stated.limit, 0.0)
+        share = _METADATA_SHARE if name == _METADATA else share
+        a, b = (np.array(sampled, dtype=np.float64) for sampled in (values, after[array]))
         is_close = np.isclose(a, b, atol=amount, rtol=share + _ROUNDING, equal_nan=True)
         n_apart = np.count_nonzero(~is_close)
-        if n_apart > _STRAY_SHARE * len(old.values):
-            return f"{n_apart} of {len(old.values)} sampled values of {name} changed"
+        if n_apart > _STRAY_SHARE * len(a):
+            return f"{n_apart} of {len(a)} sampled values of {name} changed"
     return ""
 
 
-def _sample(array: NDArray[np.generic]) -> Sample:
+def _sampled(array: NDArray[np.generic]) -> list[float | None]:
     flat = array.reshape(-1)
     if flat.size > _AT_MOST:
         flat = flat[np.arange(1, _AT_MOST + 1) * _STRIDE % flat.size]
     values = [float(value) for value in flat]
-    return Sample(
-        shape=list(array.shape),
-        values=[float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None for value in values],
-    )
+    return [float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None for value in values]
 
 
-def _limit(name: str, tolerances: Mapping[str, Tolerance]) -> tuple[float, float]:
-    """Return the tolerance of two numbers: an absolute value, and a share of the larger number."""
-    if name == _METADATA:
-        return _UNSTATED, _METADATA_SHARE
-    tolerance = tolerances.get(name.rpartition("/")[2])
-    return (_UNSTATED, _UNSTATED) if tolerance is None else (tolerance.limit, 0.0)
-
-
-def _is_bytes(payload: Payload, name: str) -> bool:
-    node: JsonValue = dict(payload.metadata)
-    for part in name.split("/"):
-        if isinstance(node, dict):
-            node = node[part]
-        elif isinstance(node, list):
-            node = node[int(part)]
-    return node == {"$array": "bytes"}
-
-
-def _numbers(node: JsonValue) -> Iterator[float]:
-    if isinstance(node, dict):
-        for value in node.values():
-            yield from _numbers(value)
-    elif isinstance(node, list):
-        for value in node:
-            yield from _numbers(value)
-    elif isinstance(node, int | float) and not isinstance(node, bool):
-        yield float(node)
+def _leaves(node: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Yield each value of a document with its path."""
+    if not isinstance(node, dict | list):
+        yield path, node
+        return
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        yield from _leaves(value, f"{path}/{key}")

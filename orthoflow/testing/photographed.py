@@ -10,14 +10,14 @@ import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from orthoflow.files.images import encode_png
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import WallFrame, up_vector
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import (
@@ -38,7 +38,9 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
-from orthoflow.testing.surveyed import settled
+from orthoflow.testing.surveyed import few_points, settled
+
+_Array: TypeAlias = NDArray[np.float64]
 
 SIZE_M: Final = (3.0, 2.0)
 GSD_M: Final = 0.006
@@ -64,20 +66,14 @@ class TexturedWall:
     """
 
     frame: WallFrame
-    noises: tuple[NDArray[np.float64], ...]
+    noises: tuple[_Array, ...]
 
-    def depth_m(
-        self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def depth_m(self, across_m: _Array, down_m: _Array) -> _Array:
         """Return the relief towards the viewer, at positions in metres from the top-left corner."""
-        wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4) + 0.4 * np.sin(
-            5.0 * across_m + 1
-        )
-        return RELIEF_M * wave
+        wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4)
+        return RELIEF_M * (wave + 0.4 * np.sin(5.0 * across_m + 1))
 
-    def grey(
-        self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def grey(self, across_m: _Array, down_m: _Array) -> _Array:
         """Return the grey value, 0 to 1, at positions in metres from the top-left corner."""
         total = np.zeros(np.broadcast(across_m, down_m).shape)
         for step, noise in zip(_OCTAVES_M, self.noises, strict=True):
@@ -86,13 +82,16 @@ class TexturedWall:
         return 1.0 / (1.0 + np.exp(-1.3 * total))
 
 
-def textured_wall(
-    seed: int, *, origin_world: NDArray[np.float64] | None = None, gsd_m: float = GSD_M
-) -> TexturedWall:
-    """Return a 3 m x 2 m wall with 6 cm relief, whose plane contains `origin_world`."""
+def textured_wall(seed: int = 1, *, gsd_m: float = GSD_M) -> TexturedWall:
+    """Return a 3 m x 2 m wall with 6 cm relief, whose bottom-left corner is the origin.
+
+    Args:
+        seed: seed of the texture; the examples have the first.
+        gsd_m: cell size of its raster.
+    """
     rng = np.random.default_rng(seed)
     frame = WallFrame(
-        origin_world=np.array([0.0, 0.0, SIZE_M[1]]) if origin_world is None else origin_world,
+        origin_world=np.array([0.0, 0.0, SIZE_M[1]]),
         u_world=np.array([1.0, 0.0, 0.0]),
         v_world=np.array([0.0, 0.0, -1.0]),
         normal_world=np.array([0.0, -1.0, 0.0]),
@@ -107,16 +106,16 @@ def textured_wall(
     return TexturedWall(frame=frame, noises=noises)
 
 
-def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Walls:
+def walls_of(scene: TexturedWall) -> Walls:
     """Return the scanned wall, with a window and a different contrast curve from the photos."""
     frame = scene.frame
     across, down = places_of_cells(frame)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(5)
     grey = scene.grey(across, down)
-    intensity = 0.2 + 0.5 * grey**1.4
-    intensity += noise * rng.normal(size=intensity.shape)
+    intensity = 0.2 + 0.5 * grey**1.4 + 0.02 * rng.normal(size=grey.shape)
     depth = scene.depth_m(across, down) + 0.001 * rng.normal(size=across.shape)
-    _cut_window(intensity, frame.gsd_m)
+    left, right, top, bottom = (round(m / frame.gsd_m) for m in (1.2, 1.44, 0.72, 0.9))
+    intensity[top:bottom, left:right] = np.nan
     known = np.isfinite(intensity)
     wall = Wall(
         frame=frame,
@@ -139,43 +138,21 @@ def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Wall
     )
 
 
-def places_of_cells(frame: WallFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def places_of_cells(frame: WallFrame) -> tuple[_Array, _Array]:
     """Return the positions of raster cell centres, metres across and down, each (rows, cols)."""
     across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
     return across * frame.gsd_m, down * frame.gsd_m
 
 
-def _cut_window(values: NDArray[np.float64], gsd_m: float) -> None:
-    left, right, top, bottom = (round(metres / gsd_m) for metres in (1.2, 1.44, 0.72, 0.9))
-    values[top:bottom, left:right] = np.nan
-
-
 def cloud_of(scene: TexturedWall, *, spacing_m: float = 0.005) -> PointCloud:
     """Return the wall as coloured points on a regular grid, with a station opposite its centre."""
-    across, down = (
-        places.ravel()
-        for places in np.meshgrid(
-            np.arange(spacing_m / 2, SIZE_M[0], spacing_m),
-            np.arange(spacing_m / 2, SIZE_M[1], spacing_m),
-        )
-    )
-    gsd_m, origin = scene.frame.gsd_m, scene.frame.origin_world
-    points = scene.frame.world_from_wall(
-        np.column_stack([across, down]) / gsd_m, scene.depth_m(across, down)
-    )
-    x, y, z = np.ascontiguousarray((points - origin).T, dtype=np.float32)
+    grid = np.meshgrid(*(np.arange(spacing_m / 2, size_m, spacing_m) for size_m in SIZE_M))
+    across, down = (places.ravel() for places in grid)
+    cells, origin = np.column_stack([across, down]) / scene.frame.gsd_m, scene.frame.origin_world
+    points = scene.frame.world_from_wall(cells, scene.depth_m(across, down))
     grey = np.rint(255 * scene.grey(across, down)).astype(np.uint8)
-    return PointCloud(
-        origin=origin.copy(),
-        x=x,
-        y=y,
-        z=z,
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity=(grey / 255.0).astype(np.float32),
-        rgb=np.repeat(grey[:, np.newaxis], 3, axis=1),
-        stations=origin[np.newaxis] + [[SIZE_M[0] / 2, -2.6, -1.0]],
-        stations_source="file",
-    )
+    stations = origin[np.newaxis] + [[SIZE_M[0] / 2, -2.6, -1.0]]
+    return replace(few_points(points - origin, grey), origin=origin.copy(), stations=stations)
 
 
 def two_halves(scene: TexturedWall) -> Layers:
@@ -185,33 +162,27 @@ def two_halves(scene: TexturedWall) -> Layers:
     across = np.broadcast_to(np.arange(frame.width) / frame.width, frame.shape)
     layers = []
     for source, shown in (("left", across < 0.6), ("right", across > 0.4)):
-        mask = np.where(shown, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8)
-        layers.append(
-            Layer(
-                frame=frame,
-                wall=0,
-                source=source,
-                rgb=np.where(shown, grey, 0)[..., np.newaxis].repeat(3, axis=2),
-                mask=mask,
-                quality=shown.astype(np.float32),
-            )
+        one = Layer(
+            frame=frame,
+            wall=0,
+            source=source,
+            rgb=np.where(shown, grey, 0)[..., np.newaxis].repeat(3, axis=2),
+            mask=np.where(shown, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
+            quality=shown.astype(np.float32),
         )
+        layers.append(one)
     return Layers(layers=tuple(layers), names=("wall 0",))
 
 
 def camera_before(
-    scene: TexturedWall,
     *,
     centre: tuple[float, float, float] = (1.2, -2.6, 1.1),
     towards: tuple[float, float, float] = (1.5, 0.0, 1.0),
     roll: float = 0.0,
 ) -> ViewingCamera:
-    """Return a distorted camera; positions are in metres from the wall's bottom-left corner."""
-    corner = scene.frame.origin_world - [0.0, 0.0, SIZE_M[1]]
-    rotation = looking_at(
-        corner + np.array(centre), corner + np.array(towards), np.array([0.0, 0.0, 1.0])
-    )
-    rotation = rotation_from_vector(np.array([0.0, 0.0, roll])) @ rotation
+    """Return a distorted camera that looks at the wall, whose bottom-left corner is the origin."""
+    upright = looking_at(np.array(centre), np.array(towards), up_vector("z"))
+    rotation = rotation_from_vector(np.array([0.0, 0.0, roll])) @ upright
     return ViewingCamera(
         width=900,
         height=640,
@@ -221,7 +192,7 @@ def camera_before(
         cy=316.4,
         distortion=np.array(DISTORTION),
         rotation=rotation,
-        translation=-rotation @ (corner + np.array(centre)),
+        translation=-rotation @ np.array(centre),
     )
 
 
@@ -243,9 +214,8 @@ def photo_of(
 @lru_cache(maxsize=32)
 def _picture(pickled: bytes) -> bytes:
     """Return the image of a pickled scene and camera; equal ones share an entry of the cache."""
-    scene: TexturedWall
-    camera: ViewingCamera
-    scene, camera = pickle.loads(pickled)
+    known: tuple[TexturedWall, ViewingCamera] = pickle.loads(pickled)
+    scene, camera = known
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = camera.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
     gsd_m = scene.frame.gsd_m
@@ -258,12 +228,9 @@ def _picture(pickled: bytes) -> bytes:
         before, depth = depth, scene.depth_m(across, down)
         if np.abs(depth - before).max() < 1e-7:
             break
-    grey = np.where(
-        (across > 0) & (across < SIZE_M[0]) & (down > 0) & (down < SIZE_M[1]),
-        scene.grey(across, down),
-        0.0,
-    )
-    return encode_png(np.rint(255 * grey).astype(np.uint8).reshape(camera.height, camera.width))
+    inside = (across > 0) & (across < SIZE_M[0]) & (down > 0) & (down < SIZE_M[1])
+    grey = np.rint(255 * np.where(inside, scene.grey(across, down), 0.0))
+    return encode_png(grey.astype(np.uint8).reshape(camera.height, camera.width))
 
 
 def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
@@ -296,45 +263,36 @@ def nudged(camera: ViewingCamera, vector: tuple[float, ...]) -> ViewingCamera:
 
 def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera) -> float:
     """Return the RMS per coordinate, in the wall's plane, of projected pixels: found minus true."""
-    steps = np.linspace(20.0, 620.0, 9)
-    pixels = np.array([(u, v) for u in np.linspace(20.0, 880.0, 9) for v in steps])
+    pixels = np.mgrid[20.0:880.0:9j, 20.0:620.0:9j].reshape(2, -1).T
     landed = []
     for camera in (found, true):
         rays = camera.rays_world(pixels)
-        normal, offset = scene.frame.normal_world, scene.frame.plane.offset_m
-        reach = (offset - camera.centre_world @ normal) / (rays @ normal)
+        plane = scene.frame.plane
+        reach = -plane.distances_m(camera.centre_world[None]) / (rays @ plane.normal)
         landed.append(camera.centre_world + reach[:, None] * rays)
     cells = scene.frame.wall_from_world(landed[1])[:, :2]
-    inside = ((cells > 0) & (cells < [scene.frame.width, scene.frame.height])).all(axis=1)
+    inside = ((cells > 0) & (cells < scene.frame.shape[::-1])).all(axis=1)
     difference = (landed[0] - landed[1])[inside]
     return float(np.sqrt((difference**2).sum(axis=1).mean() / 2.0))
 
 
-@cache
-def photographed_scene(gsd_m: float = 0.006) -> TexturedWall:
-    """Return the wall with the given cell size of its raster."""
-    return textured_wall(1, gsd_m=gsd_m)
-
-
-def photographing_cameras() -> Mapping[str, ViewingCamera]:
-    """Return the true cameras by photo name."""
-    scene = photographed_scene()
-    return {
-        "a.png": camera_before(scene),
-        "b.png": camera_before(scene, centre=(1.9, -2.4, 0.8), towards=(1.5, 0.0, 1.0), roll=0.05),
-    }
+# True cameras by photo name.
+PHOTOGRAPHING: Final[Mapping[str, ViewingCamera]] = {
+    "a.png": camera_before(),
+    "b.png": camera_before(centre=(1.9, -2.4, 0.8), towards=(1.5, 0.0, 1.0), roll=0.05),
+}
 
 
 @cache
 def _photos() -> Photos:
-    scene, views = photographed_scene(), photographing_cameras()
-    return photos(*(photo_of(scene, camera, name=name) for name, camera in views.items()))
+    scene = textured_wall()
+    return photos(*(photo_of(scene, view, name=name) for name, view in PHOTOGRAPHING.items()))
 
 
 @cache
 def _cameras() -> Cameras:
-    views = photographing_cameras()
-    return cameras(*(oriented(settled_camera(view), name=name) for name, view in views.items()))
+    views = PHOTOGRAPHING.items()
+    return cameras(*(oriented(settled_camera(view), name=name) for name, view in views))
 
 
 def settled_camera(camera: ViewingCamera) -> ViewingCamera:
@@ -345,20 +303,18 @@ def settled_camera(camera: ViewingCamera) -> ViewingCamera:
 
 @cache
 def _calibration() -> Calibration:
-    camera = next(iter(photographing_cameras().values()))
-    return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(camera),))
+    return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(PHOTOGRAPHING["a.png"]),))
 
 
 @cache
 def _checkpoints() -> CheckPoints:
-    frame = photographed_scene().frame
+    frame = textured_wall().frame
     pixels = np.array([[50.0, 60.0], [440.0, 70.0], [250.0, 170.0], [60.0, 280.0], [430.0, 270.0]])
-    count = len(pixels)
     return CheckPoints(
-        names=tuple(f"P{index}" for index in range(count)),
+        names=("P0", "P1", "P2", "P3", "P4"),
         points_world=frame.world_from_wall(pixels),
-        classes=("flat",) * count,
-        wall=np.zeros(count, dtype=np.int32),
+        classes=("flat",) * 5,
+        wall=np.zeros(5, dtype=np.int32),
         pixels_wall=pixels,
     )
 
@@ -378,34 +334,33 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
             ties.
     """
     rng = np.random.default_rng(seed)
-    scene = photographed_scene()
-    views = list(photographing_cameras().values())
-    columns: list[tuple[NDArray[np.float64], ...]] = []
-    for index, camera in enumerate(views):
+    scene = textured_wall()
+    tables: list[_Array] = []  # photo, wall, two of the pixel, three of the point
+    for index, camera in enumerate(PHOTOGRAPHING.values()):
         places = rng.random((320, 2)) * SIZE_M
         on_board = np.arange(len(places)) >= 220
         depths = np.where(on_board, _BOARD_M, scene.depth_m(places[:, 0], places[:, 1]))
         points = scene.frame.world_from_wall(places / scene.frame.gsd_m, depths)
-        wall = on_board.astype(np.float64)
         pixels = camera.project(points)[:, :2]
-        inside = (pixels > 10.0).all(axis=1)
-        inside &= (pixels < [camera.width - 10.0, camera.height - 10.0]).all(axis=1)
-        points, wall, pixels = points[inside], wall[inside], pixels[inside]
-        pixels = pixels + _TIE_SIGMA_PX * rng.normal(size=pixels.shape)
-        is_wrong = rng.random(len(pixels)) < _WRONG_SHARE
-        pixels[is_wrong] += rng.uniform(-40.0, 40.0, (int(is_wrong.sum()), 2))
+        far = [camera.width - 10.0, camera.height - 10.0]
+        inside = ((pixels > 10.0) & (pixels < far)).all(axis=1)
+        photo = np.full(len(places), index)
+        table = np.column_stack([photo, on_board, pixels, points])[inside]
+        table[:, 2:4] += _TIE_SIGMA_PX * rng.normal(size=(len(table), 2))
+        is_wrong = rng.random(len(table)) < _WRONG_SHARE
+        table[is_wrong, 2:4] += rng.uniform(-40.0, 40.0, (int(is_wrong.sum()), 2))
         if noise_m:
-            points = points + noise_m * rng.normal(size=points.shape)
-        columns.append((np.full(len(wall), float(index)), wall, pixels, points))
-    photo, wall, pixels, points = (np.concatenate(column) for column in zip(*columns, strict=True))
-    count = len(photo)
+            table[:, 4:] += noise_m * rng.normal(size=(len(table), 3))
+        tables.append(table)
+    rows = np.concatenate(tables)
+    count = len(rows)
     return Ties(
-        photo_names=tuple(photographing_cameras()),
-        photo=photo.astype(np.int32),
-        wall=wall.astype(np.int32),
+        photo_names=tuple(PHOTOGRAPHING),
+        photo=rows[:, 0].astype(np.int32),
+        wall=rows[:, 1].astype(np.int32),
         # Rounding errors of pixels are a millionth of the last digit kept.
-        pixels_photo=settled(pixels, 6),
-        points_world=settled(points),
+        pixels_photo=settled(rows[:, 2:4], 6),
+        points_world=settled(rows[:, 4:]),
         sigma_px=np.full(count, _TIE_SIGMA_PX),
         sigma_m=np.full(count, _TIE_SIGMA_M),
         role=np.full(count, TieRole.CONTROL, dtype=np.uint8),
@@ -418,8 +373,8 @@ PHOTOGRAPHED: Final[Mapping[str, Callable[[], Product]]] = {
     "cameras": _cameras,
     "calibration": _calibration,
     "ties": example_ties,
-    "walls": cache(lambda: walls_of(photographed_scene())),
-    "layers": cache(lambda: two_halves(photographed_scene())),
-    "cloud": cache(lambda: cloud_of(photographed_scene(), spacing_m=0.01)),
+    "walls": cache(lambda: walls_of(textured_wall())),
+    "layers": cache(lambda: two_halves(textured_wall())),
+    "cloud": cache(lambda: cloud_of(textured_wall(), spacing_m=0.01)),
     "checkpoints": _checkpoints,
 }

@@ -16,7 +16,8 @@ from tempfile import TemporaryDirectory
 from typing import Final, TypeVar
 
 from orthoflow.engine.kernels import VARIABLE
-from orthoflow.products import Product
+from orthoflow.engine.store import digest_of
+from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.examples import example_inputs
 from orthoflow.testing.trials import Trial, TrialRun, run_trial
@@ -45,6 +46,7 @@ class Subject:
     def __init__(self, trial: Trial, golden: Path | None = None) -> None:
         self.trial = trial
         self.golden = golden
+        self.changed_inputs: list[str] = []  # ports whose input the first run changed
 
     @property
     def method(self) -> type[Method]:
@@ -54,7 +56,11 @@ class Subject:
     @cached_property
     def first(self) -> TrialRun:
         """The first run; later runs are not affected by side effects on its inputs."""
-        return _run(replace(self.trial, inputs=deepcopy(dict(self.trial.inputs))))
+        copies = deepcopy(dict(self.trial.inputs))
+        run = _run(replace(self.trial, inputs=copies))
+        before, after = (_digests(inputs) for inputs in (self.trial.inputs, copies))
+        self.changed_inputs += [name for name in before if after[name] != before[name]]
+        return run
 
     @cached_property
     def again(self) -> TrialRun:
@@ -99,6 +105,10 @@ class Subject:
         return _run(self.trial, is_cancelled=True)
 
 
+def _digests(inputs: Mapping[str, Product | InputFiles]) -> dict[str, str]:
+    return {name: digest_of(one) for name, one in inputs.items() if isinstance(one, Product)}
+
+
 def _run(trial: Trial, *, is_cancelled: bool = False) -> TrialRun:
     # Outputs may be files mapped from the scratch folder; they remain readable after its removal.
     with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
@@ -137,12 +147,8 @@ def _run_elsewhere(trial: Trial, world: Path) -> tuple[Mapping[str, str], list[s
         raise AssertionError(
             f"in a new process the method ended with exit code {done.returncode}: {last}"
         )
-    strays = [
-        str(path.relative_to(world))
-        for place in places.values()
-        for path in sorted(place.rglob("*"))
-        if path.is_file()
-    ]
+    found = [path for place in places.values() for path in sorted(place.rglob("*"))]
+    strays = [str(path.relative_to(world)) for path in found if path.is_file()]
     return json.loads((world / "digests.json").read_text()), strays
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.geometry import up_vector
 from orthoflow.products import Planes, PointCloud, PointLabels, Product, Truth
 from orthoflow.sdk import StepContext
 
@@ -33,29 +34,41 @@ def settled(values: NDArray[np.float64], decimals: int = _DECIMALS) -> NDArray[n
     return np.asarray(np.round(values, decimals) + 0.0)
 
 
+def few_points(offsets_m: NDArray[np.floating], grey: int | NDArray[np.uint8] = 128) -> PointCloud:
+    """Return a grey cloud of points at offsets (n, 3) from the origin, which is its station."""
+    x, y, z = np.ascontiguousarray(offsets_m.T, dtype=np.float32)
+    greys = np.broadcast_to(np.uint8(grey), x.shape)
+    return PointCloud(
+        origin=np.zeros(3),
+        x=x,
+        y=y,
+        z=z,
+        up=up_vector("z"),
+        intensity=(greys / 255.0).astype(np.float32),
+        rgb=np.repeat(greys[:, np.newaxis], 3, axis=1),
+        stations=np.zeros((1, 3)),
+        stations_source="file",
+    )
+
+
 @cache
 def _room() -> tuple[PointCloud, Truth]:
     method = discover_catalog().method("simulate.room").load()
     with TemporaryDirectory(prefix="orthoflow-example-") as folder:
         ctx = StepContext(rng=np.random.default_rng(1), cores=1, scratch=Path(folder))
-        outputs = method().run(
-            method.In(), method.Params.model_validate({"scan_step_m": _SCAN_STEP_M}), ctx
-        )
-    made = vars(outputs)
+        params = method.Params.model_validate({"scan_step_m": _SCAN_STEP_M})
+        made = vars(method().run(method.In(), params, ctx))
     cloud, truth = made["cloud"], made["truth"]
-    scene = replace(
-        truth.scene,
-        **{
-            name: settled(getattr(truth.scene, name))
-            for name in ("origin", "centre", "axis_a", "axis_b", "extent", "hole_extent")
-        },
+    sides = ("origin", "centre", "axis_a", "axis_b", "extent", "hole_extent")
+    scene = {name: settled(getattr(truth.scene, name)) for name in sides}
+    fitted = ("normal", "offset", "corners", "rms_m")
+    planes = {name: settled(getattr(truth.planes, name)) for name in fitted}
+    return cloud, replace(
+        truth,
+        scene=replace(truth.scene, **scene),
+        planes=replace(truth.planes, **planes),
+        stations=settled(truth.stations),
     )
-    planes = replace(
-        truth.planes,
-        **{name: settled(getattr(truth.planes, name)) for name in ("normal", "offset", "corners")},
-        rms_m=settled(truth.planes.rms_m),
-    )
-    return cloud, replace(truth, scene=scene, planes=planes, stations=settled(truth.stations))
 
 
 @cache

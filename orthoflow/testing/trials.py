@@ -41,7 +41,6 @@ class TrialRun:
     Attributes:
         outputs: products by port.
         digests: digests of the products by port.
-        changed_inputs: ports whose input was changed.
         drew_globally: whether numpy's global random generator was used.
         metrics: metrics reported by the method.
         figures: figures, in the scratch folder.
@@ -51,7 +50,6 @@ class TrialRun:
 
     outputs: Mapping[str, Product]
     digests: Mapping[str, str]
-    changed_inputs: tuple[str, ...]
     drew_globally: bool
     metrics: tuple[Metric, ...]
     figures: tuple[DrawnFigure, ...]
@@ -103,9 +101,8 @@ def run_trial(
         draws=draws,
     )
     method = trial.method
-    inputs = {name: one for name, one in trial.inputs.items() if isinstance(one, Product)}
-    before, state = {name: digest_of(one) for name, one in inputs.items()}, _global_state()
-    # The type is Any, since the type of the returned value is checked here.
+    state = _global_state()
+    # `Any`: the type of the returned value is checked here.
     returned: Any = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     if not isinstance(returned, method.Out):
         got = type(returned).__name__
@@ -114,7 +111,6 @@ def run_trial(
     return TrialRun(
         outputs=outputs,
         digests={name: digest_of(product) for name, product in outputs.items()},
-        changed_inputs=tuple(name for name in inputs if digest_of(inputs[name]) != before[name]),
         drew_globally=state != _global_state(),
         metrics=tuple(ctx.metrics),
         figures=tuple(ctx.figures),

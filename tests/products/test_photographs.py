@@ -16,7 +16,7 @@ from orthoflow.products import (
     Ties,
     TieWall,
 )
-from orthoflow.testing.photographed import camera_before, oriented, textured_wall
+from orthoflow.testing.photographed import camera_before, oriented
 from tests import samples
 
 CORNERS = [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 0.0, 2.0]]
@@ -78,7 +78,7 @@ def test_people_know_a_wall_of_ties_by_its_plane_where_that_is_said(wall: int, n
     assert said.number(wall) == number
 
 
-TRUE = camera_before(textured_wall(1))
+TRUE = camera_before()
 
 
 def test_a_lens_comes_back_from_its_camera() -> None:

@@ -145,7 +145,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "meddling": (
         "inputs-stay-untouched",
-        "input cloud was changed",
+        "changed inputs: cloud",
         """
         def lift_m(self, cloud, ctx):
             cloud.x.flags.writeable = True
@@ -356,7 +356,7 @@ def test_inputs_that_a_method_changed_are_as_before_for_the_next_one() -> None:
     before = digest_of(cloud)
     cases = conformance_cases("plane.meddling", inputs={"cloud": cloud})
     (case,) = (case for case in cases if case.check.name == "inputs-stay-untouched")
-    assert case.problem() == "input cloud was changed"
+    assert case.problem() == "changed inputs: cloud"
     assert digest_of(cloud) == before
 
 

@@ -51,7 +51,7 @@ def oriented(shift_m: float) -> Any:
         photographed.oriented(
             photographed.nudged(camera, (0.0, 0.0, 0.0, shift_m, 0.0, 0.0)), name=name
         )
-        for name, camera in photographed.photographing_cameras().items()
+        for name, camera in photographed.PHOTOGRAPHING.items()
     ]
     run = SimpleNamespace(outputs={"cameras": photographed.cameras(*found)})
     return SimpleNamespace(run_on_photographs=lambda: run)
@@ -80,7 +80,7 @@ def layer(
     *, columns: float = 0.0, rows: float = 0.0, share: float = 1.0, lighter: int = 0
 ) -> Layer:
     """The wall in its true colours, shifted, in a share of its columns, and made lighter."""
-    scene = photographed.photographed_scene(0.01)
+    scene = photographed.textured_wall(gsd_m=0.01)
     frame = scene.frame
     across, down = photographed.places_of_cells(frame)
     grey = scene.grey(across - columns * frame.gsd_m, down - rows * frame.gsd_m)
@@ -111,7 +111,7 @@ def layer(
 )
 def test_cells_that_show_another_place_are_reported(image: dict[str, Any], message: str) -> None:
     shown = layer(**image)
-    scene = photographed.photographed_scene(0.01)
+    scene = photographed.textured_wall(gsd_m=0.01)
     with pytest.raises(AssertionError, match=message):
         physics._check_cells(scene, shown, "a.png", shown.mask == LayerMask.PAINTED)
 

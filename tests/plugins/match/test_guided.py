@@ -82,7 +82,7 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them() -> None:
 
 @pytest.mark.parametrize("content", ["grey", "colours"])
 def test_a_rough_pose_suffices(tmp_path: Path, content: str) -> None:
-    camera, walls = ms.camera_before(SCENE, roll=0.1), mw.walls(2)
+    camera, walls = ms.camera_before(roll=0.1), mw.walls(2)
     photo = ms.photo_of(SCENE, camera)
     if content == "colours":
         # For the laser, red is bright and green is dark.
@@ -113,7 +113,7 @@ def test_cells_finer_than_points_lie_apart_do_as_well(tmp_path: Path) -> None:
         count=np.where(is_void, 0, fine.count // 3).astype(np.uint32),
         intensity=np.where(is_void, np.float32(np.nan), fine.intensity),
     )
-    camera = ms.camera_before(SCENE)
+    camera = ms.camera_before()
     walls = replace(mw.walls(2), walls=(sparse,))
     ties = guided(ms.photos(ms.photo_of(SCENE, camera)), walls, rough(camera), tmp_path)
     error = mw.off_px(ties, camera)
@@ -133,8 +133,8 @@ def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(tmp_p
     stripes = np.where(wall.intensity > np.nanmedian(wall.intensity), 1.0, -1.0)
     strange = replace(wall, intensity=(0.5 + stripes * (wall.intensity - 0.5)).astype(np.float32))
     cameras = {
-        "a.png": ms.camera_before(SCENE),
-        "b.png": ms.camera_before(SCENE, centre=(1.9, -2.3, 0.9), roll=1.57),
+        "a.png": ms.camera_before(),
+        "b.png": ms.camera_before(centre=(1.9, -2.3, 0.9), roll=1.57),
     }
     photos = ms.photos(*(ms.photo_of(SCENE, each, name=name) for name, each in cameras.items()))
     start = ms.cameras(
@@ -149,7 +149,7 @@ def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(tmp_p
 
 def test_ties_on_a_part_of_the_wall_that_was_moved_are_rejected(tmp_path: Path) -> None:
     # The moved ties agree with their neighbours, but differ from the others by four cells.
-    camera = ms.camera_before(SCENE)
+    camera = ms.camera_before()
     photo = ms.photo_of(SCENE, camera)
     rgb = decode_image(photo.encoded, "a.png").copy()
     rgb[220:380, 380:540] = rgb[220:380, 372:532]
@@ -164,7 +164,7 @@ def test_ties_on_a_part_of_the_wall_that_was_moved_are_rejected(tmp_path: Path) 
 def test_no_oriented_photo_is_refused_and_a_pose_far_off_gives_hardly_any_ties(
     tmp_path: Path,
 ) -> None:
-    camera = ms.camera_before(SCENE)
+    camera = ms.camera_before()
     photos = ms.photos(ms.photo_of(SCENE, camera))
     off = ms.nudged(camera, (0.0, 0.15, 0.0, -0.4, 0.0, 0.0))
     assert len(guided(photos, mw.walls(2), ms.cameras(ms.oriented(off)), tmp_path).photo) < 30
@@ -176,7 +176,7 @@ def test_no_oriented_photo_is_refused_and_a_pose_far_off_gives_hardly_any_ties(
 def test_the_papers_mask_keeps_best_matches_from_going_astray(tmp_path: Path) -> None:
     # The photo shows a quarter of the wall; without the ratio test, every key point of the wall has
     # a match.
-    camera = ms.camera_before(SCENE, centre=(1.0, -1.3, 1.0), towards=(1.0, 0.0, 1.0))
+    camera = ms.camera_before(centre=(1.0, -1.3, 1.0), towards=(1.0, 0.0, 1.0))
     inputs = {"photos": ms.photos(ms.photo_of(SCENE, camera)), "walls": mw.walls(2)}
     wrong, n_right = {}, {}
     for ratio in (1.0, 0.8):

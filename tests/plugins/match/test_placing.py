@@ -21,7 +21,7 @@ from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
 
 SCENE = ms.textured_wall(1)
-PHOTO = ms.photo_of(SCENE, ms.camera_before(SCENE), calibrated=False)
+PHOTO = ms.photo_of(SCENE, ms.camera_before(), calibrated=False)
 
 
 def patchy_wall() -> Wall:
@@ -44,7 +44,7 @@ def placed(photo: Photo) -> Placed | None:
 
 def test_a_photo_is_placed_whatever_its_lens_and_however_it_was_held() -> None:
     """The contrast of the wall is inverted in places; the photo's lens and rotation are unknown."""
-    camera = ms.camera_before(SCENE, centre=(3.4, -1.9, 1.2), towards=(1.6, 0.0, 1.0))
+    camera = ms.camera_before(centre=(3.4, -1.9, 1.2), towards=(1.6, 0.0, 1.0))
     upright = decode_image(ms.photo_of(SCENE, camera).encoded, "a.png")
     turned = np.ascontiguousarray(np.rot90(upright))
     found = placed(Photo(name="a.png", encoded=encode_png(turned), width=640, height=900))
@@ -64,7 +64,7 @@ def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
     mirrored = np.ascontiguousarray(decode_image(PHOTO.encoded, "a.png")[:, ::-1])
     assert placed(replace(PHOTO, encoded=encode_png(mirrored))) is None
     other = ms.textured_wall(2)
-    assert placed(ms.photo_of(other, ms.camera_before(other), calibrated=False)) is None
+    assert placed(ms.photo_of(other, ms.camera_before(), calibrated=False)) is None
     # On a wall without intensity, there are no positions.
     blind = replace(patchy_wall(), intensity=None)
     assert places_of(0, PHOTO, [structures.wall_structure(blind)]) == []
@@ -73,9 +73,9 @@ def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
 SCENE = ms.textured_wall(1)
 WALLS = mw.walls(1)
 CAMERAS = [
-    ms.camera_before(SCENE),
-    ms.camera_before(SCENE, centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
-    ms.camera_before(SCENE, centre=(1.5, -2.4, 0.9), towards=(1.4, 0.0, 1.1)),
+    ms.camera_before(),
+    ms.camera_before(centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
+    ms.camera_before(centre=(1.5, -2.4, 0.9), towards=(1.4, 0.0, 1.1)),
 ]
 
 

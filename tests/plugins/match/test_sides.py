@@ -42,7 +42,7 @@ def faced(
     given: Planes, folder: Path, *, cloud: PointCloud = CLOUD, shown: ms.TexturedWall = SCENE
 ) -> tuple[Planes, dict[str, float]]:
     ctx = mw.context(folder)
-    photos = ms.photos(ms.photo_of(shown, ms.camera_before(shown)))
+    photos = ms.photos(ms.photo_of(shown, ms.camera_before()))
     inputs = {"planes": given, "cloud": cloud, "photos": photos}
     found = run(FaceByPhotos, ctx, inputs).planes
     return found, {metric.name: metric.value for metric in ctx.metrics}

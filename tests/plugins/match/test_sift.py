@@ -36,7 +36,7 @@ def sift(
 
 @pytest.mark.parametrize("roll", [0.0, 1.57], ids=["level", "portrait"])
 def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: float) -> None:
-    camera = ms.camera_before(SCENE, roll=roll)
+    camera = ms.camera_before(roll=roll)
     ties, _ = sift(tmp_path, ms.photo_of(SCENE, camera))
     error = mw.off_px(ties, camera)
     length = np.linalg.norm(error, axis=1)
@@ -52,7 +52,7 @@ def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: 
 
 
 def test_a_photo_of_nothing_known_is_warned_of(tmp_path: Path) -> None:
-    photo = ms.photo_of(SCENE, ms.camera_before(SCENE))
+    photo = ms.photo_of(SCENE, ms.camera_before())
     blank = replace(photo, encoded=encode_png(np.full((photo.height, photo.width), 128, np.uint8)))
     ties, codes = sift(tmp_path, blank)
     assert not (ties.role != TieRole.REJECTED).any()
@@ -98,7 +98,7 @@ def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertaint
 
 
 HAND_SCENE = ms.textured_wall(0)
-HAND_CAMERA = ms.camera_before(HAND_SCENE, centre=(1.3, -2.6, 1.1))
+HAND_CAMERA = ms.camera_before(centre=(1.3, -2.6, 1.1))
 
 
 HAND_PHOTO = ms.photo_of(HAND_SCENE, HAND_CAMERA)
@@ -163,9 +163,7 @@ def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
 
 
 # The middle of the picture, which contains enough key points.
-CAMERA = replace(
-    ms.camera_before(ms.textured_wall(1)), width=630, height=448, cx=0.5 * 630, cy=0.5 * 448
-)
+CAMERA = replace(ms.camera_before(), width=630, height=448, cx=0.5 * 630, cy=0.5 * 448)
 
 
 def grey_of(seed: int) -> NDArray[np.uint8]:

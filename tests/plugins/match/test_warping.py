@@ -22,7 +22,7 @@ from orthoflow.products import Photo, PointCloud, Wall
 from orthoflow.testing import photographed as ms
 from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
-from tests.tied_photos import SCENE, photo, seen_by
+from tests.tied_photos import photo, seen_by
 
 GSD_M = 0.01
 
@@ -229,7 +229,7 @@ def test_values_between_cells_are_bilinear_and_unknown_beyond_them() -> None:
     np.testing.assert_allclose(warping.between(product, np.array([[0.5, 0.25]])), [1.0])
 
 
-VIEW = ms.camera_before(SCENE)
+VIEW = ms.camera_before()
 
 
 OLD = {"old.png": ms.oriented(replace(VIEW, fx=1000.0, fy=1000.0), name="old.png")}

@@ -30,7 +30,7 @@ from tests.method_runs import run
 from tests.tied_photos import context, known_ties, photo
 
 SCENE = tp.SCENE
-CAMERA = ms.camera_before(SCENE, centre=(1.3, -2.6, 1.1))
+CAMERA = ms.camera_before(centre=(1.3, -2.6, 1.1))
 SIGMA_PX = 1.0
 # Two rows of typical clicks, as shares of the photo; the points are on relief.
 SPREAD = ((0.12, 0.15), (0.5, 0.12), (0.88, 0.16), (0.13, 0.86), (0.52, 0.88), (0.87, 0.84))
@@ -243,7 +243,7 @@ def test_given_poses_are_taken_as_they_are(tmp_path: Path) -> None:
     "away",
     [
         replace(CAMERA, translation=CAMERA.translation + np.array([500.0, 0, 0])),
-        ms.camera_before(SCENE, centre=(1.3, 2.6, 1.1)),
+        ms.camera_before(centre=(1.3, 2.6, 1.1)),
     ],
     ids=["elsewhere", "behind"],
 )

@@ -32,7 +32,7 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known:
     # The principal point is off by 5 px, there is distortion of all kinds, and EXIF is off by 1 %.
     ratios = []
     for seed in range(10):
-        camera = ms.camera_before(tp.SCENE, centre=(0.4 + 0.24 * seed, -2.5, 0.9))
+        camera = ms.camera_before(centre=(0.4 + 0.24 * seed, -2.5, 0.9))
         exif = ms.photos(tp.photo(exif_focal_px=1.01 * camera.fx))
         photos = calibrated(camera) if known else exif
         ties = known_ties(camera, seed, wrong_share=0.2)
@@ -46,7 +46,7 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known:
 
 def test_a_common_factor_of_all_sigmas_of_ties_changes_no_pose(tmp_path: Path) -> None:
     """Errors of ties are four times their sigmas; the weight of residuals depends on sigma0."""
-    camera = ms.camera_before(tp.SCENE)
+    camera = ms.camera_before()
     ties = known_ties(camera, 3, n=300, wrong_share=0.0)
     bold = replace(ties, sigma_px=ties.sigma_px / 4.0, sigma_m=ties.sigma_m / 4.0)
     right, same = (
@@ -61,7 +61,7 @@ def test_a_common_factor_of_all_sigmas_of_ties_changes_no_pose(tmp_path: Path) -
 
 
 def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None:
-    camera = ms.camera_before(tp.SCENE)
+    camera = ms.camera_before()
     ties = known_ties(camera, 5)
     cameras = orient(ties, calibrated(camera), context(tmp_path))
     assert cameras.ties is not None
@@ -80,7 +80,7 @@ def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None
 def test_opencvs_pose_is_the_least_squares_of_ties_that_count_alike(
     tmp_path: Path, seed: int
 ) -> None:
-    camera = ms.camera_before(tp.SCENE, centre=(0.4 + 0.6 * seed, -2.5, 0.9))
+    camera = ms.camera_before(centre=(0.4 + 0.6 * seed, -2.5, 0.9))
     ties = known_ties(camera, seed, n=300, wrong_share=0.3, shift_m=SURVEY_SHIFT_M)
     found = orient(ties, calibrated(camera), context(tmp_path), method="opencv")
     oriented = found.cameras[0]
@@ -99,7 +99,7 @@ def test_opencvs_pose_is_the_least_squares_of_ties_that_count_alike(
 
 
 def test_opencvs_pose_leaves_the_lens_as_it_is_known(tmp_path: Path) -> None:
-    camera = ms.camera_before(tp.SCENE, centre=(0.2, -1.8, 0.4))
+    camera = ms.camera_before(centre=(0.2, -1.8, 0.4))
     photos = ms.photos(tp.photo(exif_focal_px=1.01 * camera.fx))
     ties = known_ties(camera, 8, n=400)
     wide = {"max_sigma_wall_cells": 20.0, "max_sigma_corner_cells": 60.0}
@@ -111,7 +111,7 @@ def test_opencvs_pose_leaves_the_lens_as_it_is_known(tmp_path: Path) -> None:
 
 
 def test_ties_searched_within_a_small_radius_prove_less(tmp_path: Path) -> None:
-    camera = ms.camera_before(tp.SCENE)
+    camera = ms.camera_before()
     ties = known_ties(camera, 1, n=120)
     # All ties are wrong, within 12 px of wrong expected positions.
     jitter = np.random.default_rng(0).uniform(-12.0, 12.0, ties.pixels_photo.shape)

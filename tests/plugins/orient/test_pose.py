@@ -19,13 +19,13 @@ from orthoflow.products import Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
-from tests.tied_photos import SCENE, photo, seen_by, tied
+from tests.tied_photos import photo, seen_by, tied
 
 PARAMS = lenses.OrientParams()
 
 
 def camera() -> ViewingCamera:
-    return ms.camera_before(SCENE)
+    return ms.camera_before()
 
 
 def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone() -> None:
@@ -200,7 +200,7 @@ def lens_photo(name: str = "a.jpg", size: tuple[int, int] = (600, 400), **known:
 
 
 def oriented(*focal_px: float) -> list[ViewingCamera]:
-    camera = ms.camera_before(ms.photographed_scene())
+    camera = ms.camera_before()
     return [replace(camera, fx=focal, fy=focal) for focal in focal_px]
 
 
@@ -266,9 +266,7 @@ def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
 
 
 def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:
-    camera = replace(
-        ms.camera_before(ms.photographed_scene()), distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0])
-    )
+    camera = replace(ms.camera_before(), distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
     # With k1 = -0.5, no distorted ray is farther than 0.54 focal lengths from the axis.
     rays = lenses.camera_rays(
         camera,
@@ -346,7 +344,7 @@ def test_check_points_are_withheld_evenly(share: float, n_check: int) -> None:
     assert photos.withheld(pixels[:0], (600, 600), 0.5, rng).shape == (0,)
 
 
-CAMERA = ms.camera_before(SCENE)
+CAMERA = ms.camera_before()
 
 
 def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:

@@ -52,7 +52,7 @@ def test_shares_follow_their_three_conventions() -> None:
 def test_an_orientation_is_recorded_with_its_lens_its_errors_and_its_residuals(
     tmp_path: Path,
 ) -> None:
-    camera = ms.camera_before(tp.SCENE)
+    camera = ms.camera_before()
     photos = ms.photos(tp.photo(exif_focal_px=1.01 * camera.fx))
     ties = tp.known_ties(camera, 2, wrong_share=0.2)
     found = tp.oriented(OrientPnp, ties, photos, tp.context(tmp_path))
