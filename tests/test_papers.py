@@ -42,7 +42,7 @@ TABLES = {
     f"{paper}: {title}": [
         [cell.strip() for cell in line.strip("|").split("|")]
         for line in table.splitlines()
-        if line.startswith("|") and not line.startswith(("| where", "| ---"))
+        if line.startswith("|") and not line.startswith(("| where", "|---"))
     ]
     for paper, text in re.findall(
         r"^## (\w+2\d{3})\n(.*?)(?=^## |\Z)", TEXT, re.MULTILINE | re.DOTALL

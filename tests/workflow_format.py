@@ -67,7 +67,6 @@ HEAD = f"""\
 # The workflow file
 
 `{COMMAND}` generates this page from `orthoflow/workflow/model.py`.
-The same models define the checks and the output of `orthoflow schema`.
 
 ```yaml
 {EXAMPLE}```
