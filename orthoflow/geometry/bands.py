@@ -29,7 +29,7 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
 
     Args:
         shape: numbers of rows and columns, and the further dimensions of a cell.
-        multiple: the height of every band except the last is a multiple of this.
+        multiple: the height of every band except the last is a multiple of this number.
 
     Yields:
         The rows of each band, from top to bottom.

@@ -21,7 +21,8 @@ def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba inf
 
     The model is Brown's as in OpenCV, but with the first pixel centre at (0.5, 0.5). A point is not
     visible if it is behind the camera, or farther from the axis than the radius at which the
-    distortion polynomial folds back; otherwise, it would appear a second time inside the image.
+    distortion polynomial folds back. Beyond this radius, a point would be projected into the image
+    by mistake.
     """
     xc = camera[0] * x + camera[1] * y + camera[2] * z + camera[9]
     yc = camera[3] * x + camera[4] * y + camera[5] * z + camera[10]

@@ -43,8 +43,8 @@ _UNTURNED: Final = np.eye(3)
 class ViewingCamera:
     """A photo's camera: interior and exterior orientation.
 
-    Camera axes: x right, y down, z forward. Pixels (u, v) = (column, row), first centre at
-    (0.5, 0.5).
+    The camera axes are x right, y down, z forward. Pixels are (u, v) = (column, row), with the
+    centre of the first at (0.5, 0.5).
 
     Attributes:
         width: image width in pixels.
@@ -100,8 +100,8 @@ class ViewingCamera:
     def shifted(self, origin_world: NDArray[np.float64]) -> ViewingCamera:
         """Return the same camera in coordinates whose origin is at `origin_world` (3,).
 
-        With survey coordinates of 10^6 m, use it to project offsets: R x + t, a sum of large
-        numbers, would not keep the precision of float32 offsets.
+        Use this camera to project offsets if survey coordinates are about 10^6 m, because R x + t,
+        a sum of large numbers, would lose the precision of float32 offsets.
         """
         return replace(self, translation=self.rotation @ origin_world + self.translation)
 
@@ -248,7 +248,7 @@ def opencv_matrix(lens: ViewingCamera) -> NDArray[np.float64]:
 
 POSE_PARAMETERS: Final = 6
 # Standard deviation of ln(focal length) with EXIF, which contains the focal length in whole
-# millimetres or as a full-frame equivalent, and not the focusing distance.
+# millimetres or as a full-frame equivalent, but not the focusing distance.
 _EXIF_SIGMA: Final = 0.05
 # Standard deviation of ln(focal length) without EXIF: the range of common lenses.
 _UNKNOWN_SIGMA: Final = 0.35

@@ -49,7 +49,7 @@ def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
     return sums
 
 
-# Sides of pieces in metres; if pieces contain too few points, the next value is used.
+# Sides of pieces in metres; the next value is used if pieces contain too few points.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
 _PIECES_MOST: Final = 300
 _PIECES_LEAST: Final = 20
@@ -61,7 +61,7 @@ _AT_ONCE: Final = 1 << 16
 _HASH_BITS: Final = 20
 _CUBE_BITS: Final = 21
 _GATHERED_MOST: Final = 1_500_000
-# Maximum number of points assigned to cubes; of larger clouds, only some slabs of cubes are used.
+# Maximum number of points assigned to cubes; only some slabs of cubes of a larger cloud are used.
 _LOOKED_AT_MOST: Final = 4_000_000
 # Odd numbers with well distributed bits, so that the upper bits of a product depend on all bits.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
@@ -93,7 +93,7 @@ class CloudQuality:
     Attributes:
         side_m: side of the pieces.
         n_pieces: number of measured pieces.
-        sigma_m: thickness: robust standard deviation of the points of a scan from the surface.
+        sigma_m: thickness, the robust standard deviation of a scan's points from the surface.
         width_95_m: width of the range that contains 95 % of these distances.
         scan_step_m: distance from a point to the nearest point of the same scan.
         scans_apart_m: distance between scans of the same piece, perpendicular to it; None if fewer
@@ -127,8 +127,8 @@ class CloudQuality:
 
         `up` is wrong if no surface is level with respect to it and many are inclined, while all
         surfaces are level or upright with respect to one axis, and some of them are level. The
-        result is None for slopes, single walls, and rooms that are parallel to all axes, since they
-        look the same along each axis.
+        result is None for slopes, single walls, and rooms whose walls are parallel to the axes,
+        since they look the same along each axis.
         """
         level, square = self.square_shares(up)
         for axis, direction in enumerate(np.eye(3)):

@@ -5,9 +5,9 @@ are among the arguments, the wrappers take as long to compile as the function it
 are called only by kernels need no wrappers.
 
 Numba caches kernels, but not its own functions, so each process that compiles a kernel also
-compiles the numba functions called by it. To assign an array to a slice (`part[2:] = array`), forty
-of them are compiled just for an error message about shapes; therefore, kernels assign single
-numbers.
+compiles the numba functions called by it. The assignment of an array to a slice
+(`part[2:] = array`) makes it compile forty of them just for an error message about shapes, so
+kernels assign single numbers.
 """
 
 from __future__ import annotations
@@ -219,7 +219,8 @@ def _described(value: object) -> bytes:
         return f"{value.__module__}.{value.__qualname__}{fields}".encode()
     if isinstance(value, int | float | complex | str | bytes | None):
         return repr(value).encode()
-    # This is part of a library; the digest includes the version of numba and the platform.
+    # Use only the name of an object of a library; the digest includes numba's version and the
+    # platform.
     return str(getattr(value, "__name__", type(value).__name__)).encode()
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 # Correlation lengths, as shares of the extent of the points of a photo, for rough errors
 # (exponential correlation: matching, structure, steps between scans) and smooth errors (Gaussian
 # correlation: bending, drift of a path, stereo). Errors with shorter correlation lengths are
-# practically independent; those with longer ones are shifts and tilts of all points, which do not
+# practically independent; errors with longer ones are shifts and tilts of all points, which do not
 # appear in residuals.
 _ROUGH: Final = (0.04, 0.15, 0.5, 1.5)
 _SMOOTH: Final = (0.05, 0.15, 0.4, 1.0)

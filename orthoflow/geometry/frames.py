@@ -275,7 +275,8 @@ class WallFrame:
         """Name of the coordinate system in files: that of the map or of the wall.
 
         The latter consists of the name of the wall and a hash of the world position of X = Y = 0.
-        So it is the same for all rasters and parts of a wall, and differs between walls.
+        The name is therefore the same for all rasters and parts of a wall, and differs between
+        walls.
         """
         if self.map_crs is not None:
             return self.map_crs

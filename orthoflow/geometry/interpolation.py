@@ -89,9 +89,9 @@ def interpolate(
     """Interpolate cells linearly from surrounding cells.
 
     A void cell is interpolated from the surrounding points of one surface: the surface at its own
-    depth if known, otherwise that of the nearest point (or, of equally near points, the one nearest
-    to the viewer). The value of a cell with points is shifted from the position of its points to
-    the centre. Results are limited to the range of the surrounding values.
+    depth if known, otherwise that of the nearest point (if several are equally near, that of the
+    one nearest to the viewer). The value of a cell with points is shifted from the position of its
+    points to the centre. Results are limited to the range of the surrounding values.
 
     Args:
         cells: (n,) flat indices of the cells to interpolate.

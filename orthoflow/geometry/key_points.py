@@ -1,8 +1,9 @@
 """Evenly distributed key points of pictures, and matching of their descriptors.
 
 OpenCV's SIFT shifts all key points by a quarter of a pixel to the right and down unless its precise
-upscaling is enabled (opencv issue 23123; measured with 5.0: 0.25 px, for all sizes). The shift
-would be a systematic error of an orientation, so it is subtracted if the default upscaling is used.
+upscaling is enabled (opencv issue 23123; with version 5.0, a shift of 0.25 px was measured for all
+sizes). The shift would be a systematic error of an orientation, so it is subtracted if the default
+upscaling is used.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ class Features(Rows):
         )
 
     def undescribed(self) -> Features:
-        """Return the key points without descriptors, which take most of the memory."""
+        """Return the key points without their descriptors, which need most of the memory."""
         return replace(self, descriptors=self.descriptors[:, :0].copy())
 
     def strongest(self, n_most: int) -> Features:

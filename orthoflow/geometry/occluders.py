@@ -23,8 +23,8 @@ from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24
-# Side of a voxel: small enough to separate the legs of a chair, large enough to contain several
-# points of a surface.
+# Side of a voxel, which is small enough to separate the legs of a chair, and large enough to
+# contain several points of a surface.
 _VOXEL_CELLS: Final = 6.0
 # Scanners do not measure at shorter ranges. Points there are errors, even if they are dense.
 _BLIND_M: Final = 0.3
@@ -34,7 +34,7 @@ _PASSING_RAYS: Final = 200
 _N_ELEVATIONS: Final = 90
 # Half the number of points in 3 x 3 x 3 voxels of a surface scanned with the spacing of the wall.
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
-# At the corner of a surface there are a quarter of these points, at its edge half.
+# Around the corner of a surface, there are a quarter of these points; at its edge, there are half.
 _CORNER_SHARE: Final = 0.25
 # Limit of the share of point pairs in the same voxel; closer to 1 in 27 than to 1 in 9.
 _SPREAD_SHARE: Final = 0.07
@@ -146,7 +146,7 @@ def occluders_in(
         stations = np.unique(stations_world, axis=0) - cloud.origin
         _forget_passed(grid, points, stations, _CORNER_SHARE * n_few)
         _forget_around(grid, stations)
-    # In larger voxels, a linear object has more points by this factor.
+    # In a larger voxel, the number of points of a linear object is larger by this factor.
     n_asked = math.ceil(n_least * larger)
     return Occluders(
         origin=cloud.origin, points=points, around=grid, n_least=n_asked, threads=threads
@@ -231,8 +231,8 @@ def _forget_passed(
     """Reject voxels through which nearly all rays of the stations passed.
 
     Stray points of a dense scan can be as dense as points of a surface, especially near a station,
-    but only a small share of the rays in their direction ends at them. In a thinned cloud, there
-    are equally few points near a station, but as many as expected on a surface.
+    but only a small share of the rays in their direction ends at them. Near a station in a thinned
+    cloud, there are equally few points, but on a surface they are as many as expected.
     """
     every = slice(None, None, max(1, len(points.x) // _SAMPLED_MOST))
     places = np.column_stack([axis[every] for axis in points]).astype(np.float64)
@@ -241,7 +241,8 @@ def _forget_passed(
     middles = grid.low + grid.side_m * (
         np.array(np.unravel_index(filled, grid.counts.shape)).T + 0.5
     )
-    # All points are attributed to each station, so the mean applies to all stations together.
+    # It is unknown which station measured a point, so all stations are assumed to have the same
+    # share.
     rays = np.zeros(len(filled))
     for station in stations:
         per_sr = weight * _points_per_sr(places - station) / len(stations)

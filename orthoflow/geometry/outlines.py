@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, Plane, basis_from_up
 
-# Rectangles of points may end this far before a corner, if furniture hides it, or extend this far
-# beyond it, at a reveal.
+# A rectangle of points may end this far before a corner that furniture hides, or extend this far
+# beyond a corner with a reveal.
 REACH_M: Final = 0.3
 SHORTEST_M: Final = 0.1
 # The intersection of planes at a smaller angle is poorly determined.

@@ -116,7 +116,7 @@ def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers
 
 @compiled
 def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
-    """Select the point of each cell with the largest depth; if equal, that nearest to the centre.
+    """Select each cell's point with the largest depth; if equal, the one nearest to the centre.
 
     Args:
         entries: points of one chunk; the first of equally near points is used.
@@ -186,7 +186,7 @@ def entries_inside(
 ) -> Iterator[Entries]:
     """Yield the points inside a slab in order, by chunks.
 
-    Blocks of points whose bounding boxes are outside the slab are not read.
+    Blocks of points are not read if their bounding boxes are outside the slab.
 
     Args:
         points: points of the cloud.
@@ -277,7 +277,8 @@ def topmost_points(
 ) -> NDArray[np.void]:
     """Return the point of each cell that is nearest to the viewer (skarlatos2012).
 
-    Of equally near points, the one nearest to the centre of the cell is used, then the first one.
+    If points are equally near, the one nearest to the centre of the cell is used; if these are also
+    equally near, the first one is used.
 
     Args:
         points: points of the cloud.

@@ -33,14 +33,14 @@ from orthoflow.geometry.frames import cross_matrix
 from orthoflow.geometry.rows import Rows
 
 _ITERATIONS: Final = 40
-# Relative change of the sum of squares at convergence. With a few hundred points, a step with such
-# a change moves no parameter by more than 1 % of its standard deviation, and the next step is far
+# Relative change of the sum of squares at convergence. With a few hundred points, a step with this
+# change moves no parameter by more than 1 % of its standard deviation, and the next step is far
 # smaller.
 _CONVERGED: Final = 1e-7
 _DAMPING_START: Final = 1e-6
 _DAMPING_MOST: Final = 1e8
-# A point is not used if its uncertainty exceeds this share of the image's longer side, since it
-# would agree with any pixel.
+# A point is not used if its uncertainty exceeds this share of the image's longer side, since the
+# point would agree with any pixel.
 _BLUR_MOST_SHARE: Final = 0.02
 
 

@@ -55,8 +55,8 @@ _SAMPLES: Final = 300_000
 def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
     """Estimate the standard deviation of a depth from second differences of neighbours.
 
-    Edges do not influence the median of the differences. The result is 0 if there are no three
-    adjacent measured cells in a raster (rows, cols).
+    Edges do not influence the median of the differences. The result is 0 if no three adjacent cells
+    of the raster (rows, cols) are measured.
     """
     # Half of the samples are horizontal, half vertical.
     step = max(1, 2 * depth_m.size // _SAMPLES)

@@ -1,11 +1,11 @@
 """Ray casting in a simulated scene: the surface that a ray hits, and its colour.
 
-Rays are traced through a tree of bounding boxes. The nearest hit is exact: the tree only skips
-rectangles that a ray cannot hit, and if two rectangles are at the same distance, the one with the
+Rays are traced through a tree of bounding boxes. The nearest hit is exact, because the tree only
+skips rectangles that a ray cannot hit. If two rectangles are at the same distance, the one with the
 smaller index is returned.
 
 A texture is a function of position, without grids or images, so the true orthoimage can be computed
-at any resolution. Stains are value noise on hashed lattices with quintic interpolation: the noise
+at any resolution. Stains are value noise on hashed lattices with quintic interpolation. This noise
 is twice continuously differentiable, and its shortest wavelength is about twice the lattice
 spacing. Ornaments have sharp edges.
 
@@ -248,7 +248,7 @@ def paint_points(
     points: NDArray[np.float64],
     painted: NDArray[np.float32],
 ) -> None:
-    """Fill `painted` (4, n) with red, green, blue (0..255), reflectance (0..1) of points (3, n).
+    """Fill `painted` (4, n) with red, green, blue (0..255) and reflectance (0..1) of points (3, n).
 
     Values for rectangle -1 remain unchanged. A point outside the plane of its rectangle gets the
     colour at its projection onto that plane.

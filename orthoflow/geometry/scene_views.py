@@ -275,7 +275,7 @@ class _Renderer:
         ways = np.broadcast_to(-self._normal, (3, len(cells)))
         for sub in range(n_sub * n_sub):
             # A sheared grid has n^2 different positions along each axis, so edges along rows or
-            # columns, which are frequent on walls, are not rounded to 1/n of a cell.
+            # columns, which are frequent on walls, are not rendered in steps of 1/n of a cell.
             i, j = sub % n_sub, sub // n_sub
             starts = self._starts(
                 cells, (i + (j + 0.5) / n_sub) / n_sub, (j + (n_sub - i - 0.5) / n_sub) / n_sub

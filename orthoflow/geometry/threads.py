@@ -1,7 +1,7 @@
 """Division of work among threads, with results in order.
 
-Either the parts do not depend on the number of threads, or they do not affect the result; so
-results are identical for any number of threads. Compiled kernels release the interpreter lock.
+Results are identical for any number of threads, because the division into parts either does not
+depend on this number or does not affect the result. Compiled kernels release the interpreter lock.
 """
 
 from __future__ import annotations

@@ -15,7 +15,8 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products.product import JsonValue, Product, Tolerance, require_shapes
 
-# Respectively: the laser passed through, the back was measured, there were no returns.
+# An opening has one of these kinds if the laser passed through it, if its back was measured, or if
+# there were no returns, respectively.
 OpeningKind = Literal["through", "niche", "no data"]
 
 _CORNERS_LEAST: Final = 3

@@ -177,7 +177,7 @@ class TieRole(IntEnum):
     Attributes:
         CONTROL: used to orient the photo.
         CHECK: withheld from the orientation, to check it.
-        REJECTED: contradicts the other ties, or its photo is not oriented.
+        REJECTED: the tie contradicts the other ties, or its photo is not oriented.
     """
 
     CONTROL = 0
@@ -194,8 +194,8 @@ class TieWall:
         corners_world: four corners (x, y, z) of its raster in metres: top-left, then
             counter-clockwise for the viewer, as in `WallFrame.corners_world`.
         normal_world: unit vector (x, y, z) towards the viewer; photos are never taken from behind.
-        gsd_m: cell size of its raster in metres; None if it has no raster; in this case, errors are
-            not limited in cells.
+        gsd_m: cell size of its raster in metres. If this is None, the wall has no raster, and
+            errors are not limited in cells.
         plane_index: index of its plane in `Planes`; None if unknown.
     """
 
@@ -228,11 +228,11 @@ class TieWall:
 
 @dataclass(frozen=True, kw_only=True)
 class Ties(Product):
-    """Points measured in photos whose positions on walls are known.
+    """Points with known positions on walls that were measured in photos.
 
-    A method may leave `walls` and `search_radius_px` empty, but both help to assess orientations.
-    If `walls` is empty, walls are described by the points of the ties, and neither the visible side
-    of a wall nor its cell size is known.
+    A method may leave `walls` and `search_radius_px` empty, although both help to assess
+    orientations. If `walls` is empty, walls are described by the points of the ties, and neither
+    the visible side of a wall nor its cell size is known.
 
     Attributes:
         photo_names: photos to which `photo` refers.
@@ -472,7 +472,7 @@ class Cameras(Product):
 
 
 def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:
-    """If a step has photos, refuse names that do not belong to them."""
+    """Refuse names that do not belong to the photos of a step, if it has any."""
     for product in others.values():
         known = {photo.name for photo in product.photos} if isinstance(product, Photos) else None
         unknown = [name for name in names if known is not None and name not in known]

@@ -33,7 +33,7 @@ _USUAL_TOLERANCE_M: Final = 0.05
 def plane_name(kind: PlaneKind, place: int) -> str:
     """Return the name of a plane and its wall, which contains the plane's index in `planes.json`.
 
-    The files `wall_<number>_*` have this number for all kinds of planes.
+    The names of the files `wall_<number>_*` contain this number for all kinds of planes.
 
     >>> plane_name("floor", 3)
     'floor 3'

@@ -64,7 +64,7 @@ class OrthoMask(IntEnum):
         FILLED: the colour is from neighbouring cells.
         OCCLUDED: the cell is hidden in all sources that face it.
         NO_SURFACE: the depth is unknown.
-        CONTRADICTED: the colour is from a single photo and contradicts the colour of the scan.
+        CONTRADICTED: the colour is from a single photo, and it contradicts the colour of the scan.
     """
 
     NONE = 0

@@ -29,7 +29,7 @@ class Project:
 
     Attributes:
         name: name of the distribution and the method, e.g. `my-detector`.
-        kind: kind of its method, either one of an installed plugin or a new one.
+        kind: kind of its method, which is either a kind of an installed plugin or a new one.
         takes: product types of the inputs of a new kind.
         gives: existing product types of the outputs of a new kind; empty for an existing kind.
         product: name of a new product type, which the new kind also outputs; empty if there is

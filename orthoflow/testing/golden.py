@@ -30,7 +30,7 @@ _AT_MOST: Final = 32
 # Share of cells that may differ, since a cell at an edge can change sides with the last bit of a
 # number.
 _STRAY_SHARE: Final = 1 / 16
-# As in comparisons of records, only the last digits may differ if no tolerance is declared.
+# If no tolerance is declared, only the last digits may differ, as in comparisons of records.
 _UNSTATED: Final = 1e-6
 # Tolerance of metadata values that describe a result, such as medians or counts. Without wide
 # processor instructions, such a value of a built-in method changed by 3e-4, while all arrays were

@@ -64,7 +64,7 @@ class Subject:
 
     @cached_property
     def again(self) -> TrialRun:
-        """A second run in the same process; with two cores if that gave the same results."""
+        """A second run in the same process, on two cores if the results are then the same."""
         if self.on_two_cores.digests == self.first.digests:
             return self.on_two_cores
         return _run(self.trial)
@@ -127,7 +127,8 @@ def _run_elsewhere(trial: Trial, world: Path) -> tuple[Mapping[str, str], list[s
         "PYTHONHASHSEED": "random",
         "HOME": str(places["home"]),
         "TMPDIR": str(places["tmp"]),
-        # As for steps of the engine, since matplotlib's font cache does not belong to the method.
+        # Redirect matplotlib's font cache as the engine does, since it does not belong to the
+        # method.
         "MPLCONFIGDIR": str(world / "matplotlib"),
         # Use two threads if this process uses one, otherwise one.
         "OPENBLAS_NUM_THREADS": "2" if os.environ.get("OPENBLAS_NUM_THREADS") == "1" else "1",

@@ -1,7 +1,7 @@
 """The simulated room as an example, for methods that use a scan or the truth about it.
 
-It has the same bits on every processor: results of sums, roots and angles are rounded to far fewer
-digits than they are accurate to.
+It has the same bits on every processor, because results of sums, roots and angles are rounded to
+far fewer digits than are accurate.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _DECIMALS: Final = 9
 
 
 def settled(values: NDArray[np.float64], decimals: int = _DECIMALS) -> NDArray[np.float64]:
-    """Remove differences due to the order of sums and to fused instructions, by rounding."""
+    """Round values, so that the order of sums and fused instructions make no difference."""
     # Adding zero converts minus zero, whose bits differ from those of zero.
     return np.asarray(np.round(values, decimals) + 0.0)
 

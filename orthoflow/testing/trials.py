@@ -1,4 +1,4 @@
-"""Runs of a method outside a workflow, for checks: single, observed, in a given folder."""
+"""Runs of a method outside a workflow, for checks."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow.sdk import DiagnosticSpec, StepContext
 
-# Side of the squares in which scans are compared: large enough for many points of each scan, and
-# small enough to have a single colour in most cases.
+# Side of the squares in which scans are compared. A square is large enough for many points of each
+# scan, and usually small enough to have a single colour.
 _PLACE_M: Final = 0.05
 _POINTS_MOST: Final = 2_000_000
 _PLACES_LEAST: Final = 20
@@ -53,7 +53,7 @@ class _Trend:
 
 
 def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
-    """Return the cloud with intensities as if all scans had been taken under the same conditions.
+    """Return the cloud with the intensities it would have if all scans had the same conditions.
 
     Only points on walls are corrected. If scans do not overlap, the cloud is unchanged and a
     warning is reported.

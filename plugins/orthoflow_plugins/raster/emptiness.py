@@ -24,7 +24,7 @@ _TILE_M: Final = 0.05
 _POINTS_LEAST: Final = 2
 # Points farther behind a wall belong to another room or the street.
 _BEHIND_MOST_M: Final = 4.0
-# Objects farther in front of a wall, such as a portico or a balcony, count as hiding it only if
+# Objects farther in front of a wall, such as a portico or a balcony, only count as occluders if
 # stations are known.
 _BEFORE_MOST_M: Final = 5.0
 # Share of the points in front of a wall that a suggested buffer includes, per cent.
@@ -51,7 +51,7 @@ class Emptiness:
             relief, borders); `unseen`: nothing was scanned there.
         behind_m: median depth behind the plane of the points behind the buffer; NaN if there are
             none.
-        before_m: depth in front of the plane that includes 95 % of the objects directly in front;
+        before_m: depth in front of the plane that includes 95 % of the points directly in front;
             NaN if there are none.
     """
 
@@ -79,7 +79,7 @@ class Sight:
 
     @cached_property
     def room(self) -> _Room:
-        """Return the voxels with points; computed on demand, because few walls need them."""
+        """Return the voxels with points; computed on demand because few walls need them."""
         return _Room.of(self.points)
 
 
@@ -210,7 +210,7 @@ class _Room:
     @classmethod
     def of(cls, points: SampledPoints) -> _Room:
         axes = (points.x, points.y, points.z)
-        # Quantiles, so that isolated distant points do not enlarge the voxels.
+        # Use quantiles, so that isolated distant points do not enlarge the box of the voxels.
         low, high = np.array([np.percentile(axis, (0.1, 99.9)) for axis in axes]).T
         low, high = low - 2.0 * _VOXEL_M, high + 2.0 * _VOXEL_M
         side_m = max(

@@ -49,8 +49,8 @@ _SEEDS_LEAST: Final = 4
 _COVERED_LEAST: Final = 0.2
 # Share of the outermost points that may be stray points.
 _STRAY_SHARE: Final = 0.02
-# Depth searched beyond the limit: an object that extends into it, such as a cornice of an adjoining
-# wall or the side of a piece of furniture, has no front within the limit.
+# Depth searched beyond the limit. An object that extends into this depth, such as a cornice of an
+# adjoining wall or the side of a piece of furniture, has no front within the limit.
 _BEYOND_MOST_M: Final = 0.1
 # An object that extends farther in front of a wall and is connected to it, such as a fountain on a
 # facade, belongs to the wall up to this distance.
@@ -261,13 +261,14 @@ def extent_of(
 
 @dataclass(frozen=True, kw_only=True)
 class _Bound:
-    """An adjoining plane, given by the distance of positions (right, down, depth) inside it.
+    """An adjoining plane, given by the distance of positions (right, down, depth) from it.
 
     Attributes:
         side: side of the rectangle that the plane bounds.
-        slopes: (3,) derivatives of the distance along right, down and depth.
+        slopes: (3,) derivatives of the distance, which is positive on the wall's side, along right,
+            down and depth.
         offset_m: distance at the top-left corner of the rectangle of the points.
-        noise_m: maximum distance of its points from it.
+        noise_m: maximum distance of the plane's points from it.
         beyond_m: smallest distance of the plane from the rectangle's side, positive outside.
         askew_m: difference between its largest and smallest distance from the side.
     """
@@ -322,7 +323,7 @@ class _Search:
         )
         size_m = width_m, height_m
         around = _Around.of(points, rectangle, size_m)
-        # Whole cells of growth, so that a cell begins at the rectangle's corner.
+        # Grow by whole cells, so that a cell begins at the rectangle's corner.
         growth_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
         frame = frame_of(planes, index, gsd_m=side_m, margin_m=growth_m)
         return cls(
@@ -404,7 +405,7 @@ def _far_front_m(
         return 0.0
     is_far = surface.front_m > near_m
     is_far &= ~(surface.behind_m <= near_m)
-    # Remove thin parts: these are objects that extend beyond this depth, such as adjoining walls.
+    # Remove thin parts, which are objects that extend beyond this depth, such as adjoining walls.
     is_far = np.asarray(ndimage.binary_opening(is_far, np.ones((3, 3), dtype=np.bool_)))
     rows, columns = far.inside
     gained_m = surface.front_m[rows, columns][is_far[rows, columns]]

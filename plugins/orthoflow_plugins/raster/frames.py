@@ -81,7 +81,7 @@ def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> WallFrame | None:
 def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
     """Make cells of a cropped wall void if their centres are outside the crop (even-odd rule)."""
     corners = outline_m(crop) / wall.frame.gsd_m
-    # Relative to the first cell of the cropped grid.
+    # Make the corners relative to the first cell of the cropped grid.
     corners -= np.floor(corners.min(axis=0) + 1e-6).clip(0, None)
     for rows in row_bands(wall.mask.shape):
         outside = ~filled((corners - [0.0, rows.start],), wall.mask[rows].shape)

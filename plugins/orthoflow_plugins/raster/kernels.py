@@ -16,9 +16,9 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.rastering import Entries, is_own
 from orthoflow.geometry.slabs import Offsets
 
-# With more points, their mean position is near the centre of the cell. With few points, it may be
-# off by up to half a point spacing, and in the same direction in many cells if the cell size is a
-# multiple of the spacing.
+# Maximum number of points in a cell with few points. The mean position of more points is near the
+# centre of the cell. That of few points may be off by up to half a point spacing, and in the same
+# direction in many cells if the cell size is a multiple of the spacing.
 FEW_POINTS: Final = 16
 # Tolerance outside a triangle, so that a centre on an edge belongs to at least one triangle.
 _ON_EDGE: Final = 1e-9

@@ -82,7 +82,7 @@ def _interpolate(
     for top in range(0, slab.frame.height, _ROWS_AT_ONCE):
         bottom = min(top + _ROWS_AT_ONCE, slab.frame.height)
         rows, columns = (axis.ravel() for axis in np.mgrid[top:bottom, : slab.frame.width] + 0.5)
-        # For each position outside all triangles, scipy slowly tests every triangle.
+        # Exclude positions outside the hull, because scipy tests every triangle for each of them.
         inside = np.ones(rows.size, dtype=np.bool_)
         for right, down, offset in sides:
             inside &= right * columns + down * rows + offset <= _ROUNDING_CELLS

@@ -160,7 +160,7 @@ def _least_gsd_m(step_m: float) -> float:
     """Return the smallest cell size with two significant digits that suits a point spacing."""
     least_m = step_m / _STEP_MOST_CELLS
     digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
-    # Rounded up, because the nearest number with two significant digits may be too fine.
+    # Round up, because the nearest number with two significant digits may be too fine.
     return float(f"{math.ceil(least_m / digit_m - 1e-6) * digit_m:.2g}")
 
 
@@ -253,7 +253,8 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
             f"{wall.name}: {of_wall.share:.1%} of its cells are empty: "
             + ", ".join(f"{share:.1%} {cause}" for cause, share in shares_of.items())
         )
-        # No warning for the few tiles at the border of a hole, which also contain its surroundings.
+        # Do not warn about the few tiles at the border of a hole, which also contain its
+        # surroundings.
         least = max(_CAUSE_WORTH_WORDS, 0.1 * of_wall.share)
         if shares_of["before"] < _LEFT_OUT_WORTH_WORDS and of_wall.share < _SHARE_WORTH_WORDS:
             continue

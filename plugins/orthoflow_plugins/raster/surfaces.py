@@ -156,7 +156,7 @@ def carried_to_centres(
 def _surface_of_winners(
     cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """Return the surface with the depth, intensity and colour of one point per cell; one pass."""
+    """Return the surface with depth, intensity and colour of one point per cell, in one pass."""
     winners = empty_winners(slab.n_cells)
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=threads):
@@ -269,7 +269,7 @@ def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDA
         np.divide(mean, n_points, out=mean)
         squares -= mean * mean * n_points
         np.maximum(squares, 0.0, out=squares)
-        # 1.0 instead of 1, because 0 - 1 overflows in unsigned integers.
+        # Subtract 1.0 instead of 1, because 0 - 1 overflows in unsigned integers.
         np.divide(squares, n_points - 1.0, out=squares)
         np.sqrt(squares, out=squares)
     squares[n_points < 2] = np.nan
@@ -285,7 +285,7 @@ def _grouped(
     totals = np.cumsum(count, dtype=np.int64)
     first = n_before = 0
     while first < count.size:
-        # At least one cell, even if it has more points.
+        # Use at least one cell, even if it has more points.
         end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
         end = max(first + 1, end)
         ends = totals[first:end] - n_before
@@ -383,7 +383,7 @@ def _averaged_values(
 def without_specks(
     depth_m: NDArray[np.float32], *, gsd_m: float, layer_m: float, threads: int
 ) -> NDArray[np.float32]:
-    """Set cells to void whose depth is an outlier, with which hardly any neighbour agrees.
+    """Set cells to void if their depth is an outlier, with which hardly any neighbour agrees.
 
     Otherwise such a cell would show a distant part of a photo. In the scan shadow of an edge, cells
     are sparser than around it, and there are outliers and mixed pixels from both sides of the edge.

@@ -341,7 +341,7 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
 
 
 def repeated_place(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return a position (3,) shared by too many points (n, 3) to be laser returns, or None.
+    """Return a position (3,) that more points (n, 3) share than laser returns could, or None.
 
     Rays without a return are written as points at 0 0 0; programs that transform a scan transform
     these points, too.
@@ -362,7 +362,7 @@ def resolution_m(farthest_m: float) -> float:
 def _make_ready(array: NDArray[Any], part: slice) -> None:
     """Request all pages that will be written next to a memory-mapped file in a single call.
 
-    This is four times as fast as a page fault for each of them.
+    This is four times as fast as one page fault per page.
     """
     mapping: object = array.base
     if not isinstance(mapping, mmap.mmap):

@@ -229,7 +229,7 @@ def _file_name(path: str) -> str:
 
 
 def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> GivenCamera | None:
-    """Return the camera whose folders match a photo's best, or a reason why there is none.
+    """Return the camera whose folders best match those of a photo, or a reason why there is none.
 
     Args:
         found: cameras with the photo's file name.

@@ -19,8 +19,9 @@ _PLAN_SAMPLE: Final = 250_000
 _POLAR_SIDE_PX: Final = 1200
 _POLAR_SAMPLE: Final = 2_000_000
 
-# Rows and columns of a scan drawn as lines over a wall: maximum number of each, and colours.
+# Maximum numbers of rows and of columns of a scan that are drawn as lines over a wall.
 _LINES: Final = 24
+# Colours of these rows and of these columns.
 _ROW_RGB: Final = (235, 165, 20)
 _COLUMN_RGB: Final = (20, 150, 215)
 _WALL_STEP_DEG: Final = 2.0
@@ -58,7 +59,7 @@ def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
     offsets = np.column_stack([cloud.x[::step], cloud.y[::step], cloud.z[::step]])
     first, second, up = basis_from_up(cloud.up)
     plan = offsets.astype(np.float64) @ np.column_stack([first, second])
-    # Percentiles, so that stray points do not reduce the scale.
+    # Use percentiles, so that stray points do not reduce the scale.
     low, high = np.percentile(plan, [0.1, 99.9], axis=0)
     span = max(float((high - low).max()), 1e-6)
     size = np.maximum(np.ceil((high - low) / span * _PLAN_SIDE_PX).astype(int), 1)
@@ -219,7 +220,7 @@ def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
 def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Return the direction (2,) of the vertical plane with the most points, and its distance."""
     some = plan[:: max(1, len(plan) // _PLAN_SAMPLE)]
-    # Points of damaged files can be anywhere, so limit the size of the table of cells.
+    # Points of damaged files can be anywhere, so the size of the table of cells must be limited.
     is_near = np.all(np.abs(some - np.median(some, axis=0)) <= _WALL_FARTHEST_M, axis=1)
     some = some[is_near] if is_near.any() else some[:1]
     angles = np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG))

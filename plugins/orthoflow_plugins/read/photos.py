@@ -95,15 +95,15 @@ UNUSED_ENTRIES: Final = DiagnosticSpec(
 
 
 class ReadPhotos(Method):
-    """Read JPEG, PNG, TIFF, WebP and HEIC photos, also from E57 files, ordered by name.
+    """Read JPEG, PNG, TIFF, WebP and HEIC photos and those in E57 files, ordered by name.
 
     If photos in several folders have the same file name, their names include the path within the
     input.
 
     A panorama, from an E57 file or listed in `panoramas`, is split into six photos, the faces of a
     cube, as PNG files without distortion. Photos that have a fisheye lens (OpenCV's model) or are
-    panoramas according to the calibration or the given cameras are split in the same way; only
-    those parts of the faces are used that a fisheye photo shows.
+    panoramas according to the calibration or the given cameras are split in the same way; of the
+    faces of a fisheye photo, only the parts shown in the photo are used.
 
     The content of the files is kept unchanged and never re-encoded. Pixels are those of the stored
     array: the EXIF orientation is recorded, but not applied. In a TIFF file with several pages, the
@@ -149,7 +149,7 @@ class ReadPhotos(Method):
     class In(Ports):
         """The photos, and optionally a calibration file, masks and given cameras.
 
-        Of the given cameras, only those with a fisheye lens or a panorama are used here.
+        Only those given cameras that have a fisheye lens or are panoramas are used here.
         """
 
         files: InputFiles
@@ -316,7 +316,7 @@ class _Cubes:
         ]
 
 
-# Any size, for photos that the user declares as panoramas.
+# Lens of photos that the user declares as panoramas; the size is set later.
 _PANORAMA: Final = PanoramaLens(width=0, height=0)
 
 

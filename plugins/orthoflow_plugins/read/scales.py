@@ -28,16 +28,16 @@ _FULL: Final[dict[RgbScale, float]] = {
 
 _BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
-# From this correlation on, an intensity is considered a copy of the grey of the colours. It is
-# 0.99997 for lion-takanawa, whose intensity is such a copy; laser intensity at 532..1550 nm
-# correlates far less, unless a scene has only two colours.
+# An intensity with at least this correlation is considered a copy of the grey of the colours. The
+# correlation is 0.99997 for lion-takanawa, whose intensity is such a copy; laser intensity at
+# 532..1550 nm correlates far less, unless a scene has only two colours.
 _LUMINANCE_CORRELATION: Final = 0.999
 # Two roundings to 8 bits cause differences of 0.4 grey levels.
 _ROUNDING_LEVELS: Final = 0.7
 # Values outside these percentiles by more than the distance between them are extreme.
 _PERCENTILES: Final = (2.0, 98.0)
-# If the data of all scans cover less than this part of the range in the metadata, it is the range
-# of the sensor, and pictures scaled by it would be black.
+# If the data of all scans cover less than this part of the range in the metadata, the latter is the
+# range of the sensor, and pictures scaled by it would be black.
 _SMALLEST_PART: Final = 0.25
 # Scans whose ranges overlap by more than this part get a common scale, so that the same surfaces
 # have the same brightness.
@@ -159,7 +159,7 @@ def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
         scale: the intensities that map to 0 and 1.
 
     Returns:
-        The number of values outside the scale, which were clipped.
+        The number of values that were clipped because they were outside the scale.
     """
     n_clipped = 0
     width = scale.high - scale.low
@@ -186,10 +186,10 @@ def correlation_with_grey(
     rgb: NDArray[np.uint8],
     has_rgb: NDArray[np.bool_] | None = None,
 ) -> float | None:
-    """Return the correlation of intensity and grey of the colours, if the intensity is that grey.
+    """Return the correlation of the intensity with the grey of the colours if it is a copy of it.
 
     Returns:
-        None if they differ by more than rounding, or if too few points have both.
+        None if the two differ by more than rounding errors, or if too few points have both.
     """
     step = max(1, len(intensity) // _SAMPLE)
     values = intensity[::step].astype(np.float64)

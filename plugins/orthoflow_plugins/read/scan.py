@@ -56,7 +56,7 @@ _SAMPLE: Final = 200_000
 
 
 class ReadScan(Method):
-    """Read E57, LAS, LAZ, COPC, PLY, PCD, PTX and text scans, several files into one cloud."""
+    """Read one or several E57, LAS, LAZ, COPC, PLY, PCD, PTX or text scans into one cloud."""
 
     id = "read.scan"
     result_version: ClassVar[int] = 2

@@ -29,7 +29,7 @@ class RegisterSimilarity(Method):
     All pairs have the same weight. `sigma0_mm` is the standard deviation of one coordinate;
     `left_out_rms_mm` is computed from the distance between each control point and its position
     predicted from the other pairs, so no pair influences its own distance. The transformed cloud
-    takes over the up direction of the control points.
+    has the up direction of the control points.
     """
 
     id: ClassVar[str] = "register.similarity"
@@ -176,7 +176,7 @@ def _require_same_hand(
     *,
     with_scale: bool,
 ) -> None:
-    """Refuse lists that are mirror images of each other: their fit is poor and its scale wrong.
+    """Refuse lists that are mirror images, since their fit is poor and its scale is wrong.
 
     Raises:
         GeometryError: the fit is far better if one of the lists is mirrored.

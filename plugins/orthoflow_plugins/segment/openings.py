@@ -42,7 +42,7 @@ from orthoflow_plugins.segment.outlines import Outline, moved_to_edges, outline_
 _UPRIGHT: Final = math.sin(math.radians(30.0))
 # A surface farther behind the plane is not the face of the same wall.
 _FACE_FARTHEST_M: Final = 0.3
-# Minimum share of its bounding rectangle that an empty area must fill; round windows fill more,
+# An empty area must fill at least this share of its bounding rectangle; round windows fill more,
 # scan shadows less.
 _FILLED_LEAST: Final = 0.7
 # If the wall was measured along less than this share of an outline, the area is at the border of

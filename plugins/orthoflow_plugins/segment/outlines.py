@@ -53,11 +53,11 @@ _CONTRAST_LEAST_GREY: Final = 4.0
 _CONTRAST_LEAST: Final = 3.0
 # Slopes of at least this share of the steepest slope belong to an edge.
 _EDGE_SHARE: Final = 0.2
-# Minimum standard deviation of an edge: the orthoimage was made with the same depths, so their
-# errors affect its edges, too.
+# Minimum standard deviation of an edge. The orthoimage was made with the same depths, so their
+# errors also affect its edges.
 _SIGMA_LEAST_CELLS: Final = 0.5
-# Depth and orthoimage show different edges if these are more than this many sigmas (of the depth
-# edge) apart.
+# If an edge in the orthoimage is more than this many sigmas of the depth edge away from it, the two
+# edges are different.
 _APART_SIGMAS: Final = 1.5
 # The choice is ambiguous if another edge in the profile exceeds this share of the steepest slope.
 _SECOND_MOST: Final = 0.6
@@ -275,7 +275,7 @@ def _meeting(first: _Side, second: _Side) -> NDArray[np.float64] | None:
 
 
 def _sigma(side: _Side, spacing: float) -> float:
-    """Return the sigma of a side, from cell size, point spacing and the scatter of its border."""
+    """Return the sigma of a side, due to cell size, point spacing and the scatter of its border."""
     scatter = side.scatter
     if side.middle is not None:
         scatter /= math.sqrt(max(1.0, side.length / spacing))

@@ -264,7 +264,8 @@ def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDAr
     for start in range(0, len(cloud), _CHUNK):
         part = np.flatnonzero(labels[start : start + _CHUNK] >= 0) + start
         own = labels[part]
-        # Not a dot product: in BLAS the order of summation depends on the number of threads.
+        # Do not use a dot product, because in BLAS the order of summation depends on the number of
+        # threads.
         distances = -offsets[own]
         for axis, values in enumerate((cloud.x, cloud.y, cloud.z)):
             distances += planes.normal[own, axis] * values[part]
@@ -274,13 +275,13 @@ def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDAr
 
 @dataclass(frozen=True, kw_only=True)
 class _Spots(Rows):
-    """Positions on rectangles: rectangle (n,) and coordinates (a, b) in metres (n, 2)."""
+    """Positions on rectangles: indices (n,) of the rectangles, and (a, b) in metres (n, 2)."""
 
     rectangle: NDArray[np.int64]
     in_rectangle: NDArray[np.float64]
 
     def moved(self, step: NDArray[np.float64]) -> _Spots:
-        """Return positions moved by (2,), or each by its row of (n, 2)."""
+        """Return the positions moved by one vector (2,), or by one vector each (n, 2)."""
         return _Spots(rectangle=self.rectangle, in_rectangle=self.in_rectangle + step)
 
     def points(self, scene: Scene) -> NDArray[np.float64]:

@@ -42,7 +42,7 @@ _FURNITURE_M: Final = -0.45
 _WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
-# For the legs and the upper body: lower and upper end above the room's origin, and half the width.
+# Legs and upper body of a person: lower and upper end above the room's origin, and half the width.
 _BODY_M: Final = ((-1.45, -0.6, 0.17), (-0.6, 0.3, 0.25))
 _ABSENT: Final = 0.5
 _OF_PEOPLE: Final = (
@@ -183,7 +183,7 @@ def with_passers_by(
     """
     if not count:
         return ()
-    # A separate random stream, so that people do not change the other random numbers.
+    # Use a separate random stream, so that people do not change the other random numbers.
     drawn = rng.spawn(1)[0]
     clothes = drawn.uniform(15.0, 240.0, (count, 2, 3))
     along, towards = main_wall_axes()
@@ -237,7 +237,7 @@ def take_photos(
     if not shots:
         return Photos(photos=())
     exif_focal = shots[0].camera.fx * (1.0 + rng.uniform(-_EXIF_ERROR, _EXIF_ERROR))
-    # A separate random stream, so that exposures do not change the other random numbers.
+    # Use a separate random stream, so that exposures do not change the other random numbers.
     light = 1.0 + film.exposures * rng.spawn(1)[0].uniform(-1.0, 1.0, len(shots))
     photos = []
     for place, shot in enumerate(shots):

@@ -312,7 +312,7 @@ class SimulateRoom(Method):
         )
 
         scan_rng, photo_rng, wall_rng = ctx.rng.spawn(3)
-        # A separate random stream, so that noise and photos are those of the designed room.
+        # Use a separate random stream, so that noise and photos are those of the designed room.
         place_rng = ctx.rng.spawn(1)[0]
         if params.design_seed is not None:
             wall_rng = np.random.default_rng(params.design_seed)

@@ -201,7 +201,8 @@ def build_room(
         for number, side in enumerate(sides):
             _build_wall(side, number, relief, [] if number else _cloths(textile_share))
     else:
-        # Separate random streams, so that cloth and plaques do not change the rest of the walls.
+        # Use separate random streams, so that cloth and plaques do not change the rest of the
+        # walls.
         cloth_rng, plaque_rng = rng.spawn(2)
         cloth = _drawn_cloth(textile_share, cloth_rng)
         for side, (name, ground, span, _) in zip(sides, _WALLS, strict=True):

@@ -179,7 +179,7 @@ def station_positions(
         places += rng.uniform(-1.0, 1.0, places.shape) * _STATIONS_DRAWN_M
     along, towards = main_wall_axes()
     up = np.array([0.0, 0.0, 1.0])
-    # Not a matrix product, whose last digit depends on the processor.
+    # Do not use a matrix product, because its last digit depends on the processor.
     return np.array([a * along + t * towards + h * up for a, t, h in places])
 
 
@@ -265,7 +265,7 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
         )
     places = {name: arrays[name] for name, *_ in _PLACES}
     hit = points.rectangle != _MISSED
-    # In a closed room all rays hit a surface, and copying is avoided.
+    # In a closed room, all rays hit a surface, so nothing needs to be copied.
     if not bool(hit.all()):
         points, places = points.take(hit), {name: values[hit] for name, values in places.items()}
     stations = np.array([sweep.station for sweep in sweeps])
@@ -319,7 +319,7 @@ class Scanner:
             is_mixed = np.isfinite(mixed) & is_hit
             measured[is_mixed] = mixed[is_mixed]
             into.rectangle[is_mixed] = SPOILT
-        # Gross outliers: most distances are too short, some too long.
+        # For most gross outliers, the distance is too short; for some, it is too long.
         short = distance * (0.3 + 0.68 * uniforms(states, 2))
         gross = np.where(uniforms(states, 1) < 0.8, short, distance + 2.0 * uniforms(states, 2))
         is_gross = (uniforms(states, 0) < errors.outlier_share) & is_hit
