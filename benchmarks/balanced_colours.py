@@ -7,9 +7,9 @@
     python benchmarks/balanced_colours.py --room 9021
     python benchmarks/balanced_colours.py RUN --exposure 0.3 --store store
 
-The second command draws a smaller room by a seed, with true planes and cameras. The third command
-multiplies the brightness of real photos by 0.7 to 1.3 and compares the result with the balanced
-original photos.
+The second command uses a smaller room that is determined by a seed, with true planes and cameras.
+The third command multiplies the brightness of real photos by 0.7 to 1.3 and compares the result
+with the balanced original photos.
 
 The layers of a run are joined again, without and with balancing. A step is the difference between
 the means of two cells on either side of a seam, averaged over stretches of 24 cells along the seam.
@@ -167,8 +167,8 @@ def steps(mosaic: Mosaic) -> Steps:
         ]
         # (photo, side, n, 3): means of two cells.
         shown = np.reshape(cells, (2, 2, 2, -1, 3)).mean(axis=2)
-        # A stretch has the same two photos in the same order, so that steps from one to the other
-        # and back do not cancel out.
+        # All cells of a stretch have the same two photos in the same order, so that steps from one
+        # to the other and back do not cancel out.
         stretch = np.stack([rows // STRETCH, columns // STRETCH, *both])
         _, of, counts = np.unique(stretch, axis=1, return_inverse=True, return_counts=True)
         for found, values in (
@@ -245,7 +245,7 @@ def inputs_of_run(folder: Path, store: Store, exposure: float) -> MosaicSeams.In
 
 
 def inputs_of_room(seed: int, share: float) -> MosaicSeams.In:
-    """Draw a room by a seed, with true planes and cameras, varied exposure and vignetting."""
+    """Generate a room from a seed, with true planes and cameras, varied exposure and vignetting."""
     with tempfile.TemporaryDirectory() as folder:
 
         def ctx() -> StepContext:
@@ -301,7 +301,7 @@ def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
 
 
 def main() -> None:
-    """Print a line for each of: no balancing, balancing, and balancing with graph cuts."""
+    """Print one line without balancing, one with it, and one with balancing and graph cuts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, nargs="?")
     parser.add_argument("--room", type=int, metavar="SEED")

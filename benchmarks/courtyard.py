@@ -3,8 +3,8 @@
     python benchmarks/courtyard.py [--seeds 1 2 3] [--photos 16]
 
 Four plastered facades enclose a courtyard of 12 x 10 m, which is scanned from one station; each has
-rows of identical windows 0.25 m deep. Stains, viewpoints and noise are drawn by a seed. Photos are
-taken 4 to 6 m in front of a facade and show two or three windows per row, so only the stains
+rows of identical windows 0.25 m deep. Stains, viewpoints and noise are determined by a seed. Photos
+are taken 4 to 6 m in front of a facade and show two or three windows per row, so only the stains
 distinguish the windows. Photos are processed by the steps of `photos-on-scan.yaml`, with a focal
 length from EXIF: `match.sift`, a bundle adjustment with relaxed gates, `match.guided`, and a bundle
 adjustment. The output lists the facades found, the oriented photos with their errors (of the

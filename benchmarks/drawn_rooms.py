@@ -5,13 +5,13 @@
     orthoflow runs FOLDER --table numbers.csv
 
 The directions, tilts and distances of all planes, the decoration, scanner stations, photos and lens
-of a room are drawn by its seed: ten rooms have seeds from 1, and five other rooms, which verify
-rankings, have seeds from 101. Each room is measured in four parts: `planes` (plane-methods.yaml,
-paper_planes.yaml), `orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces`
-(matched_surface.yaml). The last part compares orthoimages from photos projected onto a surface
-(backward) with those from points (direct), for the scan and for points matched in the photos, as in
-skarlatos2012. Comparisons include only the check points that all orthoimages of a room show, and
-only the photos that all methods orient.
+of a room are determined by its seed: ten rooms have seeds from 1, and five other rooms, which
+verify rankings, have seeds from 101. Each room is measured in four parts: `planes`
+(plane-methods.yaml, paper_planes.yaml), `orient` (orient-methods.yaml), `ortho`
+(ortho-methods.yaml) and `surfaces` (matched_surface.yaml). The last part compares orthoimages from
+photos projected onto a surface (backward) with those from points (direct), for the scan and for
+points matched in the photos, as in skarlatos2012. Comparisons include only the check points that
+all orthoimages of a room show, and only the photos that all methods orient.
 
 The runs of a room are recorded in `FOLDER/<part>-<seed>/`, together with the numbers for the pages
 in `numbers.json`; finished runs are not repeated. Products are deleted after the room is measured.
@@ -169,7 +169,7 @@ def reduced(part: str, name: str, seed: int) -> dict[str, Any]:
             varied[step] = list(content["variants"])
             for variant in content["variants"].values():
                 variant.pop("repeat", None)
-    # The combinations that no page uses, of steps that are combined on a page.
+    # List the combinations that no page uses, of steps that are combined on a page.
     left_out = [
         combination
         for together in {tuple(one): None for one in named}

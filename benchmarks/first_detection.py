@@ -5,8 +5,8 @@
 
 Each method processes the cloud of `FOLDER/1`, first in a process that loads and compiles everything
 itself, then in processes that find compiled kernels. The output contains `first_plane_s` and
-`detection_s`, measured like `StepContext.clock_s` but in processor time, which other load on the
-machine hardly affects.
+`detection_s`, which are measured like `StepContext.clock_s` but in processor time, which other load
+on the machine hardly affects.
 """
 
 from __future__ import annotations

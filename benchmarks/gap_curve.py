@@ -6,7 +6,7 @@
     python benchmarks/gap_curve.py --rooms 40 --first 7001 --mixed
 
 The share of the contrast that is inverted in the laser intensity (0 to 1), the scan noise, the
-camera and the viewpoints of a room are drawn by its seed. Rooms are those of
+camera and the viewpoints of a room are determined by its seed. Rooms are those of
 `orientation_truth.py`: six photos of the main wall, 4 mm cells, a point spacing of 2.6 mm. Photos
 are processed as in `photos-on-scan.yaml`: `match.sift`, a bundle adjustment with relaxed gates,
 `match.guided`, and a bundle adjustment. `wall` is the error per coordinate on the wall; `wrong`

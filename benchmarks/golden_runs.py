@@ -115,7 +115,7 @@ def compare(before: Path, after: Path) -> None:
 
 
 def of_product(first: Path, second: Path) -> str:
-    """Describe how much a product changed; empty if it did not."""
+    """Describe the changes of a product; empty if there are none."""
     if first.name.endswith(".tif"):
         with rasterio.open(first) as one, rasterio.open(second) as other:
             if one.shape != other.shape:

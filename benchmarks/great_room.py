@@ -4,8 +4,8 @@ The room follows markiewicz2015: 8.6 x 4.2 x 5 m, a leaning main wall, a niche 2
 fireplace, pilasters, mouldings, windows, furniture, and a leaning mirror that shows the scanner a
 reflected copy of the room. The scan consists of a panorama and a detail scan of the main wall, with
 points in scan order. The room is built and scanned with the same code as `simulate.room`. The
-rotation, tilt and shift of the room are drawn by a seed, so that no wall coincides with a search
-grid.
+rotation, tilt and shift of the room are determined by a seed, so that no wall coincides with a
+search grid.
 
     python benchmarks/great_room.py FOLDER        # room.npy, labels.npy and truth.json for others
 """

@@ -1,4 +1,4 @@
-"""Find and fill narrow gaps of a raster; compare this with OpenCV's nearest known cell.
+"""Find and fill narrow gaps of a raster, and compare the time with OpenCV's distance transform.
 
     python benchmarks/hole_filling.py [--repeat 7] [--threads 2]
 

@@ -2,7 +2,7 @@
 
 python benchmarks/install_size.py [--without open3d-cpu]
 
-With `--without`, the distributions are listed that only the given one needs.
+With `--without`, only the distributions that nothing but the given one needs are listed.
 """
 
 from __future__ import annotations

@@ -242,7 +242,7 @@ READERS: Final[dict[str, tuple[str, str, Callable[[Path], tuple[np.ndarray, np.n
 
 
 def walk_clouds(walk: Walk) -> None:
-    """Check that points and colours are equal in four formats and all colourings; draw each."""
+    """Check that points and colours agree in four formats and all colourings; draw each file."""
     for colour in COLOURS:
         seen: list[tuple[np.ndarray, ...]] = []
         for target, (name, reader, read) in READERS.items():

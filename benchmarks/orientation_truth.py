@@ -6,13 +6,13 @@
     # ties matched as in markiewicz2015, most of them wrong:
     python benchmarks/orientation_truth.py --ties unmasked masked
 
-Each room has its own scan noise, camera and viewpoints: 4 mm cells, a point spacing of 2.6 mm, 2 mm
-range noise, photos with 2 mm pixels, textile on a third of the main wall. Photos are matched
-(`match.sift`), oriented by a bundle adjustment, matched again (`match.guided`) and oriented by both
-estimators, with a calibration and with EXIF data only. `wrong` is the share of kept ties that are
-off by more than 1.5 cells; `wall` is the error per coordinate on the wall, RMS over the photos;
-`ratio` is that error divided by the expected one, pooled (ideally 1). Seconds are CPU seconds per
-room.
+Each room has its own scan noise, camera and viewpoints. All have 4 mm cells, a point spacing of 2.6
+mm, 2 mm range noise, photos with 2 mm pixels, and textile on a third of the main wall. Photos are
+matched (`match.sift`), oriented by a bundle adjustment, matched again (`match.guided`) and oriented
+by both estimators, with a calibration and with EXIF data only. `wrong` is the share of kept ties
+that are off by more than 1.5 cells; `wall` is the error per coordinate on the wall, RMS over the
+photos; `ratio` is that error divided by the expected one, pooled (ideally 1). Seconds are CPU
+seconds per room.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from orthoflow.sdk import StepContext
 Estimator = type[OrientPnp] | type[OrientColmapBundle]
 # Folders with memory-mapped clouds of 16 million points, which are deleted when the process ends.
 _SCRATCH: list[tempfile.TemporaryDirectory[str]] = []
-# As in the shipped workflows: a first pose only needs to be accurate to a few cells.
+# As in the shipped workflows, a first pose only needs to be accurate to a few cells.
 ROUGHLY = {
     "min_quadrant_ties": 0,
     "min_hull_ratio": 0.1,

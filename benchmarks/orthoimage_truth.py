@@ -34,7 +34,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow.products import Cameras, Inspection, Orthoimages, Photos, Ties, Walls
 from orthoflow.sdk import StepContext
 
-# As in the shipped workflows: a first pose only needs to be accurate to a few cells.
+# As in the shipped workflows, a first pose only needs to be accurate to a few cells.
 ROUGHLY = {
     "min_quadrant_ties": 0,
     "min_hull_ratio": 0.1,

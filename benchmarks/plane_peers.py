@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 Points = NDArray[np.float32]
 CELL_M, TOLERANCE_M = 0.02, 0.05
-# Share of the occupied plan cells, the densest ones, that line transforms get. With all cells, they
-# find floor and ceiling everywhere and no wall.
+# Line transforms get this share of the occupied plan cells, the densest ones. With all cells, they
+# would find floor and ceiling everywhere, and no wall.
 DENSEST_SHARE = 0.03
 
 

@@ -3,11 +3,11 @@
     python benchmarks/raster_top.py [--millions 48] [--threads 2] [--repeat 5]
 
 Times are medians of interleaved runs. F is the time of one streaming pass over the coordinates,
-measured in the same run; it is the minimum for any method that reads the cloud once. The goals are:
-at most 20 F, at least four times as fast as `np.maximum.at`, and depths identical to those of
-`np.lexsort`. numpy's version does less: it assumes that the wall is vertical and along x, does not
-count points, and does not define which of several topmost points provides the intensity. The
-complete `raster.grid` is also measured.
+measured in the same run; no method that reads the cloud once can be faster. The goals are: at most
+20 F, at least four times as fast as `np.maximum.at`, and depths identical to those of `np.lexsort`.
+numpy's version does less: it assumes that the wall is vertical and along x, does not count points,
+and does not define which of several topmost points provides the intensity. The complete
+`raster.grid` is also measured.
 """
 
 from __future__ import annotations

@@ -5,11 +5,11 @@
 Photos show a wall with 12 cm of relief; correct ties have 1.5 px of noise, a given share of the
 ties is at random pixels, and the lens is known. `found` counts poses whose centre is within 50 mm
 of the truth; `centre` is the RMS error of those that all programs found; `over best` is our error
-divided by that of the best other program; `time` is the median per photo, and `over usac` our time
-divided by OpenCV's. Our estimation is the robust search followed by the adjustment and rejection of
-`orient.pnp`. The other programs are used as their manuals advise: USAC with MAGSAC and a
-Levenberg-Marquardt refinement on the inliers, and LO-RANSAC with refinement. PoseLib is included if
-it is installed (`pip install poselib`).
+divided by that of the best other program; `time` is the median per photo, and `over usac` is our
+time divided by OpenCV's. Our estimation is the robust search followed by the adjustment and
+rejection of `orient.pnp`. The other programs are used as their manuals advise: USAC with MAGSAC and
+a Levenberg-Marquardt refinement on the inliers, and LO-RANSAC with refinement. PoseLib is included
+if it is installed (`pip install poselib`).
 """
 
 from __future__ import annotations

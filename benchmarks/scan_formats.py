@@ -9,9 +9,9 @@ as E57 with rows and columns, E57 without them, LAZ, and E57 without them in ran
 is processed separately: `read.scan`, `plane.hough2d`, `raster.grid` with cells of 2, 4 and 8 mm,
 ties of six photos (`match.guided` from the true poses), and `orient.colmap-bundle`. `u` and `v` are
 the mean offsets, over all photos, of the ties from the true positions of their pixels, in cells to
-the right and down: this is the displacement of the raster, and thus of every photo. `wall` is the
-error per coordinate on the wall, RMS over the photos; `stated` is the expected error of the poses;
-`ratio` is the first divided by the second, RMS.
+the right and down. This offset is the displacement of the raster, and thus of every photo. `wall`
+is the error per coordinate on the wall, RMS over the photos; `stated` is the expected error of the
+poses; `ratio` is the first divided by the second, RMS.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from orthoflow.products import InputFiles, Planes, PointCloud, Ties, Truth, Wall
 FORMATS = ("e57 with rows", "e57 without", "laz", "random order")
 CELLS_M = (0.002, 0.004, 0.008)
 # Point spacing opposite the station; it is larger farther away. It is varied by a twentieth at
-# random, because with a single value, the scan would meet the same edges of the wall at the same
+# random, because with a single value, the scan would sample the edges of the wall at the same
 # positions in every room.
 _STEP_M = 0.00356
 _STEP_SHARE = 0.05

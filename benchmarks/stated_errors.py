@@ -3,7 +3,7 @@
     python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...]
     python benchmarks/stated_errors.py --entry FOLDER --fountain FOLDER   # real photos, see below
 
-Drawn rooms: for each type of cloud, there are several rooms with different scan noise, cameras and
+Drawn rooms: For each type of cloud, there are several rooms with different scan noise, cameras and
 viewpoints, each with six photos without a known focal length. Scans are registered with an accuracy
 of 5 mm, or the cloud is bent by 8 mm at the ends of the room, or the errors of its points are
 correlated over half a metre, as in stereo matching. Photos are matched at their true poses
@@ -12,8 +12,8 @@ relative to the scan, RMS over all photos; `stated` is the expected error; `wron
 photos whose error exceeds five expected standard deviations. `cloud` is the mean offset of the
 points that a photo shows. The scan cannot reveal this offset, so `true` and `stated` exclude it.
 
-Real photos: folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11) with
-`images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same
+Real photos: These are folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11)
+with `images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same
 coordinate system. Each folder is processed with `photos-on-scan.yaml` and 10 mm cells, with and
 without its calibration.
 """

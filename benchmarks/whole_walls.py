@@ -4,14 +4,14 @@
     python benchmarks/whole_walls.py --rooms 12 --first 1001 --rectangle points
 
 With `decoration: drawn`, cornices, pilasters, niches and recessed doors of `simulate.room` are
-drawn by the seed. The true wall extends from corner to corner and from floor to ceiling. A cell of
-it counts if the first surface, seen perpendicular to the wall, is parallel to the wall and visible
-from a station. `scanned` is the share of these cells that the raster shows. `painted` is the share,
-of the cells that are also visible in a photo, that the orthoimage shows (planes by `plane.hough2d`,
-`raster.grid` with default settings and 4 mm cells, true poses of the photos). `front` and `behind`
-are the buffer found, next to the buffer that the true relief needs. `lost` is the location of
-missing cells: `out`side the raster, beyond the `buf`fer, in a `void` cell of the raster, or in a
-cell with a depth.
+determined by the seed. The true wall extends from corner to corner and from floor to ceiling. A
+cell of it counts if the first surface, seen perpendicular to the wall, is parallel to the wall and
+visible from a station. `scanned` is the share of these cells that the raster shows. `painted` is
+the share, of the cells that are also visible in a photo, that the orthoimage shows (planes by
+`plane.hough2d`, `raster.grid` with default settings and 4 mm cells, true poses of the photos).
+`front` and `behind` are the buffer found, next to the buffer that the true relief needs. `lost` is
+the location of missing cells: `out`side the raster, beyond the `buf`fer, in a `void` cell of the
+raster, or in a cell with a depth.
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ def oriented(photo, pixels, points, params, seed):
     if len(pixels) < params.n_ties_min:
         return Camera(photo=photo.name, status=f"{len(pixels)} ties are too few")
     k1, k2, p1, p2, k3 = lens.distortion
-    # The centre of the first pixel is at (0.5, 0.5). PoseLib accepts any convention if pixels and
-    # camera have the same.
+    # The centre of the first pixel is at (0.5, 0.5). PoseLib accepts any convention as long as
+    # pixels and camera use the same one.
     camera = {
         "model": "FULL_OPENCV",
         "width": lens.width,

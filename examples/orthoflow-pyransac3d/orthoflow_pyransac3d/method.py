@@ -148,7 +148,7 @@ def products(points, cloud, found, params, ctx):
 def covariance(points, normal, centre_world):
     """Return the covariance (4, 4) of the normal and the offset (metres) of a plane.
 
-    It is that of a least-squares fit and assumes independent errors, although those of neighbouring
+    It is that of a least-squares fit with independent errors, although the errors of neighbouring
     points in a scan are correlated.
     """
     from_middle = points - points.mean(axis=0)

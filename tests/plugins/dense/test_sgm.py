@@ -49,14 +49,14 @@ def test_points_lie_on_the_surface(tmp_path: Path, room: SimulateRoom.Out) -> No
     # There are three rows of six photos; the last photo of a row has no neighbour to its right.
     assert metrics["n_pairs"] == 15
     assert metrics["n_points"] == len(cloud)
-    # 70 % overlap, but a margin as wide as the range of disparities is not matched.
+    # Photos overlap by 70 %, but a margin as wide as the range of disparities is not matched.
     assert metrics["matched_share"] > 0.3
     assert cloud.stations is not None
     assert cloud.scan is not None
     assert cloud.rgb is not None
     chosen = np.random.default_rng(1).choice(len(cloud), 5_000, replace=False)
     points, stations = cloud.points_world(chosen), cloud.stations[cloud.scan[chosen]]
-    # Distance of the first surface of the scene on the ray from the station through the point.
+    # Compute the distance of the first surface on the ray from the station through each point.
     views = SceneCameras(room.truth.scene, cores=1)
     share = np.concatenate(
         [
@@ -102,7 +102,7 @@ def test_photos_without_a_neighbour_and_surfaces_elsewhere_are_refused(
             tmp_path / "refused",
             DenseSgm.In(photos=room.photos, cameras=Cameras(cameras=tuple(refused))),
         )
-    # The first photo and the one above it, whose base is along the columns.
+    # Use the first photo and the one above it, whose base is along the columns.
     above = Cameras(cameras=(room.cameras.cameras[0], room.cameras.cameras[6]))
     with pytest.raises(MethodError, match="among 2 oriented photos"):
         matched(tmp_path / "above", DenseSgm.In(photos=room.photos, cameras=above))

@@ -62,7 +62,7 @@ def test_cells_are_compared_away_from_steps_and_by_what_they_are() -> None:
     lattice = np.zeros(SHAPE, dtype=np.bool_)
     lattice[1::2, 1::2] = True
     steps = depth_step_band(true.depth_m)
-    # Two cells on either side of the step, and two rows at the border of the surface.
+    # Expect two cells on either side of the step, and two rows at the border of the surface.
     expected = np.zeros(SHAPE, dtype=np.bool_)
     expected[:, 8:12] = expected[9:] = True
     np.testing.assert_array_equal(steps[:11], expected[:11])
@@ -147,7 +147,7 @@ def test_numbers_follow_their_definitions() -> None:
 
 
 def test_patches_further_off_than_the_rest_are_displaced() -> None:
-    """A quarter of a cell is always allowed, and otherwise four robust standard deviations."""
+    """The limit is four robust standard deviations, but at least a quarter of a cell."""
     still = np.zeros((9, 2))
     for far, share in ((0.24, 0.0), (0.26, 0.1)):
         cells = np.vstack([still, [0.0, far]])

@@ -92,7 +92,8 @@ def test_cells_take_what_the_nearest_cell_of_the_wall_holds(
     assert np.isnan(laid.depth_m[~known]).all()
     assert laid.intensity is not None
     whole = (exact >= 1.0).all(axis=-1)
-    # Interpolated between the four nearest cells, with positions that OpenCV rounds to 1/32 cell.
+    # Values are interpolated between the four nearest cells, with positions that OpenCV rounds to
+    # 1/32 cell.
     shade = 1e-3 * (exact[..., 0] - 0.5) + 1e-4 * (exact[..., 1] - 0.5)
     np.testing.assert_allclose(laid.intensity[whole], shade[whole], atol=5e-5)
     monkeypatch.setattr(placing, "IN_MEMORY_CELLS", 1999)

@@ -45,7 +45,7 @@ def test_twelve_depths_make_a_surface(n_known: int, *, is_found: bool) -> None:
     assert (found is not None) == is_found
 
 
-# A textured wall of 1.2 m x 1 m at y = 2 with 5 mm cells.
+# The textured wall of 1.2 m x 1 m at y = 2 has 5 mm cells.
 CELL_M = 0.005
 FULL: Extent = (-0.6, 0.6, -0.5, 0.5)
 
@@ -168,7 +168,7 @@ def test_a_point_is_looked_for_on_the_nearest_wall_that_holds_it(depth_m: float,
 def test_a_target_is_found_within_the_search_and_carried_back_into_space(
     off_m: float, is_found: bool
 ) -> None:
-    # Quadrants of 5 cm around the middle of the wall, where it projects by 1 cm.
+    # The target has quadrants of 5 cm around the middle of the wall, which project by 1 cm.
     rows, columns = np.indices((200, 240)) + 0.5
     bright = np.where((columns > 120.0) == (rows > 100.0), 220.0, 40.0)
     grey = gaussian_filter(bright, 0.8)
@@ -230,7 +230,7 @@ def test_edges_discs_and_even_places_are_no_targets() -> None:
     rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5
     edge = gaussian_filter(np.where(columns < 60.0, 40.0, 220.0), 0.7)
     disc = gaussian_filter(np.where(np.hypot(columns - 60, rows - 60) < 12.0, 40.0, 220.0), 0.7)
-    # A single dark quadrant, and a saddle that is symmetric under a half turn but not under a
+    # Test a single dark quadrant, and a saddle that is symmetric under a half turn but not under a
     # quarter turn.
     wedge = gaussian_filter(np.where((columns > 60.0) & (rows > 60.0), 220.0, 40.0), 0.7)
     for grey in (edge, disc, wedge, np.full((SIDE, SIDE), 90.0)):
@@ -239,7 +239,7 @@ def test_edges_discs_and_even_places_are_no_targets() -> None:
 
 @pytest.mark.parametrize(("share", "is_found"), [(0.8, True), (0.35, False)])
 def test_half_of_a_target_must_be_there_on_both_sides(share: float, is_found: bool) -> None:
-    # A void strip through the middle; cells opposite void ones are not used either.
+    # There is a void strip through the middle; cells opposite void ones are not used either.
     rows = np.mgrid[:SIDE, :SIDE][0] + 0.5
     valid = np.abs(rows - 60.0) <= share * RADIUS
     assert (crossing(quadrants(), valid=valid) is not None) == is_found

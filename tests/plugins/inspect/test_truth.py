@@ -88,7 +88,7 @@ def test_the_true_orthoimage_has_no_error(tmp_path: Path, truth: Truth) -> None:
     metrics, found, ctx = inspect(tmp_path, truth, painted(image), walled(image), **both)
     nothing = ("plane_angle_deg", "plane_offset_mm", "depth_rmse_mm", "depth_step_rmse_mm")
     assert [metrics[name] for name in nothing] == pytest.approx([0.0] * 4, abs=1e-6)
-    # Only the error of rounding to whole grey levels, sqrt(1 / 12).
+    # There is only the error of rounding to whole grey levels, sqrt(1 / 12).
     assert metrics["colour_rmse_grey"] == pytest.approx(0.289, abs=0.01)
     assert max(metrics["rmse_u_mm"], metrics["rmse_v_mm"]) < 0.05 * 1e3 * GSD_M
     for name in ("depth_within_3sigma", "completeness", "label_f1_mean", "label_iou_mean"):
@@ -106,7 +106,7 @@ def test_a_displaced_orthoimage_has_just_that_displacement(
     shown = painted(rendered(truth, shift))
     metrics, _, _ = inspect(tmp_path, truth, shown, walled(rendered(truth)))
     for axis, expected_cells in zip(("u", "v"), shift, strict=True):
-        # A twentieth of a cell, because rosettes and lines are sharper than cells.
+        # The tolerance is a twentieth of a cell, because rosettes and lines are sharper than cells.
         tolerance = 0.05 * 1e3 * GSD_M
         expected = 1e3 * GSD_M * expected_cells
         assert metrics[f"mean_{axis}_mm"] == pytest.approx(expected, abs=tolerance)
@@ -277,8 +277,7 @@ def test_a_large_wall_takes_the_memory_of_a_band(
     tracemalloc.start()
     try:
         metrics, _, _ = inspected(InspectTruth, tmp_path, **inputs)
-        # A band with its margin has half of the cells; as a whole, the wall took 174 bytes per
-        # cell.
+        # A band with its margin has half of the cells; the whole wall needed 174 bytes per cell.
         assert tracemalloc.get_traced_memory()[1] < 110 * n_cells
     finally:
         tracemalloc.stop()

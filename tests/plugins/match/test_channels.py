@@ -136,7 +136,8 @@ def test_places_are_the_strongest_five_cells_around() -> None:
         strength[row, column] = value
     usable = np.ones((40, 60), dtype=np.bool_)
     found = channels.textured_places(strength, usable, 10)
-    # The second is within two cells of the first; the third is only within two cells of the second.
+    # The second place is within two cells of the first; the third is only within two cells of the
+    # second.
     assert {tuple(place) for place in found.tolist()} == {(10, 10), (50, 30)}
     usable[10, 10] = False
     found = channels.textured_places(strength, usable, 10)

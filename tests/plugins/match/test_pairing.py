@@ -20,7 +20,7 @@ from tests.inspect_scenes import GSD_M
 from tests.tied_photos import photo
 
 LOOSE_PX = 20.0
-# Photo pixels from wall pixels: rotated, reduced, and slightly oblique.
+# Transform from wall pixels to photo pixels, which are rotated, reduced and slightly oblique.
 TILTED = np.array([[0.8, -0.3, 500.0], [0.25, 0.9, 300.0], [1e-5, -2e-5, 1.0]])
 
 
@@ -73,7 +73,7 @@ def test_what_lies_loosely_where_it_should_agrees_and_nothing_farther_off() -> N
 
 @pytest.mark.parametrize("is_photo", [True, False], ids=["in the photo", "on the wall"])
 def test_many_key_points_on_one_place_are_one(is_photo: bool) -> None:
-    # Nine positions four pixels apart, or all within two pixels.
+    # Nine positions are four pixels apart, or all are within two pixels.
     rows, columns = np.divmod(np.arange(9.0), 3.0)
     lattice = np.column_stack([columns, rows])
     for apart_px, is_shown in ((4.0, True), (0.5, False)):
@@ -190,8 +190,8 @@ def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
 def test_ties_in_masked_pixels_are_left_out() -> None:
     used = np.full((8, 10), 255, dtype=np.uint8)
     used[5:7, 3] = used[:, 0] = used[0] = 0
-    # In the mask; next to it; on the border of the photo, which is outside; and in the first column
-    # and row, which begin at 0.
+    # The pixels are in the mask, next to it, on the border of the photo, which is outside, and in
+    # the first column and row, which begin at 0.
     pixels = [(3.2, 5.9), (4.01, 5.9), (10.0, 8.0), (0.4, 3.3), (3.3, 0.4), (1.2, 1.2)]
     every = piece(pixels, [(k, k, k) for k in range(6)], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     ties = ties_of([every], photos_of(encode_png(used)), inspect_scenes.walls(), {})
@@ -202,7 +202,8 @@ def test_ties_in_masked_pixels_are_left_out() -> None:
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_large_key_points_are_less_exact_and_those_of_voids_left_out(scale: float) -> None:
     wall = inspect_scenes.walls().walls[0]
-    # The second is in a void; the last is so large that its standard deviation exceeds three cells.
+    # The second key point is in a void; the last is so large that its standard deviation exceeds
+    # three cells.
     pixels = np.array([[50.5, 40.5], [220.5, 110.5], [300.5, 200.5], [60.5, 60.5]])
     on_wall = features(pixels, sizes_px=np.array([2.0, 2.0, 40.0, 1e4]))
     sizes_px = np.array([2.0, 4.0, 100.0, 8.0])

@@ -185,7 +185,7 @@ def test_deviation_and_correlation_are_those_of_weighted_least_squares() -> None
 
 def test_patches_that_fix_no_shift_have_no_deviation() -> None:
     first, second = Channels(picture(), known()), Channels(picture((0.5, 0.25)), known())
-    # Patches too close to the border of either picture.
+    # These patches are too close to the border of either picture.
     reach = HALF + 3
     for least, is_fine in ((reach, True), (reach - 1, False)):
         for at in (least, SIDE - least - 1):

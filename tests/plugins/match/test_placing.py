@@ -53,7 +53,7 @@ def test_a_photo_is_placed_whatever_its_lens_and_however_it_was_held() -> None:
     # The photo is oblique by 44 degrees and rotated by a quarter turn; its focal length is 0.93
     # instead of 0.8 of its width.
     off_px = np.linalg.norm(np.column_stack([v, 900.0 - u]) - found.piece.pixels_photo, axis=1)
-    # In coarse cells, in which the ties were found.
+    # The offset is in coarse cells, in which the ties were found.
     off = off_px / (2.0 * found.piece.sigma_px)
     assert np.median(off) < 1.0
     assert (off < 3.0).mean() > 0.85

@@ -83,7 +83,7 @@ def test_a_plane_between_two_that_face_the_other_way_is_turned(
 ) -> None:
     normal = SCENE.frame.normal_world
     offset_m = SCENE.frame.plane.offset_m
-    # The facade, a step that the guess turned towards it, and an object farther in front.
+    # There are the facade, a step that the guess turned towards it, and an object farther in front.
     places_m = np.array([0.0, moved_m, 2.0])
     corners = SCENE.frame.corners_world() + places_m[:, None, None] * normal
     corners[1] = corners[1][[3, 2, 1, 0]]

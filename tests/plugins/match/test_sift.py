@@ -43,7 +43,7 @@ def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: 
     right = error[length < 3.0]
     assert len(right) > 1000
     assert np.mean(length >= 3.0) < 0.05
-    # With OpenCV's default, it would be a quarter of a pixel.
+    # With OpenCV's default, the mean would be a quarter of a pixel.
     np.testing.assert_allclose(right.mean(axis=0), 0.0, atol=0.05)
     # The predicted standard deviation is approximately that of the ties.
     depth = camera.project(ties.points_world)[:, 2]
@@ -91,7 +91,8 @@ def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertaint
     sigma[rows, columns], count[rows, columns] = 0.0015, 2
     sparse = replace(wall, depth_m=depth, sigma_m=sigma, count=count)
     flat = points_on_wall(sparse, np.array([[100.3, 80.7]]))
-    # Half a cell if nothing else is known; otherwise a tenth of the step.
+    # Sigma is half a cell if nothing else is known; otherwise, it is less than a tenth of the sigma
+    # on the step.
     assert flat[1][0] < (0.01 if n_even else 0.7 * ms.GSD_M)
     edge = points_on_wall(sparse, np.array([[300.1, 80.7]]))
     assert edge[1][0] > 0.05
@@ -162,7 +163,7 @@ def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
         assert [each.code for each in ctx.diagnostics] == ["scan-without-texture"]
 
 
-# The middle of the picture, which contains enough key points.
+# The camera shows only the middle of the picture, which contains enough key points.
 CAMERA = replace(ms.camera_before(), width=630, height=448, cx=0.5 * 630, cy=0.5 * 448)
 
 

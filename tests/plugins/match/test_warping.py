@@ -106,7 +106,7 @@ def test_views_flatter_than_one_in_seven_show_too_little(cosine: float, is_shown
 
 
 def test_what_another_surface_hides_is_left_out() -> None:
-    # A screen half a metre in front of the left half of the wall.
+    # Put a screen half a metre in front of the left half of the wall.
     screen = wall_at(-0.5, width=30, x_m=-0.35)
     behind, before = warping.project_walls(camera_at(), [wall_at(0.0), screen])
     assert behind is not None
@@ -126,7 +126,7 @@ def test_six_cells_behind_a_surface_are_hidden(apart_cells: float, is_hidden: bo
 
 
 def board_before(wall: Wall, camera: ViewingCamera) -> warping.Before:
-    # A board half a metre in front of the left half of the wall, which is in no raster.
+    # Put a board, which is in no raster, half a metre in front of the left half of the wall.
     across, down = np.meshgrid(np.arange(-0.35, -0.05, 0.005), np.arange(-0.5, 0.5, 0.005))
     x = across.ravel().astype(np.float32)
     cloud = PointCloud(

@@ -265,8 +265,8 @@ def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
     )
     source = np.repeat([[0, 1]], 120, axis=1).repeat(160, axis=0).astype(np.int16)
     one, other = balancing.with_seams(found, source, None).logs
-    # Weighted by the probability that both show the same object, and by the known share within 1.5
-    # blocks.
+    # Blocks are weighted by the probability that both layers show the same object, and by the known
+    # share within 1.5 blocks.
     alike = 1.0 / (1.0 + (apart / 0.15) ** 2) ** 2
     offsets = np.arange(-5, 6)
     bell = np.exp(-0.5 * (offsets / 1.5) ** 2)
@@ -382,7 +382,7 @@ def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_tak
 
 
 def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
-    # A slope of a tenth from left to right, symmetric about the middle.
+    # The slope is a tenth from left to right, symmetric about the middle.
     slope = np.broadcast_to(np.linspace(-0.05, 0.05, 40)[None, :, None], (10, 40, 3))
     first = light(slice(0, 10), slice(0, 40), 3)
     lights = [first, replace(first, log_light=first.log_light + slope.astype(np.float32))]
@@ -410,7 +410,7 @@ def test_light_is_multiplied_and_clipped(dtype: type[np.unsignedinteger], gain: 
     found = lit(colours, logs)
     assert found.dtype == dtype
     level = levels_of(np.clip(gain * light_of(colours, highest), 0.0, 1.0))
-    # Rounding errors of whole levels; with 16 bits, about one level.
+    # The limit allows rounding errors of whole levels; with 16 bits, they are about one level.
     limit = 0.51 if dtype is np.uint8 else 1.5
     assert np.abs(found - highest * level).max() <= limit
     np.testing.assert_allclose(lit_shares(colours / highest, logs), level, atol=2e-5)
@@ -456,7 +456,7 @@ def test_black_and_white_say_nothing(
 @pytest.mark.parametrize(("n_white", "is_said"), [(5, True), (6, False)])
 def test_a_twentieth_of_a_block_may_be_white(n_white: int, *, is_said: bool) -> None:
     rgb = np.full((*SMALL_SHAPE, 3), 100, np.uint8)
-    # Some of the hundred cells of the first block.
+    # Make some of the hundred cells of the first block white.
     rgb[0, :n_white] = 255
     found = block_light(samples.layer(SMALL_SHAPE, rgb=rgb), BLOCKS)
     assert found.is_known[0, 0] == is_said

@@ -85,7 +85,7 @@ def test_preferences_are_the_same_row_by_row(rule: str) -> None:
         elif rule == "best-view":
             np.testing.assert_array_equal(values, one.quality)
         elif rule == "voronoi":
-            # The distance to the nearest cell that is not painted, or to the border.
+            # Compute the distance to the nearest cell that is not painted, or to the border.
             padded = np.pad(one.mask == LayerMask.PAINTED, 1)
             others = np.argwhere(~padded)
             for cell in [(0, 0), (4, 7), (11, 3), (22, 16)]:
@@ -110,7 +110,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
     owner = source.astype(np.int16)
     island = np.zeros(SHAPE, dtype=bool)
     for index in range(3):
-        # Cells of one source that are connected by their sides.
+        # A patch consists of cells of one source that are connected by their sides.
         patch, _ = ndimage.label(owner == index)
         island |= (patch > 0) & (np.bincount(patch.ravel())[patch] < cells_min)
     assert 5 < island.sum() < 0.5 * island.size
@@ -409,7 +409,7 @@ def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
     one = rng.integers(0, 256, (64, 64))
     window = cv2.createHanningWindow((64, 64), cv2.CV_32F)
     sources: dict[str, int] = {}
-    # The same patch, mixed with others to an increasing degree.
+    # Compare a patch with itself, mixed with others to an increasing degree.
     for weight in np.linspace(0.5, 1.0, 41):
         mixed = np.rint((1.0 - weight) * one + weight * rng.integers(0, 256, one.shape))
         peak = cv2.phaseCorrelate(one.astype("f4"), mixed.astype("f4"), window)[1]

@@ -293,7 +293,7 @@ def left_and_right(
 
 
 def test_a_graph_cut_runs_where_the_photos_agree(tmp_path: Path) -> None:
-    # Two pictures that agree only in columns 64 to 67.
+    # The two pictures agree only in columns 64 to 67.
     rng = np.random.default_rng(4)
     one, other = (rng.integers(0, 256, (*WIDE, 3)).astype(np.uint8) for _ in range(2))
     other[:, 64:68] = one[:, 64:68]
@@ -354,7 +354,7 @@ def three_discs(shape: tuple[int, int], turn: Turn = TURNS[0]) -> tuple[tuple[La
     ("rule", "shape"),
     [
         *(("best-view", (41, 58)), ("voronoi", (41, 58)), ("priority", (41, 58))),
-        # Cut at full scale, and at half and a third, which do not divide the sides evenly.
+        # Cut at full scale, and at a half and a third of it, which do not divide the sides evenly.
         *(("graph-cut", (41, 58)), ("graph-cut", (205, 170))),
     ],
 )
@@ -410,7 +410,8 @@ def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
 ) -> None:
     before = along(folder=tmp_path)
     gsd_m = before.frame.gsd_m
-    # Rows 5 to 19 and columns 10 to 39; X to the right, Y upwards from the top-left corner.
+    # The ring contains rows 5 to 19 and columns 10 to 39; X is to the right, Y upwards from the
+    # top-left corner.
     ring = [[10.2, -5.2], [39.8, -5.2], [39.8, -19.8], [10.2, -19.8]]
     path = drawn(tmp_path, "photo 1", [[x * gsd_m, y * gsd_m] for x, y in ring])
     after = along(path, folder=tmp_path)

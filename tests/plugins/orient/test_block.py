@@ -185,7 +185,7 @@ def test_lenses_are_told_with_their_photos_and_deviations() -> None:
         "centre_px": [camera.cx, camera.cy],
         "distortion": camera.distortion.tolist(),
         "free": ["focal", "k1"],
-        # The 19th and the 20th unknown; focal lengths are logarithms.
+        # These are the 19th and the 20th unknown; focal lengths are logarithms.
         "sigmas": {"focal": pytest.approx(19.0 * camera.fx), "k1": pytest.approx(20.0)},
     }
     assert (second["photos"], second["free"], second["sigmas"]) == (["b.png"], [], {})

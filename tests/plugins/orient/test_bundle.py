@@ -191,7 +191,7 @@ def test_the_noise_of_ties_between_photos_is_found() -> None:
     points = rng.uniform([0.6, -0.1, 0.4], [2.4, 0.1, 1.6], (500, 3))
     pixels = np.array([camera.project(points)[:, :2] for camera in bs.viewers()])
     seen = np.array([c.sees(p) for c, p in zip(bs.viewers(), pixels, strict=True)])
-    # The photos that see each point; a few of them in random order.
+    # Choose some of the photos that see each point, in random order.
     order = np.argsort(np.where(seen, rng.uniform(size=seen.shape), 2.0), axis=0)[:n_seeing]
     kept = np.flatnonzero(seen.sum(axis=0) >= n_seeing)
     photo, point = order[:, kept].ravel(), np.tile(np.arange(len(kept)), n_seeing)

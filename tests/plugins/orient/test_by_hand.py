@@ -1,4 +1,4 @@
-"""Ties measured by hand, and poses from other programs: used, checked or corrected."""
+"""Ties measured by hand, and poses from other programs, are used, checked or corrected."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def clicked(
     shares = np.array(places or (*SPREAD, *MORE)[:n])
     n = len(shares)
     pixels = (shares + rng.uniform(-0.03, 0.03, (n, 2))) * [CAMERA.width, CAMERA.height]
-    # The wall point of a pixel: along the ray to the plane, then onto the relief.
+    # Find the wall point of a pixel, first along the ray to the plane, then onto the relief.
     rays = CAMERA.rays_world(pixels)
     points = CAMERA.centre_world + rays * (-CAMERA.centre_world[1] / rays[:, 1:2])
     cells = SCENE.frame.wall_from_world(points)[:, :2]
@@ -192,7 +192,7 @@ def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
     exact = {"sigma_m": np.zeros(6)}
     found = by_hand(points, 1.0, sigma_px=np.full(6, 3.0), **exact)
     assert not isinstance(found, str)
-    # In pixels, since no residual is so small by chance that a larger one is assumed.
+    # Errors are in pixels, since no residual is so small by chance that a larger one is assumed.
     squares = float((found[0].fit.residuals_px ** 2).sum())
     sigma_px = np.full(6, np.sqrt(squares / stats.chi2.isf(chance, 6)))
     assert isinstance(by_hand(points, 1.0, sigma_px=sigma_px, **exact), str) != fits
@@ -200,8 +200,8 @@ def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
 
 @pytest.mark.parametrize("relief_m", [0.0, 0.0004])
 def test_a_small_plate_seen_from_afar_may_be_turned_either_way(relief_m: float) -> None:
-    # A plate of 12 cm, rotated by 35 degrees, seen from 2.9 m: perspective distinguishes the two
-    # rotations by only a quarter of a pixel.
+    # Perspective distinguishes the two rotations of a plate of 12 cm, rotated by 35 degrees and
+    # seen from 2.9 m, by only a quarter of a pixel.
     across, up = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-0.06, 0.06, 3)] * 2))
     relief = relief_m * (np.arange(9) % 2 - 0.5)
     turn = np.deg2rad(35.0)

@@ -1,4 +1,4 @@
-"""The direct linear transform: exact for exact points; wrong at the corners without distortion."""
+"""The DLT is exact for exact points, and wrong at the corners if it ignores distortion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.long_loops import seeds
 from tests.tied_photos import context
 
 SIZE_PX = (4000, 3000)
-# A grey photo, since only the ties are used.
+# The photo is grey, since only the ties are used.
 ENCODED = encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
 CENTRE = np.array([0.15, -2.6, 0.1])
 orient = partial(tp.oriented, dlt.OrientDlt)
@@ -181,7 +181,7 @@ def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
     rotation = rotation_from_vector(rng.normal(size=3))
     translation = rng.normal(size=3)
     lens = np.array([[3000.0, 25.0, 2010.0], [0.0, 2800.0, 1480.0], [0.0, 0.0, 1.0]])
-    # Points at least five metres in front of the camera.
+    # Points are at least five metres in front of the camera.
     local = rng.uniform([-2.0, -2.0, 5.0], [2.0, 2.0, 9.0], (12, 3))
     points = (local - translation) @ rotation
     matrix = lens @ np.column_stack([rotation, translation])

@@ -121,8 +121,8 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
 def test_photos_stand_before_the_wall_and_look_at_it(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
-    # From 3 m in front of the wall, 3 m along it and 0.5 m below its upper edge, in the direction
-    # -n.
+    # The view is from 3 m in front of the wall, 3 m along it and 0.5 m below its upper edge, in the
+    # direction -n.
     looks = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     camera = SimpleNamespace(centre_world=np.array([4.0, -3.0, 1.5]), rotation=looks)
     points = np.array([[2.0, 0.0, 1.0], [3.0, -0.1, 0.5], [8.0, 0.0, 1.9]])

@@ -179,7 +179,7 @@ def agreeing(n_control: int, n_check: int) -> np.ndarray:
     [
         ({"agreeing": agreeing(12, 16)}, {"agreeing": agreeing(11, 16)}, "control"),
         ({"params": params(min_hull_ratio=0.8)}, {"params": params(min_hull_ratio=0.95)}, "hull"),
-        # Limits of 0.5 and 1.5 cells of 2 mm.
+        # The limits are 0.5 and 1.5 cells of 2 mm.
         ({"error": {"rms_m": 0.00099}}, {"error": {"rms_m": 0.00101}}, "accuracy"),
         ({"error": {"worst_m": 0.0029}}, {"error": {"worst_m": 0.0031}}, "accuracy-at-worst"),
         ({"centre": np.array([0.0, -0.1, 0.0])}, {"centre": np.array([0.0, 0.1, 0.0])}, "side"),

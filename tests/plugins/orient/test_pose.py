@@ -91,7 +91,7 @@ def test_a_limit_is_tightened_until_chance_is_a_tenth(n_wrong: int) -> None:
         return around / 8.0 / inside
 
     assert share(found) <= 0.1
-    # In the previous step it was not; each step reduces the limit by a fifth.
+    # This was not the case in the previous step; each step reduces the limit by a fifth.
     if found < 3.5:
         assert share(found / 0.8) > 0.1
         steps = np.log(found / 3.5) / np.log(0.8)
@@ -137,7 +137,7 @@ def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
 ) -> None:
     true = camera()
     claimed = replace(true, fx=(1.0 + off) * true.fx, fy=(1.0 + off) * true.fy)
-    # Wide enough that no tie is rejected because of the wrong focal length.
+    # The sigma is so large that no tie is rejected because of the wrong focal length.
     seen = seen_by(true, n_ties, sigma_px=6.0)
     found = lenses.estimate_pose(tied(photo(claimed), seen), PARAMS)
     assert isinstance(found, str) == is_contradicted
@@ -232,8 +232,8 @@ def test_exif_is_believed_to_a_twentieth_and_without_it_lenses_from_wide_to_long
     [
         ("per-photo", (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5)),
         ("shared", (0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 1, 2)),
-        # Two photos with one focal length, one with another, two without any, and one of another
-        # size.
+        # There are two photos with one focal length, one with another, two without any, and one of
+        # another size.
         ("focal-group", (0, 0, 1, 2, 2, 3), (0, 0, 1, 2, 3, 4)),
     ],
 )
@@ -331,7 +331,7 @@ def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:
 @pytest.mark.parametrize(("share", "n_check"), [(0.2, 144), (0.25, 180), (0.001, 1), (0.0, 0)])
 def test_check_points_are_withheld_evenly(share: float, n_check: int) -> None:
     rng = np.random.default_rng(0)
-    # Twenty ties in each of six by six cells.
+    # There are twenty ties in each of six by six cells.
     corner = np.stack(np.meshgrid(np.arange(6), np.arange(6)), axis=-1).reshape(-1, 1, 2)
     pixels = (100.0 * (corner + rng.random((36, 20, 2)))).reshape(-1, 2)
     chosen = photos.withheld(pixels, (600, 600), share, rng)
@@ -349,8 +349,8 @@ CAMERA = ms.camera_before()
 
 def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:
     ahead = CAMERA.rotation[2]
-    # Points 2 mm and 2 m in front of the camera, with a sigma of 3 mm: the first may be anywhere in
-    # the image.
+    # The points are 2 mm and 2 m in front of the camera, with a sigma of 3 mm, so the first may be
+    # anywhere in the image.
     points = CAMERA.centre_world + np.array([[0.002], [2.0]]) * ahead
     seen = SeenPoints(
         pixels_photo=CAMERA.project(points)[:, :2] + [1.0, 0.0],

@@ -52,7 +52,7 @@ def test_cells_show_their_own_place_where_they_are_seen_and_nothing_where_they_a
     is_raised = scenes.depth_m() > 0.0
     expected = np.where(is_raised, scenes.BLUE[scenes.RAISED], scenes.BLUE[scenes.BASE])
     np.testing.assert_array_equal(layer.rgb[..., 2][shown], expected[shown])
-    # Half a cell, plus half of a grey level, which corresponds to a quarter of a cell.
+    # The limit is half a cell plus half of a grey level, which corresponds to a quarter of a cell.
     assert np.abs(scenes.places_off(layer)[shown]).max() <= 0.5 + 0.125
     is_visible, is_behind_board = scenes.visible(viewer)
     assert is_behind_board.any()
@@ -193,7 +193,7 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
     where = scenes.frame()
     walls = scenes.walls(where)
     (wall,) = walls.walls
-    # A wall behind the camera that faces it but is not visible.
+    # Add a wall behind the camera that faces it but is not visible.
     behind = replace(
         where,
         origin_world=where.world_from_wall(np.array([[where.width, 0.0]]), 4.0)[0],
@@ -214,7 +214,7 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
 
 
 def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
-    # A clock that advances by one second per call.
+    # Use a clock that advances by one second per call.
     clock = count()
     ctx = replace(context(tmp_path), clock_s=lambda: float(next(clock)))
     inputs = DsmBackward.In(**scenes.inputs())

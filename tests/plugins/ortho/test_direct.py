@@ -68,7 +68,7 @@ def test_a_painted_relief_comes_back_cell_by_cell(tmp_path: Path, at_survey: boo
     assert (layer.mask == LayerMask.PAINTED).all()
     assert layer.filled is not None
     assert not layer.filled.any()
-    # Distance to the centre of 0.4 * sqrt(2) cells: quality 1 - 0.4.
+    # The distance to the centre is 0.4 * sqrt(2) cells, so the quality is 1 - 0.4.
     np.testing.assert_allclose(layer.quality, 0.6, atol=1e-4)
 
 
@@ -181,7 +181,8 @@ def test_points_without_a_colour_are_skipped_where_that_is_asked_for(
     rgb = scenes.checker(columns, rows) // 2 + 100
     least = 10
     rgb[7] = (0, 0, least)
-    # Points that are too dark are above every other cell, and the only points in the last cell.
+    # Points that are too dark are above every other cell, and they are the only points in the last
+    # cell.
     flat = np.zeros(columns.size)
     points = np.vstack(
         [
@@ -221,7 +222,7 @@ def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:
     is_void = np.zeros((10, 20), dtype=bool)
     is_void[4, 4] = True
     is_void[:, 10:] = True
-    # A clock that advances by one second per call.
+    # Use a clock that advances by one second per call.
     clock = count()
     lines: list[str] = []
     ctx = dataclasses.replace(

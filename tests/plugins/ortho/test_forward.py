@@ -55,7 +55,8 @@ def test_every_pixel_paints_the_cell_that_it_shows_and_nothing_that_is_hidden(
     is_raised = scenes.depth_m() > 0.0
     expected = np.where(is_raised, scenes.BLUE[scenes.RAISED], scenes.BLUE[scenes.BASE])
     assert np.mean(layer.rgb[..., 2][taken] == expected[taken]) > 0.999
-    # Half a cell, half of a grey level (a quarter of a cell), and a hundredth of a pixel.
+    # The limit is the sum of half a cell, half of a grey level (a quarter of a cell), and a
+    # hundredth of a pixel.
     assert np.quantile(np.abs(scenes.places_off(layer)[taken]), 0.999) <= 0.5 + 0.125 + 0.01
     is_visible, is_behind_board = scenes.visible(scenes.camera(scenes.frame(), aside_m=aside_m))
     assert not (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).any()
@@ -81,7 +82,7 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
     assert "occluders-unknown" in [one.code for one in ctx.diagnostics]
     assert holed.filled is not None
     assert not holed.filled.any()
-    # Pixels of at least 5 mm on 4 mm cells.
+    # Pixels are at least 5 mm wide on 4 mm cells.
     gsd_m = 2.0 / (1.5 * 300)
     assert np.mean(holed.mask == LayerMask.PAINTED) <= 1.1 * (scenes.GSD_M / gsd_m) ** 2
     # The clock advances with each call: once for all photos, and once for each photo.
@@ -166,7 +167,7 @@ def test_rays_meet_the_first_patch_on_their_way_and_no_sides(seed: int) -> None:
     lowest = float(np.nanmin(relief.depth))
     seen = set()
     for _ in range(150):
-        # From near the camera's foot to beyond the ends of the wall, in all four directions.
+        # Rays are aimed at positions on and beside the wall, in all four directions.
         goal = rng.uniform(-60.0, [scenes.SHAPE[1] + 60.0, scenes.SHAPE[0] + 60.0])
         way = np.append(goal, lowest) - [view.column + 0.5, view.row + 0.5, view.height_m]
         ray = way / rng.uniform(1.0, 3.0)

@@ -152,8 +152,8 @@ def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(aside_m: flo
     heights = depths[free].astype(np.float64)
     points = where.world_from_wall(np.column_stack([columns, rows]) + 0.5, heights)
     towards = camera.centre_world - points
-    # The position at which the ray to the camera passes the front of the slab, and its depth along
-    # the axis.
+    # Compute where the ray to the camera passes the front of the slab, and the depth of this
+    # position along the axis.
     share = (surface.front_m - heights) / (towards @ where.normal_world)
     leaves_m = camera.project(points + share[:, None] * towards)[:, 2]
     for nearest_m in np.quantile(leaves_m, [0.1, 0.5, 0.9]):
@@ -347,7 +347,7 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
     where = scenes.frame()
     camera = scenes.camera(where, aside_m=aside_m)
     surface = surface_of(np.full(scenes.SHAPE, 0.03))
-    # Nine cells around column 31, row 14, in a tile with a margin of two cells.
+    # There are nine cells around column 31, row 14, in a tile with a margin of two cells.
     painted = np.zeros((20, 40), dtype=np.bool_)
     painted[13 - 10 : 16 - 10, 30 - 18 : 33 - 18] = True
     tile, inner = (slice(12, 30), slice(20, 58)), (slice(2, 20), slice(2, 40))
@@ -376,7 +376,8 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
 def test_bilinear_colours_are_those_of_the_formula(depth: int, size: tuple[int, int]) -> None:
     rng = np.random.default_rng(5)
     photo = rng.integers(0, 2**depth, (*size, 3), dtype=np.uint8 if depth == 8 else np.uint16)
-    # Relative to the centre of the first pixel of a part that begins at column 7 and row 3.
+    # Positions are relative to the centre of the first pixel of a part that begins at column 7 and
+    # row 3.
     u, v = rng.uniform(-4.0, 66.0, (2, 30, 40)).astype(np.float32)
     is_painted = rng.random(u.shape) < 0.9
     last_u, last_v = size[1] - 1, size[0] - 1

@@ -20,7 +20,8 @@ from tests.wide_lenses import directions_of_panorama
 
 ROOM = BoxRoom(size_m=(2.4, 1.8, 1.6), middle=SURVEY, gsd_m=0.008)
 CENTRE = SURVEY + np.array([0.2, -0.1, 0.75])
-# Rotation from camera axes (x right, y down, z forward) to the world: north, tilted and rolled.
+# Rotation from camera axes (x right, y down, z forward) to the world, for a view to the north,
+# tilted and rolled.
 WORLD_FROM_CAMERA = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) @ rotation_from_vector(
     np.array([0.11, -0.16, 0.2])
 )

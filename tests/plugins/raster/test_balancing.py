@@ -37,7 +37,7 @@ def cloud(n_scans: int = 3, n_points: int = 40_000) -> tuple[PointCloud, np.ndar
     points = np.column_stack(
         [rng.uniform(-2.3, 2.3, n_points), np.zeros(n_points), rng.uniform(-1.8, 1.8, n_points)]
     )
-    # In front of the slab, behind it, and just inside.
+    # Some points are in front of the slab, some behind it, and some just inside.
     points[::10, 1], points[1::10, 1], points[2::10, 1] = -0.06, 0.04, -0.04
     scan = rng.integers(0, n_scans, n_points)
     rays = STATIONS[scan] - points
@@ -68,7 +68,7 @@ def test_scale_range_and_incidence_are_told_from_places_that_several_scans_see(
     assert 0.3 < on_wall.mean() < 0.9
     # Points that are not on the wall are unchanged.
     np.testing.assert_array_equal(found.intensity[~on_wall], known.intensity[~on_wall])
-    # As seen by the first scan from three metres at perpendicular incidence.
+    # The intensity is as in the first scan, from three metres at perpendicular incidence.
     ratio = found.intensity[on_wall] / true[on_wall]
     spread_before = np.std(known.intensity[on_wall] / true[on_wall])
     assert np.std(ratio) < 0.05 * spread_before

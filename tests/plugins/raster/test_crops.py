@@ -16,7 +16,7 @@ from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext
 from tests import raster_scenes as scenes
 
-# 40 x 30 cells of 0.125 m: 5 m wide, 3.75 m high.
+# The wall has 40 x 30 cells of 0.125 m, so it is 5 m wide and 3.75 m high.
 KNOWN = scenes.upright_wall()
 
 
@@ -61,7 +61,7 @@ def test_a_crop_holds_the_cells_of_the_whole_wall(
 
 def test_cells_beyond_a_polygon_are_void(tmp_path: Path) -> None:
     whole, _ = rastered(tmp_path)
-    # A triangle to the right of the line from (1, 3) to (3, 1), below v = 1.
+    # The crop is the triangle to the right of the line from (1, 3) to (3, 1), below v = 1.
     wall, _ = rastered(tmp_path, crop=[[1.0, 3.0], [3.0, 1.0], [3.0, 3.0]])
     assert wall.frame.shape == (16, 16)
     rows, columns = np.mgrid[8:24, 8:24] + 0.5

@@ -18,7 +18,7 @@ from tests import samples
 
 CODES = {"wall-behind-buffer", "wall-front-left-out", "wall-hidden", "wall-sparse", "wall-unseen"}
 CAUSES = ("behind", "before", "hidden", "sparse", "unseen")
-# A wall of 4 m x 3 m seen along +y, with points 8 mm apart and 2 cm cells; depth is -y.
+# The wall of 4 m x 3 m is seen along +y, with points 8 mm apart and 2 cm cells; depth is -y.
 WALL = scenes.KnownWall(
     normal=np.array([0.0, -1.0, 0.0]),
     top_left=np.array([0.0, 0.0, 3.0]),
@@ -85,7 +85,7 @@ def test_cells_finer_than_the_scan_are_told_from_holes(tmp_path: Path) -> None:
     assert "gsd_m" in said[0].remedy
 
 
-# A wall of 40 x 40 cells of 2 cm, with a void of 4 x 4 tiles (3 x 3 cells each) in the middle.
+# The void is in the middle of a wall of 40 x 40 cells of 2 cm. It has 4 x 4 tiles of 3 x 3 cells.
 VOID = slice(9, 21)
 VOID_SHARE = 144 / 1600
 

@@ -126,7 +126,7 @@ def test_a_wall_reaches_over_cornice_and_pilaster_to_what_adjoins_it(tmp_path: P
     assert other.frame.shape == (270, 375)
     edges_m = one.frame.corners_world()[[1, 3]][:, [0, 2]]
     np.testing.assert_allclose(edges_m, [[0.0, 0.0], [WIDTH_M, HEIGHT_M]], atol=CORNER_M)
-    # 3 mm for the median of a few points and half a step between rows of a scan.
+    # The tolerance is 3 mm for the median of a few points and half a step between rows of a scan.
     assert np.nanmedian(one.depth_m[2:20]) == pytest.approx(0.12, abs=0.003)
     assert np.nanmedian(one.depth_m[60:200, 2:20]) == pytest.approx(0.10, abs=0.003)
     # No part of the adjoining walls is treated as relief.
@@ -162,7 +162,7 @@ def test_where_no_plane_ends_it_a_wall_ends_with_its_points() -> None:
 
 
 def test_a_facade_without_anything_about_it_keeps_the_rectangle_of_its_points() -> None:
-    # Ground that rises slowly towards the viewer, stray points around the wall, and a cable.
+    # Add ground that rises slowly towards the viewer, stray points around the wall, and a cable.
     ground = patch((-2.0, 6.0), (0.0, 2.0), (0.0, 0.0))
     ground[:, 2] -= 0.03 * ground[:, 1]
     rng = np.random.default_rng(8)
@@ -185,7 +185,7 @@ def test_the_buffer_follows_a_door_that_stands_back() -> None:
     outside = patch((2.6, 3.4), (-3.0, -3.0), (1.1, 1.9))
     cloud = scanned(whole[~in_door & ~in_window], jamb, leaf, outside)
     found = extent(cloud, planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)))
-    # With a depth step, and the margin beyond the relief.
+    # The buffers include a depth step and the margin beyond the relief.
     assert (found.front_m, found.behind_m) == (0.15, pytest.approx(0.36, abs=0.06))
 
 
@@ -203,14 +203,14 @@ def test_the_cornice_of_an_adjoining_wall_is_no_relief_of_this_one() -> None:
     ]
     planes = planes_of((0.0, WIDTH_M), BESIDE_Z, *ROOM)
     found = extent(scanned(wall(z=BESIDE_Z), CORNICE, *beside, *SIDES), planes)
-    # From the wall's own cornice: half a depth step, and the margin beyond the relief.
+    # The buffer extends beyond the wall's own cornice by half a depth step and the margin.
     assert found.front_m == pytest.approx(0.15, abs=0.03)
     assert_reaches(found, planes)
 
 
 def test_the_underside_of_a_cornice_does_not_end_the_wall() -> None:
-    # A cornice of 0.2 m, whose underside forms one detected plane with that of the left wall's
-    # cornice.
+    # There is a cornice of 0.2 m, whose underside forms one detected plane with that of the left
+    # wall's cornice.
     cornice = patch((0.0, WIDTH_M), (0.2, 0.2), (2.6, HEIGHT_M))
     under = patch((0.0, WIDTH_M), (0.0, 0.2), (2.6, 2.6))
     beside = patch((0.0, 0.2), (0.2, 3.0), (2.6, 2.6))
@@ -238,7 +238,7 @@ def test_a_wall_grows_by_a_metre_at_most_where_a_fifth_of_a_line_of_cells_is_cov
         part((0.0, WIDTH_M), 0.0, (HEIGHT_M, HEIGHT_M + 1.4)),
         part((1.0, 2.2), 0.0, (-0.4, 0.0)),
     )
-    # Without a fiftieth of the outermost points, which may be stray points.
+    # A fiftieth of the outermost points is ignored, because these may be stray points.
     found = quiet(wall(), *strips)
     np.testing.assert_allclose(found.growth_m, [0.8, 0.0, 1.0, 0.4], atol=0.03)
 
@@ -261,7 +261,7 @@ def test_relief_hangs_together_over_steps_of_a_tenth_of_a_metre(
 ) -> None:
     steps = [part((1.0, 2.0), depth, (1.0, 2.0)) for depth in depths_m]
     found = quiet(wall(), *steps, least_m=0.1)
-    # A depth step of 2.5 cm, and 2 cm beyond the relief.
+    # The buffer includes a depth step of 2.5 cm, and extends 2 cm beyond the relief.
     assert found.front_m == pytest.approx(front_m, abs=0.03)
     assert found.front_m == round(found.front_m, 3)
     assert found.behind_m == 0.1
@@ -272,7 +272,7 @@ def test_what_is_set_is_not_looked_for() -> None:
     found = quiet(wall(), step, front_m=0.07)
     assert (found.front_m, found.behind_m) == (0.07, 0.15)
     back = part((1.0, 2.0), -0.11, (1.0, 2.0))
-    # The farther end of a depth step of 2.5 cm, and 2 cm beyond.
+    # The buffer ends 2 cm beyond the farther end of a depth step of 2.5 cm.
     found = quiet(wall(), back, least_m=0.06)
     assert (found.front_m, found.behind_m) == (0.06, pytest.approx(0.14, abs=0.03))
     # Tiny relief does not influence the buffer.
@@ -314,7 +314,7 @@ def beside(side: str, beyond_m: float, towards: float) -> tuple[NDArray, NDArray
 def test_a_plane_bounds_the_side_that_it_lies_beside(
     side: str, beyond_m: float, towards: float
 ) -> None:
-    # Neither planes on the wall nor planes farther away.
+    # Planes farther inside or outside than these limits do not bound the wall.
     for far_m in (-0.11, 1.01):
         assert bound_by(beside(side, far_m, towards)) is None
     place = beside(side, beyond_m, towards)
@@ -322,11 +322,11 @@ def test_a_plane_bounds_the_side_that_it_lies_beside(
     assert found.side == side
     assert found.beyond_m == pytest.approx(beyond_m)
     assert found.askew_m == pytest.approx(0.0, abs=1e-9)
-    # Three sigmas of its points, at most 2 cm.
+    # The noise is three sigmas of its points, but at most 2 cm.
     assert found.noise_m == pytest.approx(3.0 * NOISE_M)
     assert found.line_m == pytest.approx(beyond_m - 3.0 * NOISE_M)
     assert bound_by(place, rms_m=np.full(2, 0.01)).noise_m == 0.02
-    # Based on the thickness of the plane without relief, if known.
+    # It is based on the thickness of the plane without relief, if known.
     thick = Thickness(sigma_m=0.002, width_95_m=0.008, scan_step_m=0.01)
     for thickness, noise_m in (((None, thick), 0.006), ((thick, None), 3.0 * NOISE_M)):
         assert bound_by(place, thickness=thickness).noise_m == pytest.approx(noise_m)
@@ -339,7 +339,7 @@ def test_a_plane_bounds_the_side_that_it_lies_beside(
 @pytest.mark.parametrize("turn_deg", [0.0, -5.0, 24.0, 28.0])
 def test_a_plane_that_runs_askew_is_farther_at_one_end(turn_deg: float) -> None:
     turn = np.radians(turn_deg)
-    # Through the middle of the left side, rotated about the wall's normal.
+    # The plane passes through the middle of the left side, and is rotated about the wall's normal.
     normal = np.array([np.cos(turn), 0.0, np.sin(turn)])
     corners = upright(0.0, (0.0, 3.0), towards=1.0)[1]
     point = np.array([-0.7, 0.0, 0.5 * HEIGHT_M])

@@ -80,8 +80,8 @@ def cell_with(depths_m: ArrayLike, folder: Path, **params: object) -> Wall:
     [("centre", 0.015), ("topmost", 0.25), ("mean", 0.0754), ("median", 0.012)],
 )
 def test_surfaces_choose_as_they_say(tmp_path: Path, surface: str, depth_m: float) -> None:
-    # Median: the layer at 1 cm has three points, that at 25 cm a stray point, the rear one a single
-    # point.
+    # The layer at about 1 cm, which has three points, provides the median. The layers at 9 and 25
+    # cm have one point each.
     wall = cell_with([0.015, 0.25, 0.010, 0.012, 0.09], tmp_path, surface=surface)
     assert wall.depth_m[4, 3] == pytest.approx(depth_m, abs=1e-7)
     assert wall.count[4, 3] == 5
@@ -93,7 +93,7 @@ def test_surfaces_choose_as_they_say(tmp_path: Path, surface: str, depth_m: floa
 def test_a_median_never_lies_between_two_surfaces(tmp_path: Path) -> None:
     wall = cell_with([0.0, 0.001, 0.08, 0.081], tmp_path, surface="median")
     assert wall.depth_m[4, 3] == pytest.approx(0.0805, abs=1e-7)
-    # Intensity only of the two points on that surface: (0.3667 + 0.5) / 2.
+    # The intensity is the mean of the two points on that surface, (0.3667 + 0.5) / 2.
     assert wall.intensity[4, 3] == pytest.approx(0.43333, abs=1e-5)
 
 

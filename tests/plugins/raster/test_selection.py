@@ -63,16 +63,17 @@ MAIN = (0.0, 0.0, 5.0, 0.0)
 @pytest.mark.parametrize(
     ("other", "is_covered"),
     [
-        # Pilasters in front of it and panels behind it, but not beyond its buffers.
+        # Pilasters in front of the wall and panels behind it are covered, but not beyond its
+        # buffers.
         ((0.08, 1.0, 3.0, 0.0), True),
         ((0.11, 1.0, 3.0, 0.0), False),
         ((-0.14, 1.0, 3.0, 0.0), True),
         ((-0.16, 1.0, 3.0, 0.0), False),
-        # Planes inclined by five degrees, and its other side.
+        # Planes may be inclined by up to five degrees, but must not be on the other side.
         ((0.0, 2.0, 0.5, 4.8), True),
         ((0.0, 2.0, 0.5, -5.2), False),
         ((0.0, 0.0, 5.0, 180.0), False),
-        # Planes 4 m wide that are partly within the wall.
+        # These planes are 4 m wide, and a part of each is within the wall.
         ((0.0, 1.76, 4.0, 0.0), True),
         ((0.0, 1.84, 4.0, 0.0), False),
         ((0.0, -0.76, 4.0, 0.0), True),
@@ -105,7 +106,7 @@ def test_a_plane_that_a_larger_one_of_less_support_shows_is_no_wall_of_its_own()
     chosen = chosen_planes(three, CHOICE, buffer_m)
     assert chosen == [0, 2]
     assert covered_planes(three, CHOICE, buffer_m, chosen) == {1: 2}
-    # The plane with the most points always is a wall.
+    # The plane with the most points is always a wall.
     best = planes((0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0))
     assert chosen_planes(best, CHOICE, buffer_m) == [0, 1]
 
@@ -117,7 +118,8 @@ def test_a_plane_is_not_covered_by_one_that_was_left_out_itself() -> None:
 
 
 def test_the_wall_nearest_to_a_point_is_chosen() -> None:
-    # Facing -y: y = 3 from x = 0 to 5 and y = 1 from 6 to 7; and a perpendicular one at x = 5.
+    # Two planes face -y, at y = 3 from x = 0 to 5 and at y = 1 from 6 to 7; a perpendicular one is
+    # at x = 5.
     three = planes(MAIN, (2.0, 6.0, 1.0, 0.0), (0.0, 5.0, 2.0, -90.0))
     cases = {
         (2.0, 2.9, 1.0): 0,
@@ -140,7 +142,7 @@ def test_a_covered_or_small_wall_is_chosen_when_a_point_is_near_it() -> None:
 
 
 def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
-    # Two ends of one wall, and a wall 0.4 m behind the gap between them.
+    # There are two ends of one wall, and a wall 0.4 m behind the gap between them.
     ends = planes(MAIN, (-0.4, 2.0, 1.0, 0.0))
     parts = planes((0.0, 0.0, 1.0, 0.0), (0.0, 4.0, 1.0, 0.0))
     known = replace(

@@ -194,10 +194,10 @@ def test_strays_in_the_shadow_of_an_edge_are_left_void_and_sparse_surfaces_stay(
     rng = np.random.default_rng(8)
     true_m = np.where(columns < 40, 0.07, 0.0)
     in_shadow = (columns > 40) & (columns < 60)
-    # As in a scan: few points, mixed distances from both sides of the edge, and outliers.
+    # As in a scan, there are few points, mixed distances from both sides of the edge, and outliers.
     is_stray = in_shadow & (rng.random(len(columns)) < 0.06)
     depths_m = np.where(is_stray, rng.uniform(0.0, 0.2, len(columns)), true_m)
-    # A dark surface with few points, all on one plane.
+    # There is a dark surface with few points, all on one plane.
     is_dark = (columns > 100) & (columns < 140)
     kept = np.where(in_shadow, is_stray, ~is_dark | (rng.random(len(columns)) < 0.25))
     cloud = scenes.cloud_of(known.world(columns[kept], rows[kept], depths_m[kept]))
@@ -302,7 +302,7 @@ def test_a_cell_that_fewer_than_two_around_agree_with_is_a_speck(
 
 @pytest.mark.parametrize(("n_known", "is_speck"), [(5, False), (6, True)])
 def test_fewer_than_six_known_cells_say_nothing(n_known: int, is_speck: bool) -> None:
-    # Isolated in the void, so that no denser area is nearby.
+    # The cells are isolated in the void, so that no denser area is nearby.
     depth_m = np.full((40, 40), np.nan, dtype=np.float32)
     around = [(18, 18), (18, 20), (18, 22), (20, 18), (20, 22), (22, 18)][:n_known]
     for k, (row, column) in enumerate(around):
@@ -454,7 +454,8 @@ def rastered_turned(scattered: Scattered, turn: Turn, folder: Path, **params: ob
 def assert_turned(wall: Wall, turned: Wall, turn: Turn) -> None:
     np.testing.assert_array_equal(turned.count, turn.raster(wall.count))
     np.testing.assert_array_equal(turned.mask, turn.raster(wall.mask))
-    # A millionth, since float32 coordinates have another origin and sums another order.
+    # The tolerance is about a millionth, since float32 coordinates have another origin and sums
+    # another order.
     for name, tolerance in (("depth_m", 2e-6), ("sigma_m", 2e-6), ("intensity", 2e-5)):
         one, other = getattr(wall, name), getattr(turned, name)
         np.testing.assert_allclose(other, turn.raster(one), atol=tolerance, err_msg=name)
@@ -483,7 +484,7 @@ def test_even_cells_that_are_all_equally_near_are_weighed_evenly(
     columns, rows = scenes.cell_centres(TURNED)
     places = np.column_stack([columns, rows])
     places = places[(columns + rows) % 2 > 0.5]
-    # Two adjacent surfaces: each gap at their border has two equally near points on each.
+    # There are two adjacent surfaces; each gap at their border has two equally near points on each.
     scattered = Scattered(places, np.where(places[:, 0] < 21.0, 0.0, 0.0625))
     wall = rastered_turned(scattered, TURNS[0], tmp_path)
     assert_turned(wall, rastered_turned(scattered, turn, tmp_path), turn)

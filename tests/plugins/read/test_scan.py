@@ -463,7 +463,7 @@ def test_a_coarse_step_is_found(step: float) -> None:
     rounded = step * rng.integers(0, 1000, (3000, 3)) + 12.0 * step
     assert rounding_m(rounded, 1.0) == pytest.approx(step)
     if step in (0.005, 0.01, 0.02, 0.05, 0.1, 0.5):
-        # Also in millimetres, where half a metre is the coarsest step tested.
+        # This also works in millimetres, where half a metre is the coarsest step tested.
         assert rounding_m(1000.0 * rounded, 0.001) == pytest.approx(step)
 
 
@@ -590,7 +590,8 @@ def pixels(encoded: bytes | None) -> NDArray[np.uint8]:
 
 
 def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
-    # A grid of 2 m x 1 m with one point per pixel, and seven more points at one position.
+    # The cloud is a grid of 2 m x 1 m with one point per pixel, and seven more points at one
+    # position.
     x, y = np.meshgrid(np.arange(640) / 320.0, np.arange(320) / 320.0)
     grid = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     crowd = np.tile([1.6, 0.8, 3.0], (7, 1))
@@ -645,7 +646,7 @@ def expected_grey(cloud: PointCloud, rows: int, columns: int) -> NDArray[np.uint
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool) -> None:
     cloud = scanned()
-    # A cell of the grid without a point, and an additional point next to it.
+    # One cell of the grid has no point, and there is an additional point next to it.
     column = np.where((cloud.row == 3) & (cloud.column == 4), 5, cloud.column)
     cloud = replace(cloud, column=column.astype(np.uint32))
     # Azimuth increases with the columns, to the left.

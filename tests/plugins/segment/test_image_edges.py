@@ -12,7 +12,7 @@ SHAPE = (100, 120)
 LEFT, TOP, RIGHT, BOTTOM = 40.0, 20.0, 100.0, 80.0
 CORNERS = np.array([[LEFT, TOP], [LEFT, BOTTOM], [RIGHT, BOTTOM], [RIGHT, TOP]])
 HEIGHT = 60.0
-# From the picture, no side is more accurate than half a cell.
+# With the picture, no side is more accurate than half a cell.
 SIGMA = 0.5
 
 
@@ -55,7 +55,7 @@ def left_side(moved: tuple[Outline, NDArray[np.bool_]]) -> float | None:
 def test_a_side_moves_to_where_the_edge_was_painted(place: float, way: str) -> None:
     sign = 1.0 if way == "rises" else -1.0
     moved = moved_to_edges(outline(), picture(sign * step_at(LEFT + place), grey=120.0))
-    # A tenth of a cell, because of partly covered cells.
+    # The tolerance is a tenth of a cell, because of partly covered cells.
     assert left_side(moved) == pytest.approx(-place, abs=0.1)
     assert moved[1].tolist() == [True, False, False, False]
     assert moved[0].sigma[0] == pytest.approx(SIGMA, abs=1e-9)
@@ -107,7 +107,7 @@ def test_an_edge_farther_off_than_depth_errs_and_one_of_two_are_of_something_els
 def test_edges_have_four_grey_levels_and_are_three_times_as_steep_as_what_is_around() -> None:
     for height in (3.9, 4.1, -4.1):
         assert has_moved(step_at(LEFT, height)) == (abs(height) > 4.0)
-    # A slope of ten grey levels per cell, plus the step.
+    # Add a slope of ten grey levels per cell to the step.
     slope = 10.0 * np.arange(SHAPE[1])
     for height in (15.0, 25.0):
         assert has_moved(step_at(LEFT, height), slope, grey=-300.0) == (height > 20.0)
@@ -116,7 +116,7 @@ def test_edges_have_four_grey_levels_and_are_three_times_as_steep_as_what_is_aro
 @pytest.mark.parametrize(("n_pieces", "is_moved"), [(5, True), (4, True), (3, False)])
 def test_four_pieces_of_five_must_show_an_edge(n_pieces: int, is_moved: bool) -> None:
     grey = picture(step_at(LEFT))
-    # Pieces of 10.4 rows, starting four cells from each end.
+    # Pieces have 10.4 rows, starting four cells from each end.
     first = round(TOP + 4.0 + 10.4 * n_pieces)
     grey[first:] = 60.0
     assert (left_side(moved_to_edges(outline(), grey)) is not None) == is_moved
@@ -163,7 +163,7 @@ def test_corners_lie_on_the_moved_sides_unless_these_run_on_in_one_line(
     assert moved[1].tolist() == [True, False, False, False, False]
     shift = moved[0].corners[1] - corners[1]
     if is_met:
-        # On the moved side, and on the next one, which was not moved.
+        # Test the moved side, and the next one, which was not moved.
         assert shift[0] == pytest.approx(0.3, abs=0.05)
         assert shift[0] * np.cos(turn) == pytest.approx(shift[1] * np.sin(turn), abs=1e-9)
     else:

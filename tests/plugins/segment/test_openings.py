@@ -52,8 +52,8 @@ def test_what_a_screen_hides_is_an_opening_only_for_want_of_rays(tmp_path: Path)
     hidden = openings.openings[2]
     assert OutlineSource.UNSEEN in hidden.side_source.tolist()
     assert any("without the cloud" in warning for warning in ctx.warnings)
-    # Seen perpendicularly, the screen is in front of other areas than those it hides, but of some
-    # of them.
+    # Seen perpendicularly, the screen covers some of the areas that it hides from the station, and
+    # some others.
     square, _ = found(tmp_path, cloud=scenes.cloud(knows_stations=False))
     assert sum(opening.area_m2 for opening in square.openings) < sum(
         opening.area_m2 for opening in openings.openings

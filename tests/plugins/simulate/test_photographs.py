@@ -112,7 +112,8 @@ def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
         reach_cells=2,
     )
     assert len(shifts.centre) > 15
-    # In cells, which are as large as pixels; patches of 32 x 32 are accurate to a few hundredths.
+    # Shifts are in cells, which are as large as pixels; patches of 32 x 32 are accurate to a few
+    # hundredths.
     assert np.abs(np.median(shifts.shift, axis=0)).max() < 0.02
     assert np.abs(shifts.shift).max() < 0.3
 
@@ -120,7 +121,7 @@ def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
 def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> None:
     truth = room.truth
     whole = cameras_of(truth)[1]
-    # A section of the photo that includes the object and its edges.
+    # Use a section of the photo that includes the object and its edges.
     camera = replace(whole, width=160, height=120, cx=whole.cx - 200.0, cy=whole.cy - 20.0)
     views = SceneCameras(truth.scene, cores=2)
     image = views.expose(camera, supersample=8)
@@ -134,7 +135,8 @@ def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> N
     hits = cast(truth.scene, camera.centre_world, rays)
     points = camera.centre_world + hits.t[:, None] * rays
     means = colours_at(truth.scene, hits.rectangle, points).rgb.reshape(200, 256, 3).mean(axis=1)
-    # In grey levels; at edges, means of 64 and of 256 rays differ by a small part of 255.
+    # Differences are in grey levels; at edges, means of 64 and of 256 rays differ by a small part
+    # of 255.
     differences = np.abs(image[chosen[:, 1], chosen[:, 0]] - means)
     assert differences.mean() < 0.5
     assert differences.max() < 15.0
@@ -178,7 +180,7 @@ def test_variant_one_holds_each_wall_whole_in_two_photos(tmp_path: Path) -> None
     views = SceneCameras(truth.scene)
     for place, camera in enumerate(cameras_of(truth)):
         plane = truth.planes.names.index(names[place // 2])
-        # Slightly inside the corners, because other walls touch them, too.
+        # Use points slightly inside the corners, because other walls touch these, too.
         corners = truth.planes.corners[plane]
         corners = corners.mean(axis=0) + 0.85 * (corners - corners.mean(axis=0))
         assert camera.sees(camera.project(corners)[:, :2]).all(), names[place // 2]
@@ -212,7 +214,8 @@ def test_neither_world_nor_threads_nor_calibration_change_a_byte_of_a_photo(
     for one, other in zip(cameras_of(small.truth), cameras_of(far.truth), strict=True):
         marks_near = one.project(small.checkpoints.points_world)
         marks_far = other.project(far.checkpoints.points_world)
-        # In pixels; 800 km from the origin, the precision of the camera's translation is 1e-10 m.
+        # The tolerance is in pixels; 800 km from the origin, the precision of the camera's
+        # translation is 1e-10 m.
         np.testing.assert_allclose(marks_near, marks_far, atol=1e-5)
 
     known, unknown = small, simulate(tmp_path / "a", photo_gsd_m=0.016, calibrated=False)
@@ -270,7 +273,7 @@ def test_light_is_lost_towards_the_corners_by_the_fourth_power(share: float) -> 
     image = np.full((60, 100, 3), 200.0)
     found = developed(image, vignetting=share).astype(np.float64)
     rows, columns = np.mgrid[:60, :100] + 0.5
-    # 1 in the corners, for any shape of the photo.
+    # This is 1 in the corners, for any shape of the photo.
     square = 0.5 * ((rows / 30.0 - 1.0) ** 2 + (columns / 50.0 - 1.0) ** 2)
     expected = 200.0 * (1.0 - share * square**2)
     np.testing.assert_allclose(found, np.repeat(expected[..., None], 3, axis=2), atol=0.51)
@@ -325,7 +328,7 @@ def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
             rolls.append(taken.roll_deg)
             tilts.append(tilt)
     assert 2.8 < np.abs(rolls).max() <= 3.0
-    # At least 0.4 of it, except where the position is not free.
+    # The angles are at least 0.4 of the maximum, except where the position is not free.
     assert np.quantile(tilts, 0.5) < 8.0
     assert np.mean((np.array(tilts) > 3.19) & (np.array(tilts) < 8.01)) > 0.5
     assert planned_shots("none", rng(0), gsd_m=0.01, obliquity_deg=8.0) == ()

@@ -51,7 +51,7 @@ def test_survey_coordinates_change_nothing_but_the_origin(tmp_path: Path) -> Non
     np.testing.assert_array_equal(near.truth.labels, far.truth.labels)
     np.testing.assert_array_equal(far.cloud.origin, scenes.SURVEY_SHIFT_M)
     np.testing.assert_array_equal(near.truth.planes.normal, far.truth.planes.normal)
-    # In metres; 800 km from the origin, the precision of float64 is 1e-10 m.
+    # The tolerance is in metres; 800 km from the origin, the precision of float64 is 1e-10 m.
     np.testing.assert_allclose(far.truth.planes.rms_m, near.truth.planes.rms_m, atol=1e-9)
 
 
@@ -71,11 +71,10 @@ def test_points_planes_and_colours_are_those_of_the_scene_in_any_world(
     np.testing.assert_allclose(hits.t, 1.0, atol=1e-5)
     np.testing.assert_array_equal(truth.scene.plane_index[hits.rectangle], truth.labels[chosen])
     rgb = colours_at(truth.scene, hits.rectangle, points).rgb
-    # One grey level for rounding; float32 errors of a micrometre may cross a painted edge.
+    # Allow one grey level for rounding; float32 errors of a micrometre may cross a painted edge.
     wrong = np.abs(rgb - cloud.rgb[chosen]).max(axis=1) > 1.0
     assert wrong.mean() < 0.002
-    # The panorama of the first station: columns from the room's first axis on, rows from the
-    # bottom.
+    # Columns of the first station's panorama begin at the room's first axis, rows at the bottom.
     first = np.flatnonzero(cloud.scan == 0)
     rays = cloud.points_world(first) - cloud.stations[0]
     rays = rays @ basis_from_up(cloud.up).T @ _turn_about_up(turn_deg)
@@ -89,9 +88,10 @@ def test_points_planes_and_colours_are_those_of_the_scene_in_any_world(
     assert (np.diff(counts) <= 0).all()
     np.testing.assert_allclose(planes.normal[planes.names.index("floor")], cloud.up, atol=0.002)
     for plane, normal in enumerate(planes.normal):
-        # In metres, for float32 offsets of a few metres.
+        # The tolerance is in metres, for float32 offsets of a few metres.
         np.testing.assert_allclose(distances_m(cloud, truth, plane), 0.0, atol=2e-6)
-        # From the top left as seen by the viewer, counter-clockwise, around all of its points.
+        # Corners are counter-clockwise for the viewer, beginning at the top left, and enclose all
+        # points of the plane.
         corner, low, _, right = planes.corners[plane]
         sides = np.array([right - corner, low - corner])
         assert np.cross(*sides) @ normal < -0.999 * np.prod(np.linalg.norm(sides, axis=1))
@@ -191,7 +191,7 @@ def test_a_design_has_a_seed_of_its_own_and_errors_have_that_of_the_cell(tmp_pat
 def test_the_step_of_a_square_grid_is_its_spacing(step_m: float) -> None:
     at = np.arange(step_m / 2, 2.0, step_m)
     u, v = (grid.ravel() for grid in np.meshgrid(at, at))
-    # Some points of another plane in front of it.
+    # Add some points of another plane in front of it.
     beside = np.column_stack([u[:50], np.full(50, -0.3), v[:50]])
     cloud = cloud_of(np.vstack([np.column_stack([u, np.zeros(u.size), v]), beside]))
     planes = samples.planes(

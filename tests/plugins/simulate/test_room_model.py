@@ -232,7 +232,7 @@ def test_a_recess_leads_from_the_wall_to_its_back_and_needs_a_hole_of_its_size()
     assert true.name == "niche"
     np.testing.assert_allclose(true.plane.distances_m(corners_of(back)), 0.0, atol=1e-12)
     np.testing.assert_allclose(true.plane.normal, side.normal)
-    # From the top left, counter-clockwise as seen by the viewer.
+    # Corners are counter-clockwise for the viewer, beginning at the top left.
     a0, a1, b0, b1 = EXTENT
     expected = [
         side.foot - 0.25 * side.normal + a * side.axis_a + b * side.axis_b
@@ -307,7 +307,7 @@ def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:
             assert sill == pytest.approx(-0.1) if kind == "door" else 0.3 <= sill <= 0.7
             assert extent[1] - extent[0] <= 1.3
         kinds["panel"] += len(found.panels) // 4
-        # Up to 0.3 m in front of the wall; panels 3 cm.
+        # Relief is up to 0.3 m in front of the wall; panels are 3 cm.
         assert all(0.0 < depth_m <= 0.3 for depth_m, _ in found.stone)
         assert all(depth_m == pytest.approx(0.03) for depth_m, _ in found.panels)
         for one, other in pairwise(holes):

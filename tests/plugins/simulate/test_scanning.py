@@ -26,7 +26,8 @@ from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 
 NOISE_M = 0.002
 SIDE = 200
-# In radians; all rays of a sweep hit the surface at the same distance and angle, within 2e-4.
+# Angle between rays in radians; all rays of a sweep hit the surface at the same distance and angle,
+# within 2e-4.
 STEP = 1e-6
 NO_ERRORS = Errors(
     noise_m=0.0, outlier_share=0.0, beam_m=0.0, colour_noise=0.0, inversion=0.0, band_seed=0
@@ -124,7 +125,7 @@ def test_noise_grows_with_slope_range_and_on_cloth(
     turned = np.tan(azimuths()) * math.tan(math.radians(incidence_deg))
     errors = distances_m(points) - distance_m / (1.0 - turned)
     sigma = NOISE_M * expected
-    # Five standard deviations of a mean and of a standard deviation.
+    # The tolerances are five standard deviations of a mean and of a standard deviation.
     assert errors.mean() == pytest.approx(0.0, abs=5.0 * sigma / math.sqrt(errors.size))
     assert errors.std() == pytest.approx(sigma, rel=5.0 / math.sqrt(2.0 * errors.size))
 
@@ -134,7 +135,8 @@ def test_gross_outliers_fall_short_four_times_in_five() -> None:
     distance = distances_m(points)
     assert (points.rectangle == SPOILT).all()
     short = distance < 3.0
-    # Five standard deviations of a binomial share, and of means of uniform distributions.
+    # The tolerances are five standard deviations of a binomial share, and of means of uniform
+    # distributions.
     n = distance.size
     assert short.mean() == pytest.approx(0.8, abs=5.0 * math.sqrt(0.16 / n))
     assert 0.9 - 1e-5 < distance[short].min() < 0.91
@@ -252,7 +254,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.mark.parametrize("n_stations", [1, 4])
 def test_panoramas_close_and_detail_scans_just_hold_the_main_wall(n_stations: int) -> None:
     along, towards = main_wall_axes()
-    # Four metres in front of the origin, 6 m x 3 m, off-centre.
+    # The wall is four metres in front of the origin, 6 m x 3 m in size, and off-centre.
     middle = 4.0 * towards + 0.3 * along
     outline = np.array(
         [middle + a * along + h * UP for a, h in ((-3, 1.6), (-3, -1.4), (3, -1.4), (3, 1.6))]
