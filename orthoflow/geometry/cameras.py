@@ -84,7 +84,7 @@ class ViewingCamera:
 
     @cached_property
     def flat(self) -> NDArray[np.float64]:
-        """Return the camera as an array for compiled kernels, see `camera_kernels`."""
+        """Return the camera as an array for compiled kernels (see `camera_kernels`)."""
         from orthoflow.geometry.camera_kernels import largest_radius  # noqa: PLC0415 - numba
 
         return np.concatenate(

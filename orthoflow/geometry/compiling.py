@@ -62,7 +62,7 @@ def kernel_part(function: _Kernel) -> _Kernel:
 
 
 def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
-    """Compile a function that only kernels call for one signature, when it is loaded.
+    """Compile a function, which only kernels call, for one signature when it is loaded.
 
     Without a signature, a version would be compiled for each constant argument.
     """
@@ -142,7 +142,7 @@ class _KernelFiles(IndexDataCacheFile):
 
     Numba numbers the files of compiled versions. Two processes that compile different versions at
     the same time may therefore use the same number, and an index may refer to the code of the wrong
-    version. Here all file names are unique. A file truncated by a power failure is ignored.
+    version. Here, all file names are unique. A file truncated by a power failure is ignored.
     """
 
     def _save_index(self, overloads: dict[Any, str]) -> None:

@@ -135,8 +135,8 @@ def find_features(
         picture: (rows, cols) grey values.
         max_features: maximum number of key points.
         usable: (rows, cols), False where key points are not allowed; None allows all positions.
-        as_opencv: use OpenCV's default SIFT (markiewicz2015): higher contrast threshold, SIFT
-            descriptors.
+        as_opencv: use OpenCV's default SIFT as in markiewicz2015, with a higher contrast threshold
+            and SIFT descriptors.
     """
     import cv2
 

@@ -83,8 +83,8 @@ def project_points(
         offsets: offsets of the chunk.
         target: the raster.
         cells: output, -1 outside the raster or its range of depths.
-        depths_m: output, see `Entries`.
-        squares: output, see `Entries`.
+        depths_m: output (see `Entries`).
+        squares: output (see `Entries`).
         first: index of the first point.
         end: index after the last point.
     """

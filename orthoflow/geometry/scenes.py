@@ -69,7 +69,7 @@ class Scene:
         plane_index: (r,) int16 index of the rectangle's true plane, -1 for none.
         role: (r,) uint8 `SurfaceRole`.
         texture: (r,) int32 `TextureKind`.
-        texture_params: (r, 8) float64, see `TextureKind`.
+        texture_params: (r, 8) float64 (see `TextureKind`).
         hole_rectangle: (h,) int32 index of the rectangle that contains the hole, ascending.
         hole_extent: (h, 4) float64 metres, as in `extent`; the rim of a hole belongs to the
             rectangle.

@@ -53,7 +53,7 @@ def kind_ports(
 
     Args:
         catalog: the installed plugins.
-        kind: an installed kind, whose first method that loads is followed; or a new one.
+        kind: a new kind, or an installed one, whose first method that loads is the model.
         takes: product types of the inputs of a new kind, a port each.
         gives: existing product types of the outputs of a new kind, a port each.
 

@@ -39,7 +39,7 @@ _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
 # A multiple of the patch size (32 cells), large enough that little is lost at the borders.
 BLOCK_CELLS: Final = 96
-# Maximum number of cells on all walls together whose colour is compared.
+# Maximum number of cells, on all walls together, for which colours are compared.
 _COLOUR_CELLS: Final = 250_000
 # Maximum number of cells on all walls together whose visibility is tested.
 _SEEN_CELLS: Final = 600_000
@@ -71,7 +71,7 @@ class Sampling:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingRule:
-    """How densely the walls are sampled.
+    """Sampling density of the walls.
 
     Attributes:
         colour_share: share of blocks whose colours are compared.

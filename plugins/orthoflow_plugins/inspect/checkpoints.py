@@ -121,7 +121,7 @@ class InspectCheckpoints(Method):
     )
 
     class Params(MethodParams):
-        """How points without a measured position are found."""
+        """Search for points without a measured position."""
 
         search_m: float = Field(0.03, gt=0.0, le=1.0, description="Search radius for a point.")
         target_radius_m: float = Field(

@@ -1,4 +1,4 @@
-"""Statistics of displacements, and how an inspection reports them as metrics.
+"""Statistics of displacements, and their report as metrics of an inspection.
 
 The statistics are those of markiewicz2015 and of Table 1 in skarlatos2012: lengths of residuals,
 outliers by two rules, and the RMS without outliers.

@@ -77,7 +77,7 @@ class InspectOpenings(Method):
     )
 
     class Params(MethodParams):
-        """Which recesses count as openings."""
+        """Limits for recesses that count as openings."""
 
         behind_m: float = Field(
             default=0.05,

@@ -98,8 +98,8 @@ class IntensityGrey(GreyCells):
 
     Attributes:
         intensity: (rows, cols) float32 from 0 to 1, NaN where unknown.
-        of_roots: use square roots, since laser intensities span several orders of magnitude and
-            their roots are more similar to a photo.
+        of_roots: use square roots, since laser intensities span several orders of magnitude, and
+            their roots are more similar to grey values of a photo.
     """
 
     intensity: NDArray[np.float32]

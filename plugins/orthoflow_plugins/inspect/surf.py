@@ -113,7 +113,7 @@ class InspectSurf(Method):
     )
 
     class Params(MethodParams):
-        """What to do if a comparison is meaningless."""
+        """Treatment of meaningless comparisons."""
 
         unfit: Literal["refuse", "warn"] = Field(
             "refuse",

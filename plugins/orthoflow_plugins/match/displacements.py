@@ -38,7 +38,7 @@ def search_shifts(
     reach: tuple[int, int],
     found: NDArray[np.float64],
 ) -> None:
-    """Find the whole-cell shift of each patch with the highest correlation.
+    """Find, for each patch, the whole-cell shift with the highest correlation.
 
     If the first picture has one channel and the second three, each patch is compared with the
     combination of the second's channels that fits it best.

@@ -68,7 +68,7 @@ _MIN_GREY_LEVELS: Final = 8.0
 
 
 class PairingParams(MethodParams):
-    """How photos are matched with walls by key points."""
+    """Matching of photos with walls by key points."""
 
     max_features: int = Field(
         default=8000, ge=50, description="Key points per photo and per wall, evenly distributed."

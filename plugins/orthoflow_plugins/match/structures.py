@@ -101,7 +101,7 @@ class Place:
     Attributes:
         centre_m: (2,) float64 metres right and down from the corner of the wall's raster.
         width_m: approximate width of the photo on the wall.
-        lead: difference between its score and the median of all positions at this scale, in robust
+        lead: score of the position minus the median score of all positions at this scale, in robust
             standard deviations.
         parts_photo: (9, 2) float64 centres of the photo's parts, relative to its width and height.
         parts_m: (9, 2) float64 positions of the parts on the wall, as in `centre_m`.

@@ -102,7 +102,7 @@ def block_means(
 
 
 def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return a mask of cells whose depth differs from the right or lower neighbour by 3 cm."""
+    """Return a mask of cells whose right or lower neighbour differs in depth by more than 3 cm."""
     edges = np.zeros(depth_m.shape, dtype=np.bool_)
     edges[:, :-1] |= np.abs(np.diff(depth_m, axis=1)) > _DEPTH_EDGE_M
     edges[:-1] |= np.abs(np.diff(depth_m, axis=0)) > _DEPTH_EDGE_M

@@ -10,7 +10,7 @@ from orthoflow.sdk import MethodParams
 
 
 class SeamsParams(MethodParams):
-    """How the layer of a cell is chosen, and how colours are balanced."""
+    """Choice of a cell's layer, and balancing of colours."""
 
     seams: Literal["best-view", "voronoi", "graph-cut", "priority"] = Field(
         "best-view",

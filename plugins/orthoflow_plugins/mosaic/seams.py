@@ -233,7 +233,7 @@ class MosaicSeams(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Joined:
-    """The orthoimage of one wall, and how well its sources agree.
+    """The orthoimage of one wall, and the agreement of its sources.
 
     Attributes:
         image: the orthoimage.

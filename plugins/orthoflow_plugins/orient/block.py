@@ -144,7 +144,7 @@ class BlockCovariance:
 
     Attributes:
         matrix: (p, p), columns as in `Block.columns`.
-        cofactors: (p, p) the same, computed with the a priori standard deviations.
+        cofactors: (p, p) the same covariance, computed with the a priori standard deviations.
         sigma0: standard deviation of unit weight.
         redundancy: number of observations minus the number of unknowns that they determine.
     """

@@ -56,7 +56,7 @@ class DsmForward(Method):
     )
 
     class Params(VisibilityParams):
-        """Which pixels are used, and which gaps between them are filled."""
+        """Choice of pixels, and filling of the gaps between them."""
 
         fill_gap_cells: int = Field(
             default=1,

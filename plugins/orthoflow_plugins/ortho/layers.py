@@ -47,7 +47,7 @@ class LayerStack:
         return lambda name, shape, dtype: self._new(f"{wall}.scratch.{name}", shape, dtype)
 
     def add(self, layer: Layer) -> None:
-        """Add the layer of a photo that gives a colour to at least one cell."""
+        """Add the layer of a photo; at least one of its cells must have a colour."""
         self.painted.append(layer)
 
     def joined(self, level: Level) -> Layers:

@@ -96,7 +96,7 @@ def paint(
         view: camera of the photo in the axes of the wall.
         surface: the wall.
         buffer: depth buffer of objects in front of the wall.
-        params: which cells are painted, and how colours are sampled.
+        params: choice of cells, and sampling of colours.
         allocate: allocates zeroed arrays of the layer; those of colours and quality only if a cell
             is painted.
         threads: number of tiles processed at once; it does not change the result.

@@ -16,7 +16,7 @@ Inpainting = Literal["between", "telea", "navier-stokes", "none"]
 
 
 class VisibilityParams(MethodParams):
-    """Which cells a photo sees."""
+    """Visibility of cells in a photo."""
 
     incidence_max_deg: float = Field(
         default=80.0,
@@ -27,7 +27,7 @@ class VisibilityParams(MethodParams):
 
 
 class BackwardParams(VisibilityParams):
-    """How colours are sampled, and which cells a photo sees."""
+    """Sampling of colours, and visibility of cells in a photo."""
 
     resampling: Literal["nearest", "bilinear", "cubic", "lanczos"] = Field(
         default="bilinear",
@@ -42,7 +42,7 @@ class BackwardParams(VisibilityParams):
 
 
 class DirectParams(MethodParams):
-    """How cells are coloured, which gaps are filled, and how."""
+    """Colouring of cells, and filling of gaps."""
 
     void_limits: tuple[
         Annotated[int, Field(ge=0, le=9)],

@@ -165,8 +165,8 @@ def _project_run(
         place: row of the cells, and first column of their run.
         steps: (n,) columns relative to the first one.
         projected: (_N_QUANTITIES, n or more), overwritten with u, v, inverse distance along the
-            axis, cosine of the angle of incidence, the distance beyond which other objects must be,
-            and quality; u is -1 behind the camera and beyond the lens model.
+            axis, cosine of the angle of incidence, the distance beyond which objects do not hide
+            the cell, and quality; u is -1 behind the camera and beyond the lens model.
     """
     row, first_column = place
     c, gsd_m, f = view.camera, view.gsd_m, np.float32

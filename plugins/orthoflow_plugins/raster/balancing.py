@@ -87,7 +87,7 @@ def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointClo
 
 @dataclass(frozen=True)
 class _Looks:
-    """Scan geometry of the points in a slab; all arrays (n,)."""
+    """Scan geometry of the points in a slab; all arrays are (n,)."""
 
     points: NDArray[np.int64]
     place: NDArray[np.int64]

@@ -25,7 +25,7 @@ _ON_EDGE: Final = 1e-9
 
 
 class FewPoints(NamedTuple):
-    """Positions of points in cells with few points; all arrays flat over cells.
+    """Positions of points in cells with few points; all arrays are flat over cells.
 
     Attributes:
         n_inside: number of points in each cell.
@@ -62,7 +62,7 @@ def keep_nearest_around(
         winners: (cells,) of `WINNER`, updated; points are counted in their own cells.
         width: columns of the raster.
         owners: number of threads that share the cells, a power of two.
-        owner: the thread whose cells to visit.
+        owner: the thread whose cells are visited.
     """
     m = wall_from_offset
     height = winners.size // width
@@ -123,7 +123,7 @@ def sort_into_cells(
         cursors: (requested cells,) index of the next depth of each cell; incremented.
         sorted_m: (points inside,) depths grouped by cell.
         owners: number of threads that share the cells, a power of two.
-        owner: the thread whose cells to visit.
+        owner: the thread whose cells are visited.
     """
     for k in range(entries.cells.size):
         cell = entries.cells[k]
@@ -219,7 +219,7 @@ def add_values(  # noqa: PLR0913, PLR0917
         layer_m: a point farther than this from the surface belongs to another layer.
         sums: (cells, channels + 1); the last channel counts the points.
         owners: number of threads that share the cells, a power of two.
-        owner: the thread whose cells to visit.
+        owner: the thread whose cells are visited.
     """
     channels = values.shape[1]
     for k in range(entries.cells.size):
@@ -255,7 +255,7 @@ def add_places(
         wall_from_offset: (3, 4) as in `Target`.
         few: added to.
         owners: number of threads that share the cells, a power of two.
-        owner: the thread whose cells to visit.
+        owner: the thread whose cells are visited.
     """
     m = wall_from_offset
     for k in range(entries.cells.size):
@@ -303,7 +303,7 @@ class Reach(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Sums over the triangles that cover cells, flat over cells.
+    """Sums over the triangles that cover each cell; all arrays are flat over cells.
 
     Attributes:
         n: uint16 number of triangles.

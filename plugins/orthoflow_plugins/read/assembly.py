@@ -360,7 +360,7 @@ def resolution_m(farthest_m: float) -> float:
 
 
 def _make_ready(array: NDArray[Any], part: slice) -> None:
-    """Request all pages that will be written next to a memory-mapped file in a single call.
+    """Request, in a single call, all pages of a memory-mapped file that will be written next.
 
     This is four times as fast as one page fault per page.
     """

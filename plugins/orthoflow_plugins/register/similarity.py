@@ -54,7 +54,7 @@ class RegisterSimilarity(Method):
     )
 
     class Params(MethodParams):
-        """What to estimate."""
+        """Choice of the transformation."""
 
         with_scale: bool = Field(
             default=True,

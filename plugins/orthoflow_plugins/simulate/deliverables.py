@@ -50,7 +50,7 @@ class Delivery:
     Attributes:
         room: the room in its own frame.
         scan: the scans, in the room frame.
-        world_from_room: (3, 3) rotation; without rounding errors if its elements are 0, 1 or -1.
+        world_from_room: (3, 3) rotation; exact if its elements are 0, 1 or -1.
         shift_world_m: (3,) world position of the room's origin.
     """
 

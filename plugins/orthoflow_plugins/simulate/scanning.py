@@ -109,7 +109,7 @@ class Errors:
         outlier_share: share of points at a random distance.
         beam_m: diameter of the laser spot; distances are mixed if the spot is on two surfaces.
         colour_noise: standard deviation of a colour, grey levels.
-        inversion: share of inverted contrast in the laser reflectance, see `laser_reflectance`.
+        inversion: share of inverted contrast in the laser reflectance (see `laser_reflectance`).
         band_seed: seed of the laser reflectances of materials and of the common errors of points.
         registration_m: standard deviation of each coordinate of a station.
         bending_m: displacement 5 m from the middle of the room, as caused by drift along a path.
