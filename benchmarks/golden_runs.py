@@ -7,7 +7,7 @@
 ../shared/data, the hall (coloured scan only) and the fountain with and without a calibration. It
 keeps the output of each command and, if Chromium is installed, a picture of each report. `compare`
 prints, for each run, the planes, poses and orthoimages that changed, and the metrics that changed
-by more than rounding errors. Make the runs of an earlier commit in a worktree of that commit: the
+by more than rounding errors. Make the runs of an earlier commit in a worktree of that commit. The
 repository contains no real data.
 """
 

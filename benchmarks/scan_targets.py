@@ -5,9 +5,9 @@
 FOLDER contains scan patches around targets, `T1.1.txt` and so on (x y z r g b intensity, metres),
 and `target_centers_SP1.json`, the centres measured by operators: for each target, a list with one
 point per patch. For each patch, a plane is fitted, then `scan_targets.yaml` is run as from the
-command line: it computes an intensity orthoimage, the intersection of the quadrants, and the
-position on the surface. The output is the RMS and the maximum of the distances from the operators'
-centres, in the plane and in space.
+command line. This workflow computes an intensity orthoimage, the intersection of the quadrants, and
+the position on the surface. The output is the RMS and the maximum of the distances from the
+operators' centres, in the plane and in space.
 """
 
 from __future__ import annotations

@@ -253,7 +253,7 @@ _EXIF_SIGMA: Final = 0.05
 # Standard deviation of ln(focal length) without EXIF: the range of common lenses.
 _UNKNOWN_SIGMA: Final = 0.35
 # Standard deviations of the other parameters of an uncalibrated lens. Fixing them at zero distorts
-# the pose: errors of photos were 2.4 times the predicted ones and 1.7 times those with free
+# the pose, so that errors of photos were 2.4 times the predicted ones and 1.7 times those with free
 # parameters. Pixels are square to 1/1000, which corresponds to more than a pixel at the edge of an
 # image.
 _ASPECT_SIGMA: Final = 1e-3
@@ -261,7 +261,7 @@ _CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
 _K2_SIGMA: Final = 0.1
 _TANGENTIAL_SIGMA: Final = 1e-3
-# Indices in the distortion coefficients k1, k2, p1, p2, k3.
+# Positions of coefficients in the array k1, k2, p1, p2, k3.
 _COEFFICIENTS: Final = {"k1": 0, "k2": 1, "p1": 2, "p2": 3}
 
 

@@ -85,8 +85,8 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
         sigma0: standard deviation of unit weight of the whole adjustment. It is used as that of the
             independent errors, since position errors do not affect ties between photos.
     """
-    # Use one thread only: on a busy machine, synchronisation makes eigenvalue solvers ten times as
-    # slow.
+    # Use only one thread, because synchronisation makes eigenvalue solvers ten times as slow on a
+    # busy machine.
     with threadpoolctl.threadpool_limits(1):
         return _averaged(points, sigma0)
 

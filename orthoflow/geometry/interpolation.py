@@ -1,7 +1,7 @@
 """Interpolation of raster cells from surrounding points.
 
 All cells around a cell are used, weighted by the distance of their points from its centre, and a
-plane through their values gives the value at the centre. No direction is preferred: if a raster is
+plane through their values gives the value at the centre. No direction is preferred. If a raster is
 rotated or mirrored, so is the result, except for the order of summation.
 
 This module loads numba, so methods import it inside functions.

@@ -209,8 +209,8 @@ def _described(
 ) -> NDArray[np.float32]:
     """Compute SIFT descriptors (n, 128) of the chosen key points, numbered over all tiles.
 
-    Only chosen key points are described: in a picture with much texture, only one in ten is kept,
-    and description takes longer than detection.
+    Only chosen key points are described, because in a picture with much texture, only one in ten is
+    kept, and description takes longer than detection.
     """
     raw = np.empty((len(chosen), 128), dtype=np.float32)
     first = 0

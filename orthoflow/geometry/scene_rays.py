@@ -138,7 +138,7 @@ def _wear(a: float, b: float, seed: int) -> float:
 def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float]:
     """Return the ornament of the lattice cell at (a, b): (paint 0 or 1, hue 0..1).
 
-    Each cell contains a different flower: its number of petals, size, rotation, hue and position
+    Each cell contains a different flower, whose number of petals, size, rotation, hue and position
     are random.
     """
     i, j = math.floor(a / period), math.floor(b / period)

@@ -120,7 +120,7 @@ class Openings(Product):
     """Openings in all walls that were searched.
 
     Attributes:
-        openings: sorted by wall, then from left to right.
+        openings: all openings, sorted by wall, then from left to right.
         walls: numbers of the searched walls, including walls without openings.
         map_crs: coordinate system of the world, if the raster of a wall specifies one.
         details: further JSON results, for users only.

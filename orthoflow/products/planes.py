@@ -120,7 +120,8 @@ class Planes(Product):
         part_plane: (p,) int32 index of the plane of each part, or None.
         viewpoint: source of the visible side of planes: `stations`, `view_from`, `given` or
             `guess`.
-        side_from: the same for each plane, if planes differ; empty if `viewpoint` applies to all.
+        side_from: source of the visible side of each plane, if planes differ; empty if `viewpoint`
+            applies to all.
         tolerance_m: maximum distance of points from their plane in the detection; the default is
             that of markiewicz2015.
         thickness: thickness of the cloud on each plane, None for planes with too few points; empty

@@ -253,7 +253,7 @@ class Layers(Product):
     """Layers of all walls.
 
     Attributes:
-        layers: grouped by wall in the order of `Walls`, then by source.
+        layers: all layers, grouped by wall in the order of `Walls`, then by source.
         names: names of the walls.
         plane_indices: index in `Planes` of the plane of each wall; if empty, the index of the wall
             is used.

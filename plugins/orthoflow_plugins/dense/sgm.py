@@ -15,7 +15,7 @@ from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix
 from orthoflow.products import Cameras, Photo, Photos, PointCloud
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
-# Limit of the angle between base and rows: the rows of a rectified pair are parallel to its base,
+# Limit of the angle between base and rows. The rows of a rectified pair are parallel to its base,
 # so photos one above the other cannot be paired.
 _ALONG_ROWS: Final = np.cos(np.radians(30.0))
 # Minimum angle between the base and the optical axis.

@@ -41,7 +41,7 @@ _STEP_BAND_CELLS: Final = 2
 BLOCK_CELLS: Final = 96
 # Maximum number of cells, on all walls together, for which colours are compared.
 _COLOUR_CELLS: Final = 250_000
-# Maximum number of cells on all walls together whose visibility is tested.
+# Maximum number of cells, on all walls together, for which visibility is tested.
 _SEEN_CELLS: Final = 600_000
 # Maximum number of errors that are kept for all walls together (32 bytes each). The standard error
 # of the median of so many values is 1/2000 of their spread.

@@ -80,7 +80,7 @@ def n_shown(image: Orthoimage) -> int:
 
 
 def completeness(image: Orthoimage, wall: Wall) -> Finding:
-    """Compute the share of the scanned surface that the image shows; both have the same grid."""
+    """Compute the share of the scanned surface that an image with the same grid shows."""
     n_surface = n_both = 0
     for rows in row_bands(image.mask.shape):
         surface = np.isfinite(wall.depth_m[rows])
@@ -162,7 +162,7 @@ def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 def cells_per_pixel(
     image: Orthoimage, wall: Wall, camera: tuple[str, ViewingCamera]
 ) -> NDArray[np.float64]:
-    """Return how many cells a pixel covers in its longest direction, for cells of one photo.
+    """Return the number of cells that a pixel covers in its longest direction, for one photo.
 
     Args:
         image: the orthoimage.

@@ -273,7 +273,7 @@ def _error_on_walls(
     if np.any(facing * ahead <= 0.0):
         return math.inf
     off = camera.centre_world + (ahead / facing)[:, None] * rays - points
-    # The squared length includes two coordinates; half of it is the mean of one.
+    # The squared length includes two coordinates, so half of it is the mean of one.
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)) / 2.0))
 
 

@@ -222,7 +222,8 @@ def point_on_surface(
 ) -> NDArray[np.float64] | None:
     """Return the world point (3,) of a position on the plane through nearby depths, or None.
 
-    The plane is fitted robustly: a target on its holder is flat even if the wall around it is not.
+    The plane is fitted robustly, because a target on its holder is flat even if the wall around it
+    is not.
     """
     radius = radius_m / wall.frame.gsd_m
     low = np.maximum(np.floor(place - radius).astype(np.int64), 0)

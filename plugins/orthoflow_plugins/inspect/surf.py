@@ -79,8 +79,8 @@ class InspectSurf(Method):
     Metrics without a prefix describe the first wall, `all_` all walls together, and `surf_` the
     pairs before the refinement.
 
-    Without laser intensity the comparison is meaningless, since the colours of the scan may come
-    from the same photos: in this case, it is refused, or skipped with a warning.
+    Without laser intensity, the comparison is meaningless, since the colours of the scan may come
+    from the same photos. It is then refused, or skipped with a warning.
     """
 
     id: ClassVar[str] = "inspect.surf"
@@ -238,8 +238,8 @@ def _set_aside(intensity: GreyImage) -> GreyImage:
     right, down = _FLOOR_SHIFT_CELLS
     rows, columns = intensity.grey.shape
     move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
-    # Linear interpolation would smooth one of the two images; cubic interpolation keeps most of the
-    # detail.
+    # Linear interpolation would smooth one of the two images, whereas cubic interpolation keeps
+    # most of the detail.
     grey = cv2.warpAffine(
         intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
     )

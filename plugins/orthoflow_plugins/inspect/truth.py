@@ -183,14 +183,14 @@ class InspectTruth(Method):
     spread sample.
 
     With cameras, each photo's orientation is compared with the true one, and the displacement of
-    each cell coloured by a photo is computed exactly: the cell's point on the measured surface is
-    projected with the estimated camera, and the ray of that pixel through the true camera meets the
-    true scene at the point whose colour the cell shows. Displacements of patches then have the
-    prefix `patch_`. The ties stored with the cameras are compared, too. A tie is wrong if it is
-    more than 1.5 cells of the wall from the true target of its pixel. `match_wrong_share` is the
-    share of wrong ties among all ties, `tie_wrong_share` the share among those that the orientation
-    kept, and `match_wrong_share_own_wall` the share among those on the wall that covers most of
-    their photo.
+    each cell coloured by a photo is computed exactly. For this, the cell's point on the measured
+    surface is projected with the estimated camera, and the ray of that pixel through the true
+    camera meets the true scene at the point whose colour the cell shows. Displacements of patches
+    then have the prefix `patch_`. The ties stored with the cameras are compared, too. A tie is
+    wrong if it is more than 1.5 cells of the wall from the true target of its pixel.
+    `match_wrong_share` is the share of wrong ties among all ties, `tie_wrong_share` the share among
+    those that the orientation kept, and `match_wrong_share_own_wall` the share among those on the
+    wall that covers most of their photo.
 
     Without orthoimages, only planes and labels are compared, which is sufficient for plane
     detectors.

@@ -118,7 +118,7 @@ def _mixed(
     saa, sab, sac, sad = saa - sa * sa / n, sab - sa * sb / n, sac - sa * sc / n, sad - sa * sd / n
     sbc, sbd, scd = sbc - sb * sc / n, sbd - sb * sd / n, scd - sc * sd / n
     sbb, scc, sdd = sbb - sb * sb / n, scc - sc * sc / n, sdd - sd * sd / n
-    # The channels of one material are nearly collinear; ridge regression keeps their small
+    # The channels of one material are nearly collinear, so ridge regression keeps their small
     # differences from dominating.
     ridge = _RIDGE * (sbb + scc + sdd) + 1e-12
     sbb, scc, sdd = sbb + ridge, scc + ridge, sdd + ridge
@@ -313,7 +313,7 @@ def _improvement(
     gain = sab / sbb
     across, down = gain * sbx - sax, gain * sby - say
     noise = max(saa - gain * sab, 0.0) / (total * n_channels)
-    # Inverse compositional algorithm: the slopes are those of the reference picture.
+    # In the inverse compositional algorithm, the slopes are those of the reference picture.
     return (
         (nxx * down - nxy * across) / determinant,
         (nyy * across - nxy * down) / determinant,

@@ -6,8 +6,8 @@ positions; a position is probably correct if most of the patches fit one pose.
 
 A repeating motif, or another wall with the same tiles, may still fit best. Photos share many more
 key points with each other than with the laser intensity. Therefore, a position is accepted if
-another photo, at its own position, shows the same key points at the same positions on the wall: if
-they were wrong, both photos would have to be wrong in the same way.
+another photo, at its own position, shows the same key points at the same positions on the wall,
+because wrong positions would have to be wrong in the same way.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 _SAME_SHARE: Final = 0.1
 _LONGEST_SIDE_PX: Final = 1600
 _PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)
-# Minimum number of common key points; fewer may be a repeated motif.
+# Minimum number of common key points, because fewer may be a repeated motif.
 _MIN_SHARED: Final = 24
 # Maximum distance, in coarse cells, between the positions of a common key point on the wall
 # according to two photos.

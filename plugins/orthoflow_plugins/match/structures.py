@@ -2,7 +2,7 @@
 
 A laser measures at another wavelength than a camera, so contrast may be weaker, missing or
 inverted, depending on the material. Edges keep their position and orientation (modulo 180 degrees);
-relief steps are also edges of the wall. A photo is compared with the wall at many scales: nine
+relief steps are also edges of the wall. A photo is compared with the wall at many scales. Nine
 overlapping parts of the photo are correlated with the whole wall, and may shift slightly relative
 to each other because of perspective. The scale with the largest lead is chosen; the lead is the
 difference between the best sum of correlations and the sums at all other positions, relative to
@@ -26,7 +26,7 @@ from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
 # Number of cells along the shorter side of a wall, unless its raster is coarser.
 _CELLS: Final = 200.0
-# Range of scales: on the wall, the longer side of the photo is at least the first value times the
+# Range of scales. On the wall, the longer side of the photo is at least the first value times the
 # shorter side of the wall, and its shorter side at most the second value times it.
 _SIZES: Final = (0.2, 1.6)
 _STEP: Final = 1.1

@@ -73,7 +73,8 @@ _MIN_GAIN: Final = 0.03
 _CONTENTS: Final = ("gradients", "grey", "colours")
 _FEW_SHARE: Final = 0.25
 
-# Two photos of a wall share hundreds of key points; fewer than this may come from a repeated motif.
+# Two photos of a wall share hundreds of key points, but fewer than this number may come from a
+# repeated motif.
 _MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000

@@ -291,7 +291,7 @@ def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[sli
 def _project_cells(
     near: ViewingCamera, wall: Wall, part: tuple[slice, slice], step: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return u, v and distance of every step-th cell; `near` has its origin at the wall's."""
+    """Return u, v and distance of every step-th cell; `near` has its origin at that of the wall."""
     frame = wall.frame
     rows = np.arange(part[0].start, part[0].stop, step)
     columns = np.arange(part[1].start, part[1].stop, step)

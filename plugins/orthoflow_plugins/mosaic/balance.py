@@ -1,7 +1,7 @@
 """Colour balance of layers by smooth corrections of their brightness.
 
-Corrections are smooth over blocks of cells, and layers are never mixed: detail always comes from
-one photo, so there are no double contours even if some parallax remains.
+Corrections are smooth over blocks of cells, and layers are never mixed. Detail therefore always
+comes from one photo, and there are no double contours even if some parallax remains.
 
 The model consists of an exposure per photo, the vignetting of its lens, and a smooth field per
 photo. All of these are logarithms, so that factors become sums. Where two photos show the same

@@ -1,4 +1,4 @@
-"""Contradictions between photos: people and vehicles are replaced by colours of other photos.
+"""Replacement of people and vehicles by the colours of photos that contradict them.
 
 Photos of the same area, and the colours of the scan, are independent observations of brightness,
 which are compared in blocks of a few centimetres after smooth differences (lighting, exposure) have

@@ -34,8 +34,8 @@ _LEAST_OVERLAPS: Final = 10
 _MOST_TANGENT: Final = 10.0
 # Interpolated depths have larger errors than measured ones, by this factor (`docs/accuracy.md`).
 _RECOVERED_TIMES: Final = 2.0
-# The spread of a few points is uncertain; it is only used if it exceeds that of the whole raster by
-# this factor, as it does at edges.
+# The spread of a few points is uncertain, so it is only used if it exceeds that of the whole raster
+# by this factor, as it does at edges.
 _SPREAD_TIMES: Final = 2.0
 # Clouds from photos have depth errors that are correlated over this distance.
 _PATCH_M: Final = 0.05
@@ -110,7 +110,7 @@ def expected_errors_m(
     excess = _excess_of_overlaps(wall, cameras, overlaps)
     position_m, depth_m = (0.0, None) if excess is None else excess
     if depth_m is not None:
-        # Within five centimetres, relief looks like correlated errors; overlaps distinguish the
+        # Within five centimetres, relief looks like correlated errors, but overlaps distinguish the
         # two.
         patchy_m = depth_m
     for index, name in enumerate(sources):
@@ -149,8 +149,8 @@ def _pose_variances(
     if camera.covariance is None:
         return None
     viewing, middle = camera.viewing(), frame.origin_world
-    # Use coordinates relative to the wall: in survey coordinates, effects of rotations and shifts
-    # would almost cancel out, and precision would be lost.
+    # Use coordinates relative to the wall, because in survey coordinates, effects of rotations and
+    # shifts would almost cancel out, and precision would be lost.
     to_local = np.linalg.inv(moved_origin(viewing, middle, 6))
     covariance = to_local @ camera.covariance @ to_local.T
     near = viewing.shifted(middle)

@@ -144,7 +144,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
         p, q = one.ravel(), other.ravel()
         right = _seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
         left = _seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
-        # The triangle inequality must hold: a seam costs at most as much as both seams with alpha.
+        # The triangle inequality must hold, that is, a seam costs at most as much as both seams
+        # with alpha.
         kept = np.minimum(_seam_cost(scene, p, q, flat[p], flat[q]), right + left)
         # Kolmogorov and Zabih 2004: A + (C - A) p - C q + (B + C - A) (1 - p) q.
         np.add.at(take, p, left - kept)

@@ -45,7 +45,7 @@ _CONVERGED: Final = 1e-8
 _MODEL: Final = "FULL_OPENCV"
 _N_VALUES: Final = 12
 _COLUMNS: Final = {"cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7}
-# COLMAP estimates fx and fy separately; this prior keeps their ratio fixed.
+# COLMAP estimates fx and fy separately, so this prior keeps their ratio fixed.
 _TIED_ASPECT: Final = 1e-5
 # Pixel coordinate of dummy observations, far outside the photo.
 _FAR_PX: Final = -1e6

@@ -112,7 +112,7 @@ class OrientColmapBundle(Method):
 
     Each photo is first oriented separately; photos whose ties agree with their pose no better than
     by chance are excluded. Key points are then matched between overlapping photos. COLMAP's cost
-    functions and the Ceres solver adjust poses, lenses and points together: ties to walls are
+    functions and the Ceres solver adjust poses, lenses and points together. Ties to walls are
     weighted by the standard deviations from the matching step, ties between photos by that of their
     residuals. Uncalibrated lenses start from EXIF and are refined. Photos with the same focal
     length in EXIF share a lens; so do photos without EXIF unless their ties contradict this. The

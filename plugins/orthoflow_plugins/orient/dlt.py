@@ -299,9 +299,9 @@ def _with_what_is_missing(
 ) -> Estimate:
     """Add the systematic error of an incomplete lens model to the covariance.
 
-    Residuals contain less than a tenth of the missing distortion: the other parameters absorb most
-    of it and distort the photo between and beyond the ties. Therefore the error is that of the
-    complete model plus the difference between the models. Otherwise, for a typical lens with
+    Residuals contain less than a tenth of the missing distortion, because the other parameters
+    absorb most of it and distort the photo between and beyond the ties. Therefore the error is that
+    of the complete model plus the difference between the models. Otherwise, for a typical lens with
     unknown distortion, the predicted error of eleven parameters would be a ninth of the actual
     error.
 
@@ -353,8 +353,8 @@ def _flat(control: SeenPoints, why: str) -> str:
 def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArray[np.float64]:
     """Return the parameter change (p,) that best reproduces the complete model in the photo.
 
-    The plain difference of the parameters is unsuitable: large changes of focal length and distance
-    compensate each other, but not in the linearised model.
+    The plain difference of the parameters is unsuitable, because large changes of focal length and
+    distance compensate each other, but not in the linearised model.
     """
     middle = control.points_world.mean(axis=0)
     points = _frame_points(camera, control) - middle

@@ -355,9 +355,9 @@ class Candidate:
 
         In markiewicz2015, each quarter needs two ties. However, a quarter without ties may show
         only an obstacle, or an area beyond the end of the wall. Such a photo is usable if the other
-        quarters determine the pose: the largest predicted error on the walls in that quarter must
-        meet the limit for the average over the photo. A quarter that shows no wall needs no ties.
-        `strict` applies the rule of the paper.
+        quarters determine the pose so well that the largest predicted error on the walls in that
+        quarter meets the limit for the average over the photo. A quarter that shows no wall needs
+        no ties. `strict` applies the rule of the paper.
         """
         params = self.params
         for quarter, count in enumerate(self.quadrant_counts):

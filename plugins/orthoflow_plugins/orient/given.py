@@ -40,11 +40,11 @@ POSE_DISAGREES: Final = DiagnosticSpec(
 class OrientGiven(Method):
     """Use poses from other programs unchanged.
 
-    The poses are not verified: their status is `ok`, the source of their lens is `given`, and their
-    error on the wall is only known if the files contain it. A photo with at least six ties measured
-    by hand is oriented from these, with the given lens, and must pass the gates for such ties;
-    fewer ties are used only to check the given pose. If no photo shows a wall with its given pose,
-    the poses are refused, since they are not in the coordinate system of the scan.
+    The poses are not verified, so their status is `ok`, the source of their lens is `given`, and
+    their error on the wall is only known if the files contain it. A photo with at least six ties
+    measured by hand is oriented from these, with the given lens, and must pass the gates for such
+    ties; fewer ties are used only to check the given pose. If no photo shows a wall with its given
+    pose, the poses are refused, since they are not in the coordinate system of the scan.
     """
 
     id: ClassVar[str] = "orient.given"

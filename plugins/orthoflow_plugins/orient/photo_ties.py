@@ -21,7 +21,7 @@ from orthoflow_plugins.orient.pose import camera_rays
 _MAX_SIDE_PX: Final = 1600
 _MAX_RATIO: Final = 0.85
 _MAX_PARTNERS: Final = 8
-# Limits for matches; the poses are accurate to a few pixels.
+# Limits for matches with poses that are accurate to a few pixels.
 _MAX_OFF_LINE_PX: Final = 6.0
 _MAX_OFF_POINT_PX: Final = 8.0
 _MIN_ANGLE: Final = np.radians(2.0)

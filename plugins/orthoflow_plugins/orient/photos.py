@@ -45,7 +45,7 @@ from orthoflow_plugins.orient.report import Oriented, numbers_json
 
 MIN_TIES: Final = 6
 _MAX_WRONG: Final = 2
-# Maximum number of subsets to try: enough to leave out any two of 24 ties.
+# Maximum number of subsets to try, which suffices to leave out any two of 24 ties.
 _MAX_TRIALS: Final = 300
 # Probability that correct ties are classified as contradictory.
 _CONTRADICTION: Final = 1e-3

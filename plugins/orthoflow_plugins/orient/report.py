@@ -209,7 +209,7 @@ def hand_over(
         ctx: the context.
         ties: all ties of the input.
         photos: the photos.
-        found: the result of each.
+        found: the result for each photo.
         details: further details of the method.
     """
     role, residuals = ties.role.copy(), np.full_like(ties.residual_px, np.nan)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 _WINDOWS: Final = (3, 5, 7)
 # Painted cells within this distance of a gap need the position of their point.
 _BESIDE_CELLS: Final = 2
-# OpenCV propagates colours through successive gaps; beyond this distance, the effect is less than
-# one level of 8 bits.
+# OpenCV propagates colours through successive gaps, but beyond this distance, the effect is less
+# than one level of 8 bits.
 _FRONT_CELLS: Final = 64
 
 

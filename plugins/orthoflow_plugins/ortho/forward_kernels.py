@@ -109,7 +109,7 @@ def _first_meeting(
     """Return the distance along the axis at which a ray hits the surface, or -1.
 
     The ray is traced from cell to cell, each a flat patch, from the highest surface down to the
-    lowest. A ray that enters a cell below its surface has hit the side of a step: a small height
+    lowest. A ray that enters a cell below its surface has hit the side of a step. A small height
     difference is due to noise or a slope, so the cell counts as hit; a larger one is an edge.
     """
     rows, columns = relief.depth.shape

@@ -30,7 +30,8 @@ from orthoflow_plugins.ortho.visibility_kernels import (
 Tile = tuple[slice, slice]
 
 TILE_CELLS: Final = 512
-# The part of a photo that covers a tile stays below 27 MB; cv2.remap needs sides below 32767.
+# The part of a photo that covers a tile stays below 27 MB, and its sides below 32767, as cv2.remap
+# requires.
 _CROP_MOST_PX: Final = 3_000
 # Margin of that part; Lanczos needs 4 pixels, so the result does not depend on the cropping.
 _REACH_PX: Final = 5
@@ -269,7 +270,7 @@ def sample(
         inner: rows and columns of the tile in `visible`.
         bounds: first and last column, first and last row of the pixels needed.
         footprint: size of a cell in pixels.
-        params: how colours are interpolated and averaged.
+        params: interpolation and averaging of colours.
         into: (rows, cols, 3), overwritten.
     """
     import cv2

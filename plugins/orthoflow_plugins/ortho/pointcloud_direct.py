@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 # Larger walls are processed in bands of this many cells; a band needs about 600 MB.
 _BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
-# Pure black points are reported above this share; real surfaces have hardly any.
+# Pure black points are reported above this share, since real surfaces have hardly any.
 _BLACK_WORTH_WORDS: Final = 0.001
 # Points below this level are almost black.
 _ALMOST_BLACK_GREY: Final = 10
-# Scans that differ by less are not balanced: a cast of 3 % is hardly visible.
+# Scans that differ by less are not balanced, because a cast of 3 % is hardly visible.
 _CAST_LEAST: Final = 0.03
 # If more points are pure black, black is considered a real colour.
 _MOST_SPECKS: Final = 0.1

@@ -146,7 +146,8 @@ def _tiles(wall: Wall, points: SampledPoints) -> _Tiles:
     frame = wall.frame
     rows, columns = frame.shape
     n_points = max(1.0, float(wall.count.sum(dtype=np.int64)) / points.n_represented)
-    # Three times the spacing of sample points distributed over the entire wall.
+    # The side is at least three times the spacing of sample points distributed over the entire
+    # wall.
     side_m = max(_TILE_M, 3.0 * frame.gsd_m * math.sqrt(rows * columns / n_points))
     side = max(1, min(round(side_m / frame.gsd_m), rows, columns))
     starts = np.arange(0, columns, side)

@@ -1,10 +1,11 @@
 """The extent of a wall, up to adjoining surfaces and including its relief.
 
 In markiewicz2015 (section 6), points in a range in front of and behind each plane are rastered.
-Here, both this range and the rectangle are determined from the points connected to the wall: a
-sample of the cloud is divided into voxels, and a region grows along the wall and in depth from the
-voxels on the plane. If a detected plane adjoins the wall, the rectangle ends at its nearest point,
-because a larger rectangle would show the adjoining plane. Otherwise, it ends where the points end.
+Here, both this range and the rectangle are determined from the points connected to the wall. For
+this, a sample of the cloud is divided into voxels, and a region grows along the wall and in depth
+from the voxels on the plane. If a detected plane adjoins the wall, the rectangle ends at its
+nearest point, because a larger rectangle would show the adjoining plane. Otherwise, it ends where
+the points end.
 """
 
 from __future__ import annotations

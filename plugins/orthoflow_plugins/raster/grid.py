@@ -80,7 +80,7 @@ CROP_OF_SEVERAL: Final = DiagnosticSpec(
 class RasterGrid(Method):
     """Raster the cloud on each wall: depth, spread, count, intensity and colour.
 
-    Narrow gaps are interpolated: between neighbouring points of a scan if its rows and columns are
+    Narrow gaps are interpolated between neighbouring points of a scan if its rows and columns are
     known, otherwise between the measured cells around the gap, from the positions of their points.
     Wider gaps, such as windows, remain void. In cells with up to 16 points, mean intensities and
     colours are extrapolated along their gradient from the mean position of the points to the centre

@@ -220,7 +220,7 @@ def _surface_of_all(
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
     sigma_m = _spread_m(count, moments)
-    del moments  # This frees a third of the memory used so far; the next passes need more.
+    del moments  # This frees a third of the memory used so far, since the next passes need more.
     if params.surface != "mean":
         layer_m, gsd_m = LAYER_M, slab.frame.gsd_m
         depth_m = np.empty(count.size, dtype=np.float32)

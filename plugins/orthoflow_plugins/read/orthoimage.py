@@ -31,7 +31,7 @@ class ReadOrthoimage(Method):
     The plane is given by a JSON file with the same name (`wall.tif`, `wall.json`) among the input
     files, with `origin_world`, `u_world`, `v_world`, `normal_world` as in the JSON files of
     orthoflow's rasters; a copy of `wall_0_intensity.json` is sufficient. Files from orthoflow need
-    no JSON file. X and Y have the same meaning as in orthoflow's GeoTIFF files: at the origin, they
+    no JSON file. X and Y have the same meaning as in orthoflow's GeoTIFF files. At the origin, they
     have the values `x_of_left_m` and `height_of_top_m` of the JSON file, or 0 if it does not
     contain these. Thus, size, cell size and extent may differ from those of the wall. `wall` in the
     JSON file is the number of the wall: the index of its plane in `planes.json`, as in file names.

@@ -106,9 +106,9 @@ class ReadPhotos(Method):
     faces of a fisheye photo, only the parts shown in the photo are used.
 
     The content of the files is kept unchanged and never re-encoded. Pixels are those of the stored
-    array: the EXIF orientation is recorded, but not applied. In a TIFF file with several pages, the
-    photo is the largest page that is not a preview. Every photo is decoded once, so that damaged
-    files are found here and not an hour later.
+    array, that is, the EXIF orientation is recorded but not applied. In a TIFF file with several
+    pages, the photo is the largest page that is not a preview. Every photo is decoded once, so that
+    damaged files are found here and not an hour later.
 
     Pixels that are transparent, black in a mask, or inside polygons are used neither for ties nor
     for colours. Masks are pictures NAME_mask.png next to NAME.jpg, or files of the input `masks`:

@@ -1,6 +1,6 @@
 """Normalisation of intensities to 0..1 and of colours to 8 bits.
 
-Each scan is scaled separately: by the limits in its metadata if its data are within them, otherwise
+Each scan is scaled separately, by the limits in its metadata if its data are within them, otherwise
 by its data. A few extreme values, e.g. from a reflector, never determine a scale.
 """
 
@@ -43,7 +43,7 @@ _SMALLEST_PART: Final = 0.25
 # have the same brightness.
 _COMMON_PART: Final = 0.4
 # Ranges written by scanners and programs, for scans that have no limits and differ from other
-# scans: the first range that contains a scan's data is used if the data cover enough of it.
+# scans. The first range that contains a scan's data is used if the data cover enough of it.
 _NOMINAL: Final = ((0.0, 1.0), (0.0, 255.0), (-2048.0, 2047.0), (0.0, 4095.0), (0.0, 65535.0))
 _NOMINAL_PART: Final = 0.4
 # A smaller share of colours outside a scale does not change it.

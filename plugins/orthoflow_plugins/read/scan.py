@@ -392,7 +392,7 @@ def _choose_stations(
     """Return stations (s, 3) and their source: those of the files, or the user's viewpoint.
 
     The origin is used as the station of a scan without a pose only if there is a single such scan
-    and it can have been taken from there: a scan in its scanner's frame surrounds or faces the
+    and it can have been taken from there. A scan in its scanner's frame surrounds or faces the
     origin, whereas a cloud in survey coordinates can be anywhere.
 
     Args:

@@ -24,7 +24,7 @@ class ReadTies(Method):
     """Read ties measured by hand: `photo,u_px,v_px,x,y,z[,sigma_px]`, or `ties.csv` of a run.
 
     World coordinates are those of the scan. Pixel coordinates are as in `ties.csv` and
-    `cameras.json` (OpenCV): the centre of the photo's first pixel is at (0, 0), and the EXIF
+    `cameras.json` (OpenCV), so the centre of the photo's first pixel is at (0, 0), and the EXIF
     orientation is not applied.
     """
 

@@ -89,7 +89,7 @@ class SegmentOpenings(Method):
     Connected cells that are behind the face of a wall or empty form an opening if they contain a
     square of a given width and the face was measured along most of their border. The face is the
     plane, or the median of the cells behind it if these are more than half of the wall. If a cloud
-    is given, lines of sight are traced: an area that some of them pass through is `through`; an
+    is given, lines of sight are traced. An area that some of them pass through is `through`; an
     area in front of which they end is hidden and is not reported as an opening. An empty area
     without lines of sight is `no data` if it is about as compact as a round window; usually, this
     is glass or a mirror. An area with a measured back is a `niche`; this includes closed doors and

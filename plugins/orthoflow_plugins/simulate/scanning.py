@@ -2,7 +2,7 @@
 
 Noise depends only on the position in the angular grid, so it does not depend on threads.
 
-A laser and a camera measure different reflectances: at the single wavelength of a laser, red lead,
+A laser and a camera measure different reflectances. At the single wavelength of a laser, red lead,
 gold, wet plaster and retouchings have another order of brightness than in the three broad bands of
 a camera. In the simulation, reflectance decreases with red and increases with green, each with a
 gain and a power that depend on the material; wet patches are darker, and retro-reflecting spots
@@ -33,7 +33,7 @@ _MISSED: Final = -1
 SPOILT: Final = -2
 _TURN: Final = 2.0 * np.pi
 
-# Arrays of a cloud: the measurements (`Scanned`), and their positions in the scan grids.
+# Arrays of a cloud, which are the measurements (`Scanned`), and their positions in the scan grids.
 _MEASURED: Final = (
     ("x", np.float32),
     ("y", np.float32),
@@ -372,7 +372,7 @@ def shared_errors(
         of_station = np.random.default_rng([errors.band_seed, *place_mm.tolist()])
         off += errors.registration_m * of_station.normal(size=(3, 1))
     if errors.bending_m:
-        # A parabola along the longer axis of the room, with upward and sideways displacement.
+        # Displace points upwards and sideways by a parabola along the longer axis of the room.
         along = (points[0] / _BENT_M) ** 2
         off[1:] += errors.bending_m * along / math.sqrt(2.0)
     if errors.shared_m:

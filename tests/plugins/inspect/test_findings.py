@@ -90,7 +90,7 @@ def test_a_scale_shows_in_every_length_and_a_shift_in_none() -> None:
     found = {item.name: item.value for item in length_findings(places_m, shift_m, wall)}
     assert found["length_error_rms_share"] == pytest.approx(0.002)
     assert found["length_error_max_share"] == pytest.approx(0.002)
-    # Short lengths are ignored: some of the 2 x 190 pairs are shorter than a quarter of the
+    # Short lengths are ignored, and some of the 2 x 190 pairs are shorter than a quarter of the
     # longest.
     assert 250 < found["n_lengths"] < 380
     one_off = np.zeros_like(shift_m)

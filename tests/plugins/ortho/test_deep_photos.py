@@ -27,7 +27,7 @@ SIDE_PX = (1000, 800)
 
 
 def ramp() -> NDArray[np.uint16]:
-    """Return an image: red rises by 60 levels per column, green by 80 per row, and blue is odd."""
+    """Return an image whose red rises by 60 per column and green by 80 per row; blue is odd."""
     rows, columns = np.mgrid[: SIDE_PX[1], : SIDE_PX[0]]
     deep = np.dstack([60 * columns + 7, 80 * rows + 11, np.full_like(rows, 12345)])
     return deep.astype(np.uint16)

@@ -99,7 +99,8 @@ def test_panoramas_and_fisheyes_become_the_faces_that_they_show(read: PhotoReade
         *(f"a_{face}.png" for face in ("down", "front", "left", "right", "up")),
         "b.jpg",
     ]
-    # The angle of view is 90 degrees: the focal length is half the side, a quarter of the circle.
+    # The angle of view is 90 degrees, a quarter of the circle, so the focal length is half the
+    # side.
     lens = photos[0].intrinsics
     assert lens is not None
     assert (photos[0].width, lens.fx, lens.cx) == (41, 20.5, 20.5)

@@ -138,7 +138,7 @@ def test_plaques_give_drawn_walls_check_points_at_edges(tmp_path: Path) -> None:
     bare = simulate(tmp_path / "bare", **drawn)
     hung = simulate(tmp_path / "hung", **drawn, n_plaques=24)
     assert hung.checkpoints.classes.count("vertical edge") == 20
-    # Nothing else has moved: planes are the same, and rectangles include those of the bare room.
+    # Nothing else has moved, so planes are the same, and rectangles include those of the bare room.
     np.testing.assert_array_equal(hung.truth.planes.normal, bare.truth.planes.normal)
     rectangles = [
         {tuple(row) for row in np.column_stack([room.truth.scene.centre, room.truth.scene.extent])}
