@@ -351,11 +351,13 @@ def main() -> None:
         part: [[room for room in seeds if room] for seeds in both] for part, both in sets.items()
     }
     newest_s = max(path.stat().st_mtime for path in options.folder.glob("*/numbers.json"))
-    counts = ", ".join(f"{part} {len(one)} and {len(two)}" for part, (one, two) in rooms.items())
+    counts = ", ".join(
+        f"{len(one)} and {len(two)} rooms for {part}" for part, (one, two) in rooms.items()
+    )
     made = (
         f"Measured on {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} ({platform.machine()}, "
-        f"{os.cpu_count()} cores, Python {platform.python_version()}). Numbers of rooms in the "
-        f"first and second set of seeds: {counts}"
+        f"{os.cpu_count()} cores, Python {platform.python_version()}). The two sets of "
+        f"seeds contain {counts}"
     )
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)
