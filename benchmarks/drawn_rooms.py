@@ -351,13 +351,14 @@ def main() -> None:
         part: [[room for room in seeds if room] for seeds in both] for part, both in sets.items()
     }
     newest_s = max(path.stat().st_mtime for path in options.folder.glob("*/numbers.json"))
-    counts = ", ".join(
-        f"{len(one)} and {len(two)} rooms for {part}" for part, (one, two) in rooms.items()
-    )
+    counts = {part: f"{len(one)} and {len(two)} rooms" for part, (one, two) in rooms.items()}
+    stated = list(dict.fromkeys(counts.values()))
+    if len(stated) > 1:
+        stated = [f"{count} for {part}" for part, count in counts.items()]
     made = (
         f"Measured on {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} ({platform.machine()}, "
         f"{os.cpu_count()} cores, Python {platform.python_version()}). The two sets of "
-        f"seeds contain {counts}"
+        f"seeds contain {', '.join(stated)}"
     )
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)

@@ -1,4 +1,4 @@
-"""Orthoimages from laser scans and free-hand photographs, with methods that can be compared."""
+"""Orthoimages from laser scans and hand-held photographs, with methods that can be compared."""
 
 from __future__ import annotations
 

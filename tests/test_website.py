@@ -74,7 +74,7 @@ def test_the_reference_has_every_method_product_metric_and_command(
     products = pages["products"]
     assert "(#camera)" in products
     assert "small rotation vector" in products.partition("### Camera\n")[2].partition("\n#")[0]
-    assert "| 2 | `REJECTED` | contradicts" in products
+    assert "| 2 | `REJECTED` | the tie contradicts" in products
     assert "| 2 | `FILLED` | inpainted from" in products
     assert "## orthoflow plugins new\n" in pages["commands"]
     assert "_ORTHOFLOW_COMPLETE=bash_source" in pages["commands"]

@@ -36,7 +36,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "The file": WorkflowFile,
     "`inputs.<name>`: an input": InputSection,
     "`datasets.<name>`: a dataset": DatasetSection,
-    "`steps.<name>`: a step, with the keys of a call": StepSection,
+    "`steps.<name>`: a step": StepSection,
     "`steps.<name>` or `steps.<name>.variants.<name>`: a method call": CallSection,
     "`params.<name>`: a sweep": SweepSection,
     "`resources`": ResourcesSection,

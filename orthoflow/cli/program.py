@@ -46,7 +46,7 @@ _SUMMARIES: Final = {
     "doctor": "Show what is installed, what is missing, and the consequences.",
 }
 
-_HELP: Final = """Make orthoimages of walls from laser scans and free-hand photographs, with methods
+_HELP: Final = """Make orthoimages of walls from laser scans and hand-held photographs, with methods
 that can be compared and repeated.
 
 A first run, on a simulated room: orthoflow run quickstart.yaml

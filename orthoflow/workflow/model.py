@@ -210,12 +210,12 @@ class InputSection(FileSection):
     files: _Files = Field(
         (),
         description="A file, a folder, a pattern, or a list of these, relative to the workflow. "
-        "Without this key, pass `--input NAME=PATH`.",
+        "If this key is missing, pass the files with `--input NAME=PATH`.",
         examples=["data/photos/*.jpg"],
     )
     optional: _Flag = Field(
         default=False,
-        description="Steps that need the input are skipped when it is absent.",
+        description="If the input is absent, steps that need it are skipped.",
         examples=[True],
     )
 
@@ -282,9 +282,9 @@ class CallSection(FileSection):
 
 
 class StepSection(CallSection):
-    """A step either calls one method or has variants, each of which calls one method and contains
-    the keys of that call. If optional data is missing, steps that need this data are skipped, as
-    are all steps that depend on them. Steps can be listed in any order.
+    """A step contains either the keys of one method call, or variants that each contain the keys of
+    a method call. If optional data is missing, steps that need this data are skipped, as are all
+    steps that depend on them. Steps can be listed in any order.
     """  # noqa: D205
 
     in_: dict[str, _Sources] = Field(
@@ -340,9 +340,9 @@ class DatasetsSection(FileSection):
 
 class Comparison(FileSection):
     """A step that depends on variants runs once per combination that affects it. Each of these runs
-    is a cell. Its address consists of step, dataset, seed, variants and repeat, such as
-    `ortho@plane=ransac,orient=pnp#2`. Without `compare`, only the baseline runs, which is the first
-    variant of each step.
+    is a cell. The address of a cell consists of the step, dataset, seed, variants and repeat, such
+    as `ortho@plane=ransac,orient=pnp#2`. Without `compare`, only the baseline runs, which is the
+    first variant of each step.
     """  # noqa: D205
 
     design: Design = Field(
@@ -402,8 +402,7 @@ class WorkflowFile(FileSection):
     ] = Field(FORMAT, description="Version of this format.", examples=[FORMAT])
     name: _Name | None = Field(
         None,
-        description="Name of the workflow, with which the names of run folders begin; by default "
-        "the file name.",
+        description="Name of the workflow and prefix of its run folders; by default the file name.",
         examples=["palace-room"],
     )
     seed: _Seed | SeedSweep = Field(
@@ -419,7 +418,7 @@ class WorkflowFile(FileSection):
     )
     datasets: dict[_Name, DatasetSection] | str = Field(
         {},
-        description="The datasets on which the workflow runs: a mapping, or a CSV file.",
+        description="The datasets on which the workflow runs: a mapping or a CSV file.",
         examples=[{"hall": {"scan": "data/hall.e57"}, "stairs": {"scan": "data/stairs.e57"}}],
     )
     steps: dict[_Name, StepSection] = Field(

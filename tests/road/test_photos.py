@@ -1,4 +1,4 @@
-"""The main job: scan + free-hand photographs -> orthoimages, walked with the command line."""
+"""The main job: scan + hand-held photographs -> orthoimages, walked with the command line."""
 
 from __future__ import annotations
 
