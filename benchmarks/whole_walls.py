@@ -1,4 +1,4 @@
-"""Measure the share of the true wall that an orthoimage covers, in rooms drawn by seeds.
+"""Measure the share of the true wall that an orthoimage covers, in randomly generated rooms.
 
     python benchmarks/whole_walls.py --rooms 12 --first 1001
     python benchmarks/whole_walls.py --rooms 12 --first 1001 --rectangle points
@@ -6,8 +6,8 @@
 With `decoration: drawn`, cornices, pilasters, niches and recessed doors of `simulate.room` are
 determined by the seed. The true wall extends from corner to corner and from floor to ceiling. A
 cell of it counts if the first surface, seen perpendicular to the wall, is parallel to the wall and
-visible from a station. `scanned` is the share of these cells that the raster shows. `painted` is
-the share, of the cells that are also visible in a photo, that the orthoimage shows (planes by
+visible from a station. `scanned` is the share of these cells that the raster shows. Of the cells
+that are also visible in a photo, `painted` is the share that the orthoimage shows (planes by
 `plane.hough2d`, `raster.grid` with default settings and 4 mm cells, true poses of the photos).
 `front` and `behind` are the buffer found, next to the buffer that the true relief needs. `lost` is
 the location of missing cells: `out`side the raster, beyond the `buf`fer, in a `void` cell of the

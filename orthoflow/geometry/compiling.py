@@ -98,7 +98,7 @@ class _KernelCache(FunctionCache):
 
     Numba itself checks only the file that contains a kernel, not the functions that the kernel
     calls in other files. Here, file names contain a digest of the kernel, all functions that it
-    calls, and the constants used in them. Thus only kernels affected by an edit are recompiled,
+    calls, and the constants used in them. Thus, only kernels affected by an edit are recompiled,
     independently of the folder of a checkout, and several versions of the code can share a cache.
     """
 

@@ -49,7 +49,7 @@ def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
     Returns:
         (3, 3) with the rows e1, e2, up; `basis @ point_world` gives two horizontal coordinates and
         the height. e1 is the world axis that follows the axis nearest to up (x after z, y after x,
-        z after y), made perpendicular to up. For up = z this is the identity.
+        z after y), made perpendicular to up. For up = z, this is the identity.
     """
     axis = int(np.argmax(np.abs(up)))
     first = np.array(_FIRST_AXES[axis])

@@ -42,7 +42,7 @@ class Check:
 
     Attributes:
         run: raises AssertionError with one sentence if the method breaks the rule.
-        applies: a true value for methods to which the rule applies.
+        applies: returns a true value for a method to which the rule applies.
         is_quick: whether the check needs at most two runs on the example and, apart from these,
             only inputs that are refused before any computation.
     """

@@ -125,7 +125,7 @@ def example_room(
         points.append(local @ turn.T)
         normals.append(normal @ turn.T)
         offsets.append(distance + float(normals[-1] @ origin))
-        # From the top left on: down, to the right, up.
+        # Begin at the top left, and go down, to the right and up.
         u, v = (0.5 * (size @ np.abs(side)) * side for side in wall_axes(normal, up_vector("z")))
         steps = np.array([-u - v, v - u, u + v, u - v])
         corners.append((distance * normal + steps) @ turn.T + origin)

@@ -42,7 +42,7 @@ _ROUNDING: Final = 10.0 ** (1 - _DIGITS)
 _STRIDE: Final = 2_654_435_761
 _METADATA: Final = "metadata"
 
-# Name and shape of an array -> up to 32 of its values with nine digits, at positions that depend
+# By name and shape of each array, up to 32 of its values with nine digits, at positions that depend
 # only on its size; None for NaN.
 Samples: TypeAlias = Mapping[str, Sequence[float | None]]
 
@@ -105,7 +105,8 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
             known[trial.method.id] = now
             text = json.dumps(_FORMAT.dump_python(known), indent=1, sort_keys=True)
             stream.truncate(0)
-            # One line per list of numbers, so that version control shows which of them changed.
+            # Write each list of numbers in one line, so that version control shows which of them
+            # changed.
             stream.write(re.sub(r"\[[^\[\]]+\]", lambda it: " ".join(it[0].split()), text) + "\n")
             return ""
     numbers_stated = before.inputs == now.inputs
@@ -125,7 +126,7 @@ def _changes(
     *,
     numbers_stated: bool = True,
 ) -> Iterator[tuple[str, str]]:
-    """Yield each port whose samples differ beyond the tolerances, and how."""
+    """Yield each port whose samples differ beyond the tolerances, with the difference."""
     for port in sorted({*before, *after}):
         moved = "one of them has none"
         if port in before and port in after:
@@ -185,7 +186,7 @@ def sample_problem(
         name = array.partition(" [")[0]
         if name == _METADATA and not numbers_stated:
             continue
-        # An absolute value, and a share of the larger number.
+        # The tolerances are an absolute value, and a share of the larger number.
         stated = tolerances.get(name.rpartition("/")[2])
         amount, share = (_UNSTATED, _UNSTATED) if stated is None else (stated.limit, 0.0)
         share = _METADATA_SHARE if name == _METADATA else share

@@ -86,7 +86,7 @@ def textured_wall(seed: int = 1, *, gsd_m: float = GSD_M) -> TexturedWall:
     """Return a 3 m x 2 m wall with 6 cm relief, whose bottom-left corner is the origin.
 
     Args:
-        seed: seed of the texture; the examples have the first.
+        seed: seed of the texture; the examples use the default.
         gsd_m: cell size of its raster.
     """
     rng = np.random.default_rng(seed)

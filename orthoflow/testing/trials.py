@@ -102,7 +102,7 @@ def run_trial(
     )
     method = trial.method
     state = _global_state()
-    # `Any`: the type of the returned value is checked here.
+    # The type is Any, since the type of the returned value is checked here.
     returned: Any = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     if not isinstance(returned, method.Out):
         got = type(returned).__name__

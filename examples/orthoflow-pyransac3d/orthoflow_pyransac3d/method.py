@@ -96,7 +96,7 @@ def next_plane(points, params, ctx):
         raise MethodError("no three of the points span a plane: are they all in one place?")
     near = points[inliers]
     normal, centre = fitted(near)
-    for share in (0.5, 0.25, 0.25):  # points of the next wall would tilt a fit to all
+    for share in (0.5, 0.25, 0.25):  # points of the next wall would tilt a fit to all points
         distances_m = np.abs((points - centre) @ normal)
         normal, centre = fitted(points[distances_m < share * params.tolerance_m])
     return normal, centre

@@ -47,7 +47,7 @@ def search_shifts(
         first: (rows, cols, c) float32.
         second: (rows, cols, c) float32, or (rows, cols, 3) for combinations.
         places: (n, 2) int64 (column, row), at least half + radius cells from the border.
-        reach: half, radius: patches are 2 half + 1 cells wide, and shifts up to the radius are
+        reach: half and radius; patches are 2 half + 1 cells wide, and shifts up to the radius are
             tried.
         found: (n, 4) float64, filled with the shift (across, down), its correlation, and the lead
             of this correlation over the highest one away from it (-1 at the border of the search
@@ -180,7 +180,7 @@ def match_patches(
         second: the second picture.
         places: (n, 2) int64 (column, row) of the patches' centres in the first picture.
         window: (p, p) float64 weights of a patch's cells.
-        patch: scratch arrays: (p, p), (p + 3, p, c) and (p, p, c) float64.
+        patch: scratch arrays (p, p), (p + 3, p, c) and (p, p, c), float64.
         found: (n, 4) float64: the shift (across, down), refined in place; the standard deviation of
             a coordinate for independent cells (inf if undetermined), and the correlation.
     """

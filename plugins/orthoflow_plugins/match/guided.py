@@ -39,12 +39,12 @@ class MatchGuided(Method):
 
     Only the visible part of a wall is searched, within a small radius (an extension of the mask of
     markiewicz2015). Oriented gradients, grey values and combinations of the photo's colours are
-    compared, since laser and camera have different wavelengths; for each photo, those channels are
-    used whose ties have the smallest held-out error in relation to their number and spread. Cells
-    finer than the point spacing are joined. Patches at relief steps are excluded and, if the cloud
-    is connected, those hidden by objects in front of the walls. The pose is estimated again and the
-    photo projected again until held-out ties no longer improve. Photos without a pose are first
-    matched with the other photos, projected onto the walls; if that fails, they get no ties.
+    compared, since laser and camera have different wavelengths; for each photo, the channels used
+    are those whose ties have the smallest held-out error in relation to their number and spread.
+    Cells finer than the point spacing are joined. Patches at relief steps are excluded and, if the
+    cloud is connected, those hidden by objects in front of the walls. The pose is estimated again
+    and the photo projected again until held-out ties no longer improve. Photos without a pose are
+    first matched with the other photos, projected onto the walls; if that fails, they get no ties.
     """
 
     id: ClassVar[str] = "match.guided"

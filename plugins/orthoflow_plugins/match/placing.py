@@ -1,7 +1,7 @@
 """Coarse poses of photos from structure, if key points do not match the photos with a wall.
 
 A correlation of structure in nine parts does not prove a position, since a repeating motif also
-correlates elsewhere. Therefore overlapping patches are matched independently at the most likely
+correlates elsewhere. Therefore, overlapping patches are matched independently at the most likely
 positions; a position is probably correct if most of the patches fit one pose.
 
 A repeating motif, or another wall with the same tiles, may still fit best. Photos share many more

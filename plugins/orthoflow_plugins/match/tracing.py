@@ -1,9 +1,9 @@
 """Match one photo with all walls, starting from its pose: measure, reject, refit, and repeat.
 
 A photo may share too few key points with the laser intensity of a wall for a first pose, but
-hundreds with another photo of the wall. Therefore oriented photos are projected onto the walls, and
-a photo without a pose is first matched with these pictures. It is then matched with the scan like
-any other photo, so that its ties depend only on the scan.
+hundreds with another photo of the wall. Therefore, oriented photos are projected onto the walls,
+and a photo without a pose is first matched with these pictures. It is then matched with the scan
+like any other photo, so that its ties depend only on the scan.
 """
 
 from __future__ import annotations

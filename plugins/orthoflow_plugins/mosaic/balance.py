@@ -529,7 +529,7 @@ def _solved(
         for part in np.split(np.arange(len(apart)), ends[:-1]):
             spread = max(_SPREAD_LEAST, median_deviation(residuals[part], 0.0))
             counted = min(1.0, _INDEPENDENT / len(part)) / spread**2
-            # In the first iteration exposures are unknown, so large differences are not outliers.
+            # In the first iteration, exposures are unknown, so large differences are not outliers.
             limit = np.inf if sweep == 0 else _OUTLIER * spread
             weights[part] = counted / (1.0 + (residuals[part] / limit) ** 2)
         weighted = matrix.T @ diags_array(weights)

@@ -300,9 +300,9 @@ def _with_what_is_missing(
     """Add the systematic error of an incomplete lens model to the covariance.
 
     Residuals contain less than a tenth of the missing distortion, because the other parameters
-    absorb most of it and distort the photo between and beyond the ties. Therefore the error is that
-    of the complete model plus the difference between the models. Otherwise, for a typical lens with
-    unknown distortion, the predicted error of eleven parameters would be a ninth of the actual
+    absorb most of it and distort the photo between and beyond the ties. Therefore, the error is
+    that of the complete model plus the difference between the models. Otherwise, for a typical lens
+    with unknown distortion, the predicted error of eleven parameters would be a ninth of the actual
     error.
 
     Args:

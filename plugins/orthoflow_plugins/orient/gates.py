@@ -217,7 +217,7 @@ def _about(points: NDArray[np.float64]) -> TieWall:
 
 _MIN_TIES: Final = 8
 _CROWDED_RATIO: Final = 10
-# Unlike those of wrong ties, residuals of correct ties are concentrated near 0. Therefore several
+# Unlike those of wrong ties, residuals of correct ties are concentrated near 0. Therefore, several
 # radii are tested, given as shares of the limit.
 _CHANCE_RADII: Final = (0.2, 0.35, 0.6, 1.0)
 _PLACE_PX: Final = 8.0

@@ -146,7 +146,7 @@ def median_depths(
     """Set the median depth of the layer with the most points in each cell.
 
     The depths of a cell are divided into layers at differences of more than `layer_m`. If layers
-    have the same number of points, the one nearest to the viewer is used. Thus no depth is between
+    have the same number of points, the one nearest to the viewer is used. Thus, no depth is between
     two surfaces, and stray points have no influence.
 
     Args:

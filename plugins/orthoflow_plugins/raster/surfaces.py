@@ -385,9 +385,9 @@ def without_specks(
 ) -> NDArray[np.float32]:
     """Set cells to void if their depth is an outlier, with which hardly any neighbour agrees.
 
-    Otherwise such a cell would show a distant part of a photo. In the scan shadow of an edge, cells
-    are sparser than around it, and there are outliers and mixed pixels from both sides of the edge.
-    In such regions, most of the few neighbours must agree, allowing for a slope.
+    Otherwise, such a cell would show a distant part of a photo. In the scan shadow of an edge,
+    cells are sparser than around it, and there are outliers and mixed pixels from both sides of the
+    edge. In such regions, most of the few neighbours must agree, allowing for a slope.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.

@@ -68,7 +68,7 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
     """Trace the rays of a cloud to a wall.
 
     If the station of each point is known, the ray from the station to the point is intersected with
-    the wall's plane, beyond the point if necessary. Otherwise rays perpendicular to the wall are
+    the wall's plane, beyond the point if necessary. Otherwise, rays perpendicular to the wall are
     assumed.
 
     Args:

@@ -74,7 +74,7 @@ def cloud_of(delivery: Delivery) -> PointCloud:
     """Return the cloud; a shift of the world only changes its origin and its stations."""
     points = delivery.scan.points
     x, y, z = (
-        # Without rounding errors if axes are only permuted.
+        # There are no rounding errors if axes are only permuted.
         np.asarray(
             sum(
                 share * axis

@@ -124,7 +124,7 @@ def test_a_drawn_geometry_moves_planes_and_stations_and_keeps_the_truth(tmp_path
         normals = [out.truth.planes.normal[at] for out, at in zip(rooms, places, strict=True)]
         offsets = [out.truth.planes.offset[at] for out, at in zip(rooms, places, strict=True)]
         leans = [np.degrees(np.arcsin(normal[2])) for normal in normals]
-        # In degrees and metres; far above rounding errors.
+        # The limits, in degrees and metres, are far above rounding errors.
         assert np.diff(sorted(leans)).min() > 0.005, name
         assert np.diff(sorted(offsets)).min() > 0.0005, name
     stations = [out.truth.stations for out in (designed, *drawn)]
