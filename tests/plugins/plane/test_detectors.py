@@ -1,4 +1,4 @@
-"""What every detector must do: truth, invariances, options, refusals, noise, and real scans."""
+"""Requirements for all detectors: truth, invariances, options, refusals, noise and real scans."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ DETECTORS: dict[str, tuple[type[Method], dict[str, Any]]] = {
     "region-knn": (Region, {"neighbourhood": "knn"}),
 }
 
-# Half of a room's points fix its planes as well: errors are a fourth of what is asserted, or less,
-# but for the table's, which has the fewest. A fourth of them shows which planes are left.
+# Half of a room's points determine its planes with at most a quarter of the permitted error, except
+# for the table, which has the fewest points. A quarter of the points shows which planes remain.
 HALF = slice(None, None, 2)
 FEW = slice(None, None, 4)
 
@@ -50,7 +50,7 @@ every_detector = pytest.mark.parametrize("detector", DETECTORS)
 every_method = pytest.mark.parametrize(
     "detector", ["hough2d", "hough3d", "ransac-msac", "region-cube"]
 )
-# What follows when candidates were found is shared by all methods.
+# All methods share the steps that follow the detection of candidates.
 any_method = pytest.mark.parametrize("detector", ["hough2d", "region-cube"])
 
 
@@ -73,7 +73,7 @@ def test_every_surface_of_a_room_is_found_and_nothing_else(
 ) -> None:
     planes, labels = rooms[detector].planes, rooms[detector].labels.plane_index
     assert len(planes) == len(ROOM)
-    # What the detector itself proposed for the largest wall.
+    # The plane that the detector itself proposed for the largest wall.
     raw, front = planes.details["raw"][nearest(planes, ROOM[0].normal, ROOM[0].centre)], ROOM[0]
     assert np.abs(raw["normal"] @ front.normal) > np.cos(np.radians(1.0))
     assert abs(np.abs(raw["normal"] @ np.array(front.centre)) - abs(raw["offset_m"])) < 0.02
@@ -84,7 +84,7 @@ def test_every_surface_of_a_room_is_found_and_nothing_else(
         assert miss_m < 2e-4, truth.name  # 2 mm noise over thousands of points
         n_points = truth.n_points // 2
         own = labels[start : start + n_points]
-        # Points in a corner belong to either surface; a strip of some millimetres along the edges.
+        # Points in a strip of some millimetres along the edges may belong to either surface.
         assert np.mean(own == nearest(planes, truth.normal, np.array(truth.centre))) > 0.98
         start += n_points
     assert planes.viewpoint == "stations"
@@ -121,13 +121,14 @@ def test_what_else_was_scanned_neither_hides_nor_moves_the_walls(
     points = sampled()[HALF]
     expected: tuple[Rectangle, ...] = ROOM[:6]
     if case == "outliers":
-        # Five per cent of gross errors.
+        # Add five per cent of gross errors.
         points = np.vstack([points, np.random.default_rng(3).uniform(-400.0, 400.0, (2_200, 3))])
     elif case == "recesses":
-        # Of different depth: no plane that leans joins them.
+        # The recesses have different depths, so that no inclined plane joins them.
         expected, points = (DOOR, NICHE), sampled((*ROOM, DOOR, NICHE))[HALF]
     else:
-        # A mirror on the front wall shows the room behind it: 4 % of the points are of nothing.
+        # A mirror on the front wall shows the room behind it, so 4 % of the points belong to no
+        # surface.
         seen = points[np.random.default_rng(5).choice(len(points), 1_750, replace=False)]
         depth_m = (seen - ROOM[0].centre) @ ROOM[0].normal
         ghosts = seen - 2.0 * depth_m[:, None] * ROOM[0].normal
@@ -231,7 +232,7 @@ def test_a_rounded_body_is_no_wall(tmp_path: Path) -> None:
 
 def test_the_fit_follows_a_tolerance_below_its_default() -> None:
     params = Ransac.Params(tolerance_m=0.01)
-    # What is recorded is given back as it is when the step runs, and by a replay.
+    # The step and a replay get the same parameters as recorded.
     again = Ransac.Params.model_validate_json(params.model_dump_json(), strict=True)
     assert again == params
     assert again.tolerances_m(0.0, 0.0) == (0.01, 0.01)
@@ -250,7 +251,7 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
         return planes
 
     whole = found(1)
-    # 88 000 points in blocks of 256: one of three blocks is fitted.
+    # Of 88,000 points in blocks of 256, one of three blocks is fitted.
     monkeypatch.setattr(search, "_FITTED_MOST", 25_000)
     one = found(3)
     np.testing.assert_array_equal(one.offset, found(1).offset)
@@ -258,17 +259,17 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
     for truth in ROOM[:6]:
         angle_deg, miss_m = errors(one, truth)
         assert angle_deg < 0.02
-        assert miss_m < 3e-4  # a third of the points: 1.7 times the error of all of them
+        assert miss_m < 3e-4  # 1.7 times the error with all points
 
 
-# --- what is reported ---
+# --- reports ---
 
 
 @any_method
 def test_metrics_are_those_of_the_planes_and_labels(detector: str, tmp_path: Path) -> None:
     cloud, true = example_room(n_points=40_000)
     method: Any = DETECTORS[detector][0]
-    # A clock that goes on when it is asked: once at the beginning, for each plane, and at the end.
+    # The clock advances with each call: at the beginning, for each plane, and at the end.
     clock, processor = count(), count(step=10)
     ctx = StepContext(
         rng=np.random.default_rng(3),
@@ -285,7 +286,7 @@ def test_metrics_are_those_of_the_planes_and_labels(detector: str, tmp_path: Pat
     assert metrics["labelled_share"] == pytest.approx(counts.sum() / len(cloud), rel=1e-12)
     assert metrics["first_share"] == pytest.approx(counts[0] / len(cloud), rel=1e-12)
     assert metrics["rms_mm"] == pytest.approx(1e3 * planes.rms_m[0], rel=1e-12)
-    # 2 mm of noise; all labelled points are at least those of the fit.
+    # The noise is 2 mm; the labelled points include those of the fit.
     assert metrics["rms_mm"] == pytest.approx(2.0, rel=0.1)
     assert metrics["fit_rms_mm"] <= metrics["rms_mm"]
     omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
@@ -299,7 +300,7 @@ def test_metrics_are_those_of_the_planes_and_labels(detector: str, tmp_path: Pat
 
 def test_points_on_no_plane_are_reported_where_they_are_more_than_on_any(tmp_path: Path) -> None:
     cloud, _ = example_room(n_points=40_000)
-    # The largest of several walls has less than half of the points.
+    # The largest of several walls has fewer than half of the points.
     for params, is_reported in (({}, False), ({"n_planes_max": 1}, True)):
         _, ctx = detect("hough2d", cloud, tmp_path, **params)
         (share,) = (item.value for item in ctx.metrics if item.name == "labelled_share")
@@ -315,7 +316,7 @@ SIZE_M = np.array([5.0, 4.0, 2.8])
 
 
 def wall(noise_m: float, n_points: int) -> NDArray[np.float64]:
-    """One flat wall of 12 x 6 m, upright, with independent noise along its normal."""
+    """Return a flat, upright wall of 12 x 6 m, with independent noise along its normal."""
     rng = np.random.default_rng(3)
     points = rng.uniform((0.0, 0.0, 0.0), (12.0, 0.0, 6.0), (n_points, 3))
     points[:, 1] = rng.normal(0.0, noise_m, n_points)
@@ -323,7 +324,7 @@ def wall(noise_m: float, n_points: int) -> NDArray[np.float64]:
 
 
 def waves(rng: np.random.Generator, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Errors (n,) that neighbours share, of standard deviation 1, over half metres and more."""
+    """Return errors (n,) with standard deviation 1, correlated over more than half a metre."""
     total: NDArray[np.float64] = np.zeros(len(places_m))
     for _ in range(24):
         length_m, direction = rng.uniform(0.6, 3.0), rng.normal(size=places_m.shape[1])
@@ -334,7 +335,7 @@ def waves(rng: np.random.Generator, places_m: NDArray[np.float64]) -> NDArray[np
 
 
 def room(rng: np.random.Generator, noise_m: float, shared_m: float) -> NDArray[np.float64]:
-    """A box room turned at random: six surfaces, each with noise along its normal."""
+    """Return six surfaces of a randomly rotated box room, each with noise along its normal."""
     points = []
     for axis in range(3):
         for level in (0.0, SIZE_M[axis]):
@@ -394,7 +395,7 @@ def test_one_noisy_wall_is_found_at_defaults(method: type, tmp_path: Path) -> No
 def test_walls_of_a_noisy_room_are_found_beside_denser_clutter(
     method: type, noise_m: float, shared_m: float, tmp_path: Path
 ) -> None:
-    """A screen with 2 % of the points, a column and a sphere with 20 %: seven planes, no other."""
+    """A screen has 2 % of the points, column and sphere have 20 %; only seven planes are found."""
     rng = np.random.default_rng(7)
     walls = room(rng, noise_m, shared_m)
     middle = 0.5 * (walls.min(axis=0) + walls.max(axis=0))
@@ -422,7 +423,8 @@ def points_of(path: Path) -> NDArray[np.float64]:
     return np.column_stack([scan.x, scan.y, scan.z])
 
 
-# Reference: RANSAC at 2 cm, stated to a centimetre; panels lie some millimetres about the wall.
+# The reference is from RANSAC with 2 cm, and given to a centimetre; panels deviate by millimetres
+# from the wall.
 MAIN = np.array([0.9998, -0.018, 0.0]) / np.linalg.norm([0.9998, -0.018, 0.0])
 ON_MAIN = np.array([-2.865, -1.1, 1.4])
 
@@ -443,7 +445,7 @@ def test_walls_cases_recesses_floor_and_ceiling_of_the_hall_are_found(
     assert planes.plane(0).distances_m(ON_MAIN[None])[0] == pytest.approx(0.0, abs=0.01)
     assert (planes.names[0], planes.viewpoint) == ("wall 0", "guess")
     in_front = planes.plane(0).distances_m(planes.corners.mean(axis=1))
-    # Cases lean, and recesses are not all of one depth: 0.30 to 0.38 m.
+    # Cases are inclined, and recesses have different depths, 0.30 to 0.38 m.
     faces_hall = planes.normal @ planes.normal[0] > np.cos(np.radians(1.5))
     for in_front_m in (0.25, -0.36):
         assert np.abs(in_front - in_front_m)[faces_hall].min() < 0.03
@@ -457,7 +459,8 @@ def test_the_exactness_stated_of_a_real_wall_holds_between_its_halves(
 ) -> None:
     found = []
     for part in (slice(0, None, 2), slice(1, None, 2)):
-        # In one piece and read-only, as methods get them: kernels would be compiled once more.
+        # Arrays are contiguous and read-only, as methods get them; otherwise, kernels would be
+        # compiled again.
         pieces = (np.ascontiguousarray(getattr(hall, name)[part]) for name in "xyz")
         columns: dict[str, Any] = dict(zip("xyz", read_only(*pieces), strict=True))
         half = replace(hall, **columns)
@@ -466,5 +469,5 @@ def test_the_exactness_stated_of_a_real_wall_holds_between_its_halves(
     middle = first.corners[0].mean(axis=0)
     apart_m = float(second.plane(0).distances_m(middle[None])[0])
     assert abs(apart_m) < 3.0 * first.sigma_offset_m(0)
-    # Panels and painted plaster, 25 x 5 m: not micrometres.
+    # On 25 x 5 m of panels and painted plaster, micrometres would not be plausible.
     assert 1e-4 < first.sigma_offset_m(0) < 2e-3

@@ -1,4 +1,4 @@
-"""What is drawn of planes: the data of each panel against the planes found, not its looks."""
+"""Figures of planes: the data of each panel are compared with the planes found."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ POINTS: Final = sampled()[::4].astype(np.float32).astype(np.float64)
 
 
 def detected(method: Any, folder: Path, **params: Any) -> tuple[Any, NDArray[np.int16]]:
-    """Planes of a room and labels of its points, which have rows and intensities."""
+    """Return the planes of a room and the labels of its points, which have rows and intensities."""
     cloud = cloud_of(POINTS, origin=tuple(ORIGIN), stations=STATION)
     at = np.arange(len(POINTS))
     rows, columns = (place.astype(np.uint32) for place in np.divmod(at, 500))
@@ -34,7 +34,7 @@ def detected(method: Any, folder: Path, **params: Any) -> tuple[Any, NDArray[np.
 
 
 def lines(axes: Any) -> list[NDArray[np.float64]]:
-    """(2, n) what each line of a panel shows."""
+    """Return the data (2, n) of each line of a panel."""
     return [np.array(line.get_data(), dtype=np.float64) for line in axes.lines]
 
 
@@ -44,7 +44,7 @@ def image(axes: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def brightest(axes: Any) -> NDArray[np.float64]:
-    """(2,) where the largest value of an image lies, in the units of its axes."""
+    """Return the position (2,) of the largest value of an image, in the units of its axes."""
     shown, extent = image(axes)
     place = np.array(np.unravel_index(np.nanargmax(shown), shown.shape))[::-1] + 0.5
     sides = extent.reshape(2, 2)
@@ -60,14 +60,15 @@ def test_deviations_are_drawn_with_the_gauss_curve_of_their_fit(
     for k, (axes, beside) in enumerate(zip(panels[::2], panels[1::2], strict=True)):
         away_mm = 1e3 * planes.plane(k).distances_m(POINTS[labels == k] + ORIGIN)
         values, edges_mm, _ = axes.patches[0].get_data()
-        # Percent of the points per millimetre.
+        # A point in per cent of the points per millimetre.
         per_point = 100.0 / len(away_mm) / (edges_mm[1] - edges_mm[0])
         counts = np.histogram(away_mm, edges_mm)[0]
         np.testing.assert_allclose(values / per_point, counts, atol=5)
         sigma_mm = 1e3 * planes.details["fit_rms_m"][k]
         assert axes.get_title() == f"{planes.names[k]}: SD {sigma_mm:.1f} mm"
         ((x_mm, curve),) = lines(axes)
-        # As many points below it as the fit had, about their mean.
+        # The area below the curve is the number of points of the fit; the curve is centred on their
+        # mean.
         n_fit = planes.details["fit_n_points"][k]
         assert curve.sum() == pytest.approx(per_point * n_fit, rel=1e-3)
         mean_mm = (x_mm @ curve) / curve.sum()
@@ -84,14 +85,14 @@ def test_planes_are_drawn_with_their_points_and_rectangles(
 ) -> None:
     planes, labels = detected(Hough2d, tmp_path)
     above, below = drawings["planes"].axes
-    # Seen from a third of the way round and 35 degrees up: these three are its axes.
+    # Axes of the view, which is from an azimuth of -60 and an elevation of 35 degrees.
     azimuth, elevation = math.radians(-60.0), math.radians(35.0)
     towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     across = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     rise = np.array([0.0, 0.0, math.cos(elevation)]) - math.sin(elevation) * towards
     view = np.array([across, rise])
     flat = POINTS @ view.T
-    # What is on no plane, and the planes that turn to the eye.
+    # Points on no plane are drawn, and planes that face the viewer.
     turned = np.flatnonzero(planes.normal @ np.cross(across, rise) > 0.0)
     assert 2 < len(turned) < len(planes)
     for k, drawn in zip((-1, *turned), lines(above), strict=True):
@@ -144,17 +145,17 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     assert plan.sum() == len(POINTS)
     centre = extent.reshape(2, 2).mean(axis=1)
     np.testing.assert_allclose(lines(below)[0][:, 0], brightest(below), atol=1e-9)
-    # The floor is no line of the plan.
+    # The floor is not a line in the plan.
     walls = np.flatnonzero(np.abs(planes.normal[:, 2]) < 0.5)
     for k, line, mark in zip(walls, lines(above)[1:], lines(below)[1:], strict=True):
         corners = planes.corners[k] - ORIGIN
         np.testing.assert_allclose(line.T, corners[[1, 2], :2])
-        # r = x cos + y sin from the centre of the plan.
+        # From the centre of the plan, r = x cos + y sin.
         angle, distance_m = np.radians(mark[0, 0]), mark[1, 0]
         direction = np.array([np.cos(angle), np.sin(angle)])
         assert abs(planes.normal[k, :2] @ direction) == pytest.approx(1.0, abs=1e-4)
         assert distance_m == pytest.approx(direction @ (corners.mean(axis=0)[:2] - centre))
-    # A plane has one colour in all figures.
+    # A plane has the same colour in all figures.
     for axes in (above, below):
         assert [line.get_color() for line in axes.lines[1:]] == [plane_ink(k) for k in walls]
 
@@ -170,10 +171,10 @@ def test_directions_sections_and_voxels_show_the_planes(
     omega, phi = np.radians(circles).T
     ways = np.array([np.cos(phi) * np.cos(omega), np.cos(phi) * np.sin(omega), np.sin(phi)]).T
     np.testing.assert_allclose(np.abs(np.sum(ways * planes.normal, axis=1)), 1.0, atol=1e-9)
-    # Pixels of two degrees, centred on the directions.
+    # Pixels of two degrees are centred on the directions.
     np.testing.assert_allclose(image(axes)[1], [-1.0, 179.0, -91.0, 91.0])
     level, upright = drawings["accumulator-sections"].axes[:2]
-    # Of the upright planes the front wall has most votes, of those about the x axis too.
+    # In the section of upright planes, the front wall has the most votes.
     assert (level.get_title(), upright.get_title()) == ("phi = 0 deg", "omega = 0 deg")
     assert brightest(level)[0] == pytest.approx(90.0, abs=3.0)
     assert abs(brightest(level)[1]) == pytest.approx(2.0, abs=0.2)
@@ -185,7 +186,7 @@ def test_directions_sections_and_voxels_show_the_planes(
         middle = 0.5 * (low + high)[across]
         near = POINTS[np.abs(POINTS[:, across] - middle) < 0.025]
         for at, axis, counts in ((0, first, shown.sum(axis=0)), (2, second, shown.sum(axis=1))):
-            # Five voxels around the planes, and whole voxels.
+            # The image extends five voxels beyond the planes, and consists of whole voxels.
             assert extent[at] == pytest.approx(low[axis] - 0.25)
             assert 0.0 <= extent[at + 1] - (high[axis] + 0.25) < 0.051
             cells = np.floor((near[:, axis] - extent[at]) / 0.05).astype(int)
@@ -196,15 +197,15 @@ def test_normals_are_drawn_by_points_and_over_the_first_plane(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
     wall = Rectangle("wall", (0, 2, 0), (1.5, 0, 0), (0, 0, 1.0), 60_000)
-    # A slope of 30 degrees off the wall, half a metre before it.
+    # There is a slope of 30 degrees relative to the wall, half a metre in front of it.
     up = (0, 0.3 * math.sin(math.radians(30.0)), 0.3 * math.cos(math.radians(30.0)))
     points = sampled((wall, Rectangle("slope", (0, 1.5, 0), (0.3, 0, 0), up, 9_000)), noise_m=1e-3)
     cloud = cloud_of(points, origin=tuple(ORIGIN))
     params = {"neighbourhood_m": 0.15, "cell_m": 0.05, "min_share": 0.005}
     _, ctx = detect(Region, cloud, tmp_path, **params)
     metrics = {metric.name: metric.value for metric in ctx.metrics}
-    # A slope's error is s / (extent sqrt(n)) about both axes, with 225 points over 15 cm; half of
-    # the normals are within 1.18 of it.
+    # The error of a slope is s / (extent sqrt(n)) about both axes, with 225 points over 15 cm; half
+    # of the normals are within 1.18 times this error.
     expected_deg = math.degrees(1.18 * 1e-3 / (0.15 / math.sqrt(12.0) * 15.0))
     assert metrics["normal_scatter_deg"] == pytest.approx(expected_deg, rel=0.1)
     assert (metrics["n_regions"], metrics["cell_mm"]) == (2, pytest.approx(50.0))
@@ -215,6 +216,6 @@ def test_normals_are_drawn_by_points_and_over_the_first_plane(
     shown, extent = image(right)
     np.testing.assert_allclose(extent, (0.0, 3.0, 2.0, 0.0), atol=0.01)
     assert shown.shape == (40, 60)
-    # The slope stands before the wall there and is cut off at 15 degrees.
+    # Here the slope is in front of the wall, and is clipped to 15 degrees.
     assert shown[20, 30] == pytest.approx(15.0)
     assert np.nanmedian(shown[:8]) < 0.2

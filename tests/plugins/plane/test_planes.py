@@ -1,4 +1,4 @@
-"""Sides, names, rectangles, deviations and thickness of planes; planes that are given."""
+"""Sides, names, rectangles, deviations and thickness of planes; given planes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests import plane_scenes
 from tests.plane_scenes import ROOM, Rectangle, cloud_of, detect, prepared, sampled
 
 UP = np.array([0.0, 0.0, 1.0])
-# At y = 2, its normal to the south; 4 x 2 m about (0, 2, 0).
+# The wall is at y = 2, with its normal to the south, and 4 x 2 m large around (0, 2, 0).
 WALL = Plane(normal=np.array([0.0, -1.0, 0.0]), offset_m=-2.0)
 CORNERS = rectangle_m(WALL, wall_axes(WALL.normal, UP), np.array([-2.0, 2.0, -1.0, 1.0]))
 
@@ -44,12 +44,12 @@ def test_planes_are_named_by_inclination_and_the_lowest_and_highest_level_apart(
         "wall 0", "wall 1", "slope 2", "slope 3", "level 4", "floor 5", "level 6", "ceiling 7",
         "slope 8", "wall 9",
     )  # fmt: skip
-    # Nothing is seen from below: no ceiling.
+    # No plane is seen from below, so there is no ceiling.
     assert plane_names(normals[4:6], heights[4:6], UP) == ("level 0", "floor 1")
     assert plane_names(normals[6:8], heights[6:8], UP) == ("level 0", "ceiling 1")
 
 
-# --- from which side ---
+# --- visible side ---
 
 
 def test_the_nearest_station_that_is_clear_of_the_plane_tells_the_side() -> None:
@@ -64,7 +64,7 @@ def test_the_nearest_station_that_is_clear_of_the_plane_tells_the_side() -> None
     assert side((0, 0, 0)) == 1
     assert side((0, 5, 0)) == -1
     assert side((0, 0, 0), (0, 3, 0)) == -1
-    # Five centimetres are in the plane itself.
+    # Stations within five centimetres are in the plane itself.
     assert side((0, 2.04, 0)) == side((0, 1.96, 0)) == side() == 0
     assert side((0, 2.06, 0)) == -1
     assert side((0, 1.94, 0)) == side((0, 2.04, 0), (0, 0, 0)) == 1
@@ -73,7 +73,8 @@ def test_the_nearest_station_that_is_clear_of_the_plane_tells_the_side() -> None
     assert side(*three, scan=(0, 0, 0, 0, 1, 1)) == 1
     assert side(*three, scan=(0, 0, 1, 1, 1, 1)) == -1
     assert side(*three, scan=(0, 2, 2, 2, 2, 2)) == 1
-    # As many on either side, none, or a scan without a station: the nearest station.
+    # The nearest station decides if equal numbers of points were scanned from both sides, if there
+    # are no points, and if a scan has no station.
     for scan in ((0, 0, 0, 1, 1, 1), (2,) * 6, (0, 0, 0, 0, 0, 3), ()):
         assert side(*three, scan=scan) == -1
 
@@ -88,18 +89,18 @@ def test_points_before_or_behind_the_rectangle_tell_the_side() -> None:
     assert side_by([(0, 1, 0)]) == 1
     assert side_by([(0, 3, 0)]) == -1
     assert side_by([]) == side_by([(0, 2, 0)]) == 0
-    # A metre counts fully: two points at a metre against one far away.
+    # A distance of a metre counts fully, so two points at a metre outweigh one far away.
     assert side_by([(0, 1, 0), (0, 1, 0.5), (0, 9, 0)]) == 1
-    # Relief counts less: three near ones of 20 cm against one of a metre.
+    # Relief counts less, so three points at 20 cm do not outweigh one at a metre.
     assert side_by([(0, 1.8, 0)] * 3 + [(0, 3, 0)]) == -1
     assert side_by([(0, 1.8, 0)] * 6 + [(0, 3, 0)]) == 1
-    # What lies beside it by more than 30 cm counts only where nothing else is there.
+    # Points more than 30 cm beside the rectangle only count if there are no others.
     assert side_by([(2.2, 1, 0), (2.4, 3, 0), (2.4, 3, 0)]) == 1
     assert side_by([(-2.2, 1, 0), (-2.4, 3, 0), (-2.4, 3, 0)]) == 1
     assert side_by([(0, 1, 1.2), (0, 3, 1.4), (0, 3, 1.4)]) == 1
     assert side_by([(0, 1, -1.2), (0, 3, -1.4), (0, 3, -1.4)]) == 1
     assert side_by([(2.4, 3, 0)]) == -1
-    # What is on the plane itself does not count.
+    # Points on the plane itself do not count.
     assert side_by([(0, 1.96, 0)] * 9) == 0
     assert side_by([(0, 1.96, 0)] * 9 + [(0, 2.2, 0)]) == -1
 
@@ -109,15 +110,16 @@ def test_parallel_planes_are_asked_last() -> None:
     assert side_by([*behind, (0, 1, 0)], [True] * 5 + [False]) == 1
     assert side_by([*behind, (0, 1, 0)]) == -1
     assert side_by(behind, [True] * 5) == -1
-    # Before the rectangle a parallel one counts more than others beside it.
+    # Points of parallel planes in front of or behind the rectangle count more than other points
+    # beside it.
     assert side_by([*behind, (9, 1, 0)], [True] * 5 + [False]) == -1
     assert side_by([(9, 3, 0), (9, 1, 0), (9, 1, 0)], [False, True, True]) == -1
 
 
 def test_a_small_difference_decides_nothing() -> None:
-    """A hundredth of what all points add up to, were each just clear of the plane."""
+    """The limit is a hundredth of the sum if all points were just off the plane."""
     bare = [(0.0, 2.0, 0.0)] * 1_999
-    # 0.01 * 2000 * 0.05 m: one metre.
+    # The limit is 0.01 * 2000 * 0.05 m, one metre.
     assert side_by([*bare, (0, 1.01, 0)]) == 0
     assert side_by([*bare[:-1], (0, 1.5, 0), (0, 1.48, 0)]) == 1
     assert side_by([*bare[:-1], (0, 2.5, 0), (0, 2.52, 0)]) == -1
@@ -134,7 +136,7 @@ def two_walls(
     source: str = "file",
     origin: tuple[float, float, float] = ORIGIN,
 ) -> Planes:
-    """A wall in the north and, with a third of its points, one in the west: points lie beyond."""
+    """Return a north wall and a west wall with a third of its points; points lie beyond both."""
     rng = np.random.default_rng(4)
     west = rng.uniform([-2.0, -1.9, -1.0], [-2.0, 1.9, 1.0], (8_000, 3))
     north = rng.uniform([-1.9, 2.0, -1.0], [2.0, 2.0, 1.0], (24_000, 3))
@@ -156,7 +158,8 @@ def test_planes_are_ordered_by_their_points_and_face_the_station(tmp_path: Path)
     np.testing.assert_allclose(planes.n_points, [24_000, 8_000], atol=100)
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
     assert (planes.viewpoint, planes.side_from) == ("stations", ())
-    # The offset counts from the world's origin: it and its covariance move with the cloud.
+    # The offset refers to the world's origin, so it and its covariance change with the cloud's
+    # position.
     near = two_walls(tmp_path, (0.0, 0.0, 0.0), origin=(0.0, 0.0, 0.0))
     shift = np.eye(4)
     shift[3, :3] = ORIGIN
@@ -173,19 +176,20 @@ def test_planes_are_ordered_by_their_points_and_face_the_station(tmp_path: Path)
 def test_deviations_and_rectangles_are_those_for_who_sees_the_wall(tmp_path: Path) -> None:
     before, behind = (two_walls(tmp_path, at) for at in ((0.0, 0.0, 0.0), (-3.0, 3.0, 0.0)))
     for k in range(2):
-        # Points lie beyond the walls: negative from within, positive from outside.
+        # Points are beyond the walls, so skewness is negative from the inside, and positive from
+        # the outside.
         shapes: Any = [found.details["normality"][k] for found in (before, behind)]  # type: ignore[index, call-overload]
         assert shapes[0]["skewness"] == pytest.approx(-shapes[1]["skewness"])
         assert shapes[0]["mean_m"] == pytest.approx(-shapes[1]["mean_m"])
         assert shapes[1]["skewness"] > 0.5
     north, west = before.corners - ORIGIN
-    # From the top left, counter-clockwise.
+    # Corners begin at the top left and are counter-clockwise.
     for found, axis, left, right in ((north, 0, -1.9, 2.0), (west, 1, -1.9, 1.9)):
         expected = [[left, 1], [left, -1], [right, -1], [right, 1]]
         np.testing.assert_allclose(found[:, [axis, 2]], expected, atol=0.005)
     np.testing.assert_array_equal(before.part_plane, [0, 1])
     assert before.part_corners is not None
-    # Parts are known to a cell, and none reaches beyond the points.
+    # Parts are accurate to a cell, and none extends beyond the points.
     np.testing.assert_allclose(before.part_corners, before.corners, atol=0.06)
     for part, whole in zip(before.part_corners, before.corners, strict=True):
         assert (part.max(axis=0) <= whole.max(axis=0) + 1e-9).all()
@@ -196,7 +200,7 @@ def test_deviations_and_rectangles_are_those_for_who_sees_the_wall(tmp_path: Pat
     ("stations", "source", "viewpoint", "side_from"),
     [
         ([], "file", "guess", ()),
-        # In the plane of the larger one it decides nothing about that.
+        # A station in the plane of the larger wall does not determine the side of this wall.
         ([(0.0, 2.0, 0.0)], "file", "stations", ("guess", "stations")),
         ([(0.0, 2.0, 0.0), (0.0, 0.5, 0.0)], "file", "stations", ()),
         ([(0.0, 2.0, 0.0)], "view_from", "view_from", ("guess", "given")),
@@ -211,7 +215,7 @@ def test_sides_that_no_station_knows_are_guessed(
 ) -> None:
     planes = two_walls(tmp_path, *stations, source=source)
     assert (planes.viewpoint, planes.side_from) == (viewpoint, side_from)
-    # The other wall lies before each of them.
+    # For each of them, the other wall is in front.
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
 
 
@@ -223,7 +227,7 @@ def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
     rng = np.random.default_rng(3)
     cloud = prepared(rng.uniform(-1.0, 1.0, (3_000, 3)), parts=parts)
     seen = cloud.sample.offsets_m
-    # Level planes at -0.5, 0 and 0.5; the last has no points.
+    # The planes are level, at -0.5, 0 and 0.5; the last has no points.
     heights = np.array([-0.5, 0.0, 0.5])
     slabs = np.array([[0, 0, 1.0, h, 1.0, 0, 0, 0.1, 0, 1.0, 0, -0.2] for h in heights])
     find_m, fit_m = 0.2, 0.1
@@ -246,7 +250,7 @@ def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
         sides = [u[held].min(), u[held].max(), v[held].min(), v[held].max()]
         np.testing.assert_allclose(found.extents_m[k], sides, atol=1e-6)
     assert (found.n_points[2], found.rms_m[2], found.mean_fit_m[2]) == (0, 0.0, 0.0)
-    # Without points near it a plane reaches as far as its rectangle.
+    # Without points near it, a plane extends as far as its rectangle.
     np.testing.assert_array_equal(found.extents_m[2], bounds[2])
 
 
@@ -265,7 +269,7 @@ def test_normal_deviations_have_the_moments_and_shares_of_a_normal_distribution(
     assert shape.sigma_m == pytest.approx(sigma_m, rel=0.005)
     assert shape.skewness == pytest.approx(0.0, abs=0.03)
     assert shape.excess_kurtosis == pytest.approx(0.0, abs=0.06)
-    # Bins of 0.5 mm are read as evenly filled, which matters where sigma is not much wider.
+    # Bins of 0.5 mm are assumed to be evenly filled, which matters if sigma is not much larger.
     np.testing.assert_allclose(shape.within, [0.6827, 0.9545, 0.9973], atol=0.02)
     np.testing.assert_allclose(shape.found_sigmas[5:-5], shape.expected_sigmas[5:-5], atol=0.12)
 
@@ -281,12 +285,12 @@ def test_relief_shows_as_skewness_and_heavy_tails_and_evenness_as_light_ones() -
     even = shape_of(rng.uniform(-0.015, 0.015, 200_000))
     assert even.excess_kurtosis == pytest.approx(-1.2, abs=0.02)
     assert even.sigma_m == pytest.approx(0.015 / np.sqrt(3.0), rel=0.01)
-    # Few points or a single bin have no distribution.
+    # Few points, or points in a single bin, have no distribution.
     assert shape_of(rng.normal(0.0, 0.002, 50)) is None
     assert shape_of(np.full(1000, 1e-4)) is None
 
 
-# A wall of 6 x 3 m at y = 2, seen from the middle of a room.
+# The wall of 6 x 3 m at y = 2 is seen from the middle of a room.
 STATION = np.array([[0.0, 0.0, 0.0]])
 N_POINTS = 90_000
 
@@ -308,7 +312,8 @@ def test_thickness_is_the_noise_and_not_the_bow(
     noise_m: float, bow_m: float, tmp_path: Path
 ) -> None:
     _, metrics = measured(cloud_of(wall(noise_m, bow_m=bow_m), stations=STATION), tmp_path)
-    # 50 points in a tile, 90 000 in all: half a percent; a bow of 6 mm slopes little in a tile.
+    # With 50 points per tile and 90,000 in total, the error is half a per cent; a bow of 6 mm
+    # causes little slope in a tile.
     assert metrics["thickness_mm"] == pytest.approx(1000.0 * noise_m, rel=0.03)
     assert metrics["thickness_width_mm"] == pytest.approx(3.92 * 1000.0 * noise_m, rel=0.03)
     assert metrics["thickest_mm"] == metrics["thickness_mm"]
@@ -328,7 +333,7 @@ def test_noise_that_grows_with_incidence_and_range_is_given_by_class(tmp_path: P
     sigmas = [item.sigma_m for item in classes.range_m]
     assert sigmas == sorted(sigmas)
     assert sum(item.n_points for item in classes.range_m) > 0.95 * N_POINTS
-    # A view point that was stated is no station.
+    # A viewpoint given by the user is not a station.
     cloud = cloud_of(wall(noise_m), stations=STATION, source="view_from")
     (classes,) = measured(cloud, tmp_path)[0].thickness
     assert (classes.incidence_deg, classes.range_m) == ((), ())
@@ -341,7 +346,7 @@ def test_materials_have_a_thickness_each_on_the_plane_and_along_a_row(tmp_path: 
     cloud = dataclasses.replace(
         cloud_of(wall(np.where(fabric, 0.004, 0.001))),
         intensity=intensity.astype(np.float32),
-        # Row 3 of the second scan has most points.
+        # Row 3 of the second scan has the most points.
         row=np.repeat([*range(30), 3], [2900] * 30 + [3000]).astype(np.uint32),
         scan=np.repeat([0, 1], [2900 * 30, 3000]).astype(np.uint16),
         column=np.zeros(N_POINTS, dtype=np.uint32),
@@ -354,7 +359,7 @@ def test_materials_have_a_thickness_each_on_the_plane_and_along_a_row(tmp_path: 
         assert spreads[0].sigma_m == pytest.approx(0.004, rel=rel)
         assert spreads[1].sigma_m == pytest.approx(0.001, rel=rel)
     assert (row.row, row.scan, row.n_points) == (3, 1, 3000)
-    # Without numbers of scans a row is one of all scans; without rows there is none.
+    # Without scan numbers, a row is that of all scans; without rows, there is none.
     blind = dataclasses.replace(cloud, scan=None)
     assert measured(blind, tmp_path)[0].scan_row.n_points == 5900
     assert measured(dataclasses.replace(blind, row=None), tmp_path)[0].scan_row is None
@@ -370,7 +375,7 @@ def test_materials_that_overlap_or_fall_are_refused() -> None:
 
 
 SURVEY = (634512.347, 486215.781, 112.193)
-# The wall at y = -2, and the floor.
+# The planes are the wall at y = -2, and the floor.
 TRIPLE: dict[str, Any] = {"points": ((-3.0, -2.0, -1.5), (3.0, -2.0, -1.5), (0.0, -2.0, 1.5))}
 FAR: dict[str, Any] = {"normal": (0.0, 1.0, 0.0), "offset_m": 10.0}
 TWO: tuple[dict[str, Any], ...] = (TRIPLE, {"horizontal": True, "height_m": -1.5})
@@ -393,7 +398,7 @@ def test_a_given_normal_is_kept_with_its_side_and_what_is_near_is_labelled(
     assert not out.planes.covariance.any()
     near = np.abs(points[:, 1] + 2.0) <= 0.03
     labels = out.labels.plane_index
-    assert np.count_nonzero((labels == 0) != near) <= 3  # float32 offsets at the very border
+    assert np.count_nonzero((labels == 0) != near) <= 3  # float32 offsets exactly at the limit
     assert out.planes.n_points[0] == np.count_nonzero(labels == 0)
     rms_m = np.sqrt(np.mean((points[near, 1] + 2.0) ** 2))
     assert out.planes.rms_m[0] == pytest.approx(rms_m, abs=1e-5)
@@ -417,7 +422,7 @@ def test_a_horizontal_plane_lies_below_the_scene_or_at_the_height_given(tmp_path
     np.testing.assert_array_equal(planes.normal[0], [0.0, 0.0, 1.0])
     assert planes.offset[0] == pytest.approx(-1.5, abs=0.01)
     assert planes.names == ("floor 0",)
-    # The front wall leans outwards by 1 cm.
+    # The front wall is inclined outwards by 1 cm.
     np.testing.assert_allclose(planes.corners[0].min(axis=0)[:2], [-3.0, -2.0], atol=0.02)
     np.testing.assert_allclose(planes.corners[0].max(axis=0)[:2], [3.0, 2.0], atol=0.02)
     cloud = cloud_of(sampled(), origin=SURVEY)
@@ -465,7 +470,7 @@ def test_several_planes_are_those_that_each_alone_would_be(tmp_path: Path) -> No
     points = sampled()
     cloud = cloud_of(points, stations=np.array([[0.0, 1.0, 0.0]]))
     both = lay(cloud, tmp_path / "both", planes=TWO, tolerance_m=0.05)
-    # By the number of their points, as everywhere: the floor has more.
+    # Planes are ordered by the number of their points, as in all results, and the floor has more.
     assert both.planes.names == ("floor 0", "wall 1")
     for place, stated in zip((1, 0), TWO, strict=True):
         alone = lay(cloud, tmp_path, tolerance_m=0.05, **stated)
@@ -474,7 +479,7 @@ def test_several_planes_are_those_that_each_alone_would_be(tmp_path: Path) -> No
                 getattr(both.planes, name)[place], getattr(alone.planes, name)[0], err_msg=name
             )
     assert set(both.planes.part_plane.tolist()) == {0, 1}
-    # A point near both belongs to the nearer.
+    # A point near both planes belongs to the nearer one.
     to_wall, to_floor = np.abs(points[:, 1] + 2.0), np.abs(points[:, 2] + 1.5)
     disputed = (to_wall < 0.049) & (to_floor < 0.049) & (np.abs(to_wall - to_floor) > 1e-5)
     assert disputed.sum() > 10
@@ -485,7 +490,7 @@ def test_several_planes_are_those_that_each_alone_would_be(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("params", "right_m"),
-    # By default three tolerances: 15 cm, 36 cm.
+    # The default is three tolerances, which are 15 cm and 36 cm.
     [({}, 1.0), ({"tolerance_m": 0.12}, 2.0), ({"tolerance_m": 0.12, "buffer_m": 0.2}, 1.0)],
 )
 def test_the_rectangle_spans_what_lies_within_the_buffer(
@@ -502,7 +507,7 @@ def test_the_rectangle_spans_what_lies_within_the_buffer(
 def test_a_plan_reports_parts_that_it_leaves_out_and_takes_them_when_asked(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     ground = rng.uniform([0.0, 0.0, 0.0], [6.0, 4.0, 0.02], (60_000, 3))
-    # A hut apart from the rest, on half a per cent of the area.
+    # A hut on half a per cent of the area is separate from the rest.
     hut = rng.uniform([8.0, 6.0, 0.0], [8.4, 6.3, 0.02], (400, 3))
     cloud = cloud_of(np.vstack([ground, hut, [[8.4, 6.3, 0.0]]]))
     for params, corner, n_warnings in (({}, [6.0, 4.0], 1), ({"part_min_share": 0}, [8.4, 6.3], 0)):
