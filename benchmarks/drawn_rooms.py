@@ -358,7 +358,7 @@ def main() -> None:
     made = (
         f"Measured on {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} ({platform.machine()}, "
         f"{os.cpu_count()} cores, Python {platform.python_version()}). The two sets of "
-        f"seeds contain {', '.join(stated)}"
+        f"seeds define {', '.join(stated)}"
     )
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)

@@ -283,7 +283,8 @@ def _commands() -> Iterator[str]:
         "`~/.zshrc`, or `fish_source`):\n\n"
         '```sh\neval "$(_ORTHOFLOW_COMPLETE=bash_source orthoflow)"\n```\n'
     )
-    with click.Context(program, info_name="orthoflow", terminal_width=100) as context:
+    settings = program.context_settings
+    with click.Context(program, info_name="orthoflow", terminal_width=100, **settings) as context:
         yield from _command(program, context)
 
 

@@ -120,7 +120,7 @@ def called(words: Sequence[str]) -> dict[str, Any]:
         UsageError: the program would refuse them.
     """
     command: click.Command = program
-    context = click.Context(program, info_name="orthoflow")
+    context = click.Context(program, info_name="orthoflow", **program.context_settings)
     # What is left open or for a reader to choose.
     filled = {"N": "1", "FORMAT": "csv", "...": ""}
     bare = (word.strip("[]") for word in words)
