@@ -15,12 +15,12 @@ __all__ = ["__version__", "open_run", "open_runs", "run"]
 
 
 def __dir__() -> list[str]:
-    # What is loaded on first use is there for `help` and for completion, too.
+    # Names that are imported on first use must also be listed for `help` and completion.
     return sorted({*globals(), *__all__})
 
 
 def __getattr__(name: str) -> object:
-    # Lazy: `orthoflow --help` must not load numpy and h5py for a name it never uses.
+    # Imported on first use, so that `orthoflow --help` does not load numpy and h5py.
     if name in ("open_run", "open_runs"):
         from orthoflow.report import notebooks  # noqa: PLC0415
 

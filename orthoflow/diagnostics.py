@@ -1,7 +1,7 @@
 """Diagnostics as data: declared once with a code, and grouped and ordered by it.
 
 A method declares a `DiagnosticSpec` and reports it with `ctx.report(SPEC, subject=..., **values)`.
-Terminal, report and record use code, severity and values; no code parses the text.
+The terminal, the report and the record use the code, severity and values; no code parses the text.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ class DiagnosticSpec:
     def __post_init__(self) -> None:
         if not _CODE.fullmatch(self.code):
             raise ProductError(
-                f"the code of a diagnostic is lower-case words with `-` between, got {self.code!r}"
+                "the code of a diagnostic must be lower-case words joined by `-`, got "
+                f"{self.code!r}"
             )
         if self.severity not in _ORDER:
             raise ProductError(
@@ -92,13 +93,15 @@ class DiagnosticSpec:
             )
         except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
             raise ProductError(
-                f"diagnostic {self.code} cannot be written: {type(error).__name__}: {error}; it "
-                f"was given {', '.join(values) or 'no values'}"
+                f"diagnostic {self.code} cannot be formatted: {type(error).__name__}: {error}; "
+                f"its values are {', '.join(values) or 'none'}"
             ) from error
         plain = {name: _plain(self.code, name, value) for name, value in values.items()}
         rank = plain.get(self.rank_by.removeprefix("-"))
         if self.rank_by and (isinstance(rank, str) or rank is None):
-            raise ProductError(f"diagnostic {self.code} is ranked by {self.rank_by}, got {rank!r}")
+            raise ProductError(
+                f"diagnostic {self.code} is ranked by {self.rank_by}, not a number: {rank!r}"
+            )
         return Diagnostic(
             code=self.code,
             severity=self.severity,
@@ -140,7 +143,7 @@ class DiagnosticGroup:
 
     @property
     def where(self) -> str:
-        """The first address, and the number of further ones."""
+        """The first address, and the number of further addresses."""
         return first_few(self.places, most=1)
 
 
@@ -244,12 +247,12 @@ class _StepPlaceholder:
 
 
 _FORMATTER: Final = string.Formatter()
-# Spec of `ctx.warn`, which has a text only.
+# Spec of `ctx.warn`, which has only a text.
 PLAIN_WARNING: Final = DiagnosticSpec(code="warning", severity="warning", text="{text}")
 TOO_MANY: Final = DiagnosticSpec(
     code="more-diagnostics",
     severity="note",
-    text="{n:,} more diagnostics of this step are not kept",
+    text="{n:,} more diagnostics of this step were discarded",
     rank_by="n",
 )
 
@@ -270,7 +273,7 @@ def _plain(code: str, name: str, value: object) -> Value:
     if plain is None or isinstance(plain, bool | int | float):
         return plain
     raise ProductError(
-        f"value {name} of diagnostic {code} must be a number or a text, got {type(value).__name__}"
+        f"value {name} of diagnostic {code} must be a number or text, got {type(value).__name__}"
     )
 
 

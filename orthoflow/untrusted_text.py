@@ -1,4 +1,4 @@
-"""Text from records, plugins and files, made harmless where it leaves: terminal, page, table."""
+"""Escaping of untrusted text for terminals, pages and tables, and reading of text files."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from orthoflow.errors import InputError
 
 Value: TypeAlias = str | int | float | None
 
-# Controls, marks of direction and other letters without a shape, halves of letters, line ends.
+# Unicode categories: control characters, invisible format characters, surrogates, line ends.
 _UNSEEN: Final = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
-# They join letters in Persian and Indian scripts, and the parts of an emoji.
+# Format characters that join letters in Persian and Indian scripts, and the parts of emoji.
 _JOINERS: Final = "\u200c\u200d"
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE | re.ASCII)
-# The wide forms of = + - @, which some programs read as these.
+# Full-width forms of = + - @, which some programs treat like the plain characters.
 _WIDE: Final = ("\uff1d", "\uff0b", "\uff0d", "\uff20")
-# What spreadsheets take for the beginning of a formula, and the mark that is put before one.
+# First characters that make spreadsheets treat a cell as a formula, and the apostrophe that
+# prevents this.
 _FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", *_WIDE, "'")
-# Before what another reader takes for the beginning of a formula: a separator or line end, and
-# what it may strip. Numbers up to the next separator are none.
+# A separator or line end, with quotes and spaces that a reader may strip, before the beginning of a
+# formula. A number that extends to the next separator is not a formula.
 _INNER_CELL: Final = re.compile(
     rf"""[,;|\t\r\n] [\s"']*
     (?=[=@{"".join(_WIDE)}] | [+-] (?!(\d+\.?\d*|\.\d+)(e[+-]?\d+)?[\s"']*([,;|\t\r\n]|$)))""",
@@ -37,11 +38,11 @@ _INNER_CELL: Final = re.compile(
 
 
 def shown(text: str, *, keep: str = "") -> str:
-    r"""Escape control characters, marks of text direction and other invisible letters.
+    r"""Escape control characters, text direction marks and other invisible characters.
 
     Args:
-        text: any text, also with halves of surrogate pairs.
-        keep: letters that stay, such as the line ends of a text of many lines.
+        text: any text; it may contain unpaired surrogates.
+        keep: characters that are not escaped, such as the line ends of a text with several lines.
 
     >>> print(shown("a\x1b[2Jb\u202etxt.exe\n"), shown("one\ntwo", keep="\n"))
     a\x1b[2Jb\u202etxt.exe\n one
@@ -55,7 +56,7 @@ def shown(text: str, *, keep: str = "") -> str:
 
 
 def shown_json(text: str) -> str:
-    r"""Do the same to JSON, which stays the same JSON.
+    r"""Escape the same characters in JSON, without changing its values.
 
     >>> print(shown_json('{"name": "a\x9b\u202e"}'))
     {"name": "a\u009b\u202e"}
@@ -69,14 +70,13 @@ def shown_json(text: str) -> str:
 
 
 def csv_text(rows: Iterable[Sequence[Value]]) -> str:
-    r"""Write rows as CSV in which no reader finds a formula, whatever it separates by.
+    r"""Write rows as CSV that no program interprets as formulas, whatever separator it assumes.
 
-    Spreadsheets separate by `,`, `;` or tab, as the country or the user has it, and each sees other
-    cells. Text is therefore quoted, and what could begin a cell and is one of `= + - @`, a tab, a
-    line end or an apostrophe gets an apostrophe before it, unless the cell is a number: at the
-    beginning of a text, and in it behind a separator or a line end, with quotes or spaces between.
-    Who reads the table takes the first apostrophe of a cell away. Numbers stay numbers, with every
-    digit that they have.
+    Depending on country and settings, spreadsheets split a line at `,`, `;` or tabs. Text is
+    therefore quoted. An apostrophe is inserted before `= + - @`, tabs, line ends and apostrophes at
+    the beginning of a text, unless the text is a number, and before `= + - @` after a separator or
+    line end inside a text, also if quotes or spaces are in between. To restore a text, remove these
+    apostrophes. Numbers are written with all their digits.
 
     >>> csv_text([("name", "value"), ("=1+1", -2.5), ("a;=1+1", None)])
     '"name","value"\n"\'=1+1",-2.5\n"a;\'=1+1",\n'
@@ -112,7 +112,8 @@ def parse_json(text: str) -> object:
     """Parse JSON.
 
     Raises:
-        ValueError: it is no JSON, nested too deeply, or has a number of too many digits.
+        ValueError: the text is not JSON, is nested too deeply, or contains a number with too many
+            digits.
     """
     try:
         return json.loads(text, parse_constant=_refuse_constant)
@@ -121,10 +122,10 @@ def parse_json(text: str) -> object:
 
 
 def json_bytes(value: object, *, indent: int | None) -> bytes:
-    r"""Write JSON as UTF-8 for people; halves of letters, which UTF-8 has not, as escapes.
+    r"""Write readable JSON in UTF-8; unpaired surrogates, which UTF-8 does not allow, are escaped.
 
     Raises:
-        ValueError: it holds a number that is not finite.
+        ValueError: the value contains a number that is not finite.
 
     >>> json_bytes(["\xe9", "\ud800"], indent=None).decode()
     '["é", "\\ud800"]'
@@ -138,7 +139,7 @@ def _refuse_constant(constant: str) -> NoReturn:
 
 
 def open_file(path: Path) -> BufferedReader:
-    """Open a file for reading, at once.
+    """Open a file for reading without blocking.
 
     Raises:
         OSError: it cannot be read, or is a folder, a pipe or a device.
@@ -152,19 +153,20 @@ def open_file(path: Path) -> BufferedReader:
 
 @contextmanager
 def reading(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> Iterator[None]:
-    """State what is wrong with a file that is opened and read in here, as an `InputError`.
+    """Convert errors of opening and reading a file in the block into an `InputError`.
 
     Args:
         path: the file.
-        most_bytes: a larger one is not read.
-        what: it should be, e.g. `a title block (YAML)`.
-        way_out: for those whose file is too large.
+        most_bytes: maximum size; a larger file is refused.
+        what: expected content, e.g. `a title block (YAML)`.
+        way_out: remedy for a file that is too large, as the end of the message.
     """
     try:
         n_bytes = path.stat().st_size
         if n_bytes > most_bytes:
             raise InputError(
-                f"{path.name} has {n_bytes} bytes, {what} at most {most_bytes}{way_out}"
+                f"{path.name} has {n_bytes} bytes, but {what} may have at most "
+                f"{most_bytes}{way_out}"
             )
         yield
     except UnicodeDecodeError as error:
@@ -172,11 +174,11 @@ def reading(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> Ite
             f"{path.name} is not UTF-8 text: expected {what}; save it as UTF-8"
         ) from error
     except OSError as error:
-        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+        raise InputError(f"cannot read {path.name}: {error.strerror}") from error
 
 
 def open_text(path: Path) -> TextIOWrapper:
-    """Open a text, UTF-8 with or without a mark at its beginning.
+    """Open a UTF-8 text file, with or without a byte order mark.
 
     Raises:
         OSError: it cannot be read, or is a folder, a pipe or a device.
@@ -185,17 +187,17 @@ def open_text(path: Path) -> TextIOWrapper:
 
 
 def text_of_file(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> str:
-    """Read a text whole, with the arguments of `reading`.
+    """Read a whole text file, with the arguments of `reading`.
 
     Raises:
-        InputError: it cannot be read, is no text, or is too large.
+        InputError: the file cannot be read, is not text, or is too large.
     """
     with reading(path, most_bytes, what, way_out=way_out), open_text(path) as stream:
         return stream.read()
 
 
 def first_few(names: Sequence[str], most: int = 3) -> str:
-    """Name the first few, and count the others.
+    """List the first few names, and count the others.
 
     >>> first_few(["a", "b", "c", "d", "e"]), first_few(["a", "b"], most=1)
     ('a, b, c and 2 more', 'a and 1 more')

@@ -1,5 +1,5 @@
-"""Name and version of this release, for what is written into files."""
+"""Name and version of this release, as written into files."""
 
-# What pip calls it.
+# Name of the distribution on package indexes.
 DISTRIBUTION = "orthoflow-tls"
 __version__ = "0.2.0"

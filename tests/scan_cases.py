@@ -422,7 +422,7 @@ def e57_colour_limit_wrong(draw: Draw) -> Case:
     scene = draw.scene
     rgb = scene.rgb.astype(np.float64) * scale
     path = write_scene(draw.path("e57"), scene, grey=scene.reflectance, rgb=rgb, rgb_limit=limit)
-    warnings = (str(limit), "colours reach at most")
+    warnings = (str(limit), "the file declares colours up to")
     return Case(scene, [path], rgb=True, intensity="linear", warnings=warnings)
 
 

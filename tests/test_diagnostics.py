@@ -75,7 +75,7 @@ def test_values_are_plain_and_texts_one_printable_line() -> None:
 
 @pytest.mark.parametrize(
     ("values", "named"),
-    [({}, "KeyError"), ({"n": [1]}, "must be a number or a text"), ({"n": "few"}, "ranked by -n")],
+    [({}, "KeyError"), ({"n": [1]}, "must be a number or text"), ({"n": "few"}, "ranked by -n")],
 )
 def test_values_that_do_not_fit_are_refused_with_the_code(
     values: dict[str, object], named: str

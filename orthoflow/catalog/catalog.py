@@ -75,8 +75,8 @@ class Announced:
         distribution: distribution that declares it; the first one in a clash.
         state: `clash` if several declare it and none takes precedence; `broken` if it cannot be
             used.
-        problem: one sentence with the distributions concerned; for a usable entry, who else
-            declares it.
+        problem: one sentence with the distributions concerned; for a usable entry, the other
+            distributions that declare it.
     """
 
     distribution: DistributionInfo

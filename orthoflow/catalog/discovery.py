@@ -42,7 +42,7 @@ from orthoflow.sdk.hooks import (
 from orthoflow.sdk.lines import describe_error
 from orthoflow.version import DISTRIBUTION
 
-# Windows reserves the first ones for devices, and files are named after methods and steps.
+# The excluded names are devices of Windows, and files are named after methods and steps.
 NAME_PATTERN: Final = (
     r"(?!(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?![a-z0-9_-]))[a-z][a-z0-9_-]{0,31}"
 )
@@ -201,7 +201,7 @@ def _collect_products(
         spec, distribution = claims[0]
         problem = ""
         if len({(other.target, other.publisher) for other, _ in claims}) > 1:
-            used = f"the one of {distribution.name} is used"
+            used = f"the definition in {distribution.name} is used"
             problem = _contested(f"product type {name}", claims, used)
         entries[name] = ProductEntry(spec=spec, distribution=distribution, problem=problem)
     return entries
@@ -218,7 +218,7 @@ def _collect_kinds(
         if not problem and any(_ports(other) != _ports(spec) for other, _ in claims):
             # Identical ports are harmless: two plugins may declare the same kind.
             problem = _contested(
-                f"kind {name}", claims, "methods have the ports declared by their own plugin"
+                f"kind {name}", claims, "each method has the ports that its own plugin declares"
             )
         entries[name] = KindEntry(
             spec=spec, distribution=distribution, state=state, problem=problem

@@ -41,7 +41,7 @@ def guarded() -> Iterator[None]:
         sys.setrecursionlimit(limit)
         if left < limit:
             # This replaces a RecursionError caused by the lower limit.
-            raise PluginError(f"it lowers Python's recursion limit from {limit} to {left}")
+            raise PluginError(f"the plugin lowers Python's recursion limit from {limit} to {left}")
 
 
 @contextmanager

@@ -38,7 +38,7 @@ cache: Final[click.Command] = LazyGroup(
 @store_option
 @json_option
 def cache_list(store: Path, *, as_json: bool) -> int:
-    """List the stored results, last used first.
+    """List the stored results, most recently used first.
 
     A product shared by several results is stored once, but counted for each.
     """
@@ -72,7 +72,7 @@ def cache_list(store: Path, *, as_json: bool) -> int:
     "--older-than",
     type=float,
     metavar="DAYS",
-    help="Also remove results that no run used for this many days; 0 removes all.",
+    help="Also remove results that no run has used for this many days; 0 removes all.",
 )
 @click.option("--dry-run", is_flag=True, help="Only show what would be removed.")
 @json_option

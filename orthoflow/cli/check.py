@@ -15,7 +15,7 @@ from orthoflow.errors import OrthoflowError
 @workflow_arguments
 @json_option
 def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
-    """Report all mistakes in WORKFLOW, a file or the name of a shipped one.
+    """Report all mistakes in WORKFLOW, a file or the name of a shipped workflow.
 
     All problems are reported in one pass, as file:line:column: path: message; input files are
     searched for as well. Warnings mark valid but probably unintended settings. The exit code is 2
@@ -54,7 +54,7 @@ def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
     if not is_plain(cells):
         parts.append(f"{counted(len(cells), 'step run')} in total")
     if skipped:
-        parts.append(f"{skipped} skipped because optional data are missing")
+        parts.append(f"{skipped} skipped because optional inputs are missing")
     # In a sweep, the user chose no baseline, so none is shown.
     if named := variants_text(loaded.baseline):
         parts.append(f"baseline {named}")

@@ -104,7 +104,7 @@ class RecordCommand(Command):
             for path in self._runs(ctx):
                 if findings := verify_run(path, also_published=False).findings:
                     raise RecordError(
-                        f"{path} was changed after it was written: {findings[0]}"
+                        f"{path} has been changed since it was written: {findings[0]}"
                     ) from error
             raise
 
@@ -255,7 +255,7 @@ _workflow_options = _together(
         "--datasets",
         default="",
         metavar="FILE",
-        help="Run on each dataset of a CSV file with a column name and a column per input.",
+        help="Run on each dataset of a CSV file with the column `name` and a column per input.",
     ),
     click.option(
         "--only-data",
@@ -270,11 +270,18 @@ selection_options = _together(
     *(
         click.option(option, name, metavar="STEP", multiple=True, help=f"{text} Repeatable.")
         for option, name, text in (
-            ("--only", "only", "Run this step and the steps that it needs, unless stored."),
+            (
+                "--only",
+                "only",
+                "Run this step and the steps that it needs, unless their results are stored.",
+            ),
             (
                 "--from",
                 "from_",
-                "Run this step, all that depend on it, and steps that these need, unless stored.",
+                (
+                    "Run this step, all steps that depend on it, and the steps that these need, "
+                    "unless their results are stored."
+                ),
             ),
             (
                 "--until",
@@ -294,8 +301,8 @@ execution_options = _together(
         "--executor",
         type=click.Choice(["local", "inline", "dask"]),
         default="local",
-        help="One process per step, all steps in this process (for debugging; the memory of a "
-        "step then includes that of earlier ones), or dask workers.",
+        help="local: a process for each step; inline: all steps in this process, for debugging "
+        "(the memory of a step then includes that of earlier steps); dask: Dask workers.",
     ),
     click.option(
         "--scheduler",

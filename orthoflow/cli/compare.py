@@ -37,10 +37,10 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
 
     Shows differences in inputs, workflows, parameters, versions and environments, and how far
     metrics and products differ. Steps are paired by address, or else by the methods and parameters
-    of all varied steps before them. Differences by rounding (a millionth) are omitted, and
-    identical differences of several steps or repeats share a row; --json contains all values, also
-    times and memory. The exit code is 3 if the seal of a record is broken; `orthoflow verify`
-    also checks large arrays, which are not read here if their digests are the same.
+    of all varied steps upstream. Differences by rounding (a millionth) are omitted, and identical
+    differences of several steps or repeats share a row; --json contains all values, including times
+    and memory. The exit code is 3 if the seal of a record is broken; `orthoflow verify` also checks
+    large arrays, which are not read here if their digests are the same.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.compare import compare_runs
@@ -92,7 +92,7 @@ def _print(comparison: RunComparison, *, most: int | None) -> None:
     if comparison.workflow:
         echo("", "workflow, A (-) against B (+)", *comparison.workflow[2:])
     for table in differences(comparison):
-        alone = f", {table.n_alone} in one run only" if table.n_alone else ""
+        alone = f", {table.n_alone} in only one run" if table.n_alone else ""
         counts = f"{table.n_different} of {table.n_compared} differ{alone}"
         echo("", f"{table.title}: {counts if table.rows else 'the same'}{table.whose}")
         rows = [

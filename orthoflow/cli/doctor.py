@@ -38,7 +38,7 @@ _MIN_MEMORY_BYTES: Final = 2 * 1024**3
 _CORE: Final = frozenset(
     {"click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich", "ruamel-yaml"}
 )
-# Imported modules, where they are not named as their distribution.
+# Modules whose names differ from those of their distributions.
 _MODULES: Final[Mapping[str, str]] = {
     "fonttools": "fontTools",
     "open3d-cpu": "open3d",
@@ -112,7 +112,7 @@ def _print(findings: list[Finding], *, is_broken: bool) -> None:
     costs = [f"- {item.name}: {item.cost}" for item in findings if item.cost]
     if costs:
         echo("", "Consequences:", *costs)
-    restricted = f"orthoflow works, with {counted(len(costs), 'restriction')}"
+    restricted = f"orthoflow works with {counted(len(costs), 'restriction')}"
     echo("", "a required part is missing" if is_broken else restricted)
 
 
@@ -178,7 +178,7 @@ def _store(store: Path) -> Iterator[Finding]:
     places = (store.absolute(), *store.absolute().parents)
     folder = next(place for place in places if place.is_dir())
     free = shutil.disk_usage(folder).free
-    cost = "long runs may fill it (orthoflow cache gc, or --store DIR)"
+    cost = "long runs may fill it (free space with `orthoflow cache gc`, or set --store DIR)"
     yield _enough("disk of the store", free, _MIN_DISK_BYTES, cost)
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -207,8 +207,8 @@ def _plugins() -> Iterator[Finding]:
         name = f"plugin {broken.entry_point}"
         yield Finding(name, "missing", f"{broken.distribution} cannot be loaded", cost)
     for name in catalog.disabled:
-        cost = f"its methods are missing: it is disabled by {DISABLED}"
-        yield Finding(f"plugin {name}", "limited", "switched off", cost)
+        cost = f"its methods are missing: the plugin is disabled by {DISABLED}"
+        yield Finding(f"plugin {name}", "limited", "disabled", cost)
     looked_at = [entry.looked_at() for entry in catalog.methods.values()]
     entries = (*catalog.products.values(), *catalog.kinds.values(), *looked_at)
     for problem in dict.fromkeys(entry.problem for entry in entries if entry.problem):

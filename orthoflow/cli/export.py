@@ -42,7 +42,7 @@ _STEPWISE: Final = (
 
 # Any: options accept any click parameter.
 def _for(formats: str, *names: str, help: str, **more: Any) -> Callable[[_Command], _Command]:
-    """Add an option that applies to some formats only."""
+    """Add an option that applies only to some formats."""
     text = f"{formats.replace(' ', ', ')}: {help}"
     return click.option(*names, cls=FormatOption, formats=formats.split(), help=text, **more)
 
@@ -57,8 +57,8 @@ _HELP: Final = "\n\n".join(
             "by their content: at the paths given with --input, or where `replay` looks for them."
         ),
         (
-            "--split: for a run on several datasets, a run folder for each, with record, report "
-            "and products."
+            "--split: for a run on several datasets, a run folder for each dataset, with its "
+            "record, report and products."
         ),
     ]
 )
@@ -114,15 +114,17 @@ _HELP: Final = "\n\n".join(
     _DRAWN,
     "--paper",
     metavar="PAPER",
-    help="A0 to A4, an elongated size as A3.1 (297 x 841 mm), or width x height in mm as 700x500; "
-    "by default the smallest on which each drawing fits (without --scale at most A3).",
+    help="paper size: A0 to A4, an elongated size such as A3.1 (297 x 841 mm), or width x height "
+    "in mm, such as 700x500; by default the smallest for each drawing (without --scale at most "
+    "A3).",
 )
 @_for(
     "plan section sheet",
     "--grid",
     type=click.FloatRange(min=0.0),
     metavar="DISTANCE",
-    help="spacing of the grid crosses in --units, 0 for none; by default about 2 cm on the paper.",
+    help="spacing of grid crosses in the unit of --units (0: none); by default about 2 cm on the "
+    "paper.",
 )
 @_for(
     "sheet",
@@ -153,14 +155,14 @@ _HELP: Final = "\n\n".join(
     type=float,
     multiple=True,
     metavar="METRES",
-    help="height of the cut above the floor, 1.2 by default; repeatable.",
+    help="height of the cut above the floor in metres, 1.2 by default; repeatable.",
 )
 @_for(
     "section",
     "--through",
     multiple=True,
     metavar="X,Y,X,Y",
-    help="two points of the plan, in metres in scan coordinates; seen by the viewer, the first is "
+    help="two points of the plan, in metres in scan coordinates; the viewer sees the first point "
     "on the left; repeatable.",
 )
 @_for("plan section", "--dimensions", is_flag=True, help="write lengths next to the lines.")
@@ -189,16 +191,16 @@ _HELP: Final = "\n\n".join(
     "--format",
     "figure_format",
     type=click.Choice(["pdf", "svg", "png"]),
-    help="format of charts and drawings, png with 300 dpi; svg by default. Pictures are written as "
-    "PDF pages with pdf, and as PNG otherwise.",
+    help="format of charts and drawings, png with 300 dpi; svg by default. With pdf, pictures "
+    "are written as PDF pages; otherwise they are written as PNG.",
 )
 @_for(
     _CLOUDS,
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
-    help="colours from the oriented photos (grey if no photo shows the point), colours of the "
-    "scan, its intensity, a colour per plane, or blue behind and red in front of the plane; by "
-    "default the first of these that is available.",
+    help="colour of the points, from the oriented photos (grey if no photo shows the point), the "
+    "colours of the scan, its intensity, the plane (a colour for each), or the deviation from the "
+    "plane (blue behind, red in front of it); by default the first of these that is available.",
 )
 @_for(
     f"{_CLOUDS} dxf geojson gltf tiles relief iiif sheet",
@@ -234,7 +236,7 @@ _HELP: Final = "\n\n".join(
     "export/datasets).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
-    """Write the results of a run for other programs; 3 if the seal of the record is broken."""
+    """Write results of a run for other programs; return 3 if the seal of the record is broken."""
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records.open import open_run
@@ -262,7 +264,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
 
 
 def format_options() -> list[FormatOption]:
-    """Return the options that apply to some formats only."""
+    """Return the options that apply only to some formats."""
     return [option for option in export.params if isinstance(option, FormatOption)]
 
 

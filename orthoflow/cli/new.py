@@ -75,7 +75,7 @@ def _write(output: Path, text: str) -> None:
         with output.open("x", encoding="utf-8") as stream:
             stream.write(text)
     except OSError as error:
-        raise ArgumentError(f"{output} cannot be written: {error.strerror}") from error
+        raise ArgumentError(f"cannot write {output}: {error.strerror}") from error
 
 
 def _print(draft: Draft, output: Path) -> None:

@@ -28,7 +28,7 @@ from orthoflow.cli.commands import (
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 
 _SUMMARIES: Final = {
-    "list": "List all methods, and problems of plugins that cannot be loaded.",
+    "list": "List all methods, and the plugins that cannot be loaded.",
     "show": "Show a method's parameters, ports, origin and citations.",
     "new": "Write a working plugin with tests, as a basis for your own.",
     "check": "Run the conformance suite on a method.",
@@ -231,7 +231,12 @@ def _metric_text(spec: Mapping[str, str]) -> str:
 @click.command("new", cls=Command)
 @click.argument("name", metavar="NAME")
 @click.option("--kind", default="", metavar="KIND", help="Kind of the method, e.g. plane.")
-@click.option("--new-kind", default="", metavar="KIND", help="A new kind instead, e.g. mark.")
+@click.option(
+    "--new-kind",
+    default="",
+    metavar="KIND",
+    help="Name of a new kind, instead of --kind, e.g. mark.",
+)
 @click.option(
     "--takes",
     default="cloud",
@@ -284,8 +289,8 @@ def plugins_new(
     own = [name for name in given if name not in catalog.products]
     if len(own) > 1:
         raise click.UsageError(
-            f"--gives {gives}: a new plugin defines one product type, not {' and '.join(own)}; "
-            "`orthoflow plugins list` names those that exist"
+            f"--gives {gives}: {' and '.join(own)} do not exist, but a new plugin can define only "
+            "one product type; `orthoflow plugins list` shows the existing ones"
         )
     project = Project(
         name=name,

@@ -32,7 +32,7 @@ _SUMMARIES: Final = {
     "graph": "Draw a workflow as a Mermaid graph.",
     "run": "Run a workflow and write orthoimages, report and record.",
     "show": "Summarise a finished run.",
-    "runs": "List the runs below a folder: date, quality and differences.",
+    "runs": "List the runs in a folder with their date, quality and differences.",
     "compare": "Compare two runs and measure their differences.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is complete and unchanged.",
@@ -41,9 +41,9 @@ _SUMMARIES: Final = {
     "export": "Write a run's results for other programs.",
     "plugins": "List, show and check methods, or write your own plugin.",
     "schema": "Print the JSON Schema of workflow files.",
-    "warm": "Compile kernels in advance of runs.",
+    "warm": "Compile kernels before the first run.",
     "cache": "List, check or clean the store of results.",
-    "doctor": "Show what is installed, what is missing, and the consequences.",
+    "doctor": "Show which parts are installed or missing, and the consequences.",
 }
 
 _HELP: Final = """Make orthoimages of walls from laser scans and hand-held photographs, with methods

@@ -102,7 +102,7 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
         return ""
     # Otherwise a few short steps would suggest that a run of minutes is nearly finished.
     if not known or n_unknown > len(known):
-        return "remaining time still unknown"
+        return "remaining time not yet known"
     seconds = about(max(*known, sum(known) / jobs, 0.0))
     if n_unknown:
         return f"at least {seconds} left; {counted(n_unknown, 'step')} not estimated"
@@ -278,7 +278,7 @@ class Progress:
         most = (self.console.height if self.console else len(cells) + 4) - 4
         ended = len(cells) - most if len(cells) > most else 0
         for address, cell in cells.items():
-            # Where not all fit, those that ended first are left out.
+            # If not all fit, the cells that ended first are omitted.
             if ended > 0 and cell.state not in ("running", "failed", "waiting"):
                 ended -= 1
                 continue
@@ -308,7 +308,7 @@ def _end_text(event: CellFinished, more_s: float) -> str:
         return f"{event.address}: cached"
     took = f" in {duration(result.wall_s)}" if result.started else ""
     if took and more_s >= _MIN_MORE_S:
-        took += f", plus {duration(more_s)} of starting, loading and compiling"
+        took += f", plus {duration(more_s)} for starting, loading and compiling"
     # The summary contains the reasons for skipped cells.
     why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"

@@ -80,7 +80,7 @@ def replay(
 
     The result lists for every product whether it is identical, equal within the tolerance of its
     type, or different, and which metrics differ, apart from times and memory. The exit code is 3 if
-    a product differs, or if a metric differs (a count at all, other numbers by more than a
+    a product differs, or if a metric differs (a count by any amount, other numbers by more than a
     millionth) in a step whose products are identical or whose method's code has changed. It is also
     3 if the run cannot be repeated because an input or the record was changed, or a method has
     another version; it is 2 if an input is not found, and 4 if methods are missing.
@@ -199,4 +199,4 @@ def _print_metrics(metrics: Sequence[ReplayedMetric]) -> None:
             for item in moved[:ROWS_MOST]
         ],
     )
-    echo(f"{counted(len(metrics), 'metric')}, without times: {len(moved)} differ")
+    echo(f"{counted(len(metrics), 'metric')} (times not counted): {len(moved)} differ")

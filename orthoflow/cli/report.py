@@ -39,7 +39,7 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     opened = [open_run(run) for run in runs]
     if output is None and len(opened) > 1:
         raise ArgumentError(
-            f"{len(opened)} runs were given: pass -o FILE, the path of their common report"
+            f"{len(opened)} runs were given: pass -o FILE, the path of the combined report"
         )
     target = output if output is not None else opened[0].home_folder / REPORT_FILE
     if not target.parent.is_dir():

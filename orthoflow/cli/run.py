@@ -81,7 +81,7 @@ def run(
     # Any: the fields of RunOptions, whose types click has checked.
     **choices: Any,
 ) -> int:
-    """Run WORKFLOW, a file or the name of a shipped one.
+    """Run WORKFLOW, a file or the name of a shipped workflow.
 
     Stored results are not recomputed. To resume an interrupted run, repeat the command with the
     same -o. The run folder contains run.h5 (the record), report.html, and products/ with files for
@@ -245,7 +245,7 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
     try:
         file = path.open("w", encoding="utf-8", buffering=1)
     except OSError as error:
-        raise ArgumentError(f"--json-log {path} cannot be written: {error.strerror}") from error
+        raise ArgumentError(f"--json-log: cannot write {path}: {error.strerror}") from error
     with file:
 
         def listen(event: RunEvent) -> None:

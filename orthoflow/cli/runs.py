@@ -43,8 +43,9 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "--where",
     metavar="'METRIC > X'",
     multiple=True,
-    help="Only runs that meet a condition (< <= > >= = !=) on a metric, step.metric or parameter; "
-    "with variants, datasets or sweeps, one of the values must meet it.",
+    help="List only runs that meet a condition (< <= > >= = !=) on a metric, step.metric or "
+    "parameter; in runs with variants, datasets or sweeps, at least one value must meet the "
+    "condition.",
 )
 @click.option(
     "--sort",
@@ -57,7 +58,8 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "--table",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Write one CSV table with every cell and metric of the given runs, each cell once.",
+    help="Write a CSV table of the cells and metrics of the given runs; a cell in several runs "
+    "occurs once.",
 )
 @json_option
 def runs(
@@ -74,7 +76,7 @@ def runs(
     (the median over several datasets), and the parameters and inputs in which it differs from other
     runs of the workflow. Results of `export --split` inside a run are listed only if their folder
     is given. For runs without a record, and for unreadable records, the reason is shown. --table
-    FILE merges the given runs, or those below the given folders, into one table with a row per cell
+    FILE merges the given runs, or those in the given folders, into one table with a row per cell
     and metric; cells with the same methods, parameters, seeds and data in several runs are merged,
     and `environments` is the number of machines.
     """

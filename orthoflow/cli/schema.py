@@ -15,7 +15,7 @@ from orthoflow.cli.tables import echo
 def schema(*, as_json: bool) -> int:
     """Print the JSON Schema of workflow files, with the parameters of every installed method.
 
-    Save it and refer to it in an editor for completion and checks while editing. The output is JSON
+    Save the schema and refer to it in an editor to get completion and checks. The output is JSON
     with or without --json.
     """
     from orthoflow.catalog.discovery import discover_catalog

@@ -45,9 +45,9 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
 
     If there are many metrics, only those that measure quality are printed; --all prints all of
     them. With variants, there is a row per combination; over datasets, its values are medians. For
-    a folder that contains runs, their table is printed, as by `orthoflow runs`. The exit code is 3
-    if the seal of the record is broken; `orthoflow verify` also checks large arrays, which are not
-    read here.
+    a folder that contains runs, their table is printed, as `orthoflow runs` does. The exit code is
+    3 if the seal of the record is broken; `orthoflow verify` also checks large arrays, which are
+    not read here.
     """
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.records.open import open_run

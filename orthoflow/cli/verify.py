@@ -72,7 +72,9 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     else:
         for finding in findings:
             echo(finding)
-        beside = f"the seal of {verification.path} is intact, but files next to it were changed"
+        beside = (
+            f"the seal of {verification.path} is intact, but files next to it have been changed"
+        )
         echo_error(f"error: {verification.wrong or beside} (see above)")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
 

@@ -1,4 +1,4 @@
-"""`orthoflow warm`: compile kernels in advance of runs."""
+"""`orthoflow warm`: compile kernels before the first run."""
 
 from __future__ import annotations
 

@@ -2,9 +2,9 @@
 
 A worker runs each task in a child process, as on a single machine. Products go to the store; Dask
 transfers only the task and its result. Each attempt has its own folder inside the folder of the
-task, because a worker that was given up may still write to its folder; the number of these folders
-is the number of attempts. Without a scheduler address, the executor creates its own workers, as
-threads of this process.
+task, because an abandoned worker may still write to its folder; the number of these folders is the
+number of attempts. Without a scheduler address, the executor creates its own workers, as threads of
+this process.
 """
 
 from __future__ import annotations
@@ -98,9 +98,9 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
 
 
 def describe_loss(who: str, times: int) -> str:
-    """Return the error message for a task that was given up because workers were lost."""
-    lost = "its worker was lost" if times == 1 else f"its workers were lost, {times} in a row"
-    return f"{who} was given up: {lost}; see the logs of the workers"
+    """Return the error message for a task that was abandoned because workers were lost."""
+    lost = "its worker was lost" if times == 1 else f"its workers were lost {times} times in a row"
+    return f"{who} failed because {lost}; see the logs of the workers"
 
 
 def _result(executor: LocalExecutor, worker: Worker, name: str) -> CellResult:
@@ -272,7 +272,7 @@ class DaskExecutor:
         except Exception as error:  # noqa: BLE001 - whatever befell the worker
             reason = f"{type(error).__name__}: {one_line(error)}"
             return failed_result(
-                task, StepFailedError(f"{task.who} could not be run by its worker ({reason})")
+                task, StepFailedError(f"{task.who} could not be run on its worker ({reason})")
             )
 
     # `Any`: the event comes from a worker.
@@ -300,8 +300,8 @@ class DaskExecutor:
     def _lost(self) -> ClusterError:
         who = f"of {self._address}" if self._address else "of this run"
         return ClusterError(
-            f"the scheduler or all workers {who} were lost; finished steps are kept, and the same "
-            f"command with the same -o continues, with any executor"
+            f"the scheduler or all workers {who} were lost; finished steps are kept: repeat the "
+            "command with the same -o and any executor to continue"
         )
 
     # `Any`: the scheduler's description of its workers.
@@ -333,18 +333,18 @@ class DaskExecutor:
             if isinstance(answer, Exception):
                 raise PluginError(
                     f"worker {address} cannot run orthoflow ({type(answer).__name__}: "
-                    f"{one_line(answer)}); install the same version there"
+                    f"{one_line(answer)}); install the same version as on this machine"
                 )
             seen, wrong = answer
             if seen != word:
                 raise ArgumentError(
                     f"worker {address} cannot access the store {scratch.parent.parent} "
-                    f"({one_line(seen)}): give a --store on a file system that all workers "
-                    f"have mounted at the same path"
+                    f"({one_line(seen)}): choose a --store on a file system that all workers have "
+                    "mounted at the same path"
                 )
             if wrong:
                 raise PluginError(
-                    f"worker {address}: {wrong}; install the version of the plan there"
+                    f"worker {address}: {wrong}; install the version used for the plan"
                 )
 
 

@@ -21,7 +21,7 @@ _BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.E
 
 
 def is_broken(error: OSError, folder: Path) -> bool:
-    """Whether an error means that the disk of a folder fails, rather than that it is full."""
+    """Whether an error means that the disk of a folder has failed, rather than that it is full."""
     if error.errno not in _BROKEN:
         return False
     # Errors of file descriptors contain no path.
@@ -201,7 +201,7 @@ def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bo
         return False
     except OSError as error:
         raise StoreError(
-            f"cannot lock {path}: {error.strerror or error}; it must be on a file system with locks"
+            f"cannot lock {path}: {error.strerror or error}; use a file system that supports locks"
         ) from error
     return True
 

@@ -328,7 +328,7 @@ def new_run_folder(name: str, run_id: str) -> Path:
         return path_below(Path("runs"), f"{name}-{run_id}")
     except UnsafeFileError as error:
         raise RecordError(
-            f"no folder can be created in runs/: {error}; choose a folder with -o"
+            f"cannot create a folder in runs/: {error}; choose a folder with -o"
         ) from error
 
 

@@ -47,8 +47,8 @@ def kernel_folder(state: str) -> Path:
     """Return a folder for compiled kernels, see `all_kernels`.
 
     Args:
-        state: digest of a plugin's code, whose most recent versions are kept; empty for our
-            kernels.
+        state: digest of a plugin's code, whose most recent versions are kept; empty for orthoflow's
+            own kernels.
     """
     root = all_kernels()
     if not state or str(root) == os.environ.get(VARIABLE):

@@ -311,9 +311,9 @@ def misfit(methods: str) -> str:
         for what in sorted((planned.keys() | here.keys()) - {_CODE}):
             before, now = planned.get(what, "none"), here.get(what, "none")
             if before != now:
-                return f"{name} has {what} {now} there, {before} in the plan"
+                return f"{name} has {what} {now} there, but {before} in the plan"
         if planned[_CODE] != here[_CODE]:
-            return f"{name} has different code there"
+            return f"the code of {name} there differs from the plan"
     return ""
 
 

@@ -233,7 +233,7 @@ def start_process(
                 return process
     raise StepFailedError(
         f"{one_line(failure) or type(failure).__name__}; close other programs, or increase the "
-        "limits of open files and processes (`ulimit`)"
+        "limits on open files and processes (`ulimit`)"
     ) from failure
 
 
@@ -375,9 +375,9 @@ class _Step:
         tail = one_line(log.strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
         if code >= 0:
             last = f"; its log ends with: {tail}" if tail else ""
-            how = f"ended its process without a result (exit status {code}){last}"
+            how = f"ended without a result (exit status {code}){last}"
         else:
-            kind = "was killed from outside" if -code in _FROM_OUTSIDE else "crashed"
+            kind = "was killed by the system or a user" if -code in _FROM_OUTSIDE else "crashed"
             reason = signal.strsignal(-code) or f"signal {-code}"
             memory = f"{self.peak_bytes / GIB:.1f} GiB of memory"
             how = f"{kind} ({reason.lower()}) while using {memory}"
@@ -489,8 +489,8 @@ class LocalExecutor:
         step = steps[largest]
         step.is_victim = True
         step.reason = StepFailedError(
-            f"{step.task.who} needed more memory than the machine has "
-            f"({held[largest] / GIB:.1f} GiB when stopped); use less data or coarser parameters"
+            f"{step.task.who} needed more memory than the machine has ({held[largest] / GIB:.1f} "
+            "GiB when stopped); use fewer points or photos, or a coarser resolution"
         )
         step.peak_bytes = max(step.peak_bytes, held[largest])
         step.kill()

@@ -199,8 +199,8 @@ def _require_distinct(
                 first = seen.setdefault(file.sha256, file.path)
                 if first != file.path:
                     raise InputError(
-                        f"the input of {cell.step}.{port}: {first} and {file.path} have the same "
-                        "content, which would be counted twice; remove one of them"
+                        f"{first} and {file.path}, which step {cell.step} reads on port {port}, "
+                        "have the same content, which would be counted twice; remove one file"
                     )
 
 
@@ -218,8 +218,8 @@ def known_inputs(
             given = inputs[source.name]
             if given is None:
                 raise InputError(
-                    f"step {cell.step} needs the input {source.name}, which was not given; "
-                    f"give it with --input {source.name}=PATH"
+                    f"step {cell.step} needs the input {source.name}, which was not given; pass "
+                    f"--input {source.name}=PATH"
                 )
             known[port] = given.ref
     return known
@@ -349,7 +349,7 @@ def explain(key: CellKey, earlier: Sequence[CellResult]) -> str:
         earlier: results of the method, most recently used first.
     """
     if not earlier:
-        return "never ran before"
+        return "has never been run"
     if any(result.key == key.key for result in earlier):
         return "its stored result is incomplete or damaged"
     now = _ingredients(key.preimage)
@@ -359,7 +359,7 @@ def explain(key: CellKey, earlier: Sequence[CellResult]) -> str:
     )
     changes = _changed(before, now)
     if not changes:
-        return "the composition of its key has changed"
+        return "the way its cache key is computed has changed"
     named = list(dict.fromkeys(_sentence(name, before, now) for name in changes))
     return first_few(named, most=_MOST_NAMED)
 

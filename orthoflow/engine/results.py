@@ -127,7 +127,7 @@ def result_from_json(text: str, where: str) -> CellResult:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise StoreError(f"{where} has another format version: {place}: {first['msg']}") from error
+        raise StoreError(f"{where} has an unsupported format: {place}: {first['msg']}") from error
 
 
 @cache

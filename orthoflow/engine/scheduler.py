@@ -233,8 +233,8 @@ class _Run:
             self._poll(executor)
         self._journal.write("interrupted")
         raise CancelledStepError(
-            f"the run was interrupted; the same command "
-            f"continues it with -o {self._logs.parent.name}"
+            "the run was interrupted; to continue it, repeat the command with -o "
+            f"{self._logs.parent.name}"
         )
 
     def _advance(self, executor: Executor) -> None:

@@ -497,7 +497,7 @@ def _codec() -> TypeAdapter[StoredProduct]:
 
 
 def _describe(folder: Path, name: str, type_name: str) -> Mapping[str, tuple[int, str]]:
-    """Write `object.json` for the files in a folder, and return what it says of them."""
+    """Write `object.json` for the files in a folder, and return their size and SHA-256."""
     published = sorted(path for path in (folder / PUBLISHED).rglob("*") if path.is_file())
     files = {
         path.relative_to(folder).as_posix(): (path.stat().st_size, file_sha256(path))
@@ -534,7 +534,7 @@ def _files_of(folder: Path) -> Mapping[str, tuple[int, str]]:
 
 
 def stores_at(folder: str | Path) -> tuple[Store, ...]:
-    """Return the store in a folder, empty if there is none; nothing is created."""
+    """Return the store in a folder as a tuple, empty if there is no folder; nothing is created."""
     return (Store(Path(folder)),) if Path(folder).is_dir() else ()
 
 

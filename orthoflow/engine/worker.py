@@ -71,7 +71,7 @@ from orthoflow.untrusted_text import shown
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Publisher
 
-# Leaves a margin for the method's own message, which is cut shorter, and the text around it.
+# Leaves room for the method's own message, which is truncated earlier, and the text around it.
 _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
 _OOM_SCORE: Final = "900"
@@ -139,7 +139,7 @@ class Task(MethodIdentity):
 
     @property
     def who(self) -> str:
-        """Method and distribution, to begin a sentence with."""
+        """Method and distribution, for the beginning of a sentence."""
         brought = (
             f" of {self.distribution} {self.distribution_version}" if self.distribution else ""
         )
@@ -444,7 +444,7 @@ class _Call:
         return result
 
     def _cpu_s(self) -> float:
-        """Processor seconds of this process and its children, without loading."""
+        """Processor seconds of this process and its children, without loading and compiling."""
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         own_s = time.process_time() - self._meter.processor_s
         return own_s + children.ru_utime + children.ru_stime
@@ -463,21 +463,21 @@ class _Call:
             problems = "; ".join(
                 f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()
             )
-            raise MethodError(f"{self.task.who} refuses its parameters: {problems}") from error
+            raise MethodError(f"{self.task.who} has invalid parameters: {problems}") from error
 
     def _products(
         self, cls: type[Method], outputs: object, inputs: Mapping[str, Product | InputFiles]
     ) -> dict[str, Product]:
         given = {port: one for port, one in inputs.items() if isinstance(one, Product)}
         if not isinstance(outputs, cls.Out):
-            raise MethodError(f"{self.task.who} must return its Out, got {type(outputs).__name__}")
+            raise MethodError(f"{self.task.who} must return an Out, got {type(outputs).__name__}")
         products: dict[str, Product] = {}
         for port, expected in self.task.outputs.items():
             product = getattr(outputs, port)
             if not isinstance(product, Product) or product.type_name != expected.type_name:
                 raise MethodError(
-                    f"{self.task.who} must give a {expected.type_name} on its port "
-                    f"{port}, got {type(product).__name__}"
+                    f"output port {port} of {self.task.who} must be of type {expected.type_name}, "
+                    f"got {type(product).__name__}"
                 )
             products[port] = product
         for port, product in products.items():
@@ -513,9 +513,7 @@ def _check_file(file: FileRef) -> None:
         # A change of name or time stamp does not matter.
         is_same = file_identity(path) == file.identity or file_sha256(path) == file.sha256
     except OSError as error:
-        raise InputError(
-            f"the input file {path} can no longer be read: {error.strerror}"
-        ) from error
+        raise InputError(f"cannot read the input file {path} any more: {error.strerror}") from error
     if not is_same:
         raise InputError(f"the input file {path} changed while it was read; run again")
 

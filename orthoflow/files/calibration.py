@@ -11,7 +11,8 @@ cameras:
 
 The first entry that matches a photo is used. For `model: fisheye` (`cv2.fisheye`), the distortion
 is k1, k2, k3, k4, and `field_of_view_deg` is the full angle to use, 180 by default. In the file,
-the centre of the first pixel is (0, 0); internally it is (0.5, 0.5). Only this module converts.
+the centre of the first pixel is (0, 0); internally it is (0.5, 0.5). Only this module converts
+between the two.
 """
 
 from __future__ import annotations
@@ -205,7 +206,7 @@ class _Lens(BaseModel):
     ) -> tuple[float, ...]:
         terms = _FISHEYE_TERMS if info.data.get("model") else _TERMS
         if info.data.get("field_of_view_deg") and not info.data.get("model"):
-            raise ValueError("field_of_view_deg belongs to model: fisheye")
+            raise ValueError("field_of_view_deg is only allowed with model: fisheye")
         values = values or (0.0,) * len(terms)
         if len(values) != len(terms):
             raise ValueError(
@@ -259,7 +260,9 @@ def _lens(given: Mapping[str, Any], terms: tuple[float, ...]) -> Intrinsics | Fi
 
 def _problem(lens: Intrinsics | FisheyeLens) -> str:
     if isinstance(lens, Intrinsics):
-        two = "the lens model folds back inside the image, so that two directions share a pixel"
+        two = (
+            "the lens distortion is not monotonic inside the image, so two directions share a pixel"
+        )
         return two if _folds(lens) else ""
     problem = problem_of(lens)
     return f"the fisheye lens is invalid: {problem}" if problem else ""

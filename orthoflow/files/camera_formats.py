@@ -54,15 +54,16 @@ def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
     """
     found = _read(paths)
     if len(found) > MOST_CAMERAS:
-        raise InputError(f"{paths[0].name} contains more than {MOST_CAMERAS} cameras: split it")
+        raise InputError(
+            f"{paths[0].name} contains more than {MOST_CAMERAS} cameras: split the file"
+        )
     return found
 
 
 def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
     models = _colmap_models(paths)
     if models:
-        # Of several reconstructions (COLMAP numbers them), use the one with the most oriented
-        # photos.
+        # If there are several reconstructions, use the one with the most oriented photos.
         found = [read_colmap_model(parts) for parts in models]
         return max(found, key=lambda cameras: sum(not camera.reason for camera in cameras))
     readers: dict[str, Callable[[Path], tuple[GivenCamera, ...]]] = {
@@ -85,10 +86,10 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
             several = f"{len(files)} {suffix} files, one of which must be chosen; "
     names = first_few([path.name for path in paths])
     raise InputError(
-        f"{names or 'nothing'} contains no cameras that orthoflow can read: {several}expected a "
-        "cameras.json of a run, a folder with COLMAP's cameras.txt and images.txt (or .bin), "
-        "Metashape's .xml, Bundler's .out with its list of photos (.txt) next to it, "
-        "RealityCapture's .csv, or an E57 file with photos"
+        f"{names or 'nothing'} contains no cameras that orthoflow can read: {several}expected the "
+        "cameras.json of a run, a folder with COLMAP's cameras.txt and images.txt (or .bin), a "
+        "Metashape .xml file, a Bundler .out file with its list of photos (.txt) next to it, a "
+        "RealityCapture .csv file, or an E57 file with photos"
     )
 
 
@@ -157,7 +158,7 @@ def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
-        raise damaged(path, "it is not a cameras.json of a run") from error
+        raise damaged(path, "it is not the cameras.json of a run") from error
 
 
 def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:

@@ -44,7 +44,7 @@ _BROWN: Final = frozenset(
 _FISHEYES: Final = frozenset(
     {"SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}
 )
-# The files of a model; rigs and frames since version 3.12. Its points are not read.
+# The files of a model; rigs and frames were added in version 3.12. Its points are not read.
 COLMAP_PARTS: Final = ("cameras", "images", "rigs", "frames")
 _OBSERVATION_BYTES: Final = 24
 _POSE_BYTES: Final = 64
@@ -85,8 +85,8 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
     for camera in oriented:
         if len(camera.photo.split()) != 1:
             raise ArgumentError(
-                f'in a COLMAP text model, photo names end at the first space, but there is "'
-                f'{camera.photo}": rename the photo and run again'
+                "a COLMAP text model cannot contain photo names with spaces, such as "
+                f'"{camera.photo}": rename the photo and run again'
             )
     lenses = list(dict.fromkeys(_lens(camera) for camera in oriented))
     pycolmap = _pycolmap("writing a COLMAP model")
@@ -129,7 +129,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
     try:
         model.write_text(str(folder))
     except Exception as error:  # pycolmap raises various errors
-        raise StoreError(f"the COLMAP model cannot be written: {error}; free some space") from error
+        raise StoreError(f"cannot write the COLMAP model: {error}; free some disk space") from error
     return ColmapModel(n_cameras=len(lenses), n_images=len(oriented), n_points=len(places))
 
 
@@ -156,7 +156,8 @@ def _lens(camera: Camera) -> Intrinsics:
     if camera.intrinsics.skew:
         raise ArgumentError(
             f"the lens of photo {camera.photo} has a skew of {camera.intrinsics.skew:.1f} px, "
-            "which no model of COLMAP has: orient it without, by orient.pnp or skew: false"
+            "which no COLMAP camera model supports: orient the photo without skew, with "
+            "orient.pnp or skew: false"
         )
     return camera.intrinsics
 
@@ -194,7 +195,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     if not model.images:
         raise damaged(images, "the model has no images")
     if len(model.images) > MOST_CAMERAS or len(model.cameras) > MOST_CAMERAS:
-        raise InputError(f"{images.name} contains more than {MOST_CAMERAS} cameras: split it")
+        raise InputError(f"{images.name} contains more than {MOST_CAMERAS} cameras: split the file")
     lenses = {number: _lens_of(camera, images) for number, camera in model.cameras.items()}
     by_number = sorted(model.images.items())
     names = _whole_names(images) if suffix == ".txt" else {}
@@ -209,7 +210,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
 
 
 def _require_whole(path: Path) -> None:
-    """Refuse a binary file that is cut off or declares more items than its size allows.
+    """Refuse a binary file that is truncated or declares more items than its size allows.
 
     pycolmap allocates memory for the declared number, and reads past the end of the file.
     """
@@ -222,7 +223,7 @@ def _require_whole(path: Path) -> None:
             if at > len(content):
                 break
     if at > len(content) or count > len(content):
-        raise damaged(path, "it is cut off")
+        raise damaged(path, "it is truncated")
 
 
 def _end_of_image(content: bytes, at: int) -> int:

@@ -165,7 +165,7 @@ def _problem_of_numbers(lens: FisheyeLens) -> str:
     if not all(map(math.isfinite, values)) or min(lens.fx, lens.fy) <= 0.0:
         return f"focal length {lens.fx:g}, {lens.fy:g}"
     if not (1 <= lens.width <= MOST_PX and 1 <= lens.height <= MOST_PX):
-        return f"a photo of 1 to {MOST_PX} columns and rows is expected"
+        return f"expected a photo of 1 to {MOST_PX} columns and rows"
     if not 0.0 < lens.field_of_view_deg < _FULL_TURN_DEG:
         return f"a field of view of {lens.field_of_view_deg:g} degrees, expected one below 360"
     return ""
@@ -179,8 +179,8 @@ def _problem_of_faces(lens: FisheyeLens) -> str:
     is_inside = _bent(lens, fold) < math.hypot(across, down)
     if fold < math.radians(0.5 * lens.field_of_view_deg) and is_inside:
         return (
-            f"it folds back {math.degrees(fold):.1f} degrees off the axis, inside the image, so "
-            "that two directions share a pixel"
+            f"its distortion is not monotonic beyond {math.degrees(fold):.1f} degrees from the "
+            "axis, inside the image, so two directions share a pixel"
         )
     finest = max(lens.finest_px(0.0), lens.finest_px(0.5 * math.pi))
     if not finest < MOST_PX:

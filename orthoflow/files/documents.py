@@ -173,7 +173,7 @@ def _sentence(
     elif any(one["type"] in _OF_NUMBERS for one in alternatives):
         meant = meant_number(name, given)
     if owner and len(loc) == 1 and isinstance(given, list) and len(given) > 1:
-        meant += f"; to try each: {{sweep: {_shown(given)}}}"
+        meant += f"; to compare these values: {{sweep: {_shown(given)}}}"
     return f"input should be {' or '.join(dict.fromkeys(forms))}, got {describe(given)}{meant}"
 
 
@@ -215,7 +215,7 @@ def _unknown_key(name: str, known: Sequence[str], value: JsonValue, owner: str) 
     if owner and name in _BESIDE:
         meant = f" ({name} belongs next to params, not in it)"
     inside = "; parameters of the method belong in params" if "params" in known else ""
-    whose = f"{owner} has" if owner else "known here:"
+    whose = f"{owner} has" if owner else "known keys:"
     listed = f"; {whose} {', '.join(known) or 'none'}" if known or not owner else ""
     return f"unknown {'parameter' if owner else 'key'} {name}{meant}{listed}{inside}"
 
@@ -281,9 +281,9 @@ def meant_number(parameter: str, text: object) -> str:
     """Return a hint on how to write a number given as text; empty if it looks like none.
 
     >>> meant_number("tolerance_m", "0,02")
-    '; decimals have a point: 0.02'
+    '; write a decimal point: 0.02'
     >>> meant_number("tolerance_m", "5 cm")
-    '; it is in metres; write it without a unit: 0.05'
+    '; write it in metres, without a unit: 0.05'
     """
     found = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else None
     if found is None:
@@ -292,12 +292,12 @@ def meant_number(parameter: str, text: object) -> str:
     unit = found[2]
     if not unit:
         has_comma = "," in found[1]
-        return f"; decimals have a point: {value:g}" if has_comma else "; write it without quotes"
+        return f"; write a decimal point: {value:g}" if has_comma else "; write it without quotes"
     own = parameter.rpartition("_")[2]
     factor = _factor(unit, own)
     if factor is None:
         return "; write numbers without a unit"
-    return f"; it is in {_WORDS.get(own, own)}; write it without a unit: {value * factor:g}"
+    return f"; write it in {_WORDS.get(own, own)}, without a unit: {value * factor:g}"
 
 
 def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:

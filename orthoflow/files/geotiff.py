@@ -1,9 +1,9 @@
 """GeoTIFF files in the plane of a wall: single-band rasters and cloud-optimised orthoimages.
 
 The coordinates are local, in metres, pixel-is-area. For walls, X runs along the wall from its left
-edge and Y is the height; for floors and ceilings, they are x and y of the world. Rasters of level
-planes can be in map coordinates instead (easting, northing). `WallFrame.raster_axes` decides.
-Identical rasters give identical bytes.
+edge and Y is the height; for floors and ceilings, they are x and y of the world. Rasters of
+horizontal planes can be in map coordinates instead (easting, northing). `WallFrame.raster_axes`
+decides. Identical rasters give identical bytes.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ def local_crs_wkt(name: str) -> str:
 def name_run(path: Path, run_id: str) -> None:
     """Insert a run id into the names of the coordinate systems in a published file.
 
-    Products publish the same bytes in every run; the id makes the names unique. An id of another
-    length than orthoflow's is cut or padded, so that no offset in the file changes.
+    Products publish the same bytes in every run; the id makes the names unique. An id whose length
+    differs from orthoflow's is truncated or padded, so that no offset in the file changes.
     """
     if path.suffix not in _NAMED_SUFFIXES or path.stat().st_size == 0:
         return
@@ -155,7 +155,7 @@ def require_map_crs(crs: str) -> None:
     # For the local system of the site, GDAL reports the unit, but not a projection.
     if crs != SITE_CRS and not (found.is_projected and found.linear_units_factor[1] == 1.0):
         raise InputError(
-            f"{crs} is not a coordinate system in metres: expected a projected one, such as "
+            f"{crs} is not a coordinate system in metres: expected a projected system, such as "
             f"EPSG:2100, or {SITE_CRS}"
         )
 
@@ -203,7 +203,7 @@ def _map_crs(crs: str) -> CRS:
         pass
     raise InputError(
         f"there is no coordinate system {crs[:_LONGEST_CRS]}: expected the EPSG code of a "
-        f"projected one, such as EPSG:2100, or {SITE_CRS}"
+        f"projected system, such as EPSG:2100, or {SITE_CRS}"
     )
 
 
@@ -229,8 +229,8 @@ def write_raster(
     """
     if values.ndim != 2 or str(values.dtype) not in _NOTHING:
         raise ProductError(
-            f"{path.name} takes a flat raster of {', '.join(_NOTHING)}, got {values.dtype} of "
-            f"shape {values.shape}"
+            f"{path.name} requires a two-dimensional raster of {', '.join(_NOTHING)}, got "
+            f"{values.dtype} of shape {values.shape}"
         )
     profile: dict[str, object] = {
         "count": 1,
@@ -272,8 +272,8 @@ def write_orthoimage(
     is_rgb = rgb.ndim == 3 and rgb.shape[2] == 3 and rgb.dtype in (np.uint8, np.uint16)
     if not is_rgb or rgb.shape[:2] != shown.shape:
         raise ProductError(
-            f"{path.name} takes RGB of 8 or 16 bits and a mask of one size, got {rgb.dtype} of "
-            f"shape {rgb.shape} and a mask of {shown.shape}"
+            f"{path.name} requires RGB with 8 or 16 bits and a mask of the same size, got "
+            f"{rgb.dtype} of shape {rgb.shape} and a mask of {shown.shape}"
         )
     from rasterio.shutil import copy
 
@@ -569,7 +569,7 @@ def writing(path: Path) -> Iterator[None]:
         with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
             yield
     except (RasterioError, OSError) as error:
-        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+        raise StoreError(f"cannot write {path.name}: {error}; free some disk space") from error
 
 
 @contextmanager

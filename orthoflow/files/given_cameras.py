@@ -118,7 +118,9 @@ class GivenCamera:
         problem = problem_of(self.lens)
         if problem or face not in face_lenses(self.lens):
             reason = (
-                f"its lens is invalid: {problem}" if problem else "its lens does not show that face"
+                f"its lens is invalid: {problem}"
+                if problem
+                else ("its lens does not cover that face")
             )
             return GivenCamera(name=self.name, reason=reason)
         axes = FACES[face]

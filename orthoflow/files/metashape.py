@@ -74,7 +74,9 @@ def _root(path: Path) -> ET.Element:
             "contain, so it is not read"
         )
     if text.count("<") > MOST_TAGS:
-        raise InputError(f"{path.name} has more than {MOST_TAGS} tags, too many for cameras")
+        raise InputError(
+            f"{path.name} has more than {MOST_TAGS} tags, too many for a list of cameras"
+        )
     try:
         return ET.fromstring(text)
     except ET.ParseError as error:
@@ -167,7 +169,7 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
 
 # Any: pyproj has no types that mypy accepts in strict mode.
 def _from_geocentric(crs: Any, path: Path) -> Any:
-    """Return the transformer from geocentric metres of a projected system's datum, as Metashape.
+    """Return the transformer from geocentric metres to a projected system, as used by Metashape.
 
     Raises:
         InputError: the heights need a grid that is not installed.

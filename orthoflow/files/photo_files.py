@@ -234,7 +234,7 @@ def tiff_pixels(encoded: bytes) -> Colours:
     """
     found = photo_page(encoded)
     if found is None:
-        raise ValueError("it has no readable page")
+        raise ValueError("it has no readable image")
     start, tags = found
     kind = tags.get(_PHOTOMETRIC_TAG)
     if kind not in _COLOURS_OF_TIFF:
@@ -377,7 +377,7 @@ def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
 
 
 def is_whole_png(encoded: bytes) -> bool:
-    """Whether the chunks of a PNG lead to its end: decoders allocate their declared size."""
+    """Return whether a PNG contains all chunks; decoders allocate their declared sizes."""
     position = len(_PNG_MAGIC)
     while position + 12 <= len(encoded):
         if encoded[position + 4 : position + 8] == b"IEND":

@@ -87,7 +87,7 @@ TIE_COLUMNS: Final = (
 
 
 def publish_cloud(product: PointCloud, folder: Path, digest: str) -> None:
-    """Write `scans.json`: data of each scan, and what was used and omitted."""
+    """Write `scans.json`: data of each scan, and which points and fields were used or omitted."""
     scans = product.source.get("scans")
     if isinstance(scans, list):
         write_json(
@@ -163,7 +163,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
 def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None:
     """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars, preview, and world files.
 
-    If requested, layers are written as by `publish_layers`.
+    If requested, layers are written as in `publish_layers`.
     """
     if product.layers:
         called = {image.wall: (image.number, image.name) for image in product.images}

@@ -119,7 +119,7 @@ def sidecar_of(text: str, name: str) -> dict[str, object]:
 
 
 def shown_value(value: object) -> str:
-    """Return a value of a sidecar for a message, cut if it is long."""
+    """Return a value of a sidecar for a message, truncated if it is long."""
     text = repr(value)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]} ..."
 
@@ -176,9 +176,9 @@ def frame_of_raster(
         )
         if placed.raster_down != raster.down:
             raise InputError(
-                f"{name}: its rows go {'up' if raster.down > 0.0 else 'down'} along Y, but those "
-                "of the wall described in the file next to it go the other way: export it with "
-                "the rows in the order of orthoflow's own GeoTIFF"
+                f"{name}: its rows run {'up' if raster.down > 0.0 else 'down'} along Y, but the "
+                "description of the wall next to it requires the opposite order: export it with "
+                "the row order of orthoflow's GeoTIFF"
             )
         right_m = raster.corner_m[0] - left_m
         below_m = (raster.corner_m[1] - top_m) * raster.down
@@ -293,7 +293,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     try:
         path.write_bytes(content)
     except OSError as error:
-        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+        raise StoreError(f"cannot write {path.name}: {error}; free some disk space") from error
 
 
 def _finite(value: object) -> JsonValue:

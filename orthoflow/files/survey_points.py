@@ -261,7 +261,7 @@ class _Table:
                 self.add(line, f"{', '.join(whole)} belong together, got only {', '.join(there)}")
         if is_row and len(groups) > 1:
             one, other = (", ".join(group) for group in groups[:2])
-            self.add(line, f"measured twice, as {one} and as {other}: leave one of them out")
+            self.add(line, f"the point is given twice, as {one} and as {other}: remove one")
         return groups[0] if groups and len(self.problems) == n_before else ()
 
     def _cells(self, lines: list[str]) -> Iterator[tuple[int, list[str]]]:
@@ -275,9 +275,9 @@ class _Table:
         separator = next((mark for mark in _SEPARATORS if mark in first), ",")
         for place, (number, line) in enumerate(numbered):
             if len(line) > MOST_LINE:
-                problem = f"the line is longer than {MOST_LINE} characters: not such a table"
+                problem = f"the line has over {MOST_LINE} characters: expected {self.content}"
             elif place >= MOST_POINTS:
-                problem = f"the file contains more than {MOST_POINTS} {self.content}: split it"
+                problem = f"the file contains more than {MOST_POINTS} {self.content}; split it"
             else:
                 cells = next(csv.reader([line], delimiter=separator))
                 yield number, [cell.strip() for cell in cells]
@@ -295,8 +295,8 @@ class _Table:
             optional += f"[,wall,{','.join(_IN_IMAGE)}]" if self.measured else ""
             self.add(
                 line,
-                f"expected the names of the columns, {','.join(self.required)}{optional}, got "
-                f"{len(names)} values without names",
+                f"expected the column names {','.join(self.required)}{optional}, got {len(names)} "
+                "values without names",
             )
             return ()
         n_before = len(self.problems)
@@ -304,7 +304,7 @@ class _Table:
             if name not in (*known, *self.ignored):
                 near = difflib.get_close_matches(name, known, n=1)
                 hint = f" (did you mean {near[0]}?)" if near else ""
-                self.add(line, f"unknown column {name}{hint}; known are {', '.join(known)}")
+                self.add(line, f"unknown column {name}{hint}; known columns: {', '.join(known)}")
             elif names.count(name) > 1:
                 self.add(line, f"the column {name} occurs {names.count(name)} times")
         missing = [name for name in self.required if name not in names]

@@ -13,12 +13,12 @@ from orthoflow.files.drawings.words import Phrase
 from orthoflow.products import PAINTED_STATES
 
 ORTHO_FILE: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_ortho\.tif")
-# An image with a smaller painted share does not show its wall.
+# An image that covers a smaller share of its wall is not recommended.
 _MIN_PAINTED_SHARE: Final = 0.5
 
 
 class WallDescription(BaseModel):
-    """A wall and its orthoimage: size, painted share, expected error, recommendation.
+    """A wall and its orthoimage: size, covered share, expected error, recommendation.
 
     Attributes:
         number: number of the wall: index of its plane in `planes.json`.
@@ -29,8 +29,9 @@ class WallDescription(BaseModel):
         width_m: width of the image; like the following numbers, None if there is no image.
         height_m: height of the image.
         area_m2: area of the image.
-        painted_share: share of painted cells in the image.
-        height_of_top_m: height of the upper edge along the world's up; None for level surfaces.
+        painted_share: share of covered cells in the image.
+        height_of_top_m: height of the upper edge along the world's up; None for horizontal
+            surfaces.
         expected_mm_median: expected error of a point measured in the image, one standard deviation,
             median over the image; None if it was not checked.
         expected_mm_p95: the same, exceeded in 5 % of the image.
@@ -75,7 +76,7 @@ class WallDescription(BaseModel):
 
     @property
     def sentence(self) -> str:
-        """Size, painted share, expected error, and the reason if it should not be delivered."""
+        """Size, covered share, expected error, and the reason if it should not be delivered."""
         parts = [self.accuracy.text()]
         if self.painted_share is not None:
             parts.insert(0, f"{self.width_m:.2f} x {self.height_m:.2f} m")

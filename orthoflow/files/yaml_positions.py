@@ -396,7 +396,7 @@ class _Converter:
         self._report(
             before,
             at,
-            f"{before.value},{behind.value} is two numbers; decimals have a point: {meant}",
+            f"{before.value},{behind.value} is read as two numbers; write a decimal point: {meant}",
         )
         return ScalarNode(_TAG + "float", meant, before.start_mark, behind.end_mark)
 

@@ -168,8 +168,8 @@ class ViewingCamera:
         found = undistorted(*self.bent_rays(pixels_photo.T), self.distortion)
         if found.size and not np.abs(found[2]).max() < 1e-9:
             raise GeometryError(
-                "the lens distortion cannot be undone at the border of the image: the calibration "
-                f"{self.distortion.tolist()} folds back inside it"
+                "the lens distortion cannot be inverted at the border of the image: the "
+                f"calibration {self.distortion.tolist()} is not monotonic inside it"
             )
         return np.column_stack([found[0], found[1], np.ones(found.shape[1])])
 
@@ -235,7 +235,9 @@ def looking_at(
     right = np.cross(forward, up)
     length = float(np.linalg.norm(right))
     if not length > 1e-9:
-        raise GeometryError("a camera that looks straight up or down has no level orientation")
+        raise GeometryError(
+            "a camera that looks straight up or down has no horizontal viewing direction"
+        )
     right = right / length
     return np.vstack([right, np.cross(forward, right), forward])
 

@@ -269,7 +269,7 @@ class _Problem:
         damping = _DAMPING_START
         errors = self.errors(camera)
         if not math.isfinite(errors.cost):
-            raise GeometryError("a resection starts from a camera that cannot see its points")
+            raise GeometryError("the initial camera of a resection does not see the points")
         for _ in range(_ITERATIONS):
             while damping < _DAMPING_MOST:
                 moved = stepped(camera, self.step(camera, errors, damping=damping), self.lens)

@@ -105,7 +105,7 @@ class Scene:
             if shape != expected:
                 raise GeometryError(f"scene.{name} must have shape {expected}, got {shape}")
         if np.any(np.diff(self.hole_rectangle) < 0):
-            raise GeometryError("scene.hole_rectangle must ascend")
+            raise GeometryError("scene.hole_rectangle must be in ascending order")
 
     def __len__(self) -> int:
         return len(self.centre)

@@ -361,7 +361,7 @@ def _add_files(crate: _Crate, record: RunRecord, files: list[str]) -> None:
         facts: Entity = {"encodingFormat": _media_type(name)}
         title = name.rpartition("/")[2]
         if name in lists:
-            title = "Python packages that were installed"
+            title = "Python packages installed during the run"
             facts["conformsTo"] = _ref(_REQUIREMENTS)
         if name == RECORD_FILE:
             facts["description"] = _how_to_read(record)
@@ -563,10 +563,10 @@ def _how_to_read(record: RunRecord) -> str:
     return (
         f"Install the Python package {DISTRIBUTION} {version}, from a package index or a wheel "
         f"provided by the authors of this crate. In this folder, `orthoflow verify {RECORD_FILE}` "
-        "then checks that record and products have not changed since they were written, `orthoflow "
-        f"show {RECORD_FILE}` summarises the record, and `orthoflow replay {RECORD_FILE} -o "
-        f"../again` recomputes it from {source}. Any HDF5 program can open the record. Paths in "
-        f"{WORKFLOW_FILE} are those of the machine on which it ran."
+        "then checks that the record and the products have not changed since they were written, "
+        f"`orthoflow show {RECORD_FILE}` summarises the record, and `orthoflow replay "
+        f"{RECORD_FILE} -o ../again` recomputes it from {source}. Any HDF5 program can open the "
+        f"record. Paths in {WORKFLOW_FILE} are those of the machine on which the workflow ran."
     )
 
 

@@ -155,11 +155,14 @@ def _distance(
         cls = catalog.product_class(type_name)
         ours, theirs = (side.payload(address, port, cls) for side in (left, right))
     except OrthoflowError as error:
-        return distance(verdict="not measured", reason=f"the digests differ, and {error}")
+        return distance(
+            verdict="not measured",
+            reason=f"the digests differ, but the arrays cannot be compared: {error}",
+        )
     if ours is None or theirs is None:
         reason = (
-            "the digests differ, and its arrays are in no record or available store; run with "
-            "--embed to keep them"
+            "the digests differ, but the arrays cannot be compared, because they are in no "
+            "record or available store; run with --embed to keep the arrays"
         )
         return distance(verdict="not measured", reason=reason)
     limits = {
@@ -412,7 +415,7 @@ class RunComparison:
         verdicts = Counter(item.verdict for item in self.products)
         parts.append(f"{verdicts['different']} of {len(self.products)} products differ")
         parts.append(f"{verdicts['not measured']} products not measured")
-        parts.append(f"{sum(not row.is_shared for row in self.cells)} steps only in one run")
+        parts.append(f"{sum(not row.is_shared for row in self.cells)} steps in only one run")
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
         return f"<RunComparison of {runs}: {', '.join(parts)}>"
 

@@ -72,9 +72,9 @@ def find_inputs(
 ) -> InputSearch:
     """Search for files with the content given in a record.
 
-    If paths are given for an input, only these are searched, under any name; otherwise the
-    extracted files; otherwise the paths where stores last saw the content, and the paths in the
-    workflow, relative to the working directory and the run folder.
+    If paths are given for an input, only these are searched, under any name. Otherwise, the
+    extracted files are used, or else the paths where stores last found the content and the paths in
+    the workflow, relative to the working directory and the run folder.
 
     Args:
         workflow: workflow of the record.
@@ -114,7 +114,7 @@ def find_inputs(
             problems.append(
                 f"input {entry.name}: no file with the content of the recorded {file.name} "
                 f"({file.size_bytes} bytes, SHA-256 {file.sha256[:12]}...) was found; "
-                + (f"{rival} was changed" if rival else f"give it with --input {entry.name}=PATH")
+                + (f"{rival} has been changed" if rival else f"pass --input {entry.name}=PATH")
             )
         paths[entry.name] = tuple(found)
     return InputSearch(paths=paths, problems=tuple(problems), is_changed=is_changed)

@@ -35,7 +35,7 @@ _INTERRUPTED: Final = CancelledStepError.__name__
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run; of a running or interrupted one, the results so far.
+    """Open a run; a running or interrupted run contains the results so far.
 
     Args:
         path: a run folder, or the `run.h5` in it.

@@ -85,7 +85,7 @@ def plan_replay(
     findings = verify_run(run.path, also_published=False).findings
     if problems := findings or (*_inconsistencies(run), *_loose_ends(run)):
         raise RefusedRunError(
-            f"{run.path} was changed after it was written: {problem}" for problem in problems
+            f"{run.path} has been changed since it was written: {problem}" for problem in problems
         )
     try:
         workflow = workflow_from_resolved(run.record.workflow_resolved, run.record.workflow_source)
@@ -212,13 +212,13 @@ def _differences(cell: RecordedCell, catalog: Catalog, origin: str) -> Iterator[
         found = catalog.product_class(product.type_name).encoding_version
         if found < product.encoding_version:
             yield (
-                f"product type {product.type_name}: the installed one has encoding version {found},"
-                f" the record has {product.encoding_version}"
+                f"product type {product.type_name}: the installed version has encoding version "
+                f"{found}, but the record has {product.encoding_version}"
             )
     if cls.result_version != cell.result_version:
         yield (
-            f"method {cell.method}: the installed one has result version {cls.result_version}, the "
-            f"record was made with {cell.result_version} ({origin})"
+            f"method {cell.method}: the installed version has result version "
+            f"{cls.result_version}, but the record was made with {cell.result_version} ({origin})"
         )
         return
     try:
@@ -227,8 +227,8 @@ def _differences(cell: RecordedCell, catalog: Catalog, origin: str) -> Iterator[
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         yield (
-            f"step {cell.address}: the installed {cell.method} refuses the recorded parameter "
-            f"{name}: {first['msg']} (the record was made with {origin})"
+            f"step {cell.address}: the installed {cell.method} does not accept the recorded "
+            f"parameter {name}: {first['msg']} (the record was made with {origin})"
         )
 
 

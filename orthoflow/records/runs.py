@@ -200,7 +200,7 @@ def require_unchanged(run: Run, *paths: Path) -> None:
 def _require_same(folder: Path, file: PublishedFile, state: PublishedState) -> None:
     if state == "changed":
         raise RecordError(
-            f"{folder / file.path} was changed after the run: the record states the digest "
+            f"{folder / file.path} has been changed since the run: its digest in the record is "
             f"{file.sha256}"
         )
     if state != "same":
@@ -214,7 +214,7 @@ _DAMAGED: Final = "the file is damaged"
 _AWAY: Final = "; use another copy, and check it with `orthoflow verify`"
 FIGURES_FOLDER: Final = "figures"
 GRAPH_FILE: Final = "graph.svg"
-# Folder of the pages of single datasets, for a run on several.
+# Folder of the pages of the datasets, for a run on several datasets.
 PAGES_FOLDER: Final = "pages"
 _MOST_NAMED: Final = 12
 _LONGEST_REASON: Final = 400
@@ -243,7 +243,7 @@ class Run:
 
     @property
     def file_name(self) -> str:
-        """Name of the record file; it gets its own after all other files are written."""
+        """Final name of the record file, which is renamed after all other files are written."""
         return RECORD_FILE if self.path.name.startswith(f".{RECORD_FILE}") else self.path.name
 
     @contextmanager
@@ -279,8 +279,8 @@ class Run:
         """Return one cell.
 
         Args:
-            address: its address; with `variants`, its step suffices.
-            variants: `data` for the dataset, or a step with variants -> the one wanted; those on
+            address: address of the cell; with `variants`, the name of the step suffices.
+            variants: name of a step with variants, or `data` -> variant or dataset; entries on
                 which the cell does not depend are ignored.
 
         Raises:
@@ -356,8 +356,7 @@ class Run:
         figures = {figure.name: figure for figure in self.cell(address).figures}
         if name not in figures:
             raise ArgumentError(
-                f"the step {address} has no figure {name!r}; it has "
-                f"{', '.join(figures) or 'none at all'}"
+                f"the step {address} has no figure {name!r}; it has {', '.join(figures) or 'none'}"
             )
         return figures[name]
 
@@ -400,8 +399,7 @@ class Run:
             )
         if port not in outputs:
             raise ArgumentError(
-                f"the step {address} has no output {port!r}; it has "
-                f"{', '.join(outputs) or 'none at all'}"
+                f"the step {address} has no output {port!r}; it has {', '.join(outputs) or 'none'}"
             )
         if not outputs[port].embedded:
             raise RecordError(
@@ -414,7 +412,7 @@ class Run:
         """Return an output as an object of its product class.
 
         Args:
-            address: address of the cell; with `variants`, its step suffices.
+            address: address of the cell; with `variants`, the name of the step suffices.
             port: name of the output.
             variants: see `cell`.
 
@@ -480,7 +478,7 @@ def find_record(path: str | Path) -> Path:
             return inside
         state = "is unfinished; repeat the run with -o {} to finish it"
         if is_running(given):
-            state = "has not ended yet; wait for it"
+            state = "has not ended yet; wait until it ends"
         raise ArgumentError(
             f"{given} contains no {RECORD_FILE}: it is not a run folder, or its run "
             f"{state.format(given)}"
@@ -530,7 +528,7 @@ def path_inside(folder: Path, name: str) -> Path:
     try:
         return path_below(folder, name)
     except UnsafeFileError as error:
-        raise RecordError(f"nothing is written to {folder}: {error}") from error
+        raise RecordError(f"cannot write to {folder}: {error}") from error
 
 
 def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFigure]:

@@ -90,8 +90,8 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
     public_key = _openssh(key.public_key())
     if earlier is not None and earlier.public_key != public_key:
         raise ArgumentError(
-            f"there is already a signature next to {path}, with the key "
-            f"{earlier.fingerprint}: remove {path.name}{SIGNATURE_SUFFIX} to sign with another"
+            f"{path} is already signed with the key {earlier.fingerprint}: remove "
+            f"{path.name}{SIGNATURE_SUFFIX} to sign it with another key"
         )
     content_sha256 = read_run(path).content_sha256
     signature = base64.b64encode(key.sign(_message(content_sha256))).decode("ascii")
@@ -149,8 +149,8 @@ def check_signature(record: Path, signer: Path) -> Signature:
         key.verify(base64.b64decode(found.signature, validate=True), message)
     except (InvalidSignature, binascii.Error) as error:
         raise RecordError(
-            f"the signature does not match {record.name}: it belongs to another record, or "
-            "was changed"
+            f"the signature does not match {record.name}: it belongs to another record, or one of "
+            "the two files has been changed"
         ) from error
     return found
 
@@ -245,7 +245,7 @@ class Verification:
     Attributes:
         path: the record file.
         findings: one sentence per difference; empty if nothing was changed.
-        wrong: subject of the findings, in words; empty if there are none.
+        wrong: summary of the findings; empty if there are none.
         notes: files that could not be checked or do not belong to the record.
         seal: digest that seals the record, 64 hexadecimal digits, as printed on sheets; empty if
             the record itself was changed.
@@ -290,7 +290,7 @@ def verify_run(
     record_path = find_record(path)
     if found := verify_record(record_path):
         is_unchecked = found[0].code in ("foreign", "locked")
-        wrong = "cannot be checked" if is_unchecked else "was changed after it was written"
+        wrong = "cannot be checked" if is_unchecked else "has been changed since it was written"
         findings = tuple(f"{finding.place}: {finding.problem}" for finding in found)
         return Verification(path=record_path, findings=findings, wrong=f"{record_path} {wrong}")
     with record_errors(record_path), open_record(record_path) as opened:
@@ -314,7 +314,7 @@ def verify_run(
         )
     beside = [
         *(["its signature is not from the given signer"] if unsigned else []),
-        *(["published files next to it were changed"] if changed else []),
+        *(["published files next to it have been changed"] if changed else []),
     ]
     wrong = f"the seal of {record_path} is intact, but {' and '.join(beside)}" if beside else ""
     products = [product for cell in record.cells for product in cell.outputs.values()]
@@ -416,7 +416,8 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
     if not places:
         return ""
     return (
-        f"{run.path} was changed after it was written: its seal does not match {first_few(places)}"
+        f"{run.path} has been changed since it was written: its seal does not match "
+        f"{first_few(places)}"
     )
 
 

@@ -50,7 +50,7 @@ def delivered_walls(products: Path) -> tuple[WallDescription, ...]:
 def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
     """Write `walls.json` into the products of a run, if there are orthoimages.
 
-    Of several combinations, the last one is used, as for drawings.
+    If there are several combinations, the last one is used, as for drawings.
 
     Args:
         products: folder with the files of all cells.
@@ -105,7 +105,7 @@ def _with_sidecars(
 
 
 def _rank(wall: WallDescription) -> tuple[bool, float, int]:
-    """Return a sort key: recommended walls first, then by painted area, largest first."""
+    """Return a sort key: recommended walls first, then by covered area, largest first."""
     return not wall.recommended, -(wall.area_m2 or 0.0) * (wall.painted_share or 0.0), wall.number
 
 

@@ -294,8 +294,8 @@ def write_run(
         # The disk has failed, not the method.
         if result.error_type in (StoreError.__name__, DamageError.__name__):
             raise StoreError(
-                f"{address} failed: {result.error_message}; finished steps are kept, and "
-                f"the same command with -o {run_folder} continues from there"
+                f"{address} failed: {result.error_message}; finished steps are kept: to continue, "
+                f"repeat the command with -o {run_folder}"
             )
     try:
         with kept_from_others(run_folder):
@@ -316,8 +316,8 @@ def write_run(
         if not damaged and not isinstance(error, DamageError):
             raise
         raise DamageError(
-            f"the store {store.folder} has lost data that the record needs ({error}); the "
-            f"same command with -o {run_folder} recomputes it"
+            f"the store {store.folder} has lost data that the record needs ({error}); to "
+            f"recompute the data, repeat the command with -o {run_folder}"
         ) from error
 
 
@@ -511,7 +511,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
     ]
     if missing:
         raise ArgumentError(
-            f"neither the record {run.path} nor the store {store.folder} has "
+            f"neither the record {run.path} nor the store {store.folder} contains "
             f"{first_few(missing)}: give the store of the run with --store, or replay the run"
         )
     whole = tuple(
@@ -544,7 +544,7 @@ def _write_again(
                 earlier=run.path,
             )
     except (RecordFormatError, InputFileError) as error:
-        raise StoreError(f"{path} cannot be written: {error}") from error
+        raise StoreError(f"cannot write {path}: {error}") from error
 
 
 def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]:

@@ -131,7 +131,7 @@ class Combination:
 def unequal_walls(combinations: Iterable[Combination]) -> str:
     """Return in which datasets the first walls of the combinations differ; empty if in none.
 
-    The detected planes decide which wall is the first, so its metrics may be of different walls.
+    The detected planes decide which wall is the first, so its metrics may refer to different walls.
     """
     by_room: dict[tuple[Path, str], list[tuple[Combination, tuple[float, ...]]]] = {}
     for one in combinations:
@@ -157,8 +157,8 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
     if not groups:
         return ""
     return (
-        "the first wall is not the same in all combinations, so its metrics are of different walls "
-        "(the parameter `near` of the wall step selects the wall at a point): "
+        "the first wall is not the same in all combinations, so its metrics refer to different "
+        "walls (the parameter `near` of the wall step selects the wall at a point): "
         f"{first_few(groups, most=_ROOMS_MOST)}"
     )
 

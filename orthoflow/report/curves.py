@@ -188,8 +188,8 @@ def _lines(
 ) -> dict[str, _Line]:
     """Return a line per combination of the other variants, over datasets that all its points have.
 
-    Parameter values that fail on difficult datasets would look better if these were excluded for
-    them alone.
+    Parameter values that fail on difficult datasets would look better if only they omitted these
+    datasets.
     """
     lines: dict[str, _Line] = {}
     for one in combinations:
@@ -262,6 +262,6 @@ def _points_text(lines: Mapping[str, _Line], column: MetricRow, n_datasets: int)
     counted = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
     if is_flag(column.unit):
         return f"Points are shares of {counted} of {n_datasets} datasets, and of their repeats"
-    absolute = ". Errors count without their sign" if column.better == "lower" else ""
+    absolute = ". Absolute values of errors are used" if column.better == "lower" else ""
     bars = ". Bars are 1.4826 times the median absolute deviation" if counts[-1] > 1 else ""
     return f"Points are medians of {counted} of {n_datasets} datasets{absolute}{bars}"

@@ -1,4 +1,4 @@
-"""Differences between two runs, with equal ones grouped into one row."""
+"""Differences between two runs, with equal differences grouped into one row."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def graph_picture(run: Run) -> Picture:
         uri=as_image(graph_file(run)),
         title="Steps and their products",
         caption="Each box is a step with its method and time; arrows are products. Frames are "
-        "green for steps from the cache, thick red for failed ones, dashed for steps not computed.",
+        "green for cached steps, thick red for failed steps, and dashed for steps not computed.",
     )
 
 
@@ -211,7 +211,7 @@ def write_figures(
 ) -> int:
     """Write the figures of cells to `folder/<cell>/` as PNG or JPEG files, and the run's graph.
 
-    Damaged pictures are omitted, and SVG files, which may contain scripts.
+    Damaged pictures and SVG files, which may contain scripts, are omitted.
 
     Args:
         run: the run.

@@ -139,11 +139,11 @@ class OpenedRun(Run):
         """Return an output as an object of its product class.
 
         Args:
-            address: address of the cell; with `variants`, its step suffices.
+            address: address of the cell; with `variants`, the name of the step suffices.
             port: name of the output.
             store: folder of stored results, for products that the record references but does not
                 contain.
-            variants: `data` for the dataset, or a step with variants -> the one wanted.
+            variants: name of a step with variants, or `data` -> variant or dataset.
 
         Raises:
             ArgumentError: the run does not have this cell, or the cell does not have this output.
@@ -240,7 +240,7 @@ class OpenedRun(Run):
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed or not failed[0].log:
             return ""
-        return f"; run.cell({failed[0].address!r}).log has its log"
+        return f"; its log is run.cell({failed[0].address!r}).log"
 
     def _repr_html_(self) -> str:
         made = {cell.address for cell in baseline_cells(self)}

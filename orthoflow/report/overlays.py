@@ -170,7 +170,7 @@ def _overlay(
     frame = frame_of(ground)
     magnification = magnification_for(frame, lengths_m[kinds != "rejected"])
     feet = frame.wall_from_world(points_world)[:, :2]
-    # Omit marks evenly.
+    # Keep marks at regular intervals.
     chosen = np.unique(np.linspace(0, len(kinds) - 1, min(_MAX_MARKS, len(kinds))).astype(np.int64))
     longest = max(frame.width, frame.height)
     reference_mm = round_below(1e3 * _REFERENCE_SHARE * longest * frame.gsd_m / magnification)

@@ -79,7 +79,7 @@ class MethodOverDatasets:
         is_reference: whether the others are compared with this one.
         n: number of datasets with a value.
         n_failed: number of datasets on which the step or one before it failed; they are not used.
-        n_absent: number of datasets without a value although nothing failed, or left out.
+        n_absent: number of datasets that have no value, although no step failed.
         n_partly: number of datasets on which only some repeats have a value.
         n_apart: number of datasets that cannot be paired because the environments or the numbers of
             photos differ from those of the reference.
@@ -284,7 +284,7 @@ def _over(
 
 
 def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDatasets, ...]:
-    """Correct all p-values of a run together: some of many are small by chance."""
+    """Correct all p-values of a run together, because some of many are small by chance."""
     metrics = tuple(metrics)
     found = [one.paired.p for metric in metrics for one in metric.methods if one.paired]
     corrected = holm([p for p in found if math.isfinite(p)])
@@ -352,8 +352,8 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         return ""
     if not any(one.paired and math.isfinite(one.paired.p) for _, one in rows):
         return (
-            f"No claim is possible with {n_datasets} datasets: at least {_MIN_SHOWN} on which the "
-            "results differ, computed in one environment, are needed"
+            f"{n_datasets} datasets are not enough for a claim: at least {_MIN_SHOWN} are needed "
+            "on which the results differ, all computed in one environment"
         )
     leads, level = [], []
     for name in dict.fromkeys(one.name for _, one in rows):
@@ -478,8 +478,9 @@ def over_table(over: Sequence[MetricOverDatasets]) -> Table:
             )
     return Table(
         name="datasets",
-        caption="Medians over the datasets, median differences from the reference with their 95 % "
-        "confidence intervals, and p of Wilcoxon's signed-rank test after Holm's correction.",
+        caption="Medians over the datasets, median differences from the reference with their 95 "
+        "% confidence intervals, and p-values of Wilcoxon's signed-rank test after Holm's "
+        "correction.",
         columns=_OVER,
         rows=tuple(rows),
     )

@@ -100,15 +100,16 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
 def _check(project: Project, folder: Path, catalog: Catalog) -> None:
     if not _NAME.fullmatch(project.name) or keyword.iskeyword(project.package):
         raise ArgumentError(
-            f"a plugin's name must be 2 to 32 lower-case letters, digits and hyphens, start "
-            f"with a letter and be no keyword of Python, as in my-detector, got {project.name!r}"
+            "a plugin's name must be 2 to 32 lower-case letters, digits and hyphens, start with "
+            f"a letter, and not be a Python keyword, e.g. my-detector, got {project.name!r}"
         )
     if project.is_new_kind:
         _check_new_kind(project, catalog)
     elif project.kind not in catalog.kinds:
         raise ArgumentError(
-            f"no installed plugin declares the kind {project.kind}"
-            f"{did_you_mean(project.kind, catalog.kinds)}; there are {', '.join(catalog.kinds)}"
+            "no installed plugin declares the kind "
+            f"{project.kind}{did_you_mean(project.kind, catalog.kinds)}; kinds: "
+            f"{', '.join(catalog.kinds)}"
         )
     if taken := catalog.methods.get(project.method_id):
         raise ArgumentError(
@@ -127,7 +128,7 @@ def _check_new_kind(project: Project, catalog: Catalog) -> None:
     if project.kind in catalog.kinds:
         raise ArgumentError(
             f"kind {project.kind} is already declared by an installed plugin: write a method of "
-            f"it with --kind {project.kind}, or choose another name"
+            f"this kind with --kind {project.kind}, or choose another name"
         )
     for name in filter(None, (project.kind, project.product)):
         if not re.fullmatch(NAME_PATTERN, name) or keyword.iskeyword(name) or "-" in name:
@@ -142,7 +143,7 @@ def _check_new_kind(project: Project, catalog: Catalog) -> None:
     for name in (*project.takes, *project.gives):
         if name not in catalog.products:
             raise ArgumentError(
-                f"there is no product type {name}{did_you_mean(name, catalog.products)}; there are "
+                f"there is no product type {name}{did_you_mean(name, catalog.products)}; types: "
                 f"{', '.join(catalog.products)}"
             )
 

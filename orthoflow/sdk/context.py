@@ -28,10 +28,10 @@ from orthoflow.sdk.lines import is_name, one_line
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 
-# Measured for every step.
+# Metrics that the engine measures for every step.
 MEASURED_BY_THE_ENGINE: Final = tuple(COSTS)
 _MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp"}
-# More than any step needs, but few enough for terminals.
+# More diagnostics than any step needs, but few enough for a terminal.
 _MOST_DIAGNOSTICS: Final = 1_000
 _LARGEST_FIGURE: Final = 64 << 20
 _HEAD_BYTES: Final = 16  # signature of an image file
@@ -140,7 +140,7 @@ class StepContext:
             raise ProductError(f"metric {name} must be a number: {one_line(error)}") from error
         if not math.isfinite(number):
             raise ProductError(
-                f"metric {name} must be finite, got {number}: if it is unknown, do not report it"
+                f"metric {name} must be finite, got {number}: do not report unknown values"
             )
         self._named.add(name)
         self.metrics.append(Metric(name=name, value=number, unit=unit))
@@ -262,7 +262,9 @@ class StepContext:
         """
         size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
         if np.dtype(dtype).hasobject or min(shape, default=0) < 0:
-            raise ProductError(f"an array cannot be of type {np.dtype(dtype)} and shape {shape}")
+            raise ProductError(
+                f"cannot allocate an array of type {np.dtype(dtype)} and shape {shape}"
+            )
         if size_bytes == 0:
             return np.zeros(shape, dtype=dtype)
         folder = self.scratch / "allocated"

@@ -1,8 +1,8 @@
 """Hooks and specs with which a plugin declares its content; free of numpy and pydantic.
 
 A plugin is an installed distribution with an entry point in the group `orthoflow.plugins` that
-refers to a module, which implements one or more of the hooks below with `hookimpl`. Classes are
-given as import strings and imported on first use.
+refers to a module that implements one or more of the hooks below with `hookimpl`. Classes are given
+as import strings and imported on first use.
 """
 
 from __future__ import annotations

@@ -54,8 +54,8 @@ class ConformanceCase:
         problem = self.problem()
         if self.expected_failure and not problem:
             raise ConformanceError(
-                f"{self}: passes, although it was expected to fail ({self.expected_failure}): "
-                "remove it from expected_failures"
+                f"{self}: the check passes, although it was expected to fail "
+                f"({self.expected_failure}): remove it from expected_failures"
             )
         if problem and not self.expected_failure:
             raise ConformanceError(f"{self}: {problem}")

@@ -86,8 +86,8 @@ def example(type_name: str, *, within: tuple[str, ...] = ()) -> Product | InputF
         except Exception:  # noqa: BLE001 - a third-party method may raise anything
             continue
     raise ExampleError(
-        f"there is no example of a {type_name} product, and no installed method makes one of the "
-        "suite's examples: give one in `inputs` of conformance_cases"
+        f"there is no example of a {type_name} product, and no installed method makes one from "
+        "the suite's examples: add one to `inputs` of conformance_cases"
     )
 
 

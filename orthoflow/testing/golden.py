@@ -181,7 +181,7 @@ def sample_problem(
         numbers_stated: also compare the numbers in the metadata, not only their count.
     """
     for array in sorted(before.keys() ^ after.keys()):
-        return f"only one of them has {array}"
+        return f"only one of the results has {array}"
     for array, values in before.items():
         name = array.partition(" [")[0]
         if name == _METADATA and not numbers_stated:

@@ -174,7 +174,7 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
             require(
                 painted.mean() > _JOINED_SHARE,
                 f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are covered, "
-                "although the layers show all",
+                "although the layers show all cells",
             )
 
 

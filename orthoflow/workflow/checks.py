@@ -53,8 +53,8 @@ def check_wiring(
             if port not in (accepted or {}):
                 log.report(
                     (*step.location, "in", port),
-                    f"{step.calls[0].id} has no input port {port}"
-                    f"{did_you_mean(port, accepted or {})}; it has "
+                    f"{step.calls[0].id} has no input port "
+                    f"{port}{did_you_mean(port, accepted or {})}; its input ports: "
                     f"{', '.join(accepted or {}) or 'none'}",
                     at_key=True,
                 )
@@ -62,7 +62,9 @@ def check_wiring(
             found = type_of(location, reference)
             wanted = (accepted or {}).get(port)
             if found is not None and wanted is not None and found != wanted:
-                message = f"expected {_article(wanted)}, but {reference} gives {_article(found)}"
+                message = (
+                    f"expected {_article(wanted)}, but {reference} refers to {_article(found)}"
+                )
                 log.report(location, message)
         for key, condition in (("if", step.only_if), ("unless", step.unless)):
             if condition is not None:
@@ -103,8 +105,8 @@ def _types(
         if ports is not None and name not in ports:
             log.report(
                 location,
-                f"step {source} has no output port {name}{did_you_mean(name, ports)}; it has "
-                f"{', '.join(ports)}",
+                f"step {source} has no output port {name}{did_you_mean(name, ports)}; its output "
+                f"ports: {', '.join(ports)}",
             )
         return (ports or {}).get(name)
 
@@ -120,8 +122,8 @@ def _check_required(step: DraftStep, log: ProblemLog) -> None:
             if needed.required and needed.name not in wired:
                 log.report(
                     (*call.location, "use"),
-                    f"{call.id} needs port {needed.name}, {_article(needed.type_name)}, "
-                    "which is not connected",
+                    f"the required input port {needed.name} of {call.id} "
+                    f"({_article(needed.type_name)}) is not connected",
                     shown=(*step.location, "in"),
                 )
 
@@ -145,7 +147,7 @@ def _ports(step: DraftStep, *, are_given: bool) -> Mapping[str, str] | None:
 
 
 def _article(type_name: str) -> str:
-    return "files of an input" if type_name == FILES else f"the product {type_name}"
+    return "input files" if type_name == FILES else f"a product of type {type_name}"
 
 
 def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
@@ -171,7 +173,7 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
         first = min(range(len(edges)), key=lambda index: places[edges[index]])
         edges = edges[first:] + edges[:first]
         listed = ", ".join(
-            f"{edge[1]} takes {wires[edge][1]} (line {places[edge].line})" for edge in edges
+            f"{edge[1]} uses {wires[edge][1]} (line {places[edge].line})" for edge in edges
         )
         log.report(wires[edges[0]][0], f"the steps form a cycle: {listed}")
         for name in names_in_cycle:
@@ -292,8 +294,8 @@ def _known(
         if known is None:
             log.report(
                 (*location, factor),
-                f"there is no step {factor} with variants{did_you_mean(factor, names)}; with "
-                f"variants: {', '.join(names) or 'none'}",
+                f"there is no step {factor} with variants{did_you_mean(factor, names)}; steps "
+                f"with variants: {', '.join(names) or 'none'}",
                 at_key=True,
             )
         elif level in known:
@@ -314,7 +316,7 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
     """Return why a metric pattern matches nothing; empty if it may match a metric."""
     step, _, metric = pattern.partition(".")
     if not _has_wildcard(step) and step not in step_names:
-        return f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}"
+        return f"there is no step {step}, which {pattern} refers to{did_you_mean(step, step_names)}"
     chosen = [one for one in steps if fnmatchcase(one.name, step)]
     calls = [(one, call) for one in chosen for call in one.calls]
     methods = [(one, call.method) for one, call in calls if call.method is not None]
@@ -331,17 +333,17 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
     if lacking and all(lacking):
         ports = " and ".join(lacking[0])
         return (
-            f"step {names} reports {metric} only if {ports} is connected; connect it under in:, or "
-            "remove the metric"
+            f"step {names} reports {metric} only if {ports} is connected; connect {ports} under "
+            "in:, or remove the metric"
         )
     if matching:
         return ""
     known = [name for _, spec in specs if not _has_wildcard(name := spec.name)]
     ids = ", ".join(dict.fromkeys(call.id for _, call in calls))
     return (
-        f"step {names} reports no metric {metric}"
-        f"{did_you_mean(metric, [*dict.fromkeys(known), *MEASURED_BY_THE_ENGINE])}; `orthoflow "
-        f"plugins show METHOD` lists those of {ids}"
+        f"step {names} reports no metric "
+        f"{metric}{did_you_mean(metric, [*dict.fromkeys(known), *MEASURED_BY_THE_ENGINE])}; to "
+        f"list its metrics, run `orthoflow plugins show` with {ids}"
     )
 
 
@@ -382,10 +384,13 @@ def _idle_inputs(workflow: Workflow) -> Iterator[str]:
     }
     for name in workflow.inputs:
         if name not in taken:
-            yield f"no step uses the input {name}: connect it as inputs.{name}, or remove it"
+            yield (
+                f"no step uses the input {name}: connect inputs.{name} to a step, or remove the "
+                "input"
+            )
     is_idle = not workflow.data_calls and workflow.data_inputs.isdisjoint(taken)
     if workflow.datasets and is_idle and not workflow.has_data_seeds:
-        yield "the datasets have no effect: they set no parameter, and no input that a step uses"
+        yield ("the datasets have no effect: they set no parameter and no input that a step uses")
 
 
 def _cell_sizes(workflow: Workflow) -> Iterator[str]:
@@ -398,7 +403,7 @@ def _cell_sizes(workflow: Workflow) -> Iterator[str]:
             if _MIN_GSD_M <= meant_m <= _MAX_GSD_M:
                 hint = f"; for {gsd_m:g} mm write {_GSD}: {meant_m:g}"
             yield (
-                f"{place}{whose} is {gsd_m:g} m, which is implausible: cells are "
+                f"{place}{whose} is {gsd_m:g} m, which is implausible: a cell is usually "
                 f"{_MIN_GSD_M:g} to {_MAX_GSD_M:g} m wide{hint}"
             )
 
@@ -420,9 +425,9 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
     for first in matching[:1]:
         for wall in cropped.intersection(first.upstream()):
             yield (
-                f"{wall}.{_CROP} leaves a smaller area for {first.name}, so fewer photos are "
-                "oriented, and less accurately; run without it first, and use the cameras of that "
-                "run: --input cameras=RUN/products/orient/cameras.json"
+                f"{wall}.{_CROP} reduces the area that {first.name} can use, so fewer photos are "
+                "oriented, and less accurately; first run without the crop, then use the cameras "
+                "of that run: --input cameras=RUN/products/orient/cameras.json"
             )
 
 

@@ -247,7 +247,9 @@ class _Reader:
         if not self.log.has(("name",)):
             if re.fullmatch(NAME_PATTERN, self.path.stem):
                 return self.path.stem
-            message = f"{self.path.stem!r} cannot be a name: {NAME_RULE}"
+            message = (
+                f"the file name {self.path.stem!r} cannot be the name of a workflow: {NAME_RULE}"
+            )
             self.log.report((), message, shown=("name",))
         return file.name or self.path.stem
 
@@ -278,7 +280,7 @@ class _Reader:
     def _variants(self, section: StepSection, location: Location) -> tuple[DraftCall, ...]:
         for key in _OF_CALLS:
             if self.log.has((*location, key)):
-                message = f"with variants, {key} belongs in each of them"
+                message = f"a step with variants cannot have {key}; move it into each variant"
                 self.log.report((*location, key), message, at_key=True)
         calls = [
             self._call(name, call, (*location, "variants", name))

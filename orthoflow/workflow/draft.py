@@ -89,11 +89,13 @@ def recognised(paths: Sequence[Path]) -> list[Recognised]:
     found: list[Recognised] = []
     for path in paths:
         if not path.exists():
-            raise InputError(f"{path} does not exist: give scans, photos, and folders with them")
+            raise InputError(
+                f"{path} does not exist: give scans, photos, or folders that contain them"
+            )
         found += _in_folder(path, 0) if path.is_dir() else [_file(path)]
         if len(found) > MOST_FILES:
             raise InputError(
-                f"{path} contains more than {MOST_FILES} files: give only the relevant ones"
+                f"{path} contains more than {MOST_FILES} files: give only the files that are needed"
             )
     return found
 
@@ -125,7 +127,7 @@ def _file(path: Path) -> Recognised:
     if text_of_path(path) is None:
         return _unknown(path, "its path is not UTF-8: rename it")
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
-        return Recognised(kind="other", path=path, summary="an orthoimage with a frame file")
+        return Recognised(kind="other", path=path, summary="an orthoimage with its position (JSON)")
     if suffix in RAW_SUFFIXES:
         return _unknown(path, f"camera raw format, which cannot be read: {HOW_TO_DEVELOP}")
     readers: list[tuple[Sequence[str], Callable[[Path], Recognised]]] = [
@@ -171,7 +173,7 @@ def _scan(path: Path) -> Recognised:
         words.append(f"unit {unit.name} ({unit.source})")
     for beginning, names in (
         ("", fields),
-        ("nothing in its fields for ", stated - fields),
+        ("empty fields for ", stated - fields),
     ):
         if names:
             listed = " and ".join(word for name, word in _FIELDS.items() if name in names)
@@ -185,8 +187,8 @@ def _scan(path: Path) -> Recognised:
     advice = _about_extent(path.name, extent_m, "m" if unit is None else unit.name)
     if up:
         advice.append(
-            f"{_word(path.name)}: its surfaces suggest that {up} points up, not z: cloud.up is "
-            f"{up} in the workflow; change it to -{up} if floors are labelled as ceilings"
+            f"the surfaces in {_word(path.name)} suggest that {up} points up, not z, so the "
+            f"workflow contains cloud.up={up}; change it to -{up} if floors become ceilings"
         )
     return Recognised(
         kind="scan",
@@ -233,13 +235,16 @@ def _seen_in(
 def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
     """Return advice to check the unit if a scan is unusually large or small."""
     if extent_m > _MAX_EXTENT_M:
-        size, hint = f"{extent_m:,.0f} m", "if its coordinates are millimetres, set cloud.unit=mm"
+        size, hint = (
+            f"{extent_m:,.0f} m",
+            ("if its coordinates are in millimetres, set cloud.unit=mm"),
+        )
     elif 0 < extent_m < _MIN_EXTENT_M:
         size = f"{extent_m * 1000:.3g} mm"
-        hint = "check the unit of the export, and set cloud.unit"
+        hint = "check in which unit it was exported, and set cloud.unit"
     else:
         return []
-    return [f"{_word(name)} is {size} long if its unit is {unit}: {hint}"]
+    return [f"{_word(name)} extends over {size} if its unit is {unit}: {hint}"]
 
 
 # Usual extents of terrestrial scans.
@@ -300,7 +305,7 @@ def _yaml(path: Path) -> Recognised:
     found = _read(
         "calibration",
         path,
-        lambda _: f"a calibration of {', '.join(read_calibration(path).patterns)}",
+        lambda _: f"a calibration for the photos {', '.join(read_calibration(path).patterns)}",
     )
     with path.open("rb") as file:
         is_workflow = re.search(rb"^steps:", file.read(_WORKFLOW_BYTES), re.MULTILINE)
@@ -371,8 +376,8 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     if not scans:
         others = "; ".join(f"{item.path.name}: {item.summary}" for item in found[:_MOST_LISTED])
         raise InputError(
-            "there is no scan among the files, but a workflow needs one (E57, LAS, LAZ, PLY, PCD, "
-            f"PTX or text); found {others or 'nothing'}"
+            "none of the files is a scan, but a workflow needs one (E57, LAS, LAZ, PLY, PCD, PTX "
+            f"or text); found {others or 'nothing'}"
         )
     own_formats = [scan for scan in scans if scan.path.suffix.lower() not in TEXT.suffixes]
     if own_formats and len(own_formats) < len(scans):
@@ -396,12 +401,12 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     is_usual = bool(by_kind.get("photos") or has_posed)
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
-        raise InputError("photos-on-scan needs photos, but there are none among the files")
+        raise InputError("none of the files is a photo, but the recipe photos-on-scan needs photos")
     has_paint = any({"intensity", "rgb"} & scan.fields for scan in scans)
     if recipe is None and chosen == "direct" and not has_paint:
         raise InputError(
-            f"{_some([scan.path.name for scan in scans])}: the points have neither colours nor "
-            "intensity, so they cannot be used for orthoimages: give photos too, or export the "
+            f"the points of {_some([scan.path.name for scan in scans])} have neither colours nor "
+            "intensity, so no orthoimage can be made from them: give photos too, or export the "
             "scan with its colours (--recipe direct writes the workflow anyway)"
         )
     if own_photos and "photos" not in by_kind:
@@ -436,7 +441,7 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
     body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
     run = shlex.quote(target.name)
     summary = [
-        f"# Made by `orthoflow new` from the recipe {recipe}.yaml.",
+        f"# Created by `orthoflow new` from the recipe {recipe}.yaml.",
         *(f"#   {name}: {text}" for name, text in described.items()),
         *(f"# Not used: {text}" for text in left_out[:_MOST_LISTED]),
         *(f"# Note: {text}" for text in advice[:_MOST_LISTED]),
@@ -463,8 +468,8 @@ def _advice(by_kind: _ByKind) -> list[str]:
     without = [item.path.name for item in photos if not item.lens]
     if without and not {"calibration", "cameras"} & by_kind.keys():
         advice.append(
-            f"{len(without)} of {len(photos)} photos have no focal length in EXIF: {_some(without)}"
-            "; give a calibration if you have one"
+            f"{len(without)} of {len(photos)} photos have no focal length in their EXIF data: "
+            f"{_some(without)}; give a calibration if you have one"
         )
     return advice
 
@@ -488,7 +493,7 @@ def _assigned(
             ]
         elif len(items) > 1 and kind not in ("scan", "photos", "other"):
             each = ", ".join(item.path.name for item in items)
-            left_out.append(f"{each}: only one file is allowed as {kind}; choose it under inputs")
+            left_out.append(f"{each}: only one file is allowed as {kind}; choose one under inputs")
         elif items:
             taken[kind] = items
     return taken, left_out

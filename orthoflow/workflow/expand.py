@@ -175,7 +175,7 @@ def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Names of selected steps; a step must meet all options that are given.
+    """Names of selected steps; a step must match all given options.
 
     Attributes:
         only: select these steps.
@@ -236,7 +236,7 @@ def select_cells(
         chosen &= set(selection.only)
     if not chosen:
         raise ArgumentError(
-            f"no step of workflow {workflow.name} meets all of {' '.join(selection.words)}"
+            f"no step of workflow {workflow.name} matches all of {' '.join(selection.words)}"
         )
     sources = {cell.address: cell.sources for cell in cells}
     wanted = [cell.address for cell in cells if cell.step in chosen]
@@ -282,8 +282,9 @@ def _require_few(workflow: Workflow, count: int) -> None:
     if count < MOST_CELLS:
         return
     raise WorkflowError(
-        f"the comparison of {workflow.name} runs its steps {MOST_CELLS} times or more (datasets, "
-        "seeds, combinations of variants and repeats); use design: one-at-a-time, or fewer of these"
+        f"the comparison of {workflow.name} has {MOST_CELLS} step runs or more, which is too "
+        "many; set design: one-at-a-time, or reduce the number of datasets, seeds, variants or "
+        "repeats"
     )
 
 

@@ -50,7 +50,7 @@ _MOST_BESIDE: Final = 200
 _DATASETS: Final = "datasets"
 _NOWHERE: Final = Position(line=0, column=0)
 _NUMBER: Final = re.compile(r"-?(0|[1-9]\d{0,14})(\.\d{1,15})?")
-# The first one that occurs in the header is used.
+# The first of these characters that occurs in the header is the separator.
 _SEPARATORS: Final = (";", "\t", ",")
 
 
@@ -60,7 +60,7 @@ class MissingInputsError(InputError):
     def __init__(self, problems: Sequence[str], *, most: int = 100) -> None:
         self.problems = tuple(problems)
         n_more = len(problems) - most
-        more = [f"and {n_more} more have no files"] if n_more > 0 else []
+        more = [f"and {n_more} more inputs have no files"] if n_more > 0 else []
         super().__init__("\n".join([*problems[:most], *more]))
 
 
@@ -159,7 +159,7 @@ def check_shared_inputs(
             example = workflow.chosen_data[0].inputs[option.name].name
             log.report_option(
                 str(option),
-                f"every dataset has its own {option.name}; choose a dataset, as in --input "
+                f"every dataset has its own {option.name}; name the dataset, as in --input "
                 f"{example}=PATH",
             )
 
@@ -225,8 +225,8 @@ def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
         if spec.optional:
             return None
         raise InputError(
-            f"input {spec.name} has no files; give them in the workflow or with "
-            f"--input {spec.name}=PATH"
+            f"input {spec.name} has no files; list them in the workflow, or pass --input "
+            f"{spec.name}=PATH"
         )
     try:
         paths = {path for pattern in spec.files for path in _find(spec, pattern)}
@@ -290,7 +290,7 @@ def check_no_step(
         what = {DATA: "the dataset", SEED: "the seed"}[factor]
         log.report(
             location,
-            f"a step is called {factor}, which means {what} in addresses; give the step "
+            f"a step cannot be called {factor}, which denotes {what} in addresses; give the step "
             "another name",
             at_key=True,
         )
@@ -590,7 +590,11 @@ def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
     if "name" in names:
         return list(header)
     is_mapping = any(": " in name or name.endswith(":") for name in names)
-    way_out = "; write a mapping in the workflow, under datasets:" if is_mapping else ""
+    way_out = (
+        ("; write the datasets as a mapping in the workflow instead, under datasets:")
+        if is_mapping
+        else ""
+    )
     listed = first_few([name for name in names if name]) or "none"
     message = f"a table of datasets needs the column name; its columns are {listed}{way_out}"
     log.add(header[0].position, "", message)

@@ -421,7 +421,9 @@ def _once(values: list[tuple[JsonValue, Report]]) -> list[tuple[JsonValue, Repor
         text = _canonical(value)
         if text in kept:
             comma = (
-                "; if it is the start of a decimal number, use a point: 0.5" if value == 0 else ""
+                ("; if it is part of a decimal number, write a decimal point: 0.5")
+                if value == 0
+                else ""
             )
             report(f"{json.dumps(value)} occurs twice in the sweep; remove one of them{comma}")
         kept.setdefault(text, (value, report))
@@ -446,8 +448,8 @@ def _may_vary(step: DraftStep, draft: DraftCall, log: ProblemLog) -> bool:
         return True
     log.report(
         (*draft.location, "use"),
-        f"{draft.id} is a source, and sources cannot have variants, so they cannot be "
-        f"swept; use datasets instead: {{a: {{set: {{{step.name}.<parameter>: VALUE}}}}, ...}}",
+        f"{draft.id} is a source, so its parameters cannot be swept; use datasets instead: {{a: "
+        f"{{set: {{{step.name}.<parameter>: VALUE}}}}, ...}}",
         shown=(*draft.location, "params"),
     )
     return False

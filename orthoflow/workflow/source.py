@@ -69,7 +69,7 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
         with open_file(path) as stream:
             content = stream.read(most_bytes + 1)
     except OSError as error:
-        raise WorkflowError(f"{path} cannot be read: {error.strerror}") from error
+        raise WorkflowError(f"cannot read {path}: {error.strerror}") from error
     if len(content) > most_bytes:
         raise WorkflowError(f"{path} is too large: {what} may have at most {most_bytes} bytes")
     try:

@@ -9,7 +9,7 @@ from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec, ProductSpec, hookim
 # Summary of each method by module and class. The id of a method is the name of its module, with
 # hyphens instead of underscores.
 _METHODS: Final = {
-    "read.scan:ReadScan": "E57, LAS/LAZ, PLY, PCD, PTX and text scans -> cloud",
+    "read.scan:ReadScan": "a cloud from E57, LAS/LAZ, PLY, PCD, PTX or text scans",
     "read.photos:ReadPhotos": "JPEG, PNG and TIFF photos, unchanged, with EXIF data and "
     "calibration",
     "read.checkpoints:ReadCheckpoints": "surveyed points from CSV files",
@@ -21,9 +21,10 @@ _METHODS: Final = {
     "geometry",
     "register.similarity:RegisterSimilarity": "translation, rotation and scale from pairs of "
     "points, with sigma0 and residuals",
-    "plane.hough2d:Hough2d": "Hough transform of the plan, cells weighted by their number of "
-    "points",
-    "plane.hough3d:Hough3d": "Hough transform of voxels, planes in any direction",
+    "plane.hough2d:Hough2d": (
+        "Hough transform of the plan, with cells weighted by number of points"
+    ),
+    "plane.hough3d:Hough3d": "Hough transform of voxels, for planes in any direction",
     "plane.ransac:Ransac": "random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or "
     "the plan",
     "plane.region:Region": (
@@ -34,15 +35,19 @@ _METHODS: Final = {
     "plane.comparators:Open3dPatches": "open3d's detect_planar_patches, for comparison",
     "plane.given:GivenPlane": "a reference plane given by the user",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
-    "match.sift:MatchSift": "RootSIFT key points of photos and walls, mutual best matches that "
-    "pass the ratio test",
-    "match.sides:FaceByPhotos": "fronts of planes from photos, where they were only guessed",
-    "match.guided:MatchGuided": "photos matched with the walls again, starting from a first pose",
-    "orient.pnp:OrientPnp": "each photo separately from its ties, with its accuracy or the "
-    "reason for its rejection",
-    "orient.dlt:OrientDlt": "each photo by a direct linear transform, with or without distortion",
-    "orient.bundle:OrientColmapBundle": "bundle adjustment of all photos with ties to the walls "
-    "and to each other, lenses refined",
+    "match.sift:MatchSift": "match RootSIFT key points of photos and walls, if mutually best and "
+    "distinct by the ratio test",
+    "match.sides:FaceByPhotos": (
+        "determine the fronts of planes from photos, where they were only assumed"
+    ),
+    "match.guided:MatchGuided": "match photos with the walls again, starting from a first pose",
+    "orient.pnp:OrientPnp": "orient each photo separately from its ties, with its accuracy or "
+    "the reason for its rejection",
+    "orient.dlt:OrientDlt": (
+        "orient each photo by a DLT (direct linear transform), with or without distortion"
+    ),
+    "orient.bundle:OrientColmapBundle": "bundle adjustment of all photos, with ties to the walls "
+    "and between photos",
     "orient.given:OrientGiven": "poses from other programs, unchanged or "
     "corrected by ties measured by hand",
     "dense.sgm:DenseSgm": "dense cloud from neighbouring photos, by semi-global matching",
@@ -51,7 +56,9 @@ _METHODS: Final = {
     "to the viewer",
     "ortho.dsm_backward:DsmBackward": "each cell of a wall takes its colour from the photos that "
     "show it",
-    "ortho.dsm_forward:DsmForward": "each pixel of a photo is projected onto the wall it shows",
+    "ortho.dsm_forward:DsmForward": (
+        "each pixel of a photo is projected onto the wall that it shows"
+    ),
     "mosaic.seams:MosaicSeams": "one orthoimage per wall from its layers",
     "segment.openings:SegmentOpenings": "outlines of windows, doors and niches from depths, "
     "lines of sight and the orthoimage",

@@ -190,7 +190,7 @@ class RecordedFigure(Figure):
 
 @dataclass(frozen=True, kw_only=True)
 class ProductRef:
-    """A product by its content.
+    """Reference to a product by its content.
 
     Attributes:
         type_name: product type; `files` for a workflow input.

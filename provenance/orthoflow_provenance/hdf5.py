@@ -149,7 +149,7 @@ def read_text(group: h5py.Group, name: str) -> str:
     dataset = dataset_of(group, name)
     value = read_whole(dataset)
     if not isinstance(value, bytes):
-        raise RecordFormatError(f"{dataset.name} must be one text, got {dataset.dtype}")
+        raise RecordFormatError(f"{dataset.name} must be a single text, got {dataset.dtype}")
     return _decoded(bytes(value), dataset.name)
 
 
@@ -339,13 +339,14 @@ def _check_superblock(path: Path) -> None:
     with path.open("rb") as stream:
         start = stream.read(_SUPERBLOCK_BYTES)
     if not start.startswith(_SIGNATURE):
-        raise UnknownFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
+        raise UnknownFormatError(
+            f"{path.name} is not an HDF5 file: its first bytes are not those of HDF5"
+        )
     if len(start) == _SUPERBLOCK_BYTES and start[8] == 3 and start[11] & _WRITER_MARKS:
         raise LockedFileError(
-            f"{path.name} is open for writing in another program, or was left so by a program "
-            f"that crashed: close that program; if there is none, `h5clear -s {path.name}` (part "
-            "of the HDF5 tools) removes the mark, and `orthoflow verify` checks whether the file "
-            "is complete"
+            f"{path.name} is marked as open for writing: close the program that has it open; if a "
+            f"program crashed and left the mark, remove it with `h5clear -s {path.name}` (part of "
+            "the HDF5 tools), and check with `orthoflow verify` whether the file is complete"
         )
 
 

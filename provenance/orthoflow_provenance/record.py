@@ -119,8 +119,8 @@ class OpenRecord:
         # Check it here, because the caller may not have checked the seal of the file.
         if (found := payload_digest(payload)) != output.digest:
             raise RecordFormatError(
-                f"{group.name} has the digest {found}, but the record states {output.digest}: it "
-                "was changed, or the file is damaged"
+                f"{group.name} has the digest {found}, but the record states {output.digest}: the "
+                "record was changed, or the file is damaged"
             )
         return payload
 
@@ -350,7 +350,7 @@ def _check_names(record: RunRecord) -> None:
     addresses: set[str] = set()
     for cell in record.cells:
         if cell.address in addresses:
-            raise RecordFormatError(f"the cell {cell.address!r} is given twice")
+            raise RecordFormatError(f"the cell {cell.address!r} occurs twice")
         addresses.add(check_name(cell.address, "the cell"))
         for port in (*cell.inputs, *cell.outputs):
             check_name(port, "the port")

@@ -98,7 +98,7 @@ def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...
         codes = {LockedFileError: "locked", UnknownFormatError: "foreign"}
         return (Finding(codes.get(type(error), "damaged"), "/", str(error)),)
     except HDF5_ERRORS as error:
-        return (Finding("damaged", "/", f"{path.name} cannot be read: {error}"),)
+        return (Finding("damaged", "/", f"cannot read {path.name}: {error}"),)
 
 
 def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Finding]:
@@ -132,7 +132,7 @@ def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
     n_bytes = bytes_behind_end(path)
     if n_bytes:
         after = f"there are {n_bytes} bytes after"
-        how = after if n_bytes > 0 else f"{-n_bytes} bytes are missing at"
+        how = after if n_bytes > 0 else f"{-n_bytes} bytes are missing before"
         yield Finding("appended", "/", f"{how} the end declared in the file")
     try:
         seal = read_text(file, SEAL)
@@ -143,7 +143,7 @@ def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
     found = "" if offset is None or len(seal) != 64 else file_sha256(path, offset)
     if found != seal:
         problem = f"the seal is {seal:.80}, but the SHA-256 of the content is {found}"
-        yield Finding("seal", f"/{SEAL}", f"{problem}: the file was changed")
+        yield Finding("seal", f"/{SEAL}", f"{problem}: the file has been changed")
 
 
 def _object_findings(

@@ -65,7 +65,7 @@ def test_a_failure_on_a_changed_record_is_that_records(tmp_path: Path) -> None:
     for runs in ((changed,), (intact, intact, changed)):
         raised = failing(error, *runs)
         assert isinstance(raised, RecordError)
-        assert str(raised).startswith(f"{changed} was changed after it was written: ")
+        assert str(raised).startswith(f"{changed} has been changed since it was written: ")
         assert raised.__cause__ is error
     # A product that breaks its rules is the record's, too.
     for kind in (GeometryError, ProductError):

@@ -47,7 +47,7 @@ def test_where_all_is_there_nothing_is_restricted() -> None:
     result = CliRunner().invoke(program, ["doctor", "--store", "new/er"])
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
-    assert lines[-1] == "orthoflow works, with 0 restrictions"
+    assert lines[-1] == "orthoflow works with 0 restrictions"
     assert [line.split()[0] for line in lines if "  ok  " in line] == [
         *("platform", "cores", "memory", "disk", "store", "click", "plugins"),
     ]
@@ -127,9 +127,9 @@ def test_broken_and_disabled_plugins_cost_their_methods(monkeypatch: pytest.Monk
     assert findings()["plugin odd"]["found"] == "odd 1.0 cannot be loaded"
     result = CliRunner().invoke(program, ["doctor"])
     assert "- plugin odd: its methods are missing: NameError: no such name" in result.output
-    assert result.output.splitlines()[-1] == "orthoflow works, with 1 restriction"
+    assert result.output.splitlines()[-1] == "orthoflow works with 1 restriction"
     monkeypatch.setenv("ORTHOFLOW_DISABLED_PLUGINS", "odd")
-    assert findings()["plugin odd"]["found"] == "switched off"
+    assert findings()["plugin odd"]["found"] == "disabled"
     unknown = CliRunner().invoke(program, ["plugins", "show", "plane.odd"])
     assert unknown.exit_code == 2
     assert "ORTHOFLOW_DISABLED_PLUGINS disables odd" in unknown.output

@@ -104,7 +104,7 @@ def test_a_refused_export_of_a_record_alone_leaves_nothing(
     for command in (("export", "run.h5", "--embed"), ("replay", "run.h5")):
         refused = studio(*command)
         assert refused.exit_code == 2
-        assert "was found; give it with --input number=PATH" in refused.stderr
+        assert "was found; pass --input number=PATH" in refused.stderr
     assert [path.name for path in alone.rglob("*") if path.is_file()] == ["run.h5"]
 
 
@@ -121,8 +121,8 @@ def test_products_that_nobody_has_are_named_and_no_store_is_made(
     with pytest.raises(ArgumentError) as caught:
         write_embedded(named, studio.folder / "whole.h5", store)
     assert str(caught.value) == (
-        f"neither the record {run.path} nor the store {store.folder} has paint.{port}: give the "
-        "store of the run with --store, or replay the run"
+        f"neither the record {run.path} nor the store {store.folder} contains paint.{port}: "
+        "give the store of the run with --store, or replay the run"
     )
     assert not store.folder.exists()
     assert not (studio.folder / "whole.h5").exists()
@@ -138,7 +138,7 @@ def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
     (studio.folder / "n.txt").write_text("1.6")
     refused = studio("export", "first", "--embed", "-o", "whole")
     assert refused.exit_code == 3
-    assert "was found; n.txt was changed" in refused.stderr
+    assert "was found; n.txt has been changed" in refused.stderr
 
 
 def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:
@@ -153,7 +153,7 @@ def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:
     refused = studio("verify", "first")
     assert refused.exit_code == 3
     assert "products/metrics.csv: changed since it was published" in refused.stdout
-    assert "is intact, but published files next to it were" in refused.stderr
+    assert "is intact, but published files next to it have" in refused.stderr
     table.write_text(written)
     for path, text in (
         (products / "mine.tif", ""),

@@ -84,7 +84,7 @@ def test_pictures_that_were_changed_are_not_handed_on(run: Path) -> None:
     content = (run / ORTHO).read_bytes()
     (run / ORTHO).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     for target in (*PICTURED, "ro-crate"):
-        check_refused(run, target, 3, "was changed after the run")
+        check_refused(run, target, 3, "has been changed since the run")
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".json"])

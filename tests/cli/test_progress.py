@@ -109,7 +109,7 @@ def test_a_log_has_a_line_per_start_end_and_code(
         "wall: skipped (3 of 5)",
         "other: ok in 1.2 s (4 of 5)",
         "last: started",
-        "last: ok in 1.2 s, plus 45.0 s of starting, loading and compiling (5 of 5)",
+        "last: ok in 1.2 s, plus 45.0 s for starting, loading and compiling (5 of 5)",
         "resuming run r1: 1 step",
     ]
 
@@ -145,7 +145,7 @@ def test_the_live_table_shows_every_state_and_keeps_warnings(
         assert columns[0] == ["cloud", "plane", "wall", "other"]
         assert columns[1] == ["cached", " 50 %", "waiting", "waiting"]
         assert columns[4] == ["", "peeling", "", ""]
-        whole = "1 of 4 steps ended, remaining time still unknown"
+        whole = "1 of 4 steps ended, remaining time not yet known"
         assert str(progress.drawn().renderables[1]) == whole
         progress.take(CellStarted(address="plane"))
         assert str(list(progress.table().columns[1].cells)[1]) == "  0 %"
@@ -219,7 +219,7 @@ UNKNOWN = [CellState(), CellState()]
         (
             [CellState(took_s=0.0), CellState(took_s=4.0), *UNKNOWN],
             1,
-            "remaining time still unknown",
+            "remaining time not yet known",
         ),
         ([CellState(took_s=0.0), CellState(state="ok")], 1, ""),
     ],

@@ -83,7 +83,7 @@ def test_inputs_are_found_by_content_where_a_user_says(studio: Studio) -> None:
     (studio.folder / "n.txt").rename(renamed)
     missing = refused(studio, code=2)
     assert "no file with the content of the recorded n.txt (3 bytes, SHA-256 " in missing
-    assert "was found; give it with --input number=PATH" in missing
+    assert "was found; pass --input number=PATH" in missing
     (studio.folder / "o.txt").write_text("1.6")
     assert refused(studio, "--input", "number=o.txt", code=2) == missing
     done = studio("replay", "first", "-o", "again", "--input", "number=elsewhere")
@@ -109,7 +109,12 @@ def test_an_input_is_found_where_a_run_found_it(studio: Studio) -> None:
 @pytest.mark.parametrize(
     ("name", "changed", "code", "sentence"),
     [
-        ("result_version", 2, 3, "survey.offset: the installed one has result version 1, the rec"),
+        (
+            "result_version",
+            2,
+            3,
+            "survey.offset: the installed version has result version 1, but",
+        ),
         ("method", "survey.laser", 4, "survey.laser of workshop 1.0: unknown method survey.laser"),
     ],
 )
@@ -180,4 +185,4 @@ def test_a_metric_that_the_replay_does_not_confirm_is_named(studio: Studio) -> N
     assert lines[-6] == "2 products: 2 identical"
     assert lines[-4].split()[:5] == ["survey.offset_m", "7.0", "m", "1.5", "m"]
     assert lines[-4].endswith("unknown: the products of its step are identical")
-    assert lines[-3] == "2 metrics, without times: 1 differ"
+    assert lines[-3] == "2 metrics (times not counted): 1 differ"

@@ -31,7 +31,7 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
         "signed_with": "",
     }
     path.write_bytes(path.read_bytes()[:-1])
-    assert "was changed after it was written (see above)\n" in said("verify", path, code=3)
+    assert "has been changed since it was written (see above)\n" in said("verify", path, code=3)
     verified = json.loads(said("verify", path, "--json", code=3))
     assert (verified["ok"], len(verified["findings"])) == (False, 1)
 
@@ -40,11 +40,11 @@ def test_who_shows_a_record_that_was_changed_says_so(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     page = tmp_path / "page.html"
     said("report", path, "-o", page)
-    warning = "The record of this run was changed after it was written"
+    warning = "The record of this run has been changed since it was written"
     assert warning not in page.read_text()
     with h5py.File(path, "r+") as file:
         file.attrs["seed"] = type(file.attrs["seed"])(b"8")
-    doubt = f"{path} was changed after it was written: its seal does not match /; "
+    doubt = f"{path} has been changed since it was written: its seal does not match /; "
     assert doubt in said("show", path, code=3)
     assert doubt in said("report", path, "-o", page, code=3)
     assert warning in page.read_text()

@@ -79,12 +79,12 @@ RAISED = {
     "from orthoflow.errors import InputError\nraise InputError('a.csv:2: no\\na.csv:3: two')": (
         "InputError: a.csv:2: no; a.csv:3: two"
     ),
-    "result = inputs.numbers": f"MethodError: {TOY} must return its Out, got Numbers",
+    "result = inputs.numbers": f"MethodError: {TOY} must return an Out, got Numbers",
     "result = type(inputs)(numbers=products.Scan(values=values))": (
-        f"MethodError: {TOY} must give a numbers on its port numbers, got Scan"
+        f"MethodError: output port numbers of {TOY} must be of type numbers, got Scan"
     ),
     "ctx.metric('nan', float('nan'), '1')": (
-        "ProductError: metric nan must be finite, got nan: if it is unknown, do not report it"
+        "ProductError: metric nan must be finite, got nan: do not report unknown values"
     ),
     "values = np.array([object()])": (
         "ProductError: a numbers cannot be stored: an array of type object cannot be stored; only "
@@ -186,7 +186,7 @@ def test_what_a_method_does_to_its_process_harms_nothing_else(
     assert messages["segfault"].startswith(f"{TOY} crashed (segmentation fault) while using ")
     assert "string_at" in results["segfault"].log
     assert messages["quits"] == (
-        f"{TOY} ended its process without a result (exit status 7); its log ends with: last words"
+        f"{TOY} ended without a result (exit status 7); its log ends with: last words"
     )
     assert messages["interrupts"] == f"{TOY} failed unexpectedly: KeyboardInterrupt"
     printed = results["prints"].log
@@ -211,7 +211,7 @@ def test_a_step_that_kills_the_server_of_all_steps_fails_and_the_next_run_has_an
     kills = json.dumps("os.kill(os.getppid(), 9)\ntime.sleep(600)")
     steps = TWO.replace("work.add", f"work.does, params: {{code: {kills}}}")
     message = world.run(steps).results["b"].error_message
-    assert message.startswith(f"{TOY} ended its process")
+    assert message.startswith(f"{TOY} ended without a result")
     assert world.run(TWO, into="next").status == "ok"
 
 
@@ -243,8 +243,8 @@ def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
     assert result.error_type == "StepFailedError"
     assert result.error_message == (
         f"{TOY} needed more memory than the machine has "
-        f"({result.peak_rss_mib / 1024:.1f} GiB when stopped); use less data or coarser "
-        "parameters"
+        f"({result.peak_rss_mib / 1024:.1f} GiB when stopped); use fewer points or photos, "
+        "or a coarser resolution"
     )
     # What other children of this test hold (the server of processes) is missing from it.
     assert 150 < result.peak_rss_mib < 1000

@@ -90,7 +90,7 @@ def test_an_interrupted_run_says_so(world: World, number: signal.Signals) -> Non
     process.join(30)
     assert process.exitcode == 130
     said = (world.folder / "run.said").read_text()
-    assert "CancelledStepError: the run was interrupted; the same command continues" in said
+    assert "CancelledStepError: the run was interrupted; to continue it, repeat the command" in said
     assert "Traceback" not in said
     assert events(world)[-1]["event"] == "interrupted"
 

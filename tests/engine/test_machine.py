@@ -109,7 +109,7 @@ def test_a_file_system_without_locks_is_said(
     with pytest.raises(StoreError) as caught, shared_lock(path):
         pass
     assert str(caught.value) == (
-        f"cannot lock {path}: No locks available; it must be on a file system with locks"
+        f"cannot lock {path}: No locks available; use a file system that supports locks"
     )
 
 

@@ -146,7 +146,7 @@ def test_an_unreadable_earlier_preimage_does_no_harm() -> None:
     for text in ("", "[]"):
         earlier = dataclasses.replace(result_of(), key="x", key_preimage=text)
         reason = explain(CellKey(key="k", preimage="{}"), [earlier])
-        assert reason == "the composition of its key has changed"
+        assert reason == "the way its cache key is computed has changed"
 
 
 # Plans --------------------------------------------------------------------------------------------

@@ -99,7 +99,9 @@ def test_a_lens_is_refused_just_where_its_radius_turns_back(tmp_path: Path, plac
         lens[place] = share * limit
         text = f"cameras: {{a.jpg: {{{entry}, distortion: {lens}}}}}"
         if is_refused:
-            assert "the lens model folds back inside the image" in refusal(tmp_path, text)
+            assert "the lens distortion is not monotonic inside the image" in refusal(
+                tmp_path, text
+            )
         else:
             assert the_lens(read(tmp_path, text)).distortion == tuple(lens)
 

@@ -95,9 +95,9 @@ def test_what_colmap_cannot_hold_is_refused(tmp_path: Path) -> None:
     assert camera.intrinsics is not None
     skewed = replace(camera.intrinsics, skew=-2.0)
     for one, message in (
-        (replace(camera, photo="north wall 1.jpg"), r'there is "north wall 1\.jpg"'),
+        (replace(camera, photo="north wall 1.jpg"), r'such as "north wall 1\.jpg"'),
         (Camera(photo="a.png", status="too few ties"), "no photo is oriented"),
-        (replace(camera, intrinsics=skewed), "has a skew of -2.0 px, which no model of"),
+        (replace(camera, intrinsics=skewed), "has a skew of -2.0 px, which no COLMAP camera model"),
     ):
         with pytest.raises(ArgumentError, match=message):
             write_colmap_model(tmp_path, Cameras(cameras=(one,)))

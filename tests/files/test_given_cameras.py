@@ -349,7 +349,7 @@ def test_binary_models_that_state_more_than_they_hold_are_refused(
         at = {"rigs": 12, "frames": 72}[part]
         content[at : at + 4] = bytes([255] * 4)
     damaged.write_bytes(content)
-    with pytest.raises(InputError, match=f"{part}.bin: it is cut off"):
+    with pytest.raises(InputError, match=f"{part}.bin: it is truncated"):
         read_given_cameras(paths)
 
 
@@ -431,9 +431,9 @@ def test_the_faces_of_a_fisheye_have_its_place_and_their_own_directions(tmp_path
         # Through the axes of the fisheye on the one hand, through the world on the other.
         own = camera.lens.posed().rays_world(places) @ FACES[face]
         np.testing.assert_allclose(viewing.rays_world(places) @ rotation, own, atol=1e-9)
-    assert given.of_face("back").reason == "its lens does not show that face"
+    assert given.of_face("back").reason == "its lens does not cover that face"
     folding = replace(given, lens=replace(given.lens, radial=(-0.9, 0.0, 0.0, 0.0)))
-    assert folding.of_face("front").reason.startswith("its lens is invalid: it folds back")
+    assert folding.of_face("front").reason.startswith("its lens is invalid: its distortion")
     # What has no orientation has none on any face, and keeps its reason.
     lost = replace(given, rotation=None, translation=None, reason="too few ties")
     assert lost.of_face("front") is lost

@@ -88,7 +88,7 @@ def test_what_cannot_be_written_leaves_the_older_record(tmp_path: Path) -> None:
     for find, change, message in (
         (lost, {}, "is no longer in the store: run the workflow"),
         (another, {}, r"product-2\.h5 must contain the product sha256:"),
-        (shelf.find, {"cells": (cell, cell)}, "the cell 'cloud' is given twice"),
+        (shelf.find, {"cells": (cell, cell)}, "the cell 'cloud' occurs twice"),
         (shelf.find, {"cells": (replace(cell, address="a/b"),)}, "'a/b' cannot be a name"),
         (
             shelf.find,

@@ -32,7 +32,7 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     comparison = compared(*rows, alone=("wall",))
     assert repr(comparison) == (
         "<RunComparison of 'r1' and 'r2': 0 of 0 inputs, 1 of 2 parameters, 1 of 2 metrics, "
-        "1 of 3 products differ, 1 products not measured, 1 steps only in one run>"
+        "1 of 3 products differ, 1 products not measured, 1 steps in only one run>"
     )
     assert comparison.measured == rows[:2]
     table = comparison.metric_table()
@@ -86,7 +86,7 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
         ("paint", "identical"),
     ]
     assert {row.cell for row in pairing.shared(pairing.parameters)} == {"survey", "paint"}
-    assert repr(pairing).endswith(", 2 steps only in one run>")
+    assert repr(pairing).endswith(", 2 steps in only one run>")
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
 
 

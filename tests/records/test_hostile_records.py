@@ -137,7 +137,7 @@ def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> No
     os.truncate(run / "products" / "metrics.csv", 1 << 40)
     before = os.times()
     assert "products/metrics.csv: changed since it was published" in said("verify", run, code=3)
-    assert "products/metrics.csv was changed after the run" in said(
+    assert "products/metrics.csv has been changed since the run" in said(
         "export", run, "--to", "ro-crate", "-o", "crate", code=3
     )
     (run / "products" / "metrics.csv").unlink()
@@ -266,7 +266,7 @@ def close_a_circle(record: hostile.Record) -> None:
     given["source"] = "paint.planes"
 
 
-REFUSES = "step paint: the installed paint.plain refuses the recorded parameter"
+REFUSES = "step paint: the installed paint.plain does not accept the recorded parameter"
 IMPOSSIBLE: tuple[tuple[Callable[[hostile.Record], None], str], ...] = (
     (with_preimage(""), "key_preimage must not be empty"),
     *(

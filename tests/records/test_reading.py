@@ -198,7 +198,7 @@ def test_what_a_run_does_not_have_is_said(run: Run) -> None:
         run.payload("roof", "x")
     with pytest.raises(ArgumentError, match="the step cloud has no output 'x'; it has cloud"):
         run.payload("cloud", "x")
-    with pytest.raises(ArgumentError, match="step cloud has no figure 'plan'; it has none at all"):
+    with pytest.raises(ArgumentError, match="step cloud has no figure 'plan'; it has none"):
         run.figure("cloud", "plan")
 
 

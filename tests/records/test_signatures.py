@@ -82,7 +82,9 @@ def test_a_signed_record_verifies_with_the_key_of_its_signer_and_no_other(
     assert not (whole / "run.h5.sig").exists()
     # A record is signed by one person.
     signature = (run / "run.h5.sig").read_text()
-    assert ": remove run.h5.sig to sign with another" in said("sign", run, "--key", "joe", code=2)
+    assert ": remove run.h5.sig to sign it with another key" in said(
+        "sign", run, "--key", "joe", code=2
+    )
     assert (run / "run.h5.sig").read_text() == signature
     (run / "run.h5.sig").unlink()
     assert finished("sign", run, "--key", "joe").exit_code == 0

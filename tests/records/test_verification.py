@@ -120,7 +120,7 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
     require_unchanged(run)
     for name, sentence in (
         ("folder", "is not listed in the record of the run, so it cannot be checked"),
-        ("other", "other was changed after the run: the record states the digest"),
+        ("other", "other has been changed since the run: its digest in the record is"),
         ("link", "link cannot be read: no file"),
         ("gone", "gone cannot be read: missing"),
     ):

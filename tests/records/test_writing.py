@@ -188,7 +188,7 @@ def test_what_cannot_be_recorded_leaves_the_run_unfinished(executed: Executed) -
         with_paint(figures=(figure,)).write()
     # The disk refused a step.
     refused = with_paint(status="failed", error_type="StoreError", error_message="I/O error")
-    with pytest.raises(StoreError, match=r"paint failed: I/O.* same command with -o .* continues"):
+    with pytest.raises(StoreError, match=r"paint failed: I/O.* repeat the command with -o "):
         refused.write()
     shutil.rmtree(executed.store.objects)
     with pytest.raises(StoreError, match="has no intact product sha256:"):

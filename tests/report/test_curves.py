@@ -142,7 +142,7 @@ def test_a_line_is_over_the_rooms_that_all_its_points_have(tmp_path: Path) -> No
     (curve,) = curves([*over_rooms(tmp_path, values, "rms_mm").values()])
     assert points(curve) == [(1.0, 2.5), (2.0, 3.0)]
     assert curve.caption.startswith(
-        "Points are medians of 2 of 3 datasets. Errors count without their sign. "
+        "Points are medians of 2 of 3 datasets. Absolute values of errors are used. "
         "Bars are 1.4826 times the median absolute deviation. Lower is better."
     )
     # Repeats of one room are no spread of rooms.

@@ -80,7 +80,7 @@ def test_a_run_that_failed_names_the_step_its_reason_and_where_the_log_is(tmp_pa
     run = OpenedRun(path=tmp_path / "run.h5", record=record(cells, name="hall"))
     said = f"plane@data=hall failed (1 more failed): {reason} \\x1b[2J"
     assert repr(run) == f"<Run hall in {tmp_path}: 1 ok, 2 failed, 1 skipped; {said}>"
-    way = "run.cell('plane@data=hall').log has its log"
+    way = "its log is run.cell('plane@data=hall').log"
     for call in (lambda: run.orthoimage(0), lambda: run.orthoimage(0, cell="mosaic")):
         with pytest.raises(ArgumentError) as error:
             call()
@@ -90,7 +90,7 @@ def test_a_run_that_failed_names_the_step_its_reason_and_where_the_log_is(tmp_pa
     cells[1] = replace(cells[1], log="")
     silent = OpenedRun(path=tmp_path / "run.h5", record=record(cells, name="hall"))
     assert f"{escape(said)}</p>" in silent._repr_html_()
-    assert "has its log" not in silent._repr_html_()
+    assert "its log is" not in silent._repr_html_()
 
 
 def test_metrics_are_a_row_each_with_the_variants_beside(tmp_path: Path) -> None:

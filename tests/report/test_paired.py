@@ -209,7 +209,7 @@ def test_what_is_shown_to_lead_is_stated_of_six_at_most() -> None:
     assert who_leads([over({"a": (1.0, 2.0), "b": (3.0, 4.0)}, "")], 2) == ""
     assert who_leads([over({"a": (1.0, 2.0)})], 2) == ""
     few = who_leads([leading(1, 0, 4)], 4)
-    assert few.startswith("No claim is possible with 4 datasets: at least 6 on which the results ")
+    assert few.startswith("4 datasets are not enough for a claim: at least 6 are needed ")
     assert who_leads([leading(0, 2)], 12).startswith(
         "No difference is significant in any of 1 metrics"
     )

@@ -52,7 +52,7 @@ def test_layers_are_written_when_asked_for(road: Shell) -> None:
     # The record only names the layers.
     lost = road("export", "run", "--to", "layers", "--store", "elsewhere", "-o", "lost")
     assert lost.code == 2
-    assert "neither its record nor the store elsewhere" in lost.said
+    assert "neither the record nor the store elsewhere" in lost.said
 
 
 def test_the_record_verifies_and_a_second_run_comes_from_the_cache(road: Shell) -> None:

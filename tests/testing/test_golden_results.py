@@ -84,7 +84,7 @@ def test_what_other_numbers_went_into_is_held_to_its_tolerances_alone(tmp_path: 
     lifted = stating(20.23, 4.20, 0.0254, lift_m=2e-5)
     assert golden_problem(file, elsewhere, lifted).startswith(MOVED)
     one_less = golden_problem(file, elsewhere, stating(20.23, 4.20))
-    assert "(only one of them has metadata [3])" in one_less
+    assert "(only one of the results has metadata [3])" in one_less
     assert file.read_text() == before
 
 
@@ -115,4 +115,4 @@ def test_one_of_sixteen_sampled_values_may_stray(n_moved: int, is_noticed: bool)
 def test_an_array_that_only_one_of_two_samples_has_is_named() -> None:
     one = [2.0]
     for pair in (({"a": one}, {"a": one, "b": one}), ({"b": one, "a": one}, {"a": one})):
-        assert sample_problem(*pair, {}) == "only one of them has b"
+        assert sample_problem(*pair, {}) == "only one of the results has b"

@@ -189,7 +189,7 @@ def test_a_changed_record_of_datasets_is_refused(catalog: Catalog, folder: Path)
 def test_datasets_that_can_hardly_be_meant_are_doubted(catalog: Catalog) -> None:
     idle = load(ROOMS + "datasets: {hall: {}, attic: {}}\n", catalog)
     assert lint_workflow(idle) == (
-        "the datasets have no effect: they set no parameter, and no input that a step uses",
+        "the datasets have no effect: they set no parameter and no input that a step uses",
         *lint_workflow(load(ROOMS, catalog)),
     )
     coarse = load(ROOMS + "datasets: {hall: {set: {wall.gsd_m: 3}}, attic: {}}\n", catalog)

@@ -81,7 +81,7 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     text = Path("jobs/hall 1.yaml").read_text()
     assert 'photos: {files: "../the [old] hall/photos"}  # 3 photos' in text
     assert "scan: hall.las, LAS/LAZ, 500 points, intensity and colours" in out
-    assert "calibration: calibration.yaml, a calibration of *" in out
+    assert "calibration: calibration.yaml, a calibration for the photos *" in out
     assert "checkpoints: checks.csv, 2 surveyed points" in out
     assert "ties: ties.csv, 1 tie" in out
     assert "not used: notes.txt: text file, ignored because there are scans in other formats" in out
@@ -114,9 +114,9 @@ def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("nowhere",), "nowhere does not exist: give scans, photos, and folders with them"),
-        (("photos",), "there is no scan among the files, but a workflow needs one (E57, LAS"),
-        (("hall.las", "--recipe", "photos-on-scan"), "photos-on-scan needs photos, but there are"),
+        (("nowhere",), "nowhere does not exist: give scans, photos, or folders that contain them"),
+        (("photos",), "none of the files is a scan, but a workflow needs one (E57, LAS"),
+        (("hall.las", "--recipe", "photos-on-scan"), "the recipe photos-on-scan needs photos"),
         (
             ("hall.las", "-o", "notes.txt"),
             "notes.txt exists already: choose another name with -o",
@@ -184,10 +184,10 @@ def test_a_scan_with_empty_fields_is_no_source_of_colours(data: Path) -> None:
     cloud.write(str(data / "bare.las"))
     result = asked("new", data / "bare.las")
     assert result.exit_code == 2
-    assert "bare.las: the points have neither colours nor intensity" in result.output
+    assert "the points of bare.las have neither colours nor intensity" in result.output
     assert not Path("workflow.yaml").exists()
     out = said("new", data / "bare.las", data / "photos")
-    assert "nothing in its fields for intensity and colours" in out
+    assert "empty fields for intensity and colours" in out
     assert "based on the recipe photos-on-scan" in out
     said("new", data / "bare.las", "--recipe", "direct", "-o", "asked.yaml")
 
@@ -228,7 +228,7 @@ def test_the_axis_that_surfaces_show_to_be_up_is_set_and_reported(data: Path, up
     np.savetxt(data / "hall.xyz", np.column_stack([points, rng.uniform(0, 9, len(points))]))
     out = said("new", data / "hall.xyz")
     steps = Path("workflow.yaml").read_text()
-    assert (f"cloud.up is {up} in the workflow" in " ".join(out.split())) is (up != "z")
+    assert (f"the workflow contains cloud.up={up}" in " ".join(out.split())) is (up != "z")
     assert (f"    params: {{up: {up}}}\n" in steps) is (up != "z")
     assert said("check", "workflow.yaml").startswith("workflow is valid")
 
@@ -272,7 +272,7 @@ def test_an_orthoimage_is_taken_with_the_frame_beside_it(tmp_path: Path) -> None
     assert one(tmp_path / "wall.tif", b"II*\0").kind == "photos"
     (tmp_path / "wall.json").write_text("{}")
     (image,) = recognised([tmp_path / "wall.tif"])
-    assert (image.kind, image.summary) == ("other", "an orthoimage with a frame file")
+    assert (image.kind, image.summary) == ("other", "an orthoimage with its position (JSON)")
     photos = [found("scan", "hall.laz"), found("photos", "a.jpg", "a photo", 1)]
     text = draft_workflow([*photos, image], tmp_path / "w.yaml", None).text
     assert "    files:\n      - wall.tif\n      - wall.json\n" in text
@@ -311,7 +311,7 @@ def test_folders_are_looked_into_three_deep_and_no_link_is_followed(tmp_path: Pa
     (data / "link").symlink_to(data / "1", target_is_directory=True)
     assert names([data], data) == ["a.jpg", "b.jpg", "1/c.jpg", "1/2/d.jpg", "1/2/3/e.jpg"]
     assert names([data / "1", data / "a.jpg"], data)[-1] == "a.jpg"
-    with pytest.raises(InputError, match="nowhere does not exist: give scans, photos, and folders"):
+    with pytest.raises(InputError, match="nowhere does not exist: give scans, photos, or folders"):
         recognised([data, tmp_path / "nowhere"])
 
 

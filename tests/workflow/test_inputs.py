@@ -63,7 +63,7 @@ MISSING = {
     "{files: /nowhere/x.jpg}": r"input photos: there is no file /nowhere/x\.jpg$",
     "{files: photos/b_.jpg}": r"no file photos/b_\.jpg next to .* \(did you mean b\.jpg\?\)",
     "{files: [photos/a.jpg, x.jpg]}": "input photos: there is no file x.jpg",
-    "{}": r"input photos has no files; give them .* or with --input photos=PATH",
+    "{}": r"input photos has no files; list them .* or pass --input photos=PATH",
 }
 
 

@@ -347,7 +347,7 @@ def test_metrics_that_no_method_of_a_step_declares_are_refused(
     for method, metrics in declared.items():
         monkeypatch.setattr(catalog.method(method).load(), "metrics", metrics)
     assert asked("plane.own_mm, plane.wall_3_mm, plane.compile_s, 'plane.x_*'") == []
-    whose = "`orthoflow plugins show METHOD` lists those of plane.hough2d, plane.ransac"
+    whose = "to list its metrics, run `orthoflow plugins show` with plane.hough2d, plane.ransac"
     first, second = asked("plane.rsm_mm, 'plan*.depth', orient.rsm_mm")
     assert first == (
         "compare.metrics[0]: step plane reports no metric rsm_mm (did you mean rms_mm?); "

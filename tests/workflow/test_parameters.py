@@ -196,11 +196,11 @@ def test_a_file_of_parameters_is_gone_before_by_what_is_set(
 
 def test_a_number_in_words_gets_its_value() -> None:
     for parameter, text, said in (
-        ("gsd_m", "0,003", "; decimals have a point: 0.003"),
-        ("gsd_m", "3mm", "; it is in metres; write it without a unit: 0.003"),
-        ("gsd_m", "0,5 cm", "; it is in metres; write it without a unit: 0.005"),
-        ("max_tilt_deg", "10°", "; it is in degrees; write it without a unit: 10"),
-        ("noise_mm", "0.002 m", "; it is in millimetres; write it without a unit: 2"),
+        ("gsd_m", "0,003", "; write a decimal point: 0.003"),
+        ("gsd_m", "3mm", "; write it in metres, without a unit: 0.003"),
+        ("gsd_m", "0,5 cm", "; write it in metres, without a unit: 0.005"),
+        ("max_tilt_deg", "10°", "; write it in degrees, without a unit: 10"),
+        ("noise_mm", "0.002 m", "; write it in millimetres, without a unit: 2"),
         ("min_share", "5 m", "; write numbers without a unit"),
         ("gsd_m", "0.003", "; write it without quotes"),
         *(("gsd_m", odd, "") for odd in ("fine", "1.2.3", [1])),

@@ -1,4 +1,4 @@
-"""The options of `orthoflow export` that apply to some formats only."""
+"""The options of `orthoflow export` that apply only to some formats."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """Options that apply to some formats only; None, False or empty if not given.
+    """Options that apply only to some formats; None, False or empty if not given.
 
     Attributes:
         cell: address of the cell to export.
@@ -23,7 +23,7 @@ class Choices:
         author: author of a crate.
         scale: n of 1 : n of sheets.
         paper: paper size of sheets.
-        grid: distance of the grid crosses on sheets in their unit, 0 for none.
+        grid: spacing of the grid crosses in the unit of the sheets; 0 for none.
         units: unit of numbers on sheets.
         title_block: file with the office's title block.
         beside: rasters to show beside the orthoimage on sheets.

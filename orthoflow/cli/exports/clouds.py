@@ -57,14 +57,15 @@ def _export(
         taken = [item.digest for item in recorded.inputs.values() if item.type_name == "cloud"]
         if len(taken) != 1:
             raise ArgumentError(
-                f"the step {address} has no cloud of its own: it has {len(taken)} input clouds"
+                f"it is unknown to which of {len(taken)} input clouds the labels of {address} "
+                "belong"
             )
         labels = product_of(run, digest, PointLabels, chosen.store)
         digest = taken[0]
         planes = last_product(run, {address: recorded}, Planes, chosen.store)
     cloud = product_of(run, digest, PointCloud, chosen.store)
     if len(cloud) == 0:
-        raise ArgumentError(f"the cloud of {address} has no points to write")
+        raise ArgumentError(f"the cloud of {address} has no points")
     cloud.require_points(1)
     if labels is not None and len(labels.plane_index) != len(cloud):
         raise ArgumentError(
@@ -86,7 +87,7 @@ def _export(
     colouring = chosen.colour or can_show[0]
     if colouring not in can_show:
         raise ArgumentError(
-            f"--colour {colouring}: the run lacks the data for it ({address}); available: "
+            f"--colour {colouring}: the run lacks the required data ({address}); available: "
             f"{', '.join(can_show)}"
         )
     walls = last_product(run, cells, Walls, chosen.store)

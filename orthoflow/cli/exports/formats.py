@@ -82,8 +82,8 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "laz": Format(
         "clouds:export_laz",
-        "the registered cloud as LAZ 1.4, with colour, normal, plane, distance from the plane "
-        "and scan of each point",
+        "the registered cloud as LAZ 1.4, with the colour, normal, plane, distance from the "
+        "plane and scan of each point",
     ),
     "copc": Format(
         "clouds:export_copc",
@@ -104,7 +104,7 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "tiles": Format(
         "viewers:export_tiles",
-        "each orthoimage as Deep Zoom tiles, with a page to measure on that needs no server",
+        "each orthoimage as Deep Zoom tiles, with a page for measuring that needs no server",
         takes_rasters=True,
     ),
     "plan": Format(
@@ -162,10 +162,10 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 
 class FormatOption(click.Option):
-    """An option that belongs to some formats only.
+    """An option that applies only to some formats.
 
     Attributes:
-        formats: those that it belongs to.
+        formats: names of the formats to which it applies.
     """
 
     # Any: the arguments are click's.
@@ -175,15 +175,15 @@ class FormatOption(click.Option):
 
 
 def _is_given(value: object) -> bool:
-    # Wall 0 and a grid of 0 are given; a flag that nobody set is False.
+    # `--wall 0` and `--grid 0` count as given; a flag that is not set is False.
     return value is not None and value is not False and value != ()
 
 
 def check_choices(chosen: Choices, target: str | None, options: Sequence[FormatOption]) -> None:
-    """Refuse options that do not belong to the format.
+    """Refuse options that do not apply to the format.
 
     Raises:
-        ArgumentError: one does not, or no format is named.
+        ArgumentError: an option does not apply to the format, or no format is given.
     """
     mode = f"--to {target}" if target else "--split" if chosen.split else "--embed"
     if not (target or chosen.embed or chosen.split):

@@ -48,8 +48,8 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
         return Store(store).get_product(digest, cls)
     except StoreError as error:
         raise ArgumentError(
-            f"neither its record nor the store {store} contains the {cls.type_name} of this run "
-            f"({error}): pass its store with --store, or run the workflow again with --embed"
+            f"neither the record nor the store {store} contains the {cls.type_name} of this run "
+            f"({error}): pass the store of the run with --store, or run the workflow with --embed"
         ) from error
 
 
@@ -152,7 +152,7 @@ def make_empty(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ArgumentError(f"{folder} cannot be created: {error.strerror}") from error
+        raise ArgumentError(f"cannot create {folder}: {error.strerror}") from error
 
 
 def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:

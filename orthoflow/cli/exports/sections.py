@@ -111,7 +111,7 @@ def _write(
             f"{1e3 * section.slab_m:.0f} mm"
         )
     if cloud is None:
-        said.append("neither record nor store contains the cloud, so openings are missing")
+        said.append("neither the record nor the store contains the cloud, so openings are missing")
     return "; ".join(said)
 
 

@@ -103,10 +103,10 @@ def origin_of(run: Run, language: Language) -> str:
 
 
 def grid_of(chosen: Choices, scale: int) -> float:
-    """Return the distance of the grid crosses in the unit of the sheets.
+    """Return the spacing of the grid crosses in the unit of the sheets.
 
     Raises:
-        ArgumentError: the requested distance is too small for the scale.
+        ArgumentError: the requested spacing is too small for the scale.
     """
     unit_m = FOOT_M if chosen.units == "ft" else 1.0
     grid = nice_step(1e-3 * _GRID_MM * scale / unit_m) if chosen.grid is None else chosen.grid
@@ -202,8 +202,8 @@ def _coarse(walls: Sequence[WallResult], scale: int) -> str:
     enough = usual_scale(scale * _LEAST_PPI / _ppi(worst, scale))
     names = ", ".join(wall.name for wall in coarse)
     return (
-        f"; resolution too low for print, {_ppi(worst, scale):.0f} pixels per inch instead of "
-        f"{_LEAST_PPI:.0f}: {names}; 1:{enough} is sufficient"
+        f"; the resolution of {names} is too low for printing ({_ppi(worst, scale):.0f} pixels "
+        f"per inch instead of {_LEAST_PPI:.0f}), but sufficient at 1:{enough}"
     )
 
 
@@ -297,7 +297,7 @@ def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
     for kind in chosen.beside:
         if kind not in wall.rasters:
             raise ArgumentError(
-                f"--beside {kind}: the run has no {kind} of wall {wall.number}, only "
+                f"--beside {kind}: the run has no {kind} raster of wall {wall.number}, only "
                 f"{', '.join(wall.rasters)}"
             )
     return list(dict.fromkeys((_first_kind(wall), *chosen.beside)))

@@ -60,8 +60,8 @@ def _depths(
     for ortho in orthos:
         if ortho.wall not in found:
             raise ArgumentError(
-                f"--relief: the run has no depth of wall {ortho.wall}; without --relief, the model "
-                "has planes"
+                f"--relief: the run has no depth raster of wall {ortho.wall}; without --relief, "
+                "the walls of the model are flat"
             )
     return found
 

@@ -49,7 +49,7 @@ class AttributedCloud:
         cloud: the points.
         colouring: what the colours represent.
         neighbourhoods: neighbourhoods of the cloud.
-        planes: planes of the run; None if it found none; then there are no deviations.
+        planes: planes of the run; None if there are no planes, and thus no deviations.
         labels: labels of the points, or None, as for `planes`.
         photo_colours: colours for the colouring `photos`.
         photo_names: names of these photos, by number.
@@ -57,7 +57,7 @@ class AttributedCloud:
             deviations are measured from its plane.
         wall_plane: number of the plane of that wall.
         box_world: (2, 3) if given, only points between these corners are written.
-        is_cleaned: isolated points are omitted.
+        is_cleaned: whether isolated points are omitted.
         crs_wkt: coordinate system of the world, as WKT; empty if unknown.
         name: name of the cloud in files.
     """
@@ -255,7 +255,7 @@ class AttributedCloud:
         scan: NDArray[np.uint16] | None,
         plane: NDArray[np.int16] | None,
     ) -> NDArray[np.float32]:
-        """Return 1 or -1 (n,), to orient normals to the scanner, or as the plane's, or up."""
+        """Return 1 or -1 (n,), to orient normals to the scanner, like the plane's, or upwards."""
         stations = self.cloud.stations
         towards = np.broadcast_to(self.cloud.up, world.shape)
         if self.station(0) is not None and stations is not None:
@@ -409,7 +409,7 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
             "0: no surface"
         ),
         "cleaned": "points with fewer than 10 neighbours, in 3 x 3 x 3 cubes of "
-        f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, are left out"
+        f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, are omitted"
         if attributed.is_cleaned
         else None,
         "wall": None

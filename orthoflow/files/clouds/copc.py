@@ -248,7 +248,8 @@ def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> N
         if level < len(totals):
             total = totals[level][node]
         else:
-            # Smaller than a cell of the root's grid, so all its points are in this group.
+            # The node is smaller than a cell of the root's grid, so all its points are in this
+            # group.
             every = _ancestors(codes, level)
             total = np.searchsorted(every, node, "right") - np.searchsorted(every, node, "left")
         cell = _ancestors(codes[left], level + _GRID_BITS)

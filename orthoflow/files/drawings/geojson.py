@@ -61,7 +61,7 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
     After editing, the file can be passed to `mosaic.seams` as the input `seams`; it then overrides
     the automatic seams.
     """
-    # On very large walls, corners are accurate to a few cells only.
+    # On very large walls, corners are accurate only to a few cells.
     step = max(1, math.ceil(math.sqrt(image.source.size / _SEAM_CELLS_MOST)))
     source = np.ascontiguousarray(image.source[::step, ::step])
     features: list[Feature] = []

@@ -42,7 +42,7 @@ class KeyPlan:
         walls: (w, 2, 2) rectangles of upright walls from above.
         numbers: numbers of these walls, as in files and reports.
         outlines: outlines of the room, (n, 2) each; closed ones end where they begin.
-        marked: (n, 2) the marked wall: two ends, or the four corners of a level plane.
+        marked: (n, 2) the marked wall: two ends, or the four corners of a horizontal plane.
         arrow: (2, 2) from the viewer to the wall; None for horizontal planes.
         up_label: label of the upwards direction of the plan: `N` in a map, else an axis.
         number: number of the marked wall, -1 if none.
@@ -124,7 +124,7 @@ def marked_plan(
     *,
     is_map: bool = False,
 ) -> KeyPlan:
-    """Draw planes from above, and mark a line with two ends or a level plane with four corners.
+    """Draw planes from above, and mark a line by two ends or a horizontal plane by four corners.
 
     Args:
         planes: planes of the room.

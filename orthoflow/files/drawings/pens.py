@@ -58,7 +58,7 @@ def sheet_canvas(stream: BytesIO, size_mm: tuple[float, float]) -> Iterator[Canv
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
 
-    # Binary pictures; encoded as text they would be 25 % larger and slow to write.
+    # Pictures are binary; encoded as text, they would be 25 % larger and slow to write.
     rl_config.useA85 = 0
     register_fonts()
     size = tuple(POINTS_PER_MM * edge for edge in size_mm)
@@ -307,7 +307,7 @@ def fallback_font(letter: str) -> str:
 
 @lru_cache(maxsize=1)
 def _installed_letters() -> dict[str, frozenset[int]]:
-    """Return the code points of each system font by path; of collections, only the first font's."""
+    """Return the code points of each system font by path, in collections only of the first font."""
     from fontTools.ttLib import TTFont, TTLibError
     from matplotlib.font_manager import findSystemFonts
 

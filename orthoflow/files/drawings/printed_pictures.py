@@ -194,10 +194,10 @@ def contours(
 
     Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster, or of
     the drawing if the rows of the raster go up the paper. The first level is half an interval from
-    the plane, because a contour on the plane itself would only show noise. Depths are averaged over
-    0.5 mm on paper with depths that differ only by noise. Contours are omitted where the surface is
-    level within the noise or they would be more than 12 cm apart, since they would wander, and if
-    they are shorter than 6 mm.
+    the plane, because a contour on the plane itself would only show noise. Each depth is averaged
+    over 0.5 mm on paper with those that differ from it only by noise. Contours are omitted where
+    the surface is level within the noise or they would be more than 12 cm apart, since they would
+    wander, and if they are shorter than 6 mm.
     """
     from contourpy import contour_generator
 
@@ -320,7 +320,7 @@ def write_cad_picture(raster: Path, path: Path) -> None:
         whole = np.array([0.0, 0.0, columns, rows])
         with rasterio.open(aside, "w", width=columns, height=rows, **profile) as target:
             for band, values, shown in _bands(source, whole, source.shape):
-                # White in transparent cells, for programs that do not support transparency.
+                # Transparent cells are white, for programs that do not support transparency.
                 pixels = np.full((*shown.shape, 4), 255, dtype=np.uint8)
                 pixels[..., :3][shown] = eight_bits(cast("Colours", values))[shown]
                 pixels[..., 3] = np.where(shown, 255, 0)

@@ -168,7 +168,9 @@ def section_cut(planes: Planes, through: Sequence[float], language: Language = "
     first, second = (x * e1 + y * e2 for x, y in np.reshape(through, (2, 2)))
     length_m = float(np.linalg.norm(second - first))
     if length_m < 1e-6:
-        raise ArgumentError("--through must be two different points, X,Y,X,Y; both are the same")
+        raise ArgumentError(
+            "--through must be two different points, X,Y,X,Y, but both are the same"
+        )
     right = (second - first) / length_m
     values = dict(zip("abcd", (f"{value:.2f}" for value in through), strict=True))
     return Cut(
@@ -203,8 +205,7 @@ def section_of(
     lines, gaps = _drawn(cut, planes, places, plane, slab_m)
     if not lines and len(places) == 0:
         raise ArgumentError(
-            f"the cut ({cut.title}) meets no plane and no point of the room; its coordinates are "
-            "those of the scan, in metres"
+            f"the cut ({cut.title}) does not intersect the room; use scan coordinates, in metres"
         )
     return Section(
         cut=cut,
@@ -520,7 +521,7 @@ def section_sheet(
         drawing: the plan or section.
         planes: planes of the room, for the key plan.
         text: texts of the run.
-        grid: distance of the grid crosses, 0 for none.
+        grid: spacing of the grid crosses; 0 for no crosses.
         crs: coordinate system of the scan, None if it is not a map.
     """
     left, bottom, right, top = drawing.bounds_m

@@ -309,7 +309,7 @@ def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64]
         right = wide_mm - 4.0
         pens.arrow(canvas, np.array([[right, 2.0], [right, 10.0]]))
         pens.write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
-        # The marked wall first: where walls are close together, not all numbers fit.
+        # The marked wall comes first, because not all numbers fit where walls are close together.
         placed = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
         numbered: list[NDArray[np.float64]] = []
         for number in sorted(placed, key=lambda n: (n != plan.number, -_length(placed[n]))):

@@ -456,7 +456,7 @@ class Drawing:
         text: texts.
         scale: n of 1 : n.
         plan: key plan, or None.
-        grid: distance of the grid crosses in `unit`, 0 for none.
+        grid: spacing of the grid crosses in `unit`; 0 for no crosses.
         unit: unit of all numbers beside pictures.
         language: language of labels.
         heights: positions with a height mark, metres down from the top edge.

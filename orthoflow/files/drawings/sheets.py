@@ -127,7 +127,7 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
 def _with_room(
     places: dict[float, float], drawing: Drawing, limits_mm: tuple[float, float]
 ) -> Iterator[tuple[str, float]]:
-    """Yield coordinates of every 1st, 2nd, 5th ... mark, as many as have room for their labels.
+    """Yield coordinates of every 1st, 2nd, 5th ... mark, as densely as the labels permit.
 
     Args:
         places: coordinate -> its position along the edge.

@@ -293,6 +293,6 @@ def _xml_of(path: Path) -> bytes:
 
 def _refusal(path: Path, reason: str) -> InputError:
     return InputError(
-        f"{path.name} cannot be read as E57: its XML is refused, {reason}; the file is damaged or "
+        f"{path.name} cannot be read as E57 because of its XML: {reason}; the file is damaged or "
         "was not written by scanner software; copy or export it again"
     )

@@ -123,6 +123,6 @@ def open_scan(
     if scan.n_most > MOST_POINTS_PER_BYTE * n_bytes:
         raise InputError(
             f"{path.name} declares {scan.n_most} points, but its {n_bytes} bytes cannot contain "
-            "them: the file is damaged or cut off; copy or export it again"
+            "them: the file is damaged or truncated; copy or export it again"
         )
     return scan

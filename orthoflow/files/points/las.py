@@ -159,7 +159,8 @@ def _count_points(path: Path, header: Any, notes: list[str]) -> int:
     if present <= stated or rest:
         return stated
     notes.append(
-        f"{path.name}: its header declares {stated} points, but it contains {present}: all are read"
+        f"{path.name}: its header declares {stated} points, but the file contains {present}: all "
+        "are read"
     )
     return int(present)
 
@@ -303,13 +304,15 @@ def _check_header(path: Path) -> None:
         raise _damaged(path, "it ends within its header")
     header_size, start, n_records = struct.unpack_from("<HII", header, 94)
     if not header_size <= start <= n_file:
-        raise _damaged(path, "its points begin outside the file, which is cut off")
+        raise _damaged(path, "its points begin outside the file, which is truncated")
     if n_records * _VLR_BYTES > start - header_size:
-        raise _damaged(path, f"its header declares {n_records} records, which do not fit")
+        raise _damaged(
+            path, f"its header declares {n_records} records, which the file cannot contain"
+        )
     if header[25] >= 4 and len(header) >= _HEADER_BYTES:
         first, n_extended = struct.unpack_from("<QI", header, 235)
         if n_extended and first + n_extended * _EVLR_BYTES > n_file:
-            raise _damaged(path, "records at its end are missing, it is cut off")
+            raise _damaged(path, "it is truncated: records at its end are missing")
 
 
 def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
@@ -342,7 +345,7 @@ def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
             # Programs that could not seek back wrote the offset at the end of the file.
             at = _offset_at(path, file, n_file - _OFFSET_BYTES)
         if not start + _OFFSET_BYTES <= at <= n_file - _OFFSET_BYTES:
-            raise _damaged(path, "its chunk table is outside the file, which is cut off")
+            raise _damaged(path, "its chunk table is outside the file, which is truncated")
         n_bytes = at - start - _OFFSET_BYTES
         n_chunks = _offset_at(path, file, at) >> 32 & 0xFFFFFFFF
         if n_chunks > min(n_stated, n_bytes):
@@ -390,7 +393,7 @@ def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> N
     (n_items,) = struct.unpack_from("<H", record, _ITEMS_AT)
     items = [struct.unpack_from("<HH", record, _ITEMS_AT + 2 + 6 * k) for k in range(n_items)]
     if not all(kind in _LAYERS or kind == _EXTRA_BYTES for kind, _ in items):
-        raise _damaged(path, "its compression is not one of point formats 6 and up")
+        raise _damaged(path, "its compression is not that of point formats 6 and above")
     n_layers = sum(size if kind == _EXTRA_BYTES else _LAYERS[kind] for kind, size in items)
     sizes = struct.Struct(f"<I{n_layers}I")
     n_head = sum(size for _, size in items) + sizes.size

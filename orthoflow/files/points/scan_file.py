@@ -225,8 +225,8 @@ def _unpacked(packed: NDArray[Any]) -> NDArray[np.uint8]:
 def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
     """Return the error for a file that is shorter than its header declares."""
     return InputError(
-        f"{path.name} is cut off: its {what} contains {found}, but its header declares {expected}; "
-        "copy or export it again"
+        f"{path.name} is truncated: its {what} contains {found}, but its header declares "
+        f"{expected}; copy or export it again"
     )
 
 
@@ -245,7 +245,7 @@ def reading(path: Path, format_name: str) -> Iterator[None]:
         # BaseException: a panic in a Rust library is not an Exception.
         raise InputError(
             f"{path.name} cannot be read as {format_name}: {_first_line(error)}; the file is "
-            "damaged or cut off; copy or export it again"
+            "damaged or truncated; copy or export it again"
         ) from error
 
 

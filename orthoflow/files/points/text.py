@@ -227,8 +227,8 @@ def _labels(header: str) -> list[str]:
 
 def _ended_by_returns(path: Path) -> InputError:
     return InputError(
-        f"{path.name} ends lines with a carriage return only (CR, as old Macintosh programs do): "
-        "save it with line feeds (LF, or CR LF)"
+        f"{path.name} uses only carriage returns (CR) as line ends, as old Macintosh programs do: "
+        "save it with line feeds (LF or CR LF)"
     )
 
 
@@ -481,7 +481,7 @@ def _unread_line(
         cells = [fields[k] for k in wanted if k < len(fields) and fields[k]]
         fits = len(fields) <= layout.n_columns and _are_numbers(cells)
         if not fits and not is_comment(line):
-            where, got = f"line {number}", f" as in the lines before, got {text[:60]!r}"
+            where, got = f"line {number}", f" as in the preceding lines, got {text[:60]!r}"
             break
     return InputError(
         f"{path.name}, {where}: expected {layout.n_columns} numbers{got}; correct the line or "

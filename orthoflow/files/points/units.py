@@ -66,8 +66,8 @@ class StatedUnit:
     """The unit declared by a file.
 
     Attributes:
-        name: a key of `UNITS_M`, or `deg` for geographic coordinates; of two names, as in
-            `us-ft/m`, the second is for heights.
+        name: a key of `UNITS_M`, or `deg` for geographic coordinates; in a pair such as `us-ft/m`,
+            the second is for heights.
         metres: length of the unit along x, y and z in metres.
         source: where the file declares it.
     """
@@ -174,10 +174,10 @@ def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
     """
     if unit.name == "deg":
         raise InputError(
-            f"{file_name} has geographic coordinates in degrees ({unit.source}): expected "
-            "metres or feet in a projected system. Project it, e.g. with `pdal translate ... "
-            "reprojection --filters.reprojection.out_srs=EPSG:nnnn`, or set cloud.unit=m if its "
-            "numbers are metres in fact"
+            f"{file_name} has geographic coordinates in degrees ({unit.source}): expected metres "
+            "or feet in a projected system. Project it, e.g. with `pdal translate ... "
+            "reprojection --filters.reprojection.out_srs=EPSG:nnnn`, or set cloud.unit=m if the "
+            "coordinates are actually in metres"
         )
 
 

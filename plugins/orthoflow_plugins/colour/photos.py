@@ -47,8 +47,8 @@ class ColourPhotos(Method):
 
         unseen: Literal["drop", "grey"] = Field(
             "drop",
-            description="Points that no photo shows. drop: remove them; grey: colour "
-            "them medium grey.",
+            description="Treatment of points that no photo shows. drop: remove them; grey: "
+            "colour them medium grey.",
         )
 
     class In(Ports):
@@ -94,8 +94,8 @@ class ColourPhotos(Method):
         ctx.metric("coloured_share", n_seen / max(1, len(cloud)), "1")
         if n_seen == 0:
             raise MethodError(
-                "no photo sees any point of the cloud: cloud and cameras must use the same "
-                "coordinate system (colour.photos)"
+                "no photo shows a point of the cloud: the cloud and the cameras must use the "
+                "same coordinate system (colour.photos)"
             )
         coloured = replace(cloud, rgb=colours.rgb, has_rgb=None)
         return self.Out(cloud=coloured.selected(seen) if params.unseen == "drop" else coloured)

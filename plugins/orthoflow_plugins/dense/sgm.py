@@ -74,8 +74,8 @@ class DenseSgm(Method):
         spacing_m: float = Field(
             0.0,
             ge=0.0,
-            description="Each pair of photos keeps one point per cube of this side length; 0 "
-            "keeps one per pixel.",
+            description="Side of the cubes of which each pair of photos keeps one point; with 0, "
+            "it keeps one per pixel.",
         )
         up: UpDirection = Field("z", description="World direction that is up.")
 

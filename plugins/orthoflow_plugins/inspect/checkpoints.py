@@ -175,7 +175,7 @@ class InspectCheckpoints(Method):
             raise MethodError(
                 f"none of the {len(points)} check points was found in an orthoimage: "
                 f"{with_reasons(missed)}; measure them (columns wall, u_px, v_px or map_x, map_y), "
-                "or check that scan and points use the same unit and coordinate system "
+                "or check that the scan and the points use the same unit and coordinate system "
                 "(inspect.checkpoints)"
             )
         report_doubts(points, inputs.checkpoints, pictures, ctx)
@@ -235,8 +235,8 @@ def _pictures(inputs: InspectCheckpoints.In, ctx: StepContext) -> list[Picture]:
         ]
     if not pictures:
         raise MethodError(
-            "there is no image in which to find check points: connect orthoimages, or walls with "
-            "intensity (inspect.checkpoints)"
+            "there is no image in which check points can be found: connect orthoimages, or walls "
+            "with intensity (inspect.checkpoints)"
         )
     return pictures
 

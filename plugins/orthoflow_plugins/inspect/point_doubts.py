@@ -27,8 +27,7 @@ OWN_POINTS: Final = DiagnosticSpec(
 FAR_POINTS: Final = DiagnosticSpec(
     code="check-points-far",
     severity="warning",
-    text="{n} of {n_points} check points are farther from their wall than the wall is "
-    "long{how_far}",
+    text="{n} of {n_points} check points are farther from their wall than its length{how_far}",
     remedy="check `unit` of read.checkpoints, and the coordinate systems of points and scan",
     rank_by="n",
 )

@@ -117,8 +117,8 @@ class InspectSurf(Method):
 
         unfit: Literal["refuse", "warn"] = Field(
             "refuse",
-            description="If there is no laser intensity or there are too few pairs: refuse "
-            "fails, warn continues without this inspection.",
+            description="Behaviour without laser intensity or with too few pairs. refuse: the "
+            "step fails; warn: the run continues without this inspection.",
         )
 
     class In(Ports):
@@ -137,7 +137,7 @@ class InspectSurf(Method):
         """Compare wall by wall, then combine all walls."""
         images = on_walls(inputs.orthoimages, inputs.walls).images
         if not images:
-            raise MethodError("no orthoimage to inspect: at least one is needed")
+            raise MethodError("there is no orthoimage to inspect")
         reason = _unfit(inputs)
         verdicts: list[_Verdict] = []
         for place, image in enumerate(images if reason is None else ()):
@@ -149,13 +149,11 @@ class InspectSurf(Method):
             most = max(len(item.pairs) for item in verdicts)
             reason = (
                 f"orthoimage and intensity are too different: at most {most} pairs of SURF key "
-                f"points were found on one wall, at least {_FEWEST_PAIRS} are needed"
+                f"points were found on one wall, but at least {_FEWEST_PAIRS} are needed"
             )
         if reason is not None:
             if params.unfit == "refuse":
-                raise MethodError(
-                    f"{reason} (set `unfit: warn` in inspect.surf to continue without it)"
-                )
+                raise MethodError(f"{reason} (to continue, set `unfit: warn` in inspect.surf)")
             ctx.report(UNFIT, reason=reason)
         findings = [finding for item in fit for finding in item.findings()]
         if fit:

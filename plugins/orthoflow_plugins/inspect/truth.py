@@ -289,7 +289,7 @@ class InspectTruth(Method):
         if inputs.orthoimages is None or inputs.walls is None:
             return self.Out(inspection=_inspect_planes(inputs, ctx))
         if not inputs.orthoimages.images:
-            raise MethodError("no orthoimage to inspect: at least one is needed")
+            raise MethodError("there is no orthoimage to inspect")
         orthoimages = on_walls(inputs.orthoimages, inputs.walls)
         rule = SamplingRule.of(orthoimages.images)
         _warn_of_untraced(inputs.orthoimages, inputs.cameras, ctx)

@@ -29,7 +29,7 @@ _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
     severity="warning",
-    text="photo {subject}: at its given pose, it matches no part of the walls",
+    text="photo {subject} matches no part of the walls at its given pose",
     remedy="check its pose, or remove the photo",
 )
 
@@ -100,7 +100,9 @@ class MatchGuided(Method):
             "the second best match; 1 accepts any. Default: 0.8, as in openMVG.",
         )
         max_ties: int = Field(
-            default=1200, ge=50, description="Positions measured per photo, evenly distributed."
+            default=1200,
+            ge=50,
+            description="Number of positions measured per photo; they are evenly distributed.",
         )
 
     class In(Ports):
@@ -200,7 +202,7 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
     if not oriented:
         reasons = "; ".join(f"{camera.photo}: {camera.status}" for camera in cameras.cameras[:3])
         raise MethodError(
-            "no photo is oriented, so none can be matched with its pose"
+            "no photo is oriented, so no photo can be matched at its pose"
             + (f" ({reasons})" if reasons else "")
         )
     return oriented

@@ -71,7 +71,9 @@ class PairingParams(MethodParams):
     """Matching of photos with walls by key points."""
 
     max_features: int = Field(
-        default=8000, ge=50, description="Key points per photo and per wall, evenly distributed."
+        default=8000,
+        ge=50,
+        description="Number of key points per photo and per wall; they are evenly distributed.",
     )
     ratio: float | None = Field(
         default=None,

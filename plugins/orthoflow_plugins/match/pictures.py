@@ -44,7 +44,7 @@ def require_intensity(walls: Walls) -> None:
         MethodError: there are no walls, or none has intensity or colour.
     """
     if not walls.walls:
-        raise MethodError("there are no walls to match photos with: choose planes to raster")
+        raise MethodError("there are no walls to match photos with: select planes to raster")
     if all(wall.intensity is None for wall in walls.walls):
         raise MethodError(
             "the scan has neither intensity nor colour, so photos cannot be "

@@ -57,8 +57,8 @@ _OPPOSITE_COSINE: Final = -math.sqrt(0.5)
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-guessed",
     severity="warning",
-    text="neither stations nor photos determine from which side {n} of {n_planes} planes were seen "
-    "({planes}); the side with more of the other points was assumed",
+    text="neither stations nor photos determine from which side {n} of {n_planes} planes were "
+    "seen ({planes}); the side with more of the other points was assumed to be the front",
     remedy="if an image is mirrored, set view_from of read.scan",
     rank_by="n",
 )
@@ -107,7 +107,7 @@ class FaceByPhotos(Method):
         planes, cloud = inputs.planes, inputs.cloud
         require_photos(inputs.photos)
         cloud.require_points(_MIN_POINTS)
-        ctx.progress(0.0, "planes whose side was guessed")
+        ctx.progress(0.0, "planes with an assumed front")
         level = math.cos(math.radians(LEVEL_LIMIT_DEG))
         is_level = np.abs(planes.normal @ planes.up) > level
         asked = [
@@ -133,14 +133,14 @@ class FaceByPhotos(Method):
                 planes = planes.turned(index)
                 n_turned += 1
                 ctx.log(
-                    f"{planes.names[index]}: turned, since {behind} matches of the photos agree "
-                    f"with its other side and {front} with the guessed one"
+                    f"{planes.names[index]}: flipped, because {behind} matches of photos agree "
+                    f"with its other side, and only {front} with the assumed front"
                 )
         for index in asked:
             if sources[index] == "guess" and _is_turned_away(planes, index, sources):
                 planes = planes.turned(index)
                 n_turned += 1
-                ctx.log(f"{planes.names[index]}: turned like the planes in front of and behind it")
+                ctx.log(f"{planes.names[index]}: flipped like the planes in front of and behind it")
         ctx.metric("n_planes_turned", n_turned, "1")
         ctx.metric("n_planes_seen", sources.count("photos"), "1")
         _warn_of_guesses(planes, sources, ctx)

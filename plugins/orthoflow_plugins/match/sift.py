@@ -40,15 +40,15 @@ if TYPE_CHECKING:
 MIRRORED: Final = DiagnosticSpec(
     code="photo-mirrored",
     severity="warning",
-    text="photo {subject}: its mirror image matches the walls better than the photo itself, so it "
-    "gets no ties: the photo is mirrored, it shows a repeating pattern or another wall, or the "
-    "sides of the planes are wrong",
+    text="photo {subject} gets no ties, because its mirror image matches the walls better than "
+    "the photo itself: the photo is mirrored, it shows a repeating pattern or another wall, or "
+    "the front sides of the planes are wrong",
     remedy="flip the photo if it is mirrored; check view_from of read.scan",
 )
 NO_WALL: Final = DiagnosticSpec(
     code="photo-shows-no-wall",
     severity="warning",
-    text="photo {subject}: no wall was recognised in it, so it gets no ties",
+    text="photo {subject} gets no ties, because no wall was recognised in it",
 )
 
 
@@ -87,17 +87,17 @@ class MatchSift(Method):
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: as in markiewicz2015, OpenCV's default SIFT without equalisation, "
-            "and the best match in the photo for each key point of a wall; of the other "
-            "parameters, only `ratio` is used.",
+            description="paper: as in markiewicz2015, with OpenCV's default SIFT, no "
+            "equalisation, and the best match in the photo for each key point of a wall; of the "
+            "other parameters, only `ratio` is used.",
         )
         structure: Literal["never", "confirmed"] = Field(
             default="confirmed",
-            description="Whether photos without clear key point matches are compared with the "
-            "walls by their edges, at many scales, in colours, intensity and relief. confirmed: a "
-            "position is accepted if another photo, at its own position, shows the same key "
-            "points there. The errors of such ties are correlated, so the predicted error of an "
-            "orientation from them is too small; match.guided measures them again.",
+            description="Compare photos without clear key point matches with the walls by edges, "
+            "at many scales, in colours, intensity and relief. confirmed: accept a position if "
+            "another photo, also placed on the walls, shows the same key points there. The errors "
+            "of such ties are correlated, so the predicted error of an orientation from them is "
+            "too small; match.guided measures them again.",
         )
 
     class In(Ports):

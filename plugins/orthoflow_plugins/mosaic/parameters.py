@@ -25,8 +25,8 @@ class SeamsParams(MethodParams):
     gains: Literal["none", "global"] = Field(
         "global",
         description="none: the colours of the photos are not changed; global: if photos differ, "
-        "each is corrected by an exposure per channel, vignetting and other smooth differences, as "
-        "measured in overlaps, and what remains is blended near seams.",
+        "each is corrected for exposure (per channel), vignetting and other smooth differences "
+        "measured in overlaps, and remaining differences are blended near seams.",
     )
     island_cells_min: int = Field(
         default=100,

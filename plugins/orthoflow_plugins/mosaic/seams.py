@@ -100,7 +100,7 @@ EMPTY_IMAGE: Final = DiagnosticSpec(
 EMPTY_CELLS: Final = DiagnosticSpec(
     code="orthoimage-cells-empty",
     severity="warning",
-    text="the orthoimage of {subject}: {share:.0%} of its cells are empty: {causes}",
+    text="{share:.0%} of the cells of the orthoimage of {subject} are empty: {causes}",
     rank_by="share",
 )
 
@@ -200,7 +200,7 @@ class MosaicSeams(Method):
         """Join wall by wall."""
         layers = sorted(inputs.layers.layers, key=lambda layer: layer.wall)
         if not layers:
-            raise MethodError("no layer to make an orthoimage from: at least one is needed")
+            raise MethodError("there are no layers, but at least one is needed for an orthoimage")
         require_sources(layers, params.priority)
         polygons = read_seams(inputs.seams, {layer.source for layer in layers})
         verdicts: list[_Joined] = []
@@ -371,7 +371,7 @@ def _show(ctx: StepContext, image: Orthoimage) -> None:
 def _report_empty(ctx: StepContext, image: Orthoimage) -> None:
     """Report the causes of empty cells, unless they only lack a surface."""
     words = {
-        OrthoMask.NONE: "are in no oriented photo (check which are refused, or take another)",
+        OrthoMask.NONE: "are in no oriented photo (check why photos were refused, or take another)",
         OrthoMask.OCCLUDED: "are hidden in all photos, or seen too obliquely (take a "
         "photo from another side)",
         OrthoMask.NO_SURFACE: "have no surface (see the step that rastered the wall)",

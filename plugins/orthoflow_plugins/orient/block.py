@@ -258,10 +258,10 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     try:
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
-        raise GeometryError("the ties do not determine the block of photos") from error
+        raise GeometryError("the ties do not suffice to orient the block of photos") from error
     redundancy = n_rows - len(prior) + float((np.diag(cofactors) * prior).sum())
     if redundancy <= 0.0 or not (np.diag(cofactors) > 0.0).all():
-        raise GeometryError("the ties do not determine the block of photos")
+        raise GeometryError("the ties do not suffice to orient the block of photos")
     sigma0 = math.sqrt(squares / redundancy)
     matrix = honest_covariance(_adjusted_points(block, cofactors, soft_limit), sigma0)
     return BlockCovariance(matrix=matrix, cofactors=cofactors, sigma0=sigma0, redundancy=redundancy)

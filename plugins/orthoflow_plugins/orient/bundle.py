@@ -154,7 +154,9 @@ class OrientColmapBundle(Method):
             default=True, description="Also match overlapping photos with each other."
         )
         max_features: int = Field(
-            default=3000, ge=100, description="Key points per photo for ties between photos."
+            default=3000,
+            ge=100,
+            description="Number of key points per photo for ties between photos.",
         )
 
     In = OrientIn

@@ -71,9 +71,9 @@ _FRAME: Final = 12
 DLT_MISFIT: Final = DiagnosticSpec(
     code="dlt-without-distortion",
     severity="warning",
-    text="photo {subject}: its ties deviate {sigma0:.1f} times as much as expected, and a complete "
-    "lens model moves its points by {moved_px:.1f} px: its lens has distortion that this DLT does "
-    "not model, mostly at the corners; the predicted error was multiplied by {factor:.1f}",
+    text="photo {subject}: the ties deviate {sigma0:.1f} times as much as expected, and a "
+    "complete lens model moves points by {moved_px:.1f} px: the lens has distortion, mostly at "
+    "the corners, that this DLT does not model; the predicted error was multiplied by {factor:.1f}",
     remedy='set {step}.distortion to "k1 k2 p1 p2", or provide a calibration',
     rank_by="sigma0",
 )
@@ -232,7 +232,7 @@ def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[
     shift = values.mean(axis=0)
     mean = float(np.linalg.norm(values - shift, axis=1).mean())
     if not mean > 0.0:
-        raise GeometryError("the points of a direct linear transform coincide")
+        raise GeometryError("all points of a direct linear transform coincide")
     return shift, length / mean
 
 

@@ -227,7 +227,7 @@ CROWDED: Final = DiagnosticSpec(
     code="ties-crowded",
     severity="warning",
     text="photo {subject}: the ties are unevenly distributed; one quarter of the photo has "
-    "{n_most}, another {n_least} (more than {ratio} times as many)",
+    "{n_most}, another only {n_least} (a ratio of more than {ratio})",
 )
 SMALL_HULL: Final = DiagnosticSpec(
     code="control-covers-little",
@@ -239,8 +239,8 @@ SMALL_HULL: Final = DiagnosticSpec(
 FOCAL_ESTIMATED: Final = DiagnosticSpec(
     code="focal-length-estimated",
     severity="warning",
-    text="photo {subject}: its focal length was estimated, since neither calibration nor EXIF "
-    "contains it",
+    text="photo {subject}: its focal length was estimated, since neither calibration nor "
+    "EXIF contains it",
     remedy="provide a calibration file for higher accuracy",
 )
 
@@ -529,7 +529,9 @@ _SHOWN: Final = Gate(
     name="shown",
     value=lambda c: c.error is not None,
     limit=1.0,
-    reason=lambda *_: "with this pose, the photo would show none of the walls of its ties",
+    reason=lambda *_: (
+        "with this pose, the photo would show none of the walls on which its ties are"
+    ),
 )
 
 GATES: Final = (
@@ -539,8 +541,8 @@ GATES: Final = (
         value=lambda c: c.poor_quarter[0] if c.poor_quarter else None,
         limit="min_quadrant_ties",
         reason=lambda c, value, limit: (
-            f"a quarter of the photo has {value} ties; each needs {limit:g}"
-            f"{c.poor_quarter[1] if c.poor_quarter else ''}"
+            f"a quarter of the photo has {value} ties; each needs at least "
+            f"{limit:g}{c.poor_quarter[1] if c.poor_quarter else ''}"
         ),
     ),
     _SIDE,

@@ -32,7 +32,7 @@ POSE_DISAGREES: Final = DiagnosticSpec(
     severity="warning",
     text="photo {subject}: {n} of its {n_ties} ties measured by hand disagree with the given "
     "pose, by up to {longest_px:.1f} px",
-    remedy="correct them, or measure at least {n_least}, from which the photo is then oriented",
+    remedy="correct the ties, or measure at least {n_least}, from which the photo is then oriented",
     rank_by="longest_px",
 )
 

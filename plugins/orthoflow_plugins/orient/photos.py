@@ -61,7 +61,7 @@ BY_HAND: Final = DiagnosticSpec(
 HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
     code="ties-by-hand-contradict",
     severity="warning",
-    text="photo {subject}: {n} ties measured by hand contradict the others and were left out: "
+    text="photo {subject}: {n} ties measured by hand contradict the others and were ignored: "
     "{places}",
     remedy="measure them again",
     rank_by="n",

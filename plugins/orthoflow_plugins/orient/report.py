@@ -330,9 +330,9 @@ def draw_ties(
     ctx.figure(
         name,
         partial(_with_legend, canvas, counts),
-        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}. Green ties "
-        "spread over the whole wall mean a reliable orientation; green in one corner only, or "
-        "mixed with red everywhere, does not.",
+        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}. If green "
+        "ties are spread over the whole wall, the orientation is reliable; if they are only in "
+        "one corner or mixed with red ties everywhere, it is not.",
     )
 
 

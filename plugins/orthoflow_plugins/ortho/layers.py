@@ -15,8 +15,8 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
-    "no oriented photo sees a wall: the cameras are behind the walls, look past them, or "
-    "something hides the walls; check cameras.json and planes.json"
+    "no oriented photo shows a wall: the cameras are behind the walls, look past them, or "
+    "objects hide the walls; check cameras.json and planes.json"
 )
 NO_PHOTO: Final = DiagnosticSpec(
     code="wall-without-photo",

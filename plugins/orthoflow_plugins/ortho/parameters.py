@@ -83,6 +83,6 @@ class DirectParams(MethodParams):
         default=3.0,
         gt=0,
         le=100,
-        description="Radius within which a gap takes its colour; with between, gaps without a "
-        "covered cell within this radius remain empty.",
+        description="Radius within which covered cells give a gap its colour; with between, gaps "
+        "without a covered cell within this radius remain empty.",
     )

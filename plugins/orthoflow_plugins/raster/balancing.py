@@ -98,7 +98,7 @@ class _Looks:
 
 def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
     if cloud.scan is None or cloud.stations is None:
-        raise AssertionError("balancing was asked of a cloud without stations")
+        raise AssertionError("balancing needs a cloud with stations")
     frame = slab.frame
     from_corner = cloud.origin - frame.origin_world
     offsets = np.column_stack([cloud.x[points], cloud.y[points], cloud.z[points]])
@@ -126,7 +126,7 @@ def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
         intensity, log range and log cosine.
     """
     if cloud.intensity is None:
-        raise AssertionError("balancing was asked of a cloud without intensity")
+        raise AssertionError("balancing needs a cloud with intensity")
     every = max(1, len(cloud) // _POINTS_MOST)
     looks = _looks(cloud, slab, np.arange(0, len(cloud), every))
     n_scans = 0 if cloud.stations is None else len(cloud.stations)

@@ -35,7 +35,7 @@ TILTED: Final = DiagnosticSpec(
 NO_MAP: Final = DiagnosticSpec(
     code="map-without-a-level-plane",
     severity="warning",
-    text="crs {crs} applies to no raster: none of the planes is level and seen from above",
+    text="crs {crs} applies to no raster: none of the planes is horizontal and seen from above",
     remedy="omit {step}.crs, or raster a floor",
 )
 
@@ -117,8 +117,8 @@ def mapped(
         raise MethodError(f"crs: {error}") from error
     if not np.allclose(planes.up, _UP, atol=1e-9):
         raise MethodError(
-            f"crs {crs} needs a cloud whose z is up, x east and y north, got up "
-            f"{planes.up.tolist()}: transform it with register.similarity, or omit crs"
+            f"crs {crs} needs a cloud with x east, y north and z up, got up {planes.up.tolist()}: "
+            "transform it with register.similarity, or omit crs"
         )
     placed = dict(frames)
     for index, frame in frames.items():

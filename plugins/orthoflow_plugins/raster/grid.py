@@ -57,23 +57,23 @@ _CUT_WORTH_WORDS_M: Final = 0.05
 OBLIQUE: Final = DiagnosticSpec(
     code="wall-beside-an-oblique-surface",
     severity="warning",
-    text="{subject}: the adjoining surface at its {side} is oblique, and the raster ends at its "
-    "nearest point: up to {cut_m:.2f} m of its plane are left out there",
-    remedy="{step}.margin_m adds them",
+    text="{subject}: at its {side}, the raster ends at the nearest point of the adjoining "
+    "surface, which is oblique: up to {cut_m:.2f} m of the plane are omitted",
+    remedy="set {step}.margin_m to include them",
     rank_by="cut_m",
 )
 NEAR_FAR: Final = DiagnosticSpec(
     code="near-is-far",
     severity="warning",
-    text="near {place}: the nearest wall, {subject}, is {apart_m:.2f} m away",
-    remedy="check the point, its unit and the planes",
+    text="near: the wall nearest to {place}, {subject}, is {apart_m:.2f} m away",
+    remedy="check the point, the unit of its coordinates, and the planes",
     rank_by="apart_m",
 )
 CROP_OF_SEVERAL: Final = DiagnosticSpec(
     code="crop-of-several-walls",
     severity="warning",
-    text="crop is applied to {n_walls} walls",
-    remedy="choose one with {step}.near or {step}.ranks",
+    text="crop is applied to each of {n_walls} walls",
+    remedy="select one wall with {step}.near or {step}.ranks",
 )
 
 

@@ -46,9 +46,9 @@ class RasterParams(MethodParams):
         description="Depth of a cell. median: median of the layer with the most points (layers "
         "are more than 2 cm apart), without outliers; denoised: the same after edge-preserving "
         "smoothing; nearest: depth of the point nearest to the centre, also from neighbouring "
-        "cells (markiewicz2015); centre: the same, from the cell only; topmost: depth of the "
-        "point nearest to the viewer (skarlatos2012); mean: mean of all points; tin: a "
-        "triangulation, which closes windows (for comparison).",
+        "cells (markiewicz2015); centre: the same, but only from points of the cell; topmost: "
+        "depth of the point nearest to the viewer (skarlatos2012); mean: mean of all points; tin: "
+        "a triangulation, which closes windows (for comparison).",
     )
     percentiles: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(
         default=(),
@@ -58,7 +58,8 @@ class RasterParams(MethodParams):
     )
     balance_intensity: bool = Field(
         default=False,
-        description="Correct intensities for range, incidence and scan, using overlaps of scans.",
+        description="Correct intensities for range, angle of incidence and scan, using overlaps "
+        "of scans.",
     )
     recover_gap_cells: int = Field(
         default=2,
@@ -71,9 +72,9 @@ class RasterParams(MethodParams):
         default=2,
         ge=0,
         le=10,
-        description="If the rows and columns of the scan are known, void cells between points "
-        "that are up to this number of rows or columns apart are interpolated linearly first, if "
-        "the points are on one layer and at most four times recover_gap_cells apart.",
+        description="If the rows and columns of the scan are known, void cells are first "
+        "interpolated linearly between points of one layer that are up to this number of rows or "
+        "columns, and at most four times recover_gap_cells, apart.",
     )
     constraint: Constraint = Field(
         default="any", description="Orientation of the planes to raster."
@@ -104,10 +105,10 @@ class RasterParams(MethodParams):
     )
     crop: Rectangle | Polygon | None = Field(
         default=None,
-        description="Part of the wall to raster, in metres right of and below the top-left corner "
-        "of its whole raster: a rectangle [left, top, right, bottom], or a polygon [[right, "
-        "down], ...] outside which cells are void. Photos are matched only to this part, so "
-        "orient them on the whole wall first and use these cameras.",
+        description="Part of the wall to raster, in metres right of and below the top-left "
+        "corner of its whole raster: a rectangle [left, top, right, bottom], or a polygon "
+        "[[right, down], ...] outside which cells are void. Photos are matched only to this part, "
+        "so orient them with the whole wall first, and use the resulting cameras.",
     )
     skip_covered: bool = Field(
         default=True,
@@ -128,7 +129,7 @@ class RasterParams(MethodParams):
     @model_validator(mode="after")
     def _one_choice_of_walls(self) -> Self:
         if self.ranks and self.near:
-            raise ValueError("walls are chosen by ranks or by near, got both; omit one")
+            raise ValueError("walls are selected by ranks or by near, not by both: omit one")
         return self
 
     @field_validator("crop")

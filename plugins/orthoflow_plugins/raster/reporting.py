@@ -33,9 +33,9 @@ _SHARE_LEAST: Final = 0.0005
 FRONT_LEFT_OUT: Final = DiagnosticSpec(
     code="wall-front-left-out",
     severity="error",
-    text="{subject}: {share:.1%} of it is missing: objects up to {before_m} m in front of its "
-    "plane are not considered part of the wall",
-    remedy="{step}.buffer_front_m={buffer_front_m} includes them",
+    text="{subject}: {share:.1%} of the wall is missing: objects up to {before_m} m in front of "
+    "its plane are not considered part of the wall",
+    remedy="set {step}.buffer_front_m={buffer_front_m} to include them",
     rank_by="share",
 )
 STOOD_ON: Final = DiagnosticSpec(
@@ -52,7 +52,7 @@ BEHIND_BUFFER: Final = DiagnosticSpec(
     severity="warning",
     text="{subject}: {share:.1%} of its cells are empty: the points there are about {behind_m} m "
     "behind its plane",
-    remedy="{step}.buffer_behind_m={buffer_behind_m} includes them, if they belong to the wall",
+    remedy="if they belong to the wall, set {step}.buffer_behind_m={buffer_behind_m}",
     rank_by="share",
 )
 HIDDEN: Final = DiagnosticSpec(
@@ -66,9 +66,9 @@ HIDDEN: Final = DiagnosticSpec(
 SPARSE: Final = DiagnosticSpec(
     code="wall-sparse",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty near scanned ones: gaps between points, "
-    "shadows of relief, borders",
-    remedy="a larger {step}.gsd_m or {step}.recover_gap_cells closes narrow gaps",
+    text="{subject}: {share:.1%} of its cells are empty next to scanned cells: gaps between "
+    "points, shadows of relief, or borders",
+    remedy="increase {step}.gsd_m or {step}.recover_gap_cells to close narrow gaps",
     rank_by="share",
 )
 UNSEEN: Final = DiagnosticSpec(
@@ -89,7 +89,7 @@ COVERED: Final = DiagnosticSpec(
     code="wall-includes-others",
     severity="warning",
     text="{subject} shows {included} as relief, so these planes have no orthoimages of their own",
-    remedy="{step}.skip_covered=false creates one for each",
+    remedy="set {step}.skip_covered=false to create one for each plane",
 )
 NO_INTENSITY: Final = DiagnosticSpec(
     code="scan-without-intensity",
@@ -144,7 +144,7 @@ def warn(
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
             measured = np.count_nonzero(wall.count) / wall.count.size
-            larger = f"{{step}}.gsd_m={_least_gsd_m(step_m):g} or more leaves fewer"
+            larger = f"set {{step}}.gsd_m={_least_gsd_m(step_m):g} or more for fewer such cells"
             ctx.report(
                 CLOSE_CELLS,
                 subject=wall.name,
@@ -180,13 +180,13 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
         if wall.intensity is not None:
             states = (SurfaceMask.MEASURED, SurfaceMask.RECOVERED)
             if found := plain_tone(wall.intensity, wall.mask, states, white=1.0):
-                way = "{step[read.scan]}.intensity_max=NUMBER sets the value of white"
+                way = "set the intensity of white with {step[read.scan]}.intensity_max=NUMBER"
                 words = {"what": "intensity", "cause": scaled, "way": way}
                 ctx.report(PLAIN, subject=wall.name, tone=found[0], share=found[1], **words)
         if wall.rgb is None or wall.rgb_mask is None:
             continue
         if found := plain_tone(wall.rgb, wall.rgb_mask, (1,), white=255.0):
-            cause = f"so are the colours of its points{read_as}"
+            cause = f"the colours of its points are, too{read_as}"
             way = "check whether the program that wrote the scan exported colours"
             words = {"what": "colour", "cause": cause, "way": way}
             ctx.report(PLAIN, subject=wall.name, tone=found[0], share=found[1], **words)

@@ -629,7 +629,7 @@ def _unchanged(values: NDArray[_Number]) -> NDArray[_Number]:
 def _grids(cloud: PointCloud, chosen: NDArray[np.uint32]) -> Iterator[NDArray[np.int64]]:
     """Yield the indices of the chosen points of each scan by row and column."""
     if cloud.row is None or cloud.column is None:
-        raise AssertionError("a grid was asked of a cloud without rows and columns")
+        raise AssertionError("the cloud has no rows and columns")
     scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]
     for scan in np.unique(scans):
         points = chosen[scans == scan]

@@ -56,7 +56,7 @@ def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None
         raise MethodError(
             f"gsd_m = {largest.gsd_m:g} m gives {sum(sizes):.3g} cells ({largest.width} x "
             f"{largest.height} on the largest wall), which need {needed / 2**30:.3g} GiB; this "
-            f"machine has {memory / 2**30:.3g} GiB: raise gsd_m, or lower n_walls_max"
+            f"machine has {memory / 2**30:.3g} GiB: increase gsd_m, or reduce n_walls_max"
         )
 
 

@@ -124,7 +124,7 @@ class CloudAssembly:
         if free < needed:
             raise StoreError(
                 f"{self._capacity} points need {needed / 1e9:.2f} GB of scratch space, but only "
-                f"{free / 1e9:.2f} GB are free: free some space or choose another --store"
+                f"{free / 1e9:.2f} GB are free: free some disk space, or choose another --store"
             )
         fields = frozenset().union(*(file.fields for file in files))
         has_grid = all("grid" in scan.fields for file in files for scan in file.scans)

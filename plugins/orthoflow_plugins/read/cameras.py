@@ -132,7 +132,7 @@ class ReadCameras(Method):
 def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, list[str]]) -> Camera:
     found = given.of_photo(photo.name, photo.folder)
     if found is None:
-        return Camera(photo=photo.name, status="the files of given cameras do not contain it")
+        return Camera(photo=photo.name, status="the camera files do not contain it")
     if found.lens is None or found.rotation is None or found.translation is None:
         return Camera(photo=photo.name, status=found.reason)
     lens, note = found.lens, found.note
@@ -145,8 +145,8 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
     if isinstance(lens, WideLens):
         return Camera(
             photo=photo.name,
-            status="its lens is a fisheye or a panorama: connect the same files to read.photos as "
-            "cameras, which splits it into photos that can be used",
+            status="it is a fisheye or panorama photo: also connect the camera files to "
+            "read.photos, which splits it into photos that can be used",
         )
     if note:
         notes.setdefault(note, []).append(photo.name)
@@ -248,6 +248,6 @@ def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> Giv
     count = f"{len(best)} cameras of its name ({names})" if len(best) > 1 else f"only {names}"
     return GivenCamera(
         name=found[0].name,
-        reason=f"the files of given cameras contain {count}, and the folder names do not tell "
-        "which one belongs to this photo: use the same folders for photos and cameras",
+        reason=f"the camera files contain {count}, and the folder names do not tell which one "
+        "belongs to this photo: use the same folder names for photos and cameras",
     )

@@ -65,8 +65,8 @@ class ReadCheckpoints(Method):
             for point in read_survey_points(path):
                 if point.name in places:
                     raise InputError(
-                        f"check point {point.name} is in {places[point.name]} and again in "
-                        f"{path.name}: names must differ, so rename or remove one"
+                        f"check point {point.name} occurs in {places[point.name]} and in "
+                        f"{path.name}: rename or remove one of the two"
                     )
                 points.append(point)
             places.update((point.name, path.name) for point in points)

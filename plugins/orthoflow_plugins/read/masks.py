@@ -26,7 +26,7 @@ UNUSED: Final = DiagnosticSpec(
 )
 NO_MASKS: Final = DiagnosticSpec(
     code="files-are-no-masks",
-    text="files ignored as masks, neither images (PNG, JPEG, TIFF) nor polygons (GeoJSON): {names}",
+    text="files ignored, because masks are images (PNG, JPEG, TIFF) or polygons (GeoJSON): {names}",
     rank_by="n",
 )
 
@@ -98,7 +98,7 @@ class Masks:
         if used is None or used.all():
             return None
         if not used.any():
-            raise InputError(f"the mask of {photo} excludes all of it: remove the photo")
+            raise InputError(f"the mask of {photo} excludes the whole photo: remove the photo")
         return encode_png(np.where(used, np.uint8(255), np.uint8(0)))
 
     def warn_of_unused(self, ctx: StepContext) -> None:
@@ -116,7 +116,7 @@ class Masks:
         try:
             encoded = path.read_bytes()
         except OSError as error:
-            raise InputError(f"mask {path.name} cannot be read: {error.strerror}") from error
+            raise InputError(f"cannot read mask {path.name}: {error.strerror}") from error
         used = decode_mask(encoded, f"mask {path.name}")
         if used.shape != size[::-1]:
             raise InputError(

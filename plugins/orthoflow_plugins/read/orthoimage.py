@@ -52,8 +52,8 @@ class ReadOrthoimage(Method):
         wall: int = Field(
             0,
             ge=0,
-            description="Wall of images whose JSON file does not contain it: the index of its "
-            "plane in planes.json, as in file names.",
+            description="Wall number of images whose JSON file does not contain one: the index "
+            "of the plane in planes.json, as in file names.",
         )
 
     class In(Ports):
@@ -75,7 +75,7 @@ class ReadOrthoimage(Method):
         ]
         if not paths:
             raise InputError(
-                f"the input {inputs.files.name} contains no GeoTIFF: expected orthoimages, .tif"
+                f"the input {inputs.files.name} contains no GeoTIFF: expected orthoimages (.tif)"
             )
         images: dict[int, Orthoimage] = {}
         for place, path in enumerate(paths):

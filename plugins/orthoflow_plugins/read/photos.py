@@ -65,7 +65,7 @@ _MOST_PROBLEMS: Final = 20
 NO_PHOTOS: Final = DiagnosticSpec(
     code="files-are-no-photos",
     text="{n} of {n_files} files of the input {subject} are not photos (JPEG, PNG, TIFF, WebP, "
-    "HEIC) and were left out: {names}",
+    "HEIC) and were ignored: {names}",
     rank_by="n",
 )
 REMARK: Final = DiagnosticSpec(
@@ -239,7 +239,7 @@ def _bytes_of(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"photo {path.name} cannot be read: {error.strerror}") from error
+        raise InputError(f"cannot read photo {path.name}: {error.strerror}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +295,7 @@ class _Cubes:
         height, width = decode_image(encoded, f"photo {name}").shape[:2]
         if lens == _PANORAMA and width != 2 * height:
             raise InputError(
-                f"photo {name} is named in panoramas, but has {width} x {height} pixels: a "
+                f"photo {name} is listed in panoramas, but has {width} x {height} pixels: a "
                 "panorama over the whole sphere is twice as wide as high"
             )
         if lens == _PANORAMA:
@@ -434,7 +434,7 @@ def _require_whole(name: str, encoded: bytes) -> str:
     found, is_lost = damage(encoded)
     if is_lost:
         raise InputError(
-            f"photo {name} is damaged or cut off: a part of its {len(encoded)} bytes cannot be "
+            f"photo {name} is damaged or truncated: a part of its {len(encoded)} bytes cannot be "
             f"decoded ({found}); copy it again from the camera, or remove it"
         )
     return found

@@ -44,13 +44,13 @@ FIELD_ZERO: Final = DiagnosticSpec(
 )
 COLOUR_LIMIT: Final = DiagnosticSpec(
     code="scan-colour-limit-misfit",
-    text="{subject}: according to the file, colours reach at most {limit:g}, but they reach "
-    "{largest:g}: they are read as {scale}",
+    text="{subject}: the file declares colours up to {limit:g}, but contains colours up to "
+    "{largest:g}, which are read as {scale}",
 )
 COLOUR_DEPTH: Final = DiagnosticSpec(
     code="scan-colour-depth-small",
-    text="{subject}: the file gives no colour range; colours reach {largest:g} and are read as "
-    "{scale}",
+    text="{subject}: the file declares no colour range; its colours reach {largest:g} and are "
+    "read as {scale}",
     rank_by="largest",
 )
 COLOURS_GREY: Final = DiagnosticSpec(
@@ -59,9 +59,9 @@ COLOURS_GREY: Final = DiagnosticSpec(
 )
 INTENSITY_LIMITS: Final = DiagnosticSpec(
     code="scan-intensity-limits-misfit",
-    text="{subject}: intensities are {stated_low:g} to {stated_high:g} according to the file, but "
-    "the data do not fit: they are scaled from {low:g} to {high:g}",
-    remedy="{step}.intensity_max=NUMBER sets the value of white",
+    text="{subject}: the file declares intensities from {stated_low:g} to {stated_high:g}, which "
+    "do not fit its data: they are scaled from {low:g} to {high:g}",
+    remedy="set the intensity of white with {step}.intensity_max=NUMBER",
 )
 INTENSITY_CLIPPED: Final = DiagnosticSpec(
     code="scan-intensity-clipped",
@@ -71,14 +71,14 @@ INTENSITY_CLIPPED: Final = DiagnosticSpec(
 )
 INTENSITY_RANGES: Final = DiagnosticSpec(
     code="scan-intensity-ranges-differ",
-    text="the scans have different intensity ranges, and their files contain none: {ranges}; each "
-    "is scaled by its own range, so the same surface may differ in brightness",
-    remedy="{step}.intensity_max=NUMBER sets one for all",
+    text="the intensities of the scans have different ranges ({ranges}), and their files declare "
+    "no limits: each scan is scaled by its own range, so the same surface may differ in brightness",
+    remedy="set the same limit for all scans with {step}.intensity_max=NUMBER",
 )
 INTENSITY_LUMINANCE: Final = DiagnosticSpec(
     code="scan-intensity-is-luminance",
     text="the intensity is not laser intensity but the luminance of the colours (correlation "
-    "{correlation:.5f}): it is ignored, the colours contain it",
+    "{correlation:.5f}), so it is ignored",
 )
 WITHOUT_FIELD: Final = DiagnosticSpec(
     code="points-without-field",
@@ -88,7 +88,7 @@ WITHOUT_FIELD: Final = DiagnosticSpec(
 NO_INTENSITY: Final = DiagnosticSpec(
     code="scan-intensity-not-chosen",
     text="the scans have no intensity; fields not used: {names}",
-    remedy="{step}.intensity_field={candidate} uses one as the intensity",
+    remedy="set {step}.intensity_field={candidate} to use one as the intensity",
 )
 FEW_STATIONS: Final = DiagnosticSpec(
     code="scan-stations-missing",
@@ -122,7 +122,7 @@ OTHER_UP: Final = DiagnosticSpec(
     code="scan-up-doubtful",
     text="the up axis seems to be {axis}, not {up}: {share:.0%} of the surfaces are horizontal or "
     "vertical with respect to it, {share_up:.0%} with respect to {up}",
-    remedy="{step}.up={axis}, or -{axis} if floors become ceilings",
+    remedy="set {step}.up={axis}, or -{axis} if floors become ceilings",
 )
 THICK: Final = DiagnosticSpec(
     code="scan-thick",

@@ -88,8 +88,8 @@ class ReadScan(Method):
         up: UpDirection = Field("z", description="Axis of the files that points up.")
         unit: Unit | None = Field(
             None,
-            description="Unit of the files' coordinates, which overrides the files; None: the unit "
-            "in each file, or metres if there is none. The cloud is in metres.",
+            description="Unit of the coordinates, which overrides the unit in the files. None: "
+            "the unit in each file, or metres if it contains none. The cloud is in metres.",
         )
         view_from: tuple[float, float, float] | None = Field(
             None,
@@ -100,12 +100,13 @@ class ReadScan(Method):
         columns: str | tuple[str, ...] | None = Field(
             None,
             description="Columns of text files, [x, y, z, r, g, b, intensity] or 'x y z _'; _ "
-            "skips one. None: from the header, or else from their number and values.",
+            "skips a column. None: from the header, or else from the number and values of the "
+            "columns.",
         )
         intensity_field: str | None = Field(
             None,
-            description="Name of the field to use as intensity, e.g. Reflectance; None: the usual "
-            "one of the format, or else reflectance, amplitude or remission.",
+            description="Name of the field to use as intensity, e.g. Reflectance; None: the "
+            "usual field of the format, or else reflectance, amplitude or remission.",
         )
         intensity_max: float | None = Field(
             None,
@@ -117,8 +118,8 @@ class ReadScan(Method):
         box: tuple[Corner, Corner] | None = Field(
             None,
             description="Lowest and highest corner of a box, [[x, y, z], [x, y, z]], in world "
-            "metres (after unit is applied): points outside are left out, those on its faces "
-            "are kept.",
+            "metres (after unit is applied): points outside are dropped, points on its faces are "
+            "kept.",
         )
         gsd_m: float | None = Field(
             None,
@@ -129,7 +130,7 @@ class ReadScan(Method):
         classes: tuple[Annotated[int, Field(ge=0, le=255)], ...] = Field(
             (),
             description="Classes of LAS and LAZ points to keep, e.g. [1, 6] (ASPRS: 6 is "
-            "building); empty for all.",
+            "building); if empty, all are kept.",
         )
 
         @model_validator(mode="after")

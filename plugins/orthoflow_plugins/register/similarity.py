@@ -61,7 +61,7 @@ class RegisterSimilarity(Method):
             description="Also estimate the scale, for clouds from photos; for laser scans it is 1.",
         )
         up: UpDirection = Field(
-            default="z", description="Direction that is up in the system of the control."
+            default="z", description="Up direction in the coordinate system of the control points."
         )
 
     class In(Ports):
@@ -89,7 +89,7 @@ class RegisterSimilarity(Method):
         if n_free < 1:
             raise MethodError(
                 f"{len(names)} names are in both lists of points ({', '.join(names) or 'none'}), "
-                "at least 3 pairs are needed (register.similarity)"
+                "but at least 3 pairs are needed (register.similarity)"
             )
         try:
             fitted = fit_similarity(source, target, with_scale=params.with_scale)
@@ -156,7 +156,8 @@ def fit_similarity(
     spread = np.linalg.svd(source, compute_uv=False)
     if not spread[1] > _LINE_SHARE * spread[0]:
         raise GeometryError(
-            "the points of a similarity are on one line: a rotation about it is undetermined"
+            "the points of a similarity are on one line: the rotation about this line is "
+            "undetermined"
         )
     u, values, vt = np.linalg.svd(target.T @ source)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -189,9 +190,9 @@ def _require_same_hand(
     mirrored_off_m = float(np.linalg.norm(mirrored.apply(source * mirror) - target))
     if off_m > _MIRRORED_TIMES * mirrored_off_m and off_m > 1e-3:
         raise GeometryError(
-            f"the lists of points mirror each other: they fit to {off_m:.3g} m as they are, and "
-            f"to {mirrored_off_m:.3g} m with the sign of one axis changed; swap x and y, or change "
-            "that sign, in one of them"
+            f"one list of points is a mirror image of the other: residuals are {off_m:.3g} m as "
+            f"given, but {mirrored_off_m:.3g} m if the sign of one axis is changed; swap x and y, "
+            "or change that sign, in one of the lists"
         )
 
 

@@ -64,8 +64,8 @@ _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_
 NO_CLOUD: Final = DiagnosticSpec(
     code="openings-without-cloud",
     severity="warning",
-    text="without the cloud, openings cannot be distinguished from areas hidden by furniture, "
-    "nor open ones from those without returns",
+    text="without the cloud, it is unknown which openings are only areas hidden by furniture, "
+    "and which are open or have no returns",
     remedy="connect the cloud to {step}",
 )
 OTHER_SURFACE: Final = DiagnosticSpec(

@@ -96,7 +96,7 @@ class SimulateRoom(Method):
             None,
             gt=0.0,
             le=0.5,
-            description="The same for the panoramas, which cover the rest of the room; by "
+            description="Point spacing of the panoramas, which cover the rest of the room; by "
             "default three times scan_step_m.",
         )
         n_stations: int = Field(2, ge=1, le=4, description="Number of scanner stations.")
@@ -167,8 +167,9 @@ class SimulateRoom(Method):
         spectral_gap: SpectralGap = Field(
             "easy",
             description="How the laser intensity relates to the colours. none: it shows the "
-            "painted patterns; easy: mostly these; hard: mostly other patterns; inverted: it "
-            "decreases where red increases, with wet patches and retroreflective spots.",
+            "painted patterns; easy: mostly the painted patterns; hard: mostly other patterns; "
+            "inverted: it decreases where red increases, with wet patches and retroreflective "
+            "spots.",
         )
         spectral_inversion_share: float | None = Field(
             None,
@@ -195,8 +196,8 @@ class SimulateRoom(Method):
         photo_layout: PhotoLayout = Field(
             "none",
             description="none: no photos; quick: 6 photos of the main wall; variant1: 8 photos "
-            "that show whole walls, of four walls; variant2: a block of 18 photos of the "
-            "main wall with 70 % forward and 50 % side overlap.",
+            "of four walls, each of a whole wall; variant2: a block of 18 photos of the main wall "
+            "with 70 % forward and 50 % side overlap.",
         )
         photo_gsd_m: float = Field(
             0.002, gt=0.0, le=0.1, description="Photo pixel size on the wall."
@@ -223,8 +224,8 @@ class SimulateRoom(Method):
             0.0,
             ge=0.0,
             le=0.9,
-            description="Largest relative change of exposure between photos: each gets 1 - this "
-            "to 1 + this times the light.",
+            description="Largest relative change x of the exposure: each photo gets between 1 - "
+            "x and 1 + x times the light.",
         )
         n_passers_by: int = Field(
             0,
@@ -240,7 +241,7 @@ class SimulateRoom(Method):
             le=8,
             description="Rays per pixel along each axis; a pixel is the mean of all its rays.",
         )
-        calibrated: bool = Field(default=True, description="Return the calibration of the camera.")
+        calibrated: bool = Field(default=True, description="Output the calibration of the camera.")
         check_points_most: int = Field(
             24,
             ge=1,
@@ -265,12 +266,12 @@ class SimulateRoom(Method):
             if self.n_plaques and self.decoration != "drawn":
                 raise ValueError(
                     f"n_plaques {self.n_plaques} is for drawn walls, but decoration is "
-                    f"{self.decoration}: set decoration to drawn, or leave out n_plaques"
+                    f"{self.decoration}: set decoration to drawn, or omit n_plaques"
                 )
             if self.design_seed is not None and self.decoration != "drawn":
                 raise ValueError(
                     f"design_seed {self.design_seed} draws a room, but decoration is "
-                    f"{self.decoration}: set decoration to drawn, or leave out design_seed"
+                    f"{self.decoration}: set decoration to drawn, or omit design_seed"
                 )
             return self
 

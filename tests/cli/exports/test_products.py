@@ -66,7 +66,9 @@ def test_the_last_of_some_cells_gives_a_product(tmp_path: Path) -> None:
     only = {"a": run.cells["a"]}
     assert last_product(held, only, PointLabels, tmp_path).plane_index.tolist() == [1, 1, 1]  # type: ignore[union-attr]
     assert last_product(held, {"scan": run.cells["scan"]}, PointLabels, tmp_path) is None
-    with pytest.raises(ArgumentError, match="pass its store with --store, or run the workflow"):
+    with pytest.raises(
+        ArgumentError, match="pass the store of the run with --store, or run the workflow"
+    ):
         product_of(held, "sha256:" + "f" * 64, PointLabels, tmp_path / "store")
 
 
@@ -74,5 +76,5 @@ def test_a_folder_is_made_with_those_above_it(tmp_path: Path) -> None:
     make_empty(tmp_path / "a" / "b")
     make_empty(tmp_path / "a" / "b")
     (tmp_path / "a" / "b" / "file").touch()
-    with pytest.raises(ArgumentError, match="file/c cannot be created: Not a directory"):
+    with pytest.raises(ArgumentError, match=r"cannot create .*file/c: Not a directory"):
         make_empty(tmp_path / "a" / "b" / "file" / "c")

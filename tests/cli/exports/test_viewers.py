@@ -38,5 +38,5 @@ def test_a_run_without_depths_says_so(run: Path) -> None:
     shutil.rmtree(run / "products" / "wall")
     done = export(run, "--relief")
     assert done.exit_code == 2
-    assert f"--relief: the run has no depth of wall {WALL}" in " ".join(done.output.split())
+    assert f"--relief: the run has no depth raster of wall {WALL}" in " ".join(done.output.split())
     assert not (run.parent / "model").exists()

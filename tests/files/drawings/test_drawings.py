@@ -212,7 +212,7 @@ def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
             "the step plane has no orthoimages or walls; steps of this run that have them:",
         ),
         (("--step", "none"), "has no step 'none'"),
-        (("--title-block", "missing.yaml"), "missing.yaml cannot be read"),
+        (("--title-block", "missing.yaml"), "cannot read missing.yaml"),
     ],
     ids=["wall", "paper", "grid", "cell", "no-cell", "title-block"],
 )

@@ -104,7 +104,7 @@ def test_two_sides_of_a_wall_give_its_thickness() -> None:
 
 
 def test_a_cut_that_meets_nothing_is_refused() -> None:
-    with pytest.raises(ArgumentError, match="meets no plane"):
+    with pytest.raises(ArgumentError, match="does not intersect the room"):
         section_of(section_cut(box_planes(), [0.0, 0.0, 1.0, 0.0]), box_planes())
     with pytest.raises(ArgumentError, match="two different points"):
         section_cut(box_planes(), [1.0, 2.0, 1.0, 2.0])

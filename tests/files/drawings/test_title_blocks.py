@@ -27,9 +27,12 @@ def read(folder: Path, text: str) -> TitleBlock:
             "revisions: [{mark: A, texts: b}]\n",
             "block.yaml:1:23: revisions[0].texts: unknown key texts (did you mean text?)",
         ),
-        ("logo: none.png\n", "none.png cannot be read: No such file"),
+        ("logo: none.png\n", "cannot read none.png: No such file"),
         ("logo: block.yaml\n", "block.yaml is not a JPEG, PNG, TIFF"),
-        ("a" * 100_001, "block.yaml has 100001 bytes, a title block (YAML) at most 100000"),
+        (
+            "a" * 100_001,
+            "block.yaml has 100001 bytes, but a title block (YAML) may have at most 100000",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_in_one_sentence(tmp_path: Path, text: str, said: str) -> None:

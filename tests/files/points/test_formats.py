@@ -116,8 +116,8 @@ REFUSED: list[tuple[Make, str]] = [
     (changed(pcd, b"FIELDS x y", b"FIELDS u v"), "its fields are u v z rgb intensity, expected x"),
     (changed(pcd, b"COUNT 1 1 1", b"COUNT 1 1 0"), "its fields are x y z .*, expected x, y and z"),
     (changed(pcd, b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT 1"), "VIEWPOINT has 1 numbers"),
-    (text("a.pcd", f"{PCD}1 2 3\r4 5 6\n7 8 9\r1 1 1\n2 2 2\n"), "a.pcd ends lines with a car"),
-    (damaged_pcd, r"a\.pcd cannot be unpacked: 40 points need 800 bytes"),
+    (text("a.pcd", f"{PCD}1 2 3\r4 5 6\n7 8 9\r1 1 1\n2 2 2\n"), "a.pcd uses only carr"),
+    (damaged_pcd, r"a\.pcd cannot be decompressed: 40 points need 800 bytes"),
     # PTX
     (text("a.ptx", "this is text"), "a.ptx, line 1: expected the ten header lines"),
     (text("a.ptx", "5\n8\n0 0 0\n"), "a.ptx, line 1: expected the ten header lines"),
@@ -131,9 +131,9 @@ REFUSED: list[tuple[Make, str]] = [
       in ("1 2 3 10 20 30 40\n", "1 2 3 10 20 30 22\n", "1 2 3 4 5\n", "1 2 3 4 5 6 7 8\n")),
     (text("a.xyz", "1 2 3\n4 5 6\n7 eight 9\n"), "a.xyz, line 3: expected 3 .* got '7 eight 9'"),
     (text("a.xyz", "1 2 3\n4 5 6 7 8\n"), r"a\.xyz, line 2: expected 3 numbers"),
-    (text("a.xyz", "1 2 3\r4 5 6\r"), r"a\.xyz ends lines with a carriage return only"),
+    (text("a.xyz", "1 2 3\r4 5 6\r"), r"a\.xyz uses only carriage returns"),
     (text("a.xyz", "# only\n# comments\n"), r"no line with three numbers among its first 2"),
-    (text("a.xyz", "5\n1 2 3\n4 5 6\n"), "a.xyz is cut off: its list contains 2 points, .* 5"),
+    (text("a.xyz", "5\n1 2 3\n4 5 6\n"), "a.xyz is truncated: its list contains 2 points, .* 5"),
     # E57
     (e57, r"a\.e57 contains no points"),
     (lambda folder: e57(folder, {"intensity": np.arange(3.0)}), "scan 0 has the fields intensity"),
@@ -375,7 +375,7 @@ def test_the_xml_of_an_e57_file_is_read_up_to_its_limits(
     path.write_bytes(e57_of(bytes(48), most.encode()))
     e57_reader.check_xml(path)
     path.write_bytes(e57_of(bytes(48), more.encode()))
-    refused = f"a.e57 cannot be read as E57: its XML is refused, {reason}"
+    refused = f"a.e57 cannot be read as E57 because of its XML: {reason}"
     with pytest.raises(InputError, match=re.escape(refused)):
         e57_reader.check_xml(path)
     content = bytearray(e57_of(bytes(48), b"<a/>"))

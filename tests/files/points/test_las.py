@@ -74,8 +74,12 @@ def chunk_table(path: Path) -> int:
 @pytest.mark.parametrize(
     ("position", "content", "message"),
     [
-        (96, b"\xff\xff\xff\x00", "its points begin outside the file, which is cut off"),
-        (100, b"\xff\xff\xff\x7f", "its header declares 2147483647 records, which do not fit"),
+        (96, b"\xff\xff\xff\x00", "its points begin outside the file, which is truncated"),
+        (
+            100,
+            b"\xff\xff\xff\x7f",
+            "its header declares 2147483647 records, which the file cannot contain",
+        ),
         (243, b"\x05\x00\x00\x00", "records at its end are missing"),
         # Of the chunk table: 3 thousand million chunks of 16 bytes each would end the process.
         (4, b"\xff\xff\xff\xbf", "its chunk table declares 3221225471 chunks"),

@@ -144,7 +144,7 @@ def test_what_is_not_found_is_said(tmp_path: Path) -> None:
         MethodError, match=r"none of the 1 check points was found in an orthoimage: \S+ \(.* beyond"
     ):
         inspect(tmp_path, far, walls)
-    with pytest.raises(MethodError, match="there is no image in which to find check points"):
+    with pytest.raises(MethodError, match="there is no image in which check points can be found"):
         inspect(tmp_path, far, inspect_scenes.walls(source="none"))
 
 

@@ -102,5 +102,5 @@ def test_a_point_a_metre_beside_the_nearest_wall_is_told_of(
 
 
 def test_walls_are_chosen_in_one_way() -> None:
-    with pytest.raises(ValidationError, match="by ranks or by near, got both"):
+    with pytest.raises(ValidationError, match="by ranks or by near, not by both"):
         RasterGrid.Params.model_validate({"ranks": [0], "near": [[0, 0, 0]]})

@@ -197,7 +197,7 @@ def test_what_gives_no_raster_is_refused(tmp_path: Path) -> None:
         (broken, {}, "NaN or infinite"),
         (far, {}, "no point of the cloud is inside"),
         (cloud, {"constraint": "horizontal"}, "is horizontal within"),
-        (cloud, {"gsd_m": 1e-6}, "gsd_m = 1e-06 m .* raise gsd_m"),
+        (cloud, {"gsd_m": 1e-6}, "gsd_m = 1e-06 m .* increase gsd_m"),
     ]
     for given, params, message in cases:
         with pytest.raises(OrthoflowError, match=message):

@@ -70,7 +70,7 @@ def test_only_level_planes_seen_from_above_are_maps(
     # A ceiling is not a map either.
     frame, warnings = placed(level(down=True), tmp_path)
     assert frame.map_crs is None
-    assert "none of the planes is level and seen from above" in warnings[0]
+    assert "none of the planes is horizontal and seen from above" in warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_only_level_planes_seen_from_above_are_maps(
         ("EPSG:2225", UP, "EPSG:2225 is not a coordinate system in metres"),  # US survey feet
         ("EPSG:9999", UP, "there is no coordinate system EPSG:9999"),
         ("/etc/passwd", UP, "there is no coordinate system /etc/passwd"),
-        ("site", -UP, "needs a cloud whose z is up"),
+        ("site", -UP, "needs a cloud with x east, y north and z up"),
     ],
 )
 def test_what_is_no_map_in_metres_is_refused(

@@ -160,7 +160,7 @@ def test_files_are_joined_in_order(tmp_path: Path) -> None:
     assert points.classes == ("", "edge")
     extents = {"extent_x_m": 3, "extent_y_m": 3, "extent_z_m": 4}
     assert metrics == {"n_points": 2, "n_measured": 0, **extents}
-    with pytest.raises(InputError, match=r"P1 is in points0\.csv and again in points1\.csv"):
+    with pytest.raises(InputError, match=r"P1 occurs in points0\.csv and in points1\.csv"):
         read_points(tmp_path, "P1,1,2,3\n", "P1,1,2,4\n")
     with pytest.raises(InputError, match="the input checkpoints has no files"):
         read_points(tmp_path)

@@ -106,7 +106,7 @@ def test_what_cannot_be_placed_says_why(tmp_path: Path) -> None:
         read(tmp_path, image, place)
     image, place = foreign(tmp_path)
     write(image, values[:3], Affine(0.01, 0, 0, 0, 0.01, 0))
-    with pytest.raises(InputError, match="its rows go up along Y"):
+    with pytest.raises(InputError, match="its rows run up along Y"):
         read(tmp_path, image, place)
 
 

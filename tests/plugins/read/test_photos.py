@@ -143,7 +143,7 @@ def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
 
     assert run(given) == tuple(f"a_{face}.png: ok" for face in faces)
     # If only the poses are connected, the error names the missing input.
-    with pytest.raises(InputError, match="its lens is a fisheye or a panorama: connect the same"):
+    with pytest.raises(InputError, match="it is a fisheye or panorama photo: also connect the"):
         run(None)
 
 
@@ -160,7 +160,7 @@ def test_other_files_are_left_out_and_counted(read: PhotoReader) -> None:
         "K.txt": b"",
     }
     assert [item.name for item in read.files(files)] == ["a.jpg"]
-    assert "and were left out: a.jpg.camera, Thumbs.db, a.CR2 and 1 more" in read.warnings
+    assert "and were ignored: a.jpg.camera, Thumbs.db, a.CR2 and 1 more" in read.warnings
 
 
 @pytest.mark.parametrize(
@@ -406,7 +406,7 @@ def test_masks_of_no_photo_and_files_that_are_none_are_named(tmp_path: Path) -> 
     assert (
         "masks that match no photo: c.png, x*.jpg: a mask must have the name of its photo" in said
     )
-    assert "neither images (PNG, JPEG, TIFF) nor polygons (GeoJSON): notes.txt" in said
+    assert "masks are images (PNG, JPEG, TIFF) or polygons (GeoJSON): notes.txt" in said
 
 
 def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
@@ -428,7 +428,11 @@ def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
     ("name", "content", "said"),
     [
         ("a.png", encode_png(np.full(SIZE, 255, np.uint8)), "a.png has 48 x 64 pixels, but a.jpg"),
-        ("a.png", encode_png(np.zeros(SIZE[::-1], np.uint8)), "the mask of a.jpg excludes all"),
+        (
+            "a.png",
+            encode_png(np.zeros(SIZE[::-1], np.uint8)),
+            "the mask of a.jpg excludes the whole",
+        ),
         ("a.png", b"no picture", "mask a.png"),
         ("a.txt", "words", r"the masks contain no pictures .* only a\.txt"),
         ("a.json", " " * (MOST_BYTES + 1), f"more than {MOST_BYTES} bytes"),

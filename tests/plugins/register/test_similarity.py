@@ -124,7 +124,7 @@ def test_residuals_and_what_they_add_up_to_are_told(tmp_path: Path) -> None:
 def test_lists_that_mirror_each_other_are_refused(tmp_path: Path, with_scale: bool) -> None:
     source = places(3)
     control = source[:, [1, 0, 2]] + SURVEY  # north, east
-    with pytest.raises(MethodError, match=r"mirror each other: .* swap x and y"):
+    with pytest.raises(MethodError, match=r"mirror image of the other: .* swap x and y"):
         register(tmp_path, points_at(source), points_at(control), with_scale=with_scale)
 
 
