@@ -1,4 +1,4 @@
-"""Measure the rows of docs/papers.md in drawn rooms; write this page and docs/choosing.md.
+"""Measure the rows of docs/papers.md in random rooms; write this page and docs/choosing.md.
 
     python benchmarks/drawn_rooms.py FOLDER
     python benchmarks/drawn_rooms.py FOLDER --part surfaces --rooms 5

@@ -102,7 +102,7 @@ class Pair:
 
     Attributes:
         wall: index of the wall.
-        matches: matches; first: key points of the photo, second: key points of the wall.
+        matches: matched key points; `first` are those of the photo, `second` those of the wall.
         agreeing: (n,) bool, inliers of an approximate homography.
         is_shown: whether enough matches agree and the wall is not seen from behind.
         homography: (3, 3) approximate homography, photo pixels from wall pixels; None if the wall

@@ -458,8 +458,8 @@ def _without_point(
 def _set_up(block: Block) -> tuple[Any, Any]:
     """Set up poses and lenses as COLMAP's scene and adjuster.
 
-    Only COLMAP's adjuster provides the manifold of a pose, and it requires observations. So each
-    photo gets two observations whose residuals are so large that they have no weight.
+    Only COLMAP's adjuster provides the manifold of a pose, and it requires observations. Each photo
+    therefore gets two observations whose residuals are so large that they have no weight.
     """
     import pycolmap
 

@@ -182,7 +182,7 @@ def test_photos_that_zoomed_share_no_lens_where_it_matters(
 
 
 def test_the_noise_of_ties_between_photos_is_found() -> None:
-    """Points absorb a part of the noise: three quarters with two photos, a half with three."""
+    """Points absorb three quarters of the noise with two photos, and half of it with three."""
     rng, params, n_seeing = np.random.default_rng(3), OrientColmapBundle.Params(), 3
     scan, shots = bs.scan_ties(0, n=60), bs.photos(calibrated=True).photos
     trusted = [

@@ -233,7 +233,7 @@ BY_CHANCE = optimize.brentq(lambda p: 4.0 * stats.binom.sf(5, 20, p) - 1e-5, 1e-
 
 @pytest.mark.parametrize("share", [0.2, 0.35, 0.6, 1.0])
 def test_one_wrong_pose_in_a_hundred_thousand_may_look_right(share: float) -> None:
-    # Six of twenty residuals are within this share of the limit, which is three.
+    # Six of twenty residuals are within this share of the limit of 3.
     length = 0.999 * 3.0 * share
     agrees, lengths = six_agree(length)
     # Radius for residuals of half a pixel.

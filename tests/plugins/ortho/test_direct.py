@@ -116,8 +116,8 @@ def test_only_gaps_are_filled_and_they_are_marked(tmp_path: Path, method: str) -
     # The quality is less than that of a point in the corner of its cell.
     assert layer.quality[expected].max() < min(0.5, layer.quality[~is_void].min())
     assert not layer.quality[layer.mask != LayerMask.PAINTED].any()
-    # The black of the large void does not bleed into adjacent gaps: Telea changes a uniform grey by
-    # 2 levels; black would change it by 50 or more.
+    # The black of the large void does not bleed into adjacent gaps. Telea changes a uniform grey by
+    # 2 levels, whereas black would change it by 50 or more.
     even = dataclasses.replace(cloud, rgb=np.full_like(cloud.rgb, 180))
     layer = painted(even, walls, tmp_path, inpaint=method)
     shown = layer.rgb[layer.mask == LayerMask.PAINTED].astype(int)
@@ -302,7 +302,7 @@ def test_colours_follow_their_rule(tmp_path: Path, colouring: str) -> None:
     shown = layer.mask.ravel() == LayerMask.PAINTED
     np.testing.assert_array_equal(np.flatnonzero(shown), sorted(expected))
     colours = np.array([expected[cell] for cell in sorted(expected)])
-    # One grey level, since positions are float32 offsets.
+    # The tolerance is one grey level, since positions are float32 offsets.
     assert np.abs(layer.rgb.reshape(-1, 3)[shown].astype(int) - colours).max() <= 1
 
 

@@ -26,7 +26,7 @@ WALL = scenes.KnownWall(
     shape=(150, 200),
 )
 STEP_M = 0.008
-# Tolerance: half a 5 cm tile on each side of openings of 0.8 m or more.
+# The tolerance is half a 5 cm tile on each side of openings of 0.8 m or more.
 SHARE = 0.015
 
 

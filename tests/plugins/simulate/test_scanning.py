@@ -179,7 +179,7 @@ def test_neighbouring_points_share_an_error_of_the_stated_size_and_reach(length_
         for apart in (0.0, length_m)
     ]
     assert found[0].std() == pytest.approx(0.004, rel=0.3)
-    # For a Gaussian, exp(-1/2) at the correlation length.
+    # At the correlation length, a Gaussian has the value exp(-1/2).
     together = float((found[0] * found[1]).mean() / (found[0] ** 2).mean())
     assert together == pytest.approx(np.exp(-0.5), abs=0.25)
 
