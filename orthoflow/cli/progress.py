@@ -132,6 +132,8 @@ class Progress:
         self._jobs = jobs
         self._lock = threading.Lock()
         self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
+        # A step with one of these methods may resolve a diagnostic; the summary has the others.
+        self._methods = {item.cell.method for item in cells}
         self._n_cells = len(cells)
         self._reported: set[tuple[str, str]] = set()
         self._n_similar: Counter[str] = Counter()
@@ -213,7 +215,7 @@ class Progress:
         """Format a diagnostic in a line; empty for notes, and for codes reported before."""
         if one.is_summary:
             return f"{address}: {one.text}"
-        if one.severity == "note":
+        if one.severity == "note" or not self._methods.isdisjoint(one.settled_by):
             return ""
         is_plain = one.code == PLAIN_WARNING.code
         key = (one.code, one.text if is_plain else "")
@@ -221,9 +223,12 @@ class Progress:
             self._n_similar[address] += 1
             return ""
         self._reported.add(key)
-        # The summary contains the complete sentences.
-        about = f" ({one.subject})" if one.subject else ""
-        return f"{address}: {one.severity}: {one.text if is_plain else one.code + about}"
+        if one.severity == "error" or is_plain:
+            text = f"{one.text}: {one.remedy}" if one.remedy else one.text
+        else:
+            # The summary contains the complete sentences.
+            text = f"{one.code} ({one.subject})" if one.subject else one.code
+        return f"{address}: {one.severity}: {text}"
 
     def cells(self) -> dict[str, CellState]:
         """Return all cells in their current state."""
@@ -315,21 +320,26 @@ def _end_text(event: CellFinished, more_s: float) -> str:
 
 
 @contextmanager
-def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
-    """Show an activity outside of cells, with its duration so far, while the block runs."""
+def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[Callable[[str], None]]:
+    """Show an activity outside of cells, with its duration so far, while the block runs.
+
+    Yields:
+        A function that names the current part of the activity.
+    """
     started = time.monotonic()
+    parts = [what]
 
     def line() -> str:
-        return f"{what}, {duration(time.monotonic() - started)} so far"
+        return f"{parts[-1]}, {duration(time.monotonic() - started)} so far"
 
     if sys.stderr.isatty():
         from rich.console import Console
 
         with _live(Console(stderr=True), line):
-            yield
+            yield parts.append
     else:
         with _repeating(lambda: echo_error(line()), every_s):
-            yield
+            yield parts.append
 
 
 def _live(console: Console, drawn: Callable[[], RenderableType]) -> Live:

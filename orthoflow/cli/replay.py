@@ -123,7 +123,7 @@ def replay(
                 opened,
                 folder,
                 run_id,
-                report=lambda made: write_report([made], folder / REPORT_FILE),
+                report=lambda made, _: write_report([made], folder / REPORT_FILE),
             )
             distances = product_distances(
                 RunProducts(run=original, stores=stores_at(DEFAULT_STORE)),

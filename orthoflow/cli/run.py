@@ -166,7 +166,7 @@ def run_workflow(
                 folder,
                 run_id,
                 embed=embed,
-                report=lambda made: write_page(made, folder / REPORT_FILE),
+                report=lambda made, note: write_page(made, folder / REPORT_FILE, note=note),
                 listen=listen,
             )
         except (CancelledStepError, ClusterError, StoreError):
@@ -198,7 +198,7 @@ def executed(  # noqa: PLR0913 - parts of a run
     run_id: str,
     *,
     embed: bool = False,
-    report: Callable[[Run], None],
+    report: Callable[[Run, Callable[[str], None]], None],
     listen: RunListener = lambda _: None,
 ) -> tuple[RunOutcome, Run]:
     """Execute a plan, show its progress, and write products, record and report."""
@@ -220,9 +220,14 @@ def executed(  # noqa: PLR0913 - parts of a run
             return execute(plan, folder, store, take, run_id=run_id)
 
     def write(outcome: RunOutcome) -> Run:
-        with working_on("writing the products, the record and the report"):
+        with working_on("writing the products and the record") as note:
+
+            def write_report(made: Run) -> None:
+                note("writing the report")
+                report(made, note)
+
             return write_run(
-                outcome, plan, workflow, folder, store, embed=embed, before_finish=report
+                outcome, plan, workflow, folder, store, embed=embed, before_finish=write_report
             )
 
     return executed_and_written(run, write)

@@ -190,6 +190,7 @@ class _Run:
         # Keys and inputs of cells that wait for free cores.
         self._ready: dict[str, tuple[CellKey, Mapping[str, ProductRef]]] = {}
         self._running: dict[str, Task] = {}
+        self._settings = {item.cell.address: item.cell.setting for item in self._plan.cells}
         self._step_of = step_names((item.cell.step, item.cell.method) for item in self._plan.cells)
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
@@ -205,7 +206,10 @@ class _Run:
             self._poll(executor)
 
     def report(self, address: str, event: StepEvent) -> None:
-        """Pass on an event of a cell."""
+        """Pass on an event of a cell, with the names of the steps of this run."""
+        if event.diagnostic is not None:
+            named = placed(event.diagnostic, self._settings[address], self._step_of)
+            event = dataclasses.replace(event, text=named.text, diagnostic=named)
         self._listen(CellReported(address=address, event=event))
 
     def _poll(self, executor: Executor) -> None:
@@ -382,7 +386,9 @@ class _Run:
     def _settle(self, cell: Cell, result: CellResult, *, is_cached: bool = False) -> None:
         self._waiting.pop(cell.address, None)
         # The result may come from another workflow; use the names of this one.
-        named = (placed(one, cell.setting, self._step_of) for one in result.diagnostics)
+        named = (
+            placed(one, self._settings[cell.address], self._step_of) for one in result.diagnostics
+        )
         result = _reporting(dataclasses.replace(result, diagnostics=()), *named)
         self._results[cell.address] = result
         # If a cell of this run with the same key has just computed the result, it counts as new.

@@ -36,6 +36,7 @@ class WallDescription(BaseModel):
             median over the image; None if it was not checked.
         expected_mm_p95: the same, exceeded in 5 % of the image.
         n_withheld_ties: number of withheld tie points on this wall; 0 if there is no image.
+        errors: errors of the run because of which the orthoimage should not be delivered.
         orthoimage: path of the GeoTIFF, relative to the file with this description.
     """
 
@@ -54,6 +55,7 @@ class WallDescription(BaseModel):
     expected_mm_median: NonNegativeFloat | None = None
     expected_mm_p95: NonNegativeFloat | None = None
     n_withheld_ties: NonNegativeInt = 0
+    errors: tuple[str, ...] = ()
     orthoimage: str | None = None
 
     @property
@@ -70,6 +72,8 @@ class WallDescription(BaseModel):
         """Reason not to deliver the orthoimage, as a phrase for drawings; None if there is none."""
         if self.recommended:
             return None
+        if self.errors:
+            return Phrase(key="run_error")
         if (share := self.painted_share or 0.0) < _MIN_PAINTED_SHARE:
             return Phrase(key="barely_painted", values={"percent": f"{100.0 * share:.0f}"})
         return Phrase(key="no_ties")
@@ -112,7 +116,11 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
     )
     is_of_photos = path.with_name(path.name.replace("_ortho.tif", "_error.tif")).exists()
     reason = f"{painted:.0%} covered"
-    if painted < _MIN_PAINTED_SHARE:
+    stated = sidecar.get("errors")
+    errors = tuple(str(text) for text in stated) if isinstance(stated, list) else ()
+    if errors:
+        is_recommended, reason = False, "; ".join(errors)
+    elif painted < _MIN_PAINTED_SHARE:
         is_recommended, reason = False, f"only {reason}"
     elif is_of_photos and median is None:
         is_recommended = False
@@ -136,6 +144,7 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
         expected_mm_median=median,
         expected_mm_p95=high,
         n_withheld_ties=int(_number(accuracy.get("n_check_points")) or 0),
+        errors=errors,
         orthoimage=path.name,
     )
 

@@ -5,6 +5,7 @@ from orthoflow.products.input_files import InputFiles
 from orthoflow.products.inspections import CheckPoints, Finding, Inspection, TakenPhoto, Truth
 from orthoflow.products.openings import Opening, OpeningKind, Openings, OutlineSource
 from orthoflow.products.photographs import (
+    PHOTOS_UPSIDE_DOWN,
     Calibration,
     Camera,
     Cameras,
@@ -45,6 +46,7 @@ from orthoflow.products.walls import (
 
 __all__ = [
     "PAINTED_STATES",
+    "PHOTOS_UPSIDE_DOWN",
     "SHOWN_STATES",
     "Array",
     "Calibration",

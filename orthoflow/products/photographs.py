@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import ClassVar, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.diagnostics import DiagnosticSpec
 from orthoflow.errors import ProductError
 from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, unmeasured
 from orthoflow.products.product import (
@@ -20,6 +21,15 @@ from orthoflow.products.product import (
 )
 from orthoflow.products.walls import Wall
 
+# A photo is upright, or upside down, if the cosine between its top and the vertical exceeds this.
+_UPRIGHT: Final = 0.5
+PHOTOS_UPSIDE_DOWN: Final = DiagnosticSpec(
+    code="photos-upside-down",
+    severity="error",
+    text="{n_down} of {n_photos} photos are upside down: if the vertical axis of the scan points "
+    "down, walls and orthoimages are upside down and floor and ceiling are swapped",
+    remedy="set {step[read.scan]}.up={opposite}",
+)
 # Focal length relative to the longer side, if neither a calibration nor EXIF contains it.
 _USUAL_FOCAL: Final = 0.8
 
@@ -435,6 +445,24 @@ class Cameras(Product):
     ties: Ties | None = None
     residual_table: tuple[ResidualRow, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    def upside_down(self, up: NDArray[np.float64]) -> dict[str, Any]:
+        """Return the values of `PHOTOS_UPSIDE_DOWN` if most oriented photos are upside down.
+
+        Args:
+            up: (3,) unit vector, vertical axis of the scan.
+
+        Returns:
+            Values of the diagnostic; empty if the vertical axis agrees with the photos.
+        """
+        # Rows of a photo count downwards, so its top is the negative second axis.
+        tops = [-one.viewing().rotation[1] @ up for one in self.cameras if one.status == "ok"]
+        n_down = sum(float(top) < -_UPRIGHT for top in tops)
+        if 2 * n_down <= len(tops):
+            return {}
+        axis = int(np.abs(up).argmax())
+        opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
+        return {"n_down": n_down, "n_photos": len(tops), "opposite": opposite}
 
     def check_against(self, others: Mapping[str, Product]) -> None:
         """See `Product.check_against`.

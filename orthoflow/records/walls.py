@@ -7,12 +7,13 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from orthoflow_provenance.document import RecordedCell
 from pydantic import TypeAdapter, ValidationError
 
+from orthoflow.diagnostics import grouped, standing
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import ArgumentError, InputError, RecordError
 from orthoflow.files.drawings.words import Phrase
@@ -28,7 +29,13 @@ from orthoflow.products import (
     Planes,
     Walls,
 )
-from orthoflow.records.runs import PRODUCTS_FOLDER, Run, published_files, require_unchanged
+from orthoflow.records.runs import (
+    PRODUCTS_FOLDER,
+    Run,
+    published_files,
+    require_unchanged,
+    upstream_cells,
+)
 
 WALLS_FILE: Final = "walls.json"
 _WALLS_LARGEST_BYTES: Final = 1 << 22
@@ -45,6 +52,29 @@ def delivered_walls(products: Path) -> tuple[WallDescription, ...]:
         return _WALLS.validate_json(path.read_bytes()).get("walls", ())
     except (OSError, ValidationError):
         return ()
+
+
+def add_errors(folder: Path, address: str, cells: Sequence[RecordedCell]) -> None:
+    """Add the errors of a run that affect orthoimages to their sidecars, as `errors`.
+
+    These are diagnostics of severity `error` of the cell and those upstream that concern no single
+    wall; errors of one wall appear in its covered share.
+
+    Args:
+        folder: published files of the cell.
+        address: address of the cell.
+        cells: cells of the run.
+    """
+    upstream = list(upstream_cells({cell.address: cell for cell in cells}, address))
+    errors = [
+        group.sentence
+        for group in grouped(standing(upstream))
+        if group.worst.severity == "error" and not group.worst.subject
+    ]
+    for path in folder.glob("*_ortho.json") if errors else ():
+        # Any: values of JSON.
+        content: dict[str, Any] = read_sidecar(path)
+        write_json(path, content | {"errors": errors})
 
 
 def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:

@@ -66,7 +66,7 @@ from orthoflow.records.runs import (
     read_run,
     write_metrics_csv,
 )
-from orthoflow.records.walls import write_walls_json
+from orthoflow.records.walls import add_errors, write_walls_json
 from orthoflow.untrusted_text import first_few
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
@@ -122,6 +122,7 @@ def publish_products(
                     if f"{cell.address}.{port}" not in replaced
                 }
                 _publish_cell(folder, cell, current, run_id)
+                add_errors(folder, cell.address, cells)
         write_walls_json(target, cells)
         rows = [row for cell in cells for row in cell_metrics(cell)]
         write_metrics_csv(target / METRICS_FILE, rows)

@@ -7,6 +7,7 @@ import io
 import itertools
 import re
 import time
+from typing import Literal
 
 import pytest
 from rich.console import Console
@@ -47,8 +48,14 @@ def of_diagnostic(address: str, one: Diagnostic) -> CellReported:
     return CellReported(address=address, event=event)
 
 
-def reported(address: str, text: str, code: str = "warning", subject: str = "") -> CellReported:
-    spec = DiagnosticSpec(code=code, severity="warning", text="{text}")
+def reported(
+    address: str,
+    text: str,
+    code: str = "warning",
+    subject: str = "",
+    severity: Literal["error", "warning"] = "warning",
+) -> CellReported:
+    spec = DiagnosticSpec(code=code, severity=severity, text="{text}")
     return of_diagnostic(address, spec.of(subject, {"text": text}))
 
 
@@ -61,6 +68,7 @@ EVENTS: list[RunEvent] = [
     reported("plane", "the side is a [guess]"),
     reported("plane", "no point", code="empty-wall", subject="wall 2"),
     reported("plane", "no point", code="empty-wall", subject="wall 17"),
+    reported("plane", "all are upside down", code="upside-down", severity="error"),
     CellFinished(address="plane", result=FAILED, cached=False),
     CellFinished(address="wall", result=SKIPPED, cached=False),
     CellFinished(address="other", result=OK, cached=False),
@@ -105,6 +113,7 @@ def test_a_log_has_a_line_per_start_end_and_code(
         "plane: started",
         "plane: warning: the side is a [guess]",
         "plane: warning: empty-wall (wall 2)",
+        "plane: error: all are upside down",
         "plane: failed in 1 min 15 s: no plane, 1 warning with a code shown above (2 of 5)",
         "wall: skipped (3 of 5)",
         "other: ok in 1.2 s (4 of 5)",
@@ -172,12 +181,14 @@ def test_of_rows_that_do_not_fit_those_that_ended_are_left_out() -> None:
 
 
 def test_long_work_outside_of_cells_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    with working_on("writing the record", every_s=0.2):
+    with working_on("writing the record", every_s=0.2) as note:
         time.sleep(0.3)
+        note("writing the report")
+        time.sleep(0.2)
     with working_on("reading", every_s=5.0):
         pass
     lines = set(re.sub(r"\d\.\d+ s", "T", capsys.readouterr().err).splitlines())
-    assert lines == {"writing the record, T so far"}
+    assert lines == {"writing the record, T so far", "writing the report, T so far"}
 
 
 # Forecasts ----------------------------------------------------------------------------------------

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from orthoflow.diagnostics import Diagnostic, DiagnosticSpec
 from orthoflow.files.publishing import publish_orthoimages, publish_walls
+from orthoflow.files.wall_descriptions import described
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Walls
-from orthoflow.records.walls import WALLS_FILE, write_walls_json
+from orthoflow.records.walls import WALLS_FILE, add_errors, write_walls_json
 from tests import samples
 
 FRAME = samples.facing_south(0.1, 20, 10)
@@ -37,7 +39,12 @@ def image(number: int, painted: float, error_m: float | None, *, name: str = "wa
     )
 
 
-def written(folder: Path, *images: Orthoimage, included: tuple[int, ...] = ()) -> Any:
+def written(
+    folder: Path,
+    *images: Orthoimage,
+    included: tuple[int, ...] = (),
+    diagnostics: tuple[Diagnostic, ...] = (),
+) -> Any:
     """What `walls.json` says of the images of a run whose first wall shows some planes."""
     for step in ("wall", "mosaic", "theirs"):
         (folder / step).mkdir()
@@ -58,11 +65,18 @@ def written(folder: Path, *images: Orthoimage, included: tuple[int, ...] = ()) -
         SimpleNamespace(
             address=step,
             status="ok",
-            inputs={"a": None} if step != "theirs" else {},
-            outputs={"a": SimpleNamespace(type_name="walls" if step == "wall" else "orthoimages")},
+            method=f"{step}.toy",
+            diagnostics=diagnostics if step == "wall" else (),
+            inputs={"a": SimpleNamespace(source="wall.a", digest="0")} if step != "theirs" else {},
+            outputs={
+                "a": SimpleNamespace(
+                    type_name="walls" if step == "wall" else "orthoimages", digest=step
+                )
+            },
         )
         for step in ("wall", "mosaic", "theirs")
     ]
+    add_errors(folder / "mosaic", "mosaic", cells)
     write_walls_json(folder, cells)
     return json.loads((folder / WALLS_FILE).read_text())["walls"]
 
@@ -92,3 +106,20 @@ def test_walls_are_ranked_with_what_speaks_for_and_against_them(tmp_path: Path) 
     assert by_number[3]["painted_share"] == 0.2
     assert by_number[2]["reason"] == "already included in wall 0"
     assert by_number[2]["orthoimage"] is None
+
+
+def test_an_error_of_the_run_speaks_against_every_wall(tmp_path: Path) -> None:
+    spec = DiagnosticSpec(code="down", severity="error", text="all is down", remedy="turn it")
+    own = replace(spec, code="own", text="{subject} is down")
+    found = written(
+        tmp_path, image(0, 0.7, 0.0021), diagnostics=(own.of("wall 0", {}), spec.of("", {}))
+    )
+    assert [(wall["recommended"], wall["reason"]) for wall in found] == [
+        (False, "all is down: turn it")
+    ]
+    sheet = described(
+        tmp_path / "mosaic/wall_0_ortho.tif",
+        json.loads((tmp_path / "mosaic/wall_0_ortho.json").read_text()),
+    ).objection
+    assert sheet is not None
+    assert sheet.text("de").startswith("nicht empfohlen: der Bericht")

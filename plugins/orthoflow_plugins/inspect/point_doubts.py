@@ -28,7 +28,7 @@ FAR_POINTS: Final = DiagnosticSpec(
     code="check-points-far",
     severity="warning",
     text="{n} of {n_points} check points are farther from their wall than its length{how_far}",
-    remedy="check `unit` of read.checkpoints, and the coordinate systems of points and scan",
+    remedy="check {step[read.checkpoints]}.unit, and the coordinate systems of points and scan",
     rank_by="n",
 )
 

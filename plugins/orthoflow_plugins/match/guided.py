@@ -9,7 +9,16 @@ import numpy as np
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
+from orthoflow.products import (
+    PHOTOS_UPSIDE_DOWN,
+    Camera,
+    Cameras,
+    JsonValue,
+    Photos,
+    PointCloud,
+    Ties,
+    Walls,
+)
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.pictures import one_by_one, require_photos
@@ -129,6 +138,8 @@ class MatchGuided(Method):
         if alone is not None:
             return self.Out(ties=alone)
         oriented = _oriented(inputs.cameras)
+        if values := inputs.cameras.upside_down(walls.up):
+            ctx.report(PHOTOS_UPSIDE_DOWN, **values)
         details: dict[str, JsonValue] = {"intensity_source": walls.intensity_source}
         traces: dict[str, Trace] = {}
         if params.preset == "paper":

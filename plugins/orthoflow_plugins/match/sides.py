@@ -59,7 +59,7 @@ SIDES_GUESSED: Final = DiagnosticSpec(
     severity="warning",
     text="neither stations nor photos determine from which side {n} of {n_planes} planes were "
     "seen ({planes}); the side with more of the other points was assumed to be the front",
-    remedy="if an image is mirrored, set view_from of read.scan",
+    remedy="if an image is mirrored, set {step[read.scan]}.view_from",
     rank_by="n",
 )
 

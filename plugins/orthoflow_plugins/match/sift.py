@@ -43,7 +43,7 @@ MIRRORED: Final = DiagnosticSpec(
     text="photo {subject} gets no ties, because its mirror image matches the walls better than "
     "the photo itself: the photo is mirrored, it shows a repeating pattern or another wall, or "
     "the front sides of the planes are wrong",
-    remedy="flip the photo if it is mirrored; check view_from of read.scan",
+    remedy="flip the photo if it is mirrored; check {step[read.scan]}.view_from",
 )
 NO_WALL: Final = DiagnosticSpec(
     code="photo-shows-no-wall",

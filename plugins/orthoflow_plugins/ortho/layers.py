@@ -21,8 +21,7 @@ UNSEEN_WALLS: Final = (
 NO_PHOTO: Final = DiagnosticSpec(
     code="wall-without-photo",
     severity="error",
-    text="no photo shows {walls}: the orthoimage is empty",
-    rank_by="n_walls",
+    text="{subject}: no photo shows it, so its orthoimage is empty",
 )
 
 
@@ -63,9 +62,8 @@ class LayerStack:
             raise MethodError(UNSEEN_WALLS)
         walls, painted = self._walls.walls, {layer.wall for layer in self.painted}
         bare = [place for place in range(len(walls)) if place not in painted]
-        if bare:
-            names = ", ".join(walls[place].name for place in bare)
-            self._ctx.report(NO_PHOTO, n_walls=len(bare), walls=names)
+        for place in bare:
+            self._ctx.report(NO_PHOTO, subject=walls[place].name)
         layers = [*self.painted, *(self._bare_layer(place, level) for place in bare)]
         return Layers(
             layers=tuple(sorted(layers, key=lambda layer: layer.wall)),

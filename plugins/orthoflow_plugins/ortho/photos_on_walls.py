@@ -8,13 +8,21 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import before_masks, decode_image, decode_levels
 from orthoflow.files.photo_files import icc_profile, stated_bits
 from orthoflow.geometry.levels import Colours, Level, in_levels
-from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
+from orthoflow.products import (
+    PHOTOS_UPSIDE_DOWN,
+    Camera,
+    Cameras,
+    Layers,
+    Photo,
+    Photos,
+    PointCloud,
+    Walls,
+)
 from orthoflow.sdk import DiagnosticSpec, Ports, StepContext
 from orthoflow.untrusted_text import first_few
 from orthoflow_plugins.ortho.layers import LayerStack
@@ -26,21 +34,12 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.surfaces import Surface
 
 _PLAIN_BITS: Final = 8
-# A photo is upright, or upside down, if the cosine between its top and the vertical exceeds this.
-_UPRIGHT: Final = 0.5
 NO_CLOUD: Final = DiagnosticSpec(
     code="occluders-unknown",
     severity="warning",
     text="no cloud is connected to {step}: objects in front of a wall are not recognised and "
     "appear on it",
     remedy="connect the cloud to {step}",
-)
-UPSIDE_DOWN: Final = DiagnosticSpec(
-    code="photos-upside-down",
-    severity="error",
-    text="{n_down} of {n_photos} photos are upside down: if the vertical axis of the scan points "
-    "down, walls and orthoimages are upside down and floor and ceiling are swapped",
-    remedy="set `up` of read.scan to {opposite}",
 )
 MIXED_BITS: Final = DiagnosticSpec(
     code="photos-of-mixed-depth",
@@ -61,8 +60,8 @@ WITHOUT_WALL: Final = DiagnosticSpec(
     code="photos-show-no-wall",
     severity="warning",
     text="{n} of {n_photos} oriented photos show no wall ({names})",
-    remedy="if they show a surface that you need, detect more planes (min_share) and select "
-    "its plane in raster.grid (near, n_walls_max)",
+    remedy="if they show a surface that you need, detect more planes "
+    "({step[plane]}.min_share) and select its plane ({step[raster]}.near or n_walls_max)",
     rank_by="n",
 )
 
@@ -121,6 +120,8 @@ def project_photos(
     from orthoflow_plugins.ortho.surfaces import surfaces_of
 
     oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+    if values := inputs.cameras.upside_down(inputs.walls.up):
+        ctx.report(PHOTOS_UPSIDE_DOWN, **values)
     photos = [photo for photo, _ in oriented]
     level = level_of_all(photos, ctx)
     surfaces = surfaces_of(inputs.walls, ctx, hides=hides)
@@ -150,7 +151,6 @@ def project_photos(
         seconds["painting_s"] += ctx.clock_s() - looked
         # Release this photo before the next one is decoded.
         del pixels, free, buffer, opened
-    warn_of_heads(inputs.walls.up, oriented, ctx)
     profile = shared_profile(photos, ctx)
     used = {layer.source for layer in stack.painted}
     layers = stack.joined(level)
@@ -201,26 +201,6 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
             "connect the photos that were used for the orientation"
         )
     return [(by_name[camera.photo], camera) for camera in posed]
-
-
-def warn_of_heads(
-    up: NDArray[np.float64], oriented: Sequence[tuple[Photo, Camera]], ctx: StepContext
-) -> None:
-    """Warn if most photos seem upside down, which suggests that the vertical axis is inverted.
-
-    Args:
-        up: (3,) unit vector, vertical axis of the scan.
-        oriented: the photos and their poses.
-        ctx: context of the step.
-    """
-    # Rows of a photo count downwards, so its top is the negative second axis.
-    tops = [-camera.viewing().rotation[1] @ up for _, camera in oriented]
-    n_down = sum(float(top) < -_UPRIGHT for top in tops)
-    if 2 * n_down <= len(tops):
-        return
-    axis = int(np.abs(up).argmax())
-    opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
-    ctx.report(UPSIDE_DOWN, n_down=n_down, n_photos=len(tops), opposite=opposite)
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:

@@ -63,7 +63,7 @@ SIDES_GUESSED: Final = DiagnosticSpec(
     severity="warning",
     text="no scanner station shows from which side {n} of {n_planes} planes were seen; the side "
     "with more of the other points was assumed, unless photos decide later (face.photos)",
-    remedy="if an image comes out mirrored, set view_from of read.scan",
+    remedy="if an image comes out mirrored, set {step[read.scan]}.view_from",
     rank_by="n",
     settled_by=("face.photos",),
 )

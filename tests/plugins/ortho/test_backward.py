@@ -364,7 +364,7 @@ def test_a_wall_that_no_photo_paints_is_bare(tmp_path: Path) -> None:
     stack = stacked(ctx, shown)
     first, second, third = stack.joined(np.uint16).layers
     assert first is shown
-    assert [one.values["walls"] for one in ctx.diagnostics] == ["wall 1, wall 2"]
+    assert [one.subject for one in ctx.diagnostics] == ["wall 1", "wall 2"]
     assert (second.wall, second.source, third.wall, third.source) == (1, NO_SOURCE, 2, NO_SOURCE)
     for bare in (second, third):
         np.testing.assert_array_equal(bare.mask, mask_of(OUTSIDE, OUTSIDE, OUTSIDE))
