@@ -33,12 +33,11 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     """Check that the record of RUN, a run folder or its run.h5, is complete and unchanged.
 
     Recomputes the seal of the file, the digest of every product and input file in the record, and
-    every cache key; checks that redundant entries of the record agree, and that the published files
-    and report pages next to it match their digests. Missing files, files unknown to the record, and
-    a changed report are only noted; with --strict they are errors. Figures next to the report and
-    other files in the folder, such as logs, are not checked. With --signer, the record must be
-    signed with that key. The exit code is 3 if something differs, or if RUN is not a record or has
-    another version.
+    every cache key; checks that redundant entries of the record agree, and that published files,
+    report pages, figures and the files of a crate match it. Missing files, files unknown to the
+    record, and a changed report are only noted; with --strict they are errors. Files that cannot be
+    checked, such as logs, are listed. With --signer, the record must be signed with that key. The
+    exit code is 3 if something differs, or if RUN is not a record or has another version.
     """
     from orthoflow.records.verify import verify_run
 
@@ -55,9 +54,11 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
                 "inputs": verification.n_inputs,
                 "published": verification.n_published,
                 "pages": verification.n_pages,
+                "others": verification.n_others,
                 "seal": verification.seal,
                 "signed_with": verification.signed_with,
                 "findings": list(findings),
+                "not_checked": list(verification.unchecked),
                 "notes": [note.text for note in notes if note not in failing],
             }
         )
@@ -65,6 +66,8 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     for note in notes:
         if note not in failing:
             echo(f"note: {note.text}")
+    if verification.unchecked:
+        echo(f"not checked: {', '.join(verification.unchecked)}")
     if verification.seal:
         echo(f"seal: sha256:{verification.seal}")
     if not findings:
@@ -86,5 +89,6 @@ def _summary(verification: Verification) -> str:
         f"({verification.n_named} more by digest only), "
         f"{counted(verification.n_inputs, 'input file')}, "
         f"{counted(verification.n_published, 'published file')}, "
-        f"{counted(verification.n_pages, 'report page')} unchanged{signed}"
+        f"{counted(verification.n_pages, 'report page')}, "
+        f"{counted(verification.n_others, 'other file')} unchanged{signed}"
     )

@@ -8,12 +8,13 @@ import json
 import mimetypes
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 from urllib.parse import quote
 
 from orthoflow_provenance.document import (
+    PublishedFile,
     RecordedCell,
     RecordedFile,
     RecordedProduct,
@@ -32,11 +33,18 @@ from orthoflow.products import JsonValue
 from orthoflow.records.runs import (
     FIGURES_FOLDER,
     GRAPH_FILE,
+    METADATA_FILE,
     PRODUCTS_FOLDER,
     REPORT_FILE,
+    RESOLVED_FILE,
+    WORKFLOW_FILE,
     Run,
     copy_files,
+    crate_texts,
     creating,
+    described_file,
+    encoded,
+    environment_file,
     figure_files,
     pages_of,
     path_inside,
@@ -46,9 +54,6 @@ from orthoflow.version import DISTRIBUTION
 
 Entity: TypeAlias = dict[str, JsonValue]
 NO_LICENSE: Final = "not specified: ask the author of these results"
-METADATA_FILE: Final = "ro-crate-metadata.json"
-WORKFLOW_FILE: Final = "workflow.yaml"
-RESOLVED_FILE: Final = "workflow-resolved.json"
 _CRATE: Final = "https://w3id.org/ro/crate/1.1"
 _WORKFLOW_CRATE: Final = "https://w3id.org/workflowhub/workflow-ro-crate/1.0"
 _PROFILES: Final = {
@@ -102,28 +107,20 @@ def write_crate(
         RecordError: a name in the record cannot be a file name, a link replaces a file, or a cell
             uses a product that no cell produced.
     """
-    texts = {
-        WORKFLOW_FILE: run.record.workflow_source,
-        RESOLVED_FILE: run.record.workflow_resolved,
-        **{
-            _environment_file(environment.id): "".join(
-                f"{name}=={version}\n" for name, version in environment.packages.items()
-            )
-            for environment in run.record.environments
-        },
-    }
-    for name, text in texts.items():
-        _write(folder, name, text)
+    texts = crate_texts(run.record)
+    for name, content in texts.items():
+        _write(folder, name, content)
     names = [*texts, *_copy_files(run, folder)]
-    crate = crate_metadata(run.record, names, license_text=license_text, author=author)
-    _write(folder, METADATA_FILE, json.dumps(crate, indent=1, ensure_ascii=False) + "\n")
+    known = {file.path: file for file in run.record.published}
+    files = [known[name] if name in known else described_file(folder, name) for name in names]
+    crate = crate_metadata(run.record, files, license_text=license_text, author=author)
+    _write(folder, METADATA_FILE, encoded(json.dumps(crate, indent=1, ensure_ascii=False) + "\n"))
     return (folder / METADATA_FILE, *(path_inside(folder, name) for name in names))
 
 
-def _write(folder: Path, name: str, text: str) -> None:
+def _write(folder: Path, name: str, content: bytes) -> None:
     with creating(folder, name) as stream:
-        # Write unpaired surrogates, which parameters may contain, as JSON escapes.
-        stream.write(text.encode("utf-8", "backslashreplace"))
+        stream.write(content)
 
 
 def _copy_files(run: Run, folder: Path) -> list[str]:
@@ -149,18 +146,18 @@ def _copy_files(run: Run, folder: Path) -> list[str]:
     copied = copy_files(run.folder, folder, wanted, run.record.published)
     for page in set(pages) & set(copied) if is_new else ():
         text = path_inside(folder, page).read_text(encoding="utf-8")
-        _write(folder, page, page_of(text, run))
+        _write(folder, page, encoded(page_of(text, run)))
     return [RECORD_FILE, *signed, *copied]
 
 
 def crate_metadata(
-    record: RunRecord, files: list[str], *, license_text: str, author: str = ""
+    record: RunRecord, files: Sequence[PublishedFile], *, license_text: str, author: str = ""
 ) -> dict[str, JsonValue]:
     """Describe a run and the files of its crate as JSON-LD.
 
     Args:
         record: record of the run.
-        files: paths in the crate, with `/` as separator.
+        files: the files of the crate.
         license_text: URL or name of the license of the results.
         author: author of the results, as name or ORCID; empty if unknown.
     """
@@ -249,11 +246,6 @@ def _product_id(product: RecordedProduct) -> str:
     return f"#product-{product.digest.removeprefix('sha256:')}"
 
 
-def _environment_file(environment_id: str) -> str:
-    """Return the file name of the package list of an environment."""
-    return f"requirements-{environment_id.removeprefix('sha256:')[:12]}.txt"
-
-
 def _tool_id(cell: RecordedCell) -> str:
     return f"#method-{cell.method}"
 
@@ -278,8 +270,11 @@ def _add_author(crate: _Crate, author: str) -> None:
     crate.add("./", "Dataset", author=_ref(person), creator=_ref(person))
 
 
-def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: str) -> None:
+def _add_run(
+    crate: _Crate, record: RunRecord, files: Sequence[PublishedFile], license_text: str
+) -> None:
     """Add the root, the workflow, its run, and orthoflow as the program that ran it."""
+    names = [file.path for file in files]
     crate.add(
         "./",
         "Dataset",
@@ -290,7 +285,7 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
         datePublished=record.ended,
         license=license_text,
         conformsTo=_refs(_PROFILES),
-        hasPart=_refs(files),
+        hasPart=_refs(names),
         mainEntity=_ref(WORKFLOW_FILE),
         mentions=_refs([_RUN]),
     )
@@ -308,7 +303,7 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
         encodingFormat="text/yaml",
         conformsTo=_ref(_BIOSCHEMAS),
         programmingLanguage=_ref(_LANGUAGE),
-        buildInstructions=_refs(_environment_file(item.id) for item in record.environments),
+        buildInstructions=_refs(environment_file(item.id) for item in record.environments),
         **{name: [] for name in ("hasPart", "step", "input", "output", "connection")},
     )
     crate.add(_LANGUAGE, "ComputerLanguage", name="orthoflow workflow", version="1")
@@ -324,7 +319,7 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
         actionStatus=_status(is_ok=record.status == "ok"),
         object=_refs([RESOLVED_FILE]),
         result=_refs(
-            [RECORD_FILE, *(name for name in files if name.startswith(f"{PRODUCTS_FOLDER}/"))]
+            [RECORD_FILE, *(name for name in names if name.startswith(f"{PRODUCTS_FOLDER}/"))]
         ),
     )
     if record.status == "failed":
@@ -351,30 +346,26 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
     )
 
 
-def _add_files(crate: _Crate, record: RunRecord, files: list[str]) -> None:
+def _add_files(crate: _Crate, record: RunRecord, files: Sequence[PublishedFile]) -> None:
     """Add the files in the crate, and the input files, which are identified by content."""
-    lists = {_environment_file(item.id) for item in record.environments}
-    published = {file.path: file for file in record.published}
-    for name in files:
-        if name == WORKFLOW_FILE:
-            continue
+    lists = {environment_file(item.id) for item in record.environments}
+    for part in files:
+        name = part.path
         facts: Entity = {"encodingFormat": _media_type(name)}
+        facts |= {"contentSize": str(part.size_bytes), "sha256": part.sha256}
         title = name.rpartition("/")[2]
         if name in lists:
             title = "Python packages installed during the run"
             facts["conformsTo"] = _ref(_REQUIREMENTS)
         if name == RECORD_FILE:
             facts["description"] = _how_to_read(record)
-        if name in published:
-            facts["contentSize"] = str(published[name].size_bytes)
-            facts["sha256"] = published[name].sha256
         crate.add(name, "File", name=title, **facts)
     crate.add(_REQUIREMENTS, "WebPage", name="Requirements file format")
     for entry in record.inputs:
         if entry.files:
             given = crate.formal(f"{WORKFLOW_FILE}#inputs/{entry.name}", entry.name, "File")
             crate.link(WORKFLOW_FILE, "input", given)
-        part: Entity = {"isPartOf": _ref(RECORD_FILE)} if entry.embedded else {}
+        within: Entity = {"isPartOf": _ref(RECORD_FILE)} if entry.embedded else {}
         for file in entry.files:
             crate.add(
                 _file_id(file),
@@ -384,7 +375,7 @@ def _add_files(crate: _Crate, record: RunRecord, files: list[str]) -> None:
                 sha256=file.sha256,
                 encodingFormat=_media_type(file.name),
                 exampleOfWork=_refs([given]),
-                **part,
+                **within,
             )
         named = [_file_id(file) for file in entry.files]
         crate.link("./", "hasPart", *named)
@@ -407,7 +398,7 @@ def _add_cell(
     variant = cell.assignment.get(cell.step, "")
     title = f"{cell.step}{f'.{variant}' if variant else ''}"
     known = {item.id for item in record.environments}
-    made_with = {"buildInstructions": _ref(_environment_file(cell.environment))}
+    made_with = {"buildInstructions": _ref(environment_file(cell.environment))}
     step = crate.add(
         f"{WORKFLOW_FILE}#{title}",
         "HowToStep",
@@ -722,4 +713,4 @@ def _literal(value: JsonValue) -> JsonValue:
 
 
 def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()
+    return hashlib.sha256(encoded(text)).hexdigest()

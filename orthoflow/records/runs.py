@@ -45,6 +45,7 @@ from orthoflow_provenance.record import open_record
 
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.engine.durability import writing_to
+from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.journal import RECORD_FILE, cell_file_name, is_running
 from orthoflow.errors import (
     ArgumentError,
@@ -139,6 +140,19 @@ PRODUCTS_FOLDER: Final = "products"
 METRICS_FILE: Final = "metrics.csv"
 
 
+def upstream_cells(cells: Mapping[str, RecordedCell], address: str) -> Iterator[RecordedCell]:
+    """Yield a cell and all cells upstream of it, nearest first."""
+    waiting, seen = [address], {address}
+    for name in waiting:
+        # The list grows during the iteration.
+        yield cells[name]
+        for given in cells[name].inputs.values():
+            before = given.source.rpartition(".")[0]
+            if before in cells and before not in seen:
+                seen.add(before)
+                waiting.append(before)
+
+
 def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
     """Return the published files of a cell, naturally sorted (wall 2 before wall 10), or ().
 
@@ -177,6 +191,12 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
     return "same" if digest == file.sha256 else "changed"
 
 
+def described_file(folder: Path, path: str) -> PublishedFile:
+    """Return size and digest of a file in a folder that the caller has just written."""
+    file = path_inside(folder, path)
+    return PublishedFile(path=path, size_bytes=file.stat().st_size, sha256=file_sha256(file))
+
+
 def require_unchanged(run: Run, *paths: Path) -> None:
     """Refuse published files that differ from the record, before other files are derived from them.
 
@@ -208,6 +228,9 @@ def _require_same(folder: Path, file: PublishedFile, state: PublishedState) -> N
 
 
 REPORT_FILE: Final = "report.html"
+METADATA_FILE: Final = "ro-crate-metadata.json"
+WORKFLOW_FILE: Final = "workflow.yaml"
+RESOLVED_FILE: Final = "workflow-resolved.json"
 #: limit for report pages and the files that they refer to
 LARGEST_PAGE_BYTES: Final = 1 << 30
 _DAMAGED: Final = "the file is damaged"
@@ -275,56 +298,69 @@ class Run:
         """Cells by address, in the order of the graph."""
         return {cell.address: cell for cell in self.record.cells}
 
-    def cell(self, address: str, **variants: str) -> RecordedCell:
+    def cell(self, address: str, *, repeat: int = 0, **variants: str) -> RecordedCell:
         """Return one cell.
 
         Args:
             address: address of the cell; with `variants`, the name of the step suffices.
-            variants: name of a step with variants, or `data` -> variant or dataset; entries on
-                which the cell does not depend are ignored.
+            repeat: number of the repeat, from 0.
+            variants: name of a step with variants, or `data` -> variant or dataset; of a sweep, the
+                name before the parameters suffices if only one value matches. Entries on which the
+                cell does not depend are ignored.
 
         Raises:
             ArgumentError: the run has no such cell, or several.
         """
-        if address in self.cells and not variants:
+        if address in self.cells and not variants and not repeat:
             return self.cells[address]
         every = self.record.cells
         own = [cell for cell in every if address in (cell.step, cell.address)]
-        varied = {pair for cell in every for pair in cell.assignment.items()}
+        names: dict[str, dict[str, None]] = {}
+        for step, name in (pair for cell in every for pair in cell.assignment.items()):
+            names.setdefault(step, {})[name] = None
+
+        def is_wanted(step: str, name: str) -> bool:
+            wanted = variants[step]
+            return name == wanted or (wanted not in names[step] and name.startswith(f"{wanted}-"))
+
+        unknown = {
+            step
+            for step, wanted in variants.items()
+            if not any(is_wanted(step, name) for name in names.get(step, ()))
+        }
         found = [
             cell
             for cell in own
-            if all(cell.assignment.get(step, name) == name for step, name in variants.items())
-            if variants and varied >= variants.items()
-            if cell.address == address or cell.repeat == 0
+            if all(is_wanted(*pair) for pair in cell.assignment.items() if pair[0] in variants)
+            if cell.address == address or cell.repeat == repeat
         ]
-        if len(found) == 1:
+        if len(found) == 1 and not unknown:
             return found[0]
         asked = ", ".join([repr(address), *(f"{step}={name}" for step, name in variants.items())])
-        known = [cell.address for cell in found or own] or dict.fromkeys(
-            cell.step for cell in every
-        )
-        listed = first_few([*known], most=_MOST_NAMED)
-        if found:
+        if own and (found or unknown):
+            factors = [step for step in names if step in unknown] or [*names]
+            left = own if unknown else found
+            values = {step: {cell.assignment.get(step, "") for cell in left} for step in factors}
+            choices = [
+                f"{step}= ({first_few(sorted(filter(None, of_step)), most=_MOST_NAMED)})"
+                for step, of_step in values.items()
+                if len(of_step) > 1
+            ]
+            count = "no" if unknown else len(found)
             raise ArgumentError(
-                f"the run {self.record.run_id} has several cells of {asked}: {listed}; choose one"
+                f"the run {self.record.run_id} has {count} cells of {asked}: choose "
+                f"{', '.join(choices)}"
             )
+        known = [cell.address for cell in own] or dict.fromkeys(cell.step for cell in every)
         raise ArgumentError(
             f"the run {self.record.run_id} has no step {asked}"
-            f"{'' if own else did_you_mean(address, [*known])}; it has {listed}"
+            f"{'' if own else did_you_mean(address, [*known])}; it has "
+            f"{first_few([*known], most=_MOST_NAMED)}"
         )
 
     def upstream(self, address: str) -> Iterator[RecordedCell]:
         """Yield a cell and all cells upstream of it, nearest first."""
-        waiting, seen = [address], {address}
-        for name in waiting:
-            # The list grows during the iteration.
-            yield self.cells[name]
-            for given in self.cells[name].inputs.values():
-                before = given.source.rpartition(".")[0]
-                if before in self.cells and before not in seen:
-                    seen.add(before)
-                    waiting.append(before)
+        return upstream_cells(self.cells, address)
 
     def __repr__(self) -> str:
         counts = Counter(cell.status for cell in self.record.cells)
@@ -408,12 +444,13 @@ class Run:
                 "`--store FOLDER` if the store of the run is not in this folder"
             )
 
-    def product(self, address: str, port: str, **variants: str) -> Product:
+    def product(self, address: str, port: str, *, repeat: int = 0, **variants: str) -> Product:
         """Return an output as an object of its product class.
 
         Args:
             address: address of the cell; with `variants`, the name of the step suffices.
             port: name of the output.
+            repeat: see `cell`, as for `variants`.
             variants: see `cell`.
 
         Raises:
@@ -423,7 +460,7 @@ class Run:
         """
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - only products need it
 
-        address = self.cell(address, **variants).address
+        address = self.cell(address, repeat=repeat, **variants).address
         payload = self.payload(address, port)
         try:
             cls = discover_catalog().product_class(payload.type_name)
@@ -529,6 +566,28 @@ def path_inside(folder: Path, name: str) -> Path:
         return path_below(folder, name)
     except UnsafeFileError as error:
         raise RecordError(f"cannot write to {folder}: {error}") from error
+
+
+def environment_file(environment_id: str) -> str:
+    """Return the file name of the package list of an environment in a crate."""
+    return f"requirements-{environment_id.removeprefix('sha256:')[:12]}.txt"
+
+
+def encoded(text: str) -> bytes:
+    """Encode a text of a record; unpaired surrogates, as in parameters, become JSON escapes."""
+    return text.encode("utf-8", "backslashreplace")
+
+
+def crate_texts(record: RunRecord) -> dict[str, bytes]:
+    """Return the files of a crate that repeat texts of the record: path -> content."""
+    lists = {
+        environment_file(environment.id): "".join(
+            f"{name}=={version}\n" for name, version in environment.packages.items()
+        )
+        for environment in record.environments
+    }
+    texts = {WORKFLOW_FILE: record.workflow_source, RESOLVED_FILE: record.workflow_resolved}
+    return {name: encoded(text) for name, text in (texts | lists).items()}
 
 
 def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFigure]:

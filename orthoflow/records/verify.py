@@ -8,13 +8,16 @@ import hashlib
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import numpy as np
 from orthoflow_provenance.document import (
+    PublishedFile,
     RecordedCell,
+    RecordedFigure,
     RunRecord,
     UnsafeFileError,
     canonical_json,
@@ -25,28 +28,35 @@ from orthoflow_provenance.record import OpenRecord, open_record
 from orthoflow_provenance.verify import verify_record
 from pydantic import BaseModel, ValidationError
 
+from orthoflow.engine.journal import RECORD_FILE
 from orthoflow.errors import ArgumentError, InputError, PluginError, RecordError
+from orthoflow.files.images import decode_image
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Inspection
 from orthoflow.products.product import Payload
 from orthoflow.records.runs import (
+    FIGURES_FOLDER,
     LARGEST_PAGE_BYTES,
+    METADATA_FILE,
     PAGES_FOLDER,
     PRODUCTS_FOLDER,
     REPORT_FILE,
     PublishedState,
     Run,
+    crate_texts,
     creating,
+    figure_files,
     find_record,
     published_state,
     read_run,
     record_errors,
 )
-from orthoflow.untrusted_text import first_few
+from orthoflow.untrusted_text import first_few, parse_json
 
 SIGNATURE_SUFFIX: Final = ".sig"
 # Keys and signatures have a few hundred bytes.
 _LARGEST_BYTES: Final = 64 << 10
+_LARGEST_METADATA: Final = 1 << 28
 
 
 class Signature(BaseModel):
@@ -254,6 +264,8 @@ class Verification:
         n_inputs: number of input files in the record whose digest was checked.
         n_published: number of unchanged published files.
         n_pages: number of unchanged report pages of this record.
+        n_others: number of unchanged figures, and of other files of a crate.
+        unchecked: files of the folder that cannot be checked, in words.
         signed_with: fingerprint of the signer's key; empty unless requested and valid.
     """
 
@@ -267,6 +279,8 @@ class Verification:
     n_inputs: int = 0
     n_published: int = 0
     n_pages: int = 0
+    n_others: int = 0
+    unchecked: tuple[str, ...] = ()
     signed_with: str = ""
 
 
@@ -302,6 +316,8 @@ def verify_run(
     changed: list[str] = []
     states: list[PublishedState] = []
     pages: dict[str, bool] = {}
+    n_others = 0
+    unchecked: tuple[str, ...] = ()
     if also_published:
         folder = record_path.parent
         pages = _page_states(folder, seal)
@@ -312,9 +328,14 @@ def verify_run(
         notes += _published_notes(
             record_path, record, [file.path for file, state in checked if state == "missing"]
         )
+        # A record that was passed on alone may be next to unrelated files.
+        if "same" in states or "changed" in states or os.path.lexists(folder / METADATA_FILE):
+            others, gone, n_others, unchecked = _check_others(read_run(record_path), tuple(pages))
+            changed += others
+            notes += gone
     beside = [
         *(["its signature is not from the given signer"] if unsigned else []),
-        *(["published files next to it have been changed"] if changed else []),
+        *(["files next to it have been changed"] if changed else []),
     ]
     wrong = f"the seal of {record_path} is intact, but {' and '.join(beside)}" if beside else ""
     products = [product for cell in record.cells for product in cell.outputs.values()]
@@ -331,6 +352,8 @@ def verify_run(
         n_inputs=sum(len(entry.files) for entry in record.inputs if entry.embedded),
         n_published=states.count("same"),
         n_pages=sum(pages.values()),
+        n_others=n_others,
+        unchecked=unchecked,
     )
 
 
@@ -453,6 +476,125 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
     if not is_alone and (unnamed := _unnamed(path, record)):
         text = f"the record does not list these files of {PRODUCTS_FOLDER}/: {first_few(unnamed)}"
         yield Note(code="foreign", text=text)
+
+
+def _check_others(
+    run: Run, pages: tuple[str, ...]
+) -> tuple[list[str], list[Note], int, tuple[str, ...]]:
+    """Check the files next to a record that are neither published files nor pages.
+
+    Figures and, in a crate, the workflow and the lists of packages repeat parts of the record; the
+    metadata of a crate contain digests of all its files.
+
+    Returns:
+        Findings, notes on missing files, the number of unchanged files, and the files that cannot
+        be checked, in words.
+    """
+    folder, findings = run.folder, []
+    known = {file.path: file for file in run.record.published}
+    crate = _crate_files(folder)
+    if isinstance(crate, str):
+        findings.append(crate)
+        crate = {}
+    states: dict[str, tuple[PublishedState, str]] = {}
+    for name, content in crate_texts(run.record).items() if crate is not None else ():
+        digest = hashlib.sha256(content).hexdigest()
+        known[name] = PublishedFile(path=name, size_bytes=len(content), sha256=digest)
+        states[name] = published_state(folder, known[name]), "the record"
+    for name, file in (crate or {}).items():
+        # Large files are hashed once.
+        if known.get(name) != file:
+            states[name] = published_state(folder, file), METADATA_FILE
+    findings += [
+        f"{name}: differs from {source}"
+        for name, (state, source) in states.items()
+        if state in _WRONG
+    ]
+    figures = _figure_states(run)
+    findings += [
+        f"{name}: differs from the figure in the record"
+        for name, is_same in figures.items()
+        if not is_same
+    ]
+    gone = [name for name, (state, _) in states.items() if state == "missing"]
+    same = {name for name, (state, _) in states.items() if state == "same"}
+    text = f"{len(gone)} files of the crate are missing: {first_few(gone)}"
+    signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
+    checked = {RECORD_FILE, signature, *pages, *known, *states, *figures}
+    return (
+        findings,
+        [Note(code="missing", text=text)] if gone else [],
+        len({name for name, is_same in figures.items() if is_same} | same),
+        tuple(_left_over(folder, checked)),
+    )
+
+
+def _left_over(folder: Path, checked: Set[str]) -> Iterator[str]:
+    """Yield the files of a folder that were not checked; folders with the number of their files."""
+    tops: dict[str, list[str]] = {}
+    for place, _, below in os.walk(folder):
+        for name in below:
+            path = Path(place, name).relative_to(folder)
+            # `_published_notes` lists the additional files in the folder of products.
+            if path.as_posix() not in checked and path.parts[0] != PRODUCTS_FOLDER:
+                tops.setdefault(path.parts[0], []).append(path.as_posix())
+    for top, paths in sorted(tops.items()):
+        if top == METADATA_FILE:
+            yield f"{top} (author, license and descriptions)"
+        else:
+            yield f"{top}/ ({len(paths)} files)" if len(paths) > 1 else paths[0]
+
+
+def _figure_states(run: Run) -> dict[str, bool]:
+    """Return for each figure next to a record whether it shows the figure of the record."""
+    try:
+        figures = figure_files(run, run.cells)
+    except RecordError:
+        # Such names are never written as files.
+        return {}
+    found = {f"{FIGURES_FOLDER}/{path}": figure for path, figure in figures.items()}
+    states = in_order(lambda item: _is_same_figure(run.folder, *item), found.items())
+    pairs = zip(found, states, strict=True)
+    return {name: is_same for name, is_same in pairs if is_same is not None}
+
+
+def _is_same_figure(folder: Path, path: str, figure: RecordedFigure) -> bool | None:
+    """Return whether a file shows a figure, possibly in another format; None without a file."""
+    try:
+        with open_below(folder, path) as stream:
+            content = stream.read(LARGEST_PAGE_BYTES)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (UnsafeFileError, OSError):
+        return False
+    if content == figure.data:
+        return True
+    try:
+        return np.array_equal(decode_image(content, path), decode_image(figure.data, path))
+    except InputError:
+        return False
+
+
+def _crate_files(folder: Path) -> dict[str, PublishedFile] | str | None:
+    """Return the files in the metadata of a crate; a sentence if they are damaged; None if none."""
+    try:
+        with open_below(folder, METADATA_FILE) as stream:
+            # Any: entities of any kind.
+            crate: Any = parse_json(stream.read(_LARGEST_METADATA).decode())
+        return {
+            entity["@id"]: PublishedFile(
+                path=entity["@id"],
+                size_bytes=int(entity["contentSize"]),
+                sha256=str(entity["sha256"]),
+            )
+            for entity in crate["@graph"]
+            # Input files outside the crate have the scheme ni.
+            if "sha256" in entity and not str(entity["@id"]).startswith("ni:")
+        }
+    except FileNotFoundError:
+        return None
+    except (UnsafeFileError, OSError, ValueError, KeyError, TypeError) as error:
+        return f"{METADATA_FILE} is not the metadata of a crate, or is damaged: {error}"
 
 
 def _unnamed(path: Path, record: RunRecord) -> list[str]:

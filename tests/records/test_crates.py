@@ -22,6 +22,7 @@ from orthoflow.errors import RecordError
 from orthoflow.files.images import encode_png
 from orthoflow.records.archive import crate_metadata, write_crate
 from orthoflow.records.open import open_run
+from orthoflow.records.verify import verify_run
 from orthoflow.report import write_page
 from tests.crate_contexts import context_of
 from tests.studios import Studio, open_studio
@@ -91,7 +92,7 @@ def test_every_file_and_reference_is_described_once(studio: Studio, crate: dict[
             for found in references(value):
                 assert found in described or found.startswith("https://"), (entity["@id"], found)
     stated = {entity["@id"]: entity for entity in entities(crate, "File")}
-    for name in (name for name in there if name.startswith("products/")):
+    for name in there - {"ro-crate-metadata.json"}:
         content = (folder / name).read_bytes()
         assert stated[name]["sha256"] == hashlib.sha256(content).hexdigest()
         assert int(stated[name]["contentSize"]) == len(content)
@@ -192,6 +193,31 @@ def test_what_the_report_links_to_is_in_the_crate(studio: Studio, tmp_path: Path
     assert [link for link in sorted(links) if not (folder / link).is_file()] == []
     metadata = json.loads((folder / "ro-crate-metadata.json").read_text(encoding="utf-8"))
     assert links <= {entity["@id"] for entity in entities(metadata, "File")}
+
+
+def test_changed_files_of_a_crate_are_found(studio: Studio, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(studio.folder / "crate", tmp_path / "crate"))
+    metadata, (packages,) = folder / "ro-crate-metadata.json", folder.glob("requirements-*.txt")
+    found = verify_run(folder)
+    assert (found.findings, found.notes) == ((), ())
+    assert found.unchecked == ("ro-crate-metadata.json (author, license and descriptions)",)
+    digest = hashlib.sha256((folder / "products" / "metrics.csv").read_bytes()).hexdigest()
+    metadata.write_text(metadata.read_text().replace(digest, digest[::-1]))
+    for path in (folder / "workflow.yaml", packages, folder / "figures" / "graph.svg"):
+        path.write_bytes(path.read_bytes() + b"\n")
+    (folder / "workflow-resolved.json").unlink()
+    (folder / "more.txt").touch()
+    found = verify_run(folder)
+    assert sorted(found.findings) == [
+        "figures/graph.svg: differs from ro-crate-metadata.json",
+        "products/metrics.csv: differs from ro-crate-metadata.json",
+        f"{packages.name}: differs from the record",
+        "workflow.yaml: differs from the record",
+    ]
+    assert [note.text for note in found.notes] == [
+        "1 files of the crate are missing: workflow-resolved.json"
+    ]
+    assert found.unchecked[0] == "more.txt"
 
 
 def test_tables_hold_what_the_record_says(studio: Studio) -> None:

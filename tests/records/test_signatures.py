@@ -71,7 +71,7 @@ def test_a_signed_record_verifies_with_the_key_of_its_signer_and_no_other(
         )
         output = verified(finished, run, 0)
     assert (run / "run.h5").read_bytes() == before
-    assert "not checked" not in output
+    assert "was not checked" not in output
     verdict = finished.json("verify", run, "--signer", "jane.pub")
     assert verdict["signed_with"] == output.rpartition("signed with ")[2].strip()
     # A crate takes the signature along; another record has another seal.
