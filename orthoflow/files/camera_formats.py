@@ -181,7 +181,11 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
     )
     lens = checked_lens(lens, path, name)
     rotation = np.array(entry["R_camera_from_world"], dtype=np.float64).ravel().tolist()
-    sigma_mm = entry.get("sigma_wall_mm")
+    sigma_mm, covariance = entry.get("sigma_wall_mm"), entry.get("pose_covariance")
+    if covariance is not None:
+        covariance = np.array(covariance, dtype=np.float64)
+        if covariance.shape != (6, 6) or not (np.isfinite(covariance).all()):
+            raise damaged(path, f"pose_covariance of {name} must be 6 x 6 numbers")
     return GivenCamera(
         name=name,
         lens=lens,
@@ -189,6 +193,7 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
         translation=np.array(
             numbers_of([str(v) for v in entry["t_camera_from_world"]], path, f"t of {name}")
         ).reshape(3),
+        covariance=covariance,
         sigma_wall_m=None
         if sigma_mm is None
         else numbers_of([str(sigma_mm)], path, f"sigma_wall_mm of {name}")[0] / 1000.0,

@@ -98,6 +98,7 @@ class GivenCamera:
         lens: interior orientation, or None if the file does not contain it.
         rotation: (3, 3) camera_from_world; None if the file only gives the reason for its absence.
         translation: (3,) camera_from_world, in the unit of the file.
+        covariance: (6, 6) as in `Camera`, its translation in the unit of the file, or None.
         sigma_wall_m: predicted error on the wall, or None if the file does not contain it.
         reason: reason why the photo has no orientation; empty if it has one.
         note: remarks on approximations and conversions; may be empty.
@@ -107,6 +108,7 @@ class GivenCamera:
     lens: Intrinsics | CentredLens | WideLens | None = None
     rotation: NDArray[np.float64] | None = None
     translation: NDArray[np.float64] | None = None
+    covariance: NDArray[np.float64] | None = None
     sigma_wall_m: float | None = None
     reason: str = ""
     note: str = ""

@@ -281,7 +281,8 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
             "camera_axes": "x right, y down, z forward; X_camera = R X_world + t, metres",
             "errors": "one standard deviation; sigma_wall_mm: expected error on the wall due to "
             "the orientation; sigma0_px: error of a pixel coordinate of a control tie, its a "
-            "priori value times the standard deviation of unit weight",
+            "priori value times the standard deviation of unit weight; pose_covariance: of a small "
+            "rotation vector in camera axes, radians, and of t, metres",
             "cameras": {camera.photo: _camera_json(camera) for camera in product.cameras},
             "product_digest": digest,
         },
@@ -416,6 +417,8 @@ def _camera_json(camera: Camera) -> JsonValue:
         entry["R_camera_from_world"] = numbers(camera.rotation_camera_from_world)
     if camera.translation_camera_from_world is not None:
         entry["t_camera_from_world"] = numbers(camera.translation_camera_from_world)
+    if camera.covariance is not None:
+        entry["pose_covariance"] = numbers(camera.covariance)
     if camera.sigma_wall_m is not None:
         entry["sigma_wall_mm"] = number(1000.0 * camera.sigma_wall_m)
     if camera.sigma0_px is not None:

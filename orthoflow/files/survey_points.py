@@ -24,14 +24,16 @@ _SEPARATORS: Final = (";", "\t", ",")
 MOST_BYTES: Final = 20_000_000
 #: lines of a file of check points
 MOST_POINTS: Final = 100_000
+#: lines of a file of ties; runs with many photos write long ones
+MOST_TIES: Final = 1_000_000
+#: bytes of a file of ties
+MOST_TIE_BYTES: Final = 200_000_000
 _MAX_PROBLEMS: Final = 20
 #: characters of a line of a file of check points
 MOST_LINE: Final = 10_000
 # Columns of ties.csv, as written by orthoflow, besides those of measured ties.
-_OF_WRITTEN_TIES: Final = (
-    *("wall", "role", "residual_u_px", "residual_v_px"),
-    "opencv_pixel_convention",
-)
+_RESIDUALS: Final = ("residual_u_px", "residual_v_px")
+_OF_WRITTEN_TIES: Final = ("wall", "role", *_RESIDUALS, "opencv_pixel_convention")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +61,7 @@ class SurveyPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredTie:
-    """A point measured in a photo by hand.
+    """A point measured in a photo, by hand or in a run.
 
     Attributes:
         where: file and line, for messages.
@@ -67,6 +69,8 @@ class MeasuredTie:
         pixel: column and row as given in the file.
         position: x, y, z as given in the file.
         sigma_px: standard deviation of each pixel coordinate, or None.
+        is_check: whether a run withheld it from the orientation.
+        residual_px: residuals in a run, or None.
     """
 
     where: str
@@ -74,19 +78,27 @@ class MeasuredTie:
     pixel: tuple[float, float]
     position: tuple[float, float, float]
     sigma_px: float | None = None
+    is_check: bool = False
+    residual_px: tuple[float, float] | None = None
 
 
 def read_measured_ties(path: Path) -> tuple[MeasuredTie, ...]:
     """Read a tie file: `photo,u_px,v_px,x,y,z[,sigma_px]`, in the form of `read_survey_points`.
 
-    In a `ties.csv` of orthoflow, the other columns are ignored and rejected ties are left out.
+    In a `ties.csv` of orthoflow, rejected ties are left out.
 
     Raises:
         InputError: the file is invalid; one line per problem, `file:line: ...`.
     """
     required = ("photo", *_IN_IMAGE, *_POSITION)
     table = _Table(
-        path, content="ties", required=required, single=("sigma_px",), ignored=_OF_WRITTEN_TIES
+        path,
+        content="ties",
+        required=required,
+        single=("sigma_px",),
+        of_runs=_OF_WRITTEN_TIES,
+        max_rows=MOST_TIES,
+        max_bytes=MOST_TIE_BYTES,
     )
     ties = []
     for line, cells in table.rows():
@@ -100,12 +112,18 @@ def read_measured_ties(path: Path) -> tuple[MeasuredTie, ...]:
             (sigma_px,) = table.numbers(line, cells, ("sigma_px",))
             if sigma_px <= 0.0:
                 table.add(line, f"sigma_px must be positive, got {cells['sigma_px']}")
+        residual_px = None
+        if all(cells.get(name) for name in _RESIDUALS):
+            first, second = table.numbers(line, cells, _RESIDUALS)
+            residual_px = (first, second)
         tie = MeasuredTie(
             where=f"{path.name}:{line}",
             photo=cells["photo"],
             pixel=(u, v),
             position=(x, y, z),
             sigma_px=sigma_px,
+            is_check=cells.get("role") == "check",
+            residual_px=residual_px,
         )
         ties.append(tie)
     table.check()
@@ -175,7 +193,9 @@ class _Table:
         required: columns that must be present.
         single: optional columns, also possible without a header.
         measured: further optional columns, some of which belong together.
-        ignored: columns that may be present and are not read.
+        of_runs: further columns that orthoflow writes.
+        max_rows: maximum number of rows; `MOST_POINTS` if None.
+        max_bytes: maximum size of the file; `MOST_BYTES` if None.
     """
 
     path: Path = field(kw_only=False)
@@ -183,7 +203,9 @@ class _Table:
     required: tuple[str, ...]
     single: tuple[str, ...]
     measured: tuple[str, ...] = ()
-    ignored: tuple[str, ...] = ()
+    of_runs: tuple[str, ...] = ()
+    max_rows: int | None = None
+    max_bytes: int | None = None
     problems: list[str] = field(default_factory=list)
 
     def add(self, line: int, message: str) -> None:
@@ -201,7 +223,9 @@ class _Table:
         """Yield line number and cells of each row that has a cell for every column."""
         names = ",".join(self.required)
         text = text_of_file(
-            self.path, MOST_BYTES, f"a CSV file of {self.content} with the columns {names}"
+            self.path,
+            self.max_bytes or MOST_BYTES,
+            f"a CSV file of {self.content} with the columns {names}",
         )
         rows = self._cells(text.splitlines())
         line, first = next(rows, (0, []))
@@ -272,12 +296,13 @@ class _Table:
         ]
         # Last, because a comma may also be a decimal comma.
         first = numbered[0][1] if numbered else ""
+        max_rows = self.max_rows or MOST_POINTS
         separator = next((mark for mark in _SEPARATORS if mark in first), ",")
         for place, (number, line) in enumerate(numbered):
             if len(line) > MOST_LINE:
                 problem = f"the line has over {MOST_LINE} characters: expected {self.content}"
-            elif place >= MOST_POINTS:
-                problem = f"the file contains more than {MOST_POINTS} {self.content}; split it"
+            elif place >= max_rows:
+                problem = f"the file contains more than {max_rows} {self.content}; split it"
             else:
                 cells = next(csv.reader([line], delimiter=separator))
                 yield number, [cell.strip() for cell in cells]
@@ -300,13 +325,17 @@ class _Table:
             )
             return ()
         n_before = len(self.problems)
+        unknown = []
         for name in names:
-            if name not in (*known, *self.ignored):
+            if name not in (*known, *self.of_runs):
                 near = difflib.get_close_matches(name, known, n=1)
-                hint = f" (did you mean {near[0]}?)" if near else ""
-                self.add(line, f"unknown column {name}{hint}; known columns: {', '.join(known)}")
+                unknown.append(f"{name} (did you mean {near[0]}?)" if near else name)
             elif names.count(name) > 1:
                 self.add(line, f"the column {name} occurs {names.count(name)} times")
+        if unknown:
+            what = "column" if len(unknown) == 1 else "columns"
+            found, expected = ", ".join(unknown), ", ".join(known)
+            self.add(line, f"unknown {what} {found}; known columns: {expected}")
         missing = [name for name in self.required if name not in names]
         if missing:
             self.add(line, f"the column {', '.join(missing)} is missing")

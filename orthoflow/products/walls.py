@@ -197,12 +197,26 @@ class Walls(Product):
         )
         return Slab(frame=self.walls[index].frame, front_m=front_m, behind_m=behind_m)
 
-    def nearest(self, points_world: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Return the index (n,) of the wall nearest to each point (n, 3); -1 if none."""
+    def nearest(
+        self, points_world: NDArray[np.float64], *, is_within_buffer: bool = False
+    ) -> NDArray[np.int32]:
+        """Return the index (n,) of the wall nearest to each point (n, 3); -1 if none.
+
+        Args:
+            points_world: (n, 3) metres.
+            is_within_buffer: ignore walls whose raster is farther from a point than their buffer.
+        """
+        nearest = np.full(len(points_world), -1, dtype=np.int32)
         if not self.walls:
-            return np.full(len(points_world), -1, dtype=np.int32)
-        distances_m = [wall.frame.distances_m(points_world) for wall in self.walls]
-        return np.asarray(np.argmin(distances_m, axis=0), dtype=np.int32)
+            return nearest
+        distances_m = np.array([wall.frame.distances_m(points_world) for wall in self.walls])
+        if is_within_buffer:
+            slabs = map(self.slab, range(len(self.walls)))
+            limits_m = [max(slab.front_m, slab.behind_m) for slab in slabs]
+            distances_m[distances_m > np.array(limits_m)[:, None]] = np.inf
+        reached = np.isfinite(distances_m.min(axis=0))
+        nearest[reached] = distances_m[:, reached].argmin(axis=0)
+        return nearest
 
     def spacing_m(self) -> float:
         """Larger value of cell size and point spacing of the finest raster."""
@@ -290,12 +304,13 @@ class Orthoimage:
     """The finished orthoimage of one wall.
 
     Attributes:
-        frame: position of the cells.
+        frame: position of the cells, an `orthoflow.geometry.WallFrame`; `frame.gsd_m` is the size
+            of a cell in metres.
         wall: index of the wall in `Walls`.
         name: name of the wall.
         rgb: (rows, cols, 3) uint8 or uint16 as in the layers; 0 in cells without a colour.
             `geometry.eight_bits` converts to 8 bits.
-        mask: uint8 `OrthoMask`.
+        mask: uint8 `OrthoMask`; `is_shown(mask)` are the cells with a colour.
         source: int16 index in `sources`, -1 if the colour is not from a source.
         sources: names of the photos, or `cloud`.
         plane_index: index in `Planes` of the plane of the wall; None if unknown.

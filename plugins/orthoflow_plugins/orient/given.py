@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +41,11 @@ class OrientGiven(Method):
     """Use poses from other programs unchanged.
 
     The poses are not verified, so their status is `ok`, the source of their lens is `given`, and
-    their error on the wall is only known if the files contain it. A photo with at least six ties
-    measured by hand is oriented from these, with the given lens, and must pass the gates for such
-    ties; fewer ties are used only to check the given pose. If no photo shows a wall with its given
-    pose, the poses are refused, since they are not in the coordinate system of the scan.
+    their error on the wall is only known if the files contain it. If the ties of the run that
+    estimated them are given, they show which walls support the poses. A photo with at least six
+    ties measured by hand is oriented from these, with the given lens, and must pass the gates for
+    such ties; fewer ties are used only to check the given pose. If no photo shows a wall with its
+    given pose, the poses are refused, since they are not in the coordinate system of the scan.
     """
 
     id: ClassVar[str] = "orient.given"
@@ -75,17 +76,26 @@ class OrientGiven(Method):
             given.get(photo.name, Camera(photo=photo.name, status="no pose is given for it"))
             for photo in photos
         ]
+        earlier = inputs.cameras.ties
+        if earlier is not None:
+            earlier = _on_walls(earlier, inputs.walls, is_within_buffer=True)
         if inputs.ties is None:
             ctx.progress(1.0, "poses")
-            return OrientOut(cameras=_as_they_are(ctx, taken))
-        ties = _on_walls(inputs.ties, inputs.walls)
+            cameras = _as_they_are(ctx, taken)
+            return OrientOut(cameras=replace(cameras, ties=earlier))
+        ties = _on_walls(inputs.ties, inputs.walls, is_within_buffer=False)
         found = []
         for nth, (photo, camera) in enumerate(zip(photos, taken, strict=True)):
             ctx.progress(nth / len(photos), photo.name)
             known = replace(photo, intrinsics=camera.intrinsics or photo.intrinsics)
             found.append(_oriented(known, camera, ties, params, ctx))
         unchecked = [item.camera.photo for item in found if item.entry is None]
-        return OrientOut(cameras=hand_over(ctx, ties, photos, found, _details(unchecked)))
+        cameras = hand_over(ctx, ties, photos, found, _details(unchecked))
+        if cameras.ties is not None and earlier is not None:
+            is_kept = [name in unchecked for name in earlier.photo_names]
+            kept = np.array(is_kept, dtype=np.bool_)[earlier.photo]
+            cameras = replace(cameras, ties=_joined(cameras.ties, earlier, kept))
+        return OrientOut(cameras=cameras)
 
 
 def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
@@ -137,12 +147,35 @@ def _disagreement(
     return ((POSE_DISAGREES, {**values, "n_least": MIN_TIES}),)
 
 
-def _on_walls(ties: Ties, walls: Walls | None) -> Ties:
+def _joined(hand: Ties, earlier: Ties, kept: NDArray[np.bool_]) -> Ties:
+    """Append the kept (n,) ties of an earlier run to ties measured by hand."""
+    names = tuple(dict.fromkeys((*hand.photo_names, *earlier.photo_names)))
+    place = np.array([names.index(name) for name in earlier.photo_names], dtype=np.int32)
+    # Any, since the arrays of the product are collected by name.
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(hand, name), getattr(earlier, name)[kept]])
+        for name in (
+            *("wall", "pixels_photo", "points_world", "sigma_px", "sigma_m"),
+            *("role", "residual_px"),
+        )
+    }
+    n_by_hand, n_kept = len(hand.photo), int(kept.sum())
+    return replace(
+        hand,
+        photo_names=names,
+        photo=np.concatenate([hand.photo, place[earlier.photo[kept]]]),
+        by_hand=np.repeat(np.array([1, 0], dtype=np.uint8), [n_by_hand, n_kept]),
+        search_radius_px=(),
+        **columns,
+    )
+
+
+def _on_walls(ties: Ties, walls: Walls | None, *, is_within_buffer: bool) -> Ties:
     if walls is None:
         return ties
     return replace(
         ties,
-        wall=walls.nearest(ties.points_world),
+        wall=walls.nearest(ties.points_world, is_within_buffer=is_within_buffer),
         walls=tuple(TieWall.of(wall) for wall in walls.walls),
     )
 

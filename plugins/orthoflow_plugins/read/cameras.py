@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import ClassVar, Final
 
 import numpy as np
@@ -15,17 +15,26 @@ from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.cube_faces import WideLens, face_in
 from orthoflow.files.given_cameras import CentredLens, GivenCamera, lens_or_reason
 from orthoflow.files.points.units import UNITS_M
+from orthoflow.files.survey_points import read_measured_ties
+from orthoflow.geometry.cameras import from_opencv
 from orthoflow.geometry.frames import FARTHEST_M
-from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
+from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.untrusted_text import first_few
 from orthoflow_plugins.read.scan import Unit
 
+_OF_RUN: Final = "cameras.json"
 _EXPORT_OTHERWISE = "align with the model Brown3, or export a COLMAP model"
 LIMITED: Final = DiagnosticSpec(
     code="cameras-limited",
     text="{note} ({n} photos, such as {subject})",
     rank_by="n",
+)
+WITHOUT_TIES: Final = DiagnosticSpec(
+    code="cameras-without-ties",
+    text="{subject} of a run was given without the ties.csv of the same folder: which walls have "
+    "ties is unknown, so the accuracy of orthoimages is not assessed",
+    remedy="give the folder that contains both files",
 )
 NOT_ORIENTED: Final = DiagnosticSpec(
     code="photo-not-oriented",
@@ -42,11 +51,15 @@ class ReadCameras(Method):
     or if its lens differs from OpenCV's models by more than half a pixel; the reason is reported.
     Smaller differences are reported, too.
 
+    Of a run of orthoflow, give the folder with `cameras.json` and `ties.csv`: poses then keep their
+    covariance and their ties, from which the errors of orthoimages are predicted.
+
     Photos with a fisheye lens must have been split into cube faces by `read.photos`, which needs
     the lens for this; each face gets the pose of the whole photo.
     """
 
     id = "read.cameras"
+    result_version = 2
     repeatable: ClassVar[tuple[str, ...]] = ("files",)
     determinism = "exact"
     metrics = (
@@ -126,7 +139,35 @@ class ReadCameras(Method):
             ctx.metric("sigma_wall_mm_median", float(np.median(sigmas_mm)), "mm")
             ctx.metric("sigma_wall_mm_worst", max(sigmas_mm), "mm")
         ctx.log(f"{n_oriented} poses are taken as given; they are not checked here")
-        return self.Out(cameras=Cameras(cameras=cameras, details={"given": True}))
+        ties = _ties(inputs.files.paths, [photo.name for photo in photos], params)
+        if ties is None and any(camera.covariance is not None for camera in cameras):
+            ctx.report(WITHOUT_TIES, subject=_OF_RUN)
+        return self.Out(cameras=Cameras(cameras=cameras, ties=ties, details={"given": True}))
+
+
+def _ties(paths: Sequence[Path], names: Sequence[str], params: ReadCameras.Params) -> Ties | None:
+    """Return the ties next to the `cameras.json` of a run; None if there are none."""
+    beside = [path.with_name("ties.csv") for path in paths if path.name == _OF_RUN]
+    path = next((path for path in beside if path in paths), None)
+    if path is None:
+        return None
+    place = {name: index for index, name in enumerate(names)}
+    found = [tie for tie in read_measured_ties(path) if tie.photo in place]
+    count, unknown = len(found), (np.nan, np.nan)
+    roles = [TieRole.CHECK if tie.is_check else TieRole.CONTROL for tie in found]
+    return Ties(
+        photo_names=tuple(names),
+        photo=np.array([place[tie.photo] for tie in found], dtype=np.int32),
+        wall=np.full(count, -1, dtype=np.int32),
+        pixels_photo=from_opencv(np.array([tie.pixel for tie in found]).reshape(-1, 2)),
+        points_world=UNITS_M[params.unit]
+        * np.array([tie.position for tie in found]).reshape(-1, 3),
+        sigma_px=np.array([tie.sigma_px or 0.0 for tie in found], dtype=np.float64),
+        # The file does not contain it.
+        sigma_m=np.zeros(count),
+        role=np.array(roles, dtype=np.uint8),
+        residual_px=np.array([tie.residual_px or unknown for tie in found]).reshape(-1, 2),
+    )
 
 
 def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, list[str]]) -> Camera:
@@ -163,12 +204,15 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
             f"photo {photo.name} was taken {np.abs(translation_m).max():.3g} m from the origin, "
             f"according to its given camera; expected less than {FARTHEST_M:g} m: check the unit"
         )
+    scale = np.repeat([1.0, unit_m], 3)
+    covariance = None if found.covariance is None else found.covariance * np.outer(scale, scale)
     return Camera(
         photo=photo.name,
         status="ok",
         intrinsics=lens,
         rotation_camera_from_world=found.rotation,
         translation_camera_from_world=translation_m,
+        covariance=covariance,
         sigma_wall_m=found.sigma_wall_m,
     )
 

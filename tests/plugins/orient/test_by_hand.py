@@ -286,14 +286,20 @@ def test_ties_by_hand_orient_a_photo_without_a_pose(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n_by_hand", [0, 3], ids=["as they are", "checked by hand"])
-def test_the_error_that_handed_on_cameras_carry_is_reported(tmp_path: Path, n_by_hand: int) -> None:
+def test_handed_on_cameras_keep_their_errors_and_ties(tmp_path: Path, n_by_hand: int) -> None:
     sigmas_m = {"a.png": 1.25e-3, "b.png": 3.5e-3, "c.png": None, "d.png": 1.5e-3}
+    spread = np.diag(np.arange(1.0, 7.0)) * 1e-8
+    known = replace(clicked(5, n=6), by_hand=None, photo_names=tuple(sigmas_m))
+    known = replace(known, role=np.repeat([TieRole.CHECK, TieRole.CONTROL], 3).astype(np.uint8))
+    # One tie is far from every wall.
+    known.points_world[5] += 100.0
     handed_on = ms.cameras(
         *(
-            replace(ms.oriented(CAMERA, name=name), sigma_wall_m=sigma_m)
+            replace(ms.oriented(CAMERA, name=name), sigma_wall_m=sigma_m, covariance=spread)
             for name, sigma_m in sigmas_m.items()
         )
     )
+    handed_on = replace(handed_on, ties=known)
     (tmp_path / "given").mkdir()
     publish_cameras(handed_on, tmp_path / "given", "sha256:0")
     photos = ms.photos(*(replace(PHOTO, name=name) for name in sigmas_m))
@@ -303,7 +309,15 @@ def test_the_error_that_handed_on_cameras_carry_is_reported(tmp_path: Path, n_by
     cameras = run(ReadCameras, contexts[0], inputs).cameras
     ties = samples.taken(clicked(4), slice(n_by_hand)) if n_by_hand else None
     inputs = {"cameras": cameras, "photos": photos, "walls": WALLS, "ties": ties}
-    run(OrientGiven, contexts[1], inputs)
+    placed = run(OrientGiven, contexts[1], inputs).cameras
+    for camera in placed.cameras:
+        np.testing.assert_allclose(camera.covariance, spread)
+    assert placed.ties is not None
+    later = samples.taken(placed.ties, slice(n_by_hand, None))
+    np.testing.assert_array_equal(later.role, known.role)
+    np.testing.assert_array_equal(later.wall, [0, 0, 0, 0, 0, -1])
+    np.testing.assert_allclose(later.pixels_photo, known.pixels_photo)
     for ctx in contexts:
+        assert not ctx.warnings
         found = {one.name: one.value for one in ctx.metrics if one.name.startswith("sigma_wall")}
         assert found == pytest.approx({"sigma_wall_mm_median": 1.5, "sigma_wall_mm_worst": 3.5})
