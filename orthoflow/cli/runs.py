@@ -17,7 +17,7 @@ from orthoflow.cli.tables import counted, echo, echo_json, echo_table, number
 from orthoflow.untrusted_text import csv_text, first_few
 
 if TYPE_CHECKING:
-    from orthoflow.report.browsing import RunSummary
+    from orthoflow.cli.browsing import RunSummary
 
 _COLUMNS: Final = ("folder", "started", "workflow", "status")
 # Number of metrics that fit next to the other columns on a wide terminal.
@@ -93,12 +93,12 @@ def runs(
 
 def _write_table(folders: Sequence[Path], table: Path) -> int:
     """Merge runs into one CSV table."""
+    from orthoflow.cli.browsing import run_folders
     from orthoflow.engine.durability import write_whole, writing_to
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.errors import ArgumentError
     from orthoflow.records.open import open_run
     from orthoflow.records.tables import join_runs
-    from orthoflow.report.browsing import run_folders
 
     if not table.absolute().parent.is_dir():
         raise ArgumentError(f"{table.parent} does not exist: create the folder or choose another")
@@ -124,14 +124,14 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
     from orthoflow.cli.progress import working_on
 
     with working_on("reading the records"):
-        from orthoflow.report.browsing import run_folders, summaries
+        from orthoflow.cli.browsing import run_folders, summaries
 
         return _sorted(list(summaries(run_folders(folders))), "started")
 
 
 def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[dict[str, object]]:
     """Return runs as JSON, with all metrics and parameters, and differences from other runs."""
-    from orthoflow.report.browsing import differing_facts
+    from orthoflow.cli.browsing import differing_facts
 
     differs = differing_facts(found)
     return [_row_json(run, run.all_facts, differs[run.folder]) for run in kept]
@@ -139,7 +139,7 @@ def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[d
 
 def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
     """Print a table of some of the runs found, their problems, and their number."""
-    from orthoflow.report.browsing import differing_facts, key_metrics
+    from orthoflow.cli.browsing import differing_facts, key_metrics
 
     names = key_metrics(kept, most=_METRICS_MOST)
     facts = differing_facts(found)

@@ -124,18 +124,35 @@ def _print_comparison(run: Run, most: int | None) -> bool:
         return False
     from orthoflow.records.runs import parts_of
     from orthoflow.report.comparisons import comparison_table
-    from orthoflow.report.paired import over_datasets, who_leads
+    from orthoflow.report.paired import over_datasets, over_table, who_leads
 
     parts = parts_of(run)
     if over := over_datasets(parts):
+        table = over_table(over)
+        texts = [
+            {
+                column.name: table.text(value, column)
+                for column, value in zip(table.columns, row, strict=True)
+            }
+            for row in table.rows
+        ]
+        units = {"1": "", "yes/no": "share of yes"}
         rows = [
-            (name, one.name, number(one.median), number(one.spread), str(one.n))
-            for name, metric in ((f"{one.column.step}.{one.column.metric}", one) for one in over)
-            for one in metric.methods
+            (
+                f"{text['step']}.{text['metric']}",
+                units.get(text["unit"], text["unit"]),
+                *(text[name] for name in ("better", "combination", "median", "spread", "datasets")),
+            )
+            for text in texts
         ]
         echo()
-        echo_table(("metric", "combination", "median", "spread", "datasets"), rows[:most])
+        head = ("metric", "unit", "better", "combination", "median", "±", "datasets")
+        echo_table(head, rows[:most])
         echo_left_out(len(rows), most)
+        echo("±: 1.4826 times the median absolute deviation over the datasets")
+        for metric in over:
+            if metric.lead:
+                echo(f"{metric.column.step}: {metric.column.titled}: {metric.lead}")
         echo(who_leads(over, len(parts)))
         return True
     compared = comparison_table([run])

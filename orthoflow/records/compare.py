@@ -23,11 +23,13 @@ from orthoflow_provenance.document import (
     shared_fields,
 )
 
+from orthoflow.catalog.distributions import canonical_name, required_distributions
 from orthoflow.engine.keys import read_preimage, stated_versions
 from orthoflow.errors import OrthoflowError
 from orthoflow.geometry.levels import DEEPER
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 from orthoflow.records.runs import Run, cell_metrics, is_rounding
+from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.model import DATA, SEED
 
 if TYPE_CHECKING:
@@ -385,6 +387,7 @@ class RunComparison:
             e.g. for a step and for a variant with the same parameters.
         parameters: resolved parameters of each cell.
         environment: Python, system, processor and packages; several values are separated by commas.
+            Packages that are in one run only are left out if no method of either run requires them.
         metrics: metrics of each cell.
         products: comparison of each product of the cells that exist in both runs.
     """
@@ -442,6 +445,24 @@ class RunComparison:
         alone = {row.cell for row in self.cells if not row.is_shared}
         return tuple(row for row in rows if row.cell not in alone)
 
+    def parameter_table(self, *, changed: bool = True) -> pd.DataFrame:
+        """Return the parameters of both runs next to each other.
+
+        Args:
+            changed: only those that differ.
+
+        Returns:
+            Columns `cell`, `parameter`, `left` and `right`; None if a run does not have it.
+        """
+        import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
+
+        rows = [
+            (row.cell, row.name, row.left and row.left.value, row.right and row.right.value)
+            for row in self.parameters
+            if not (changed and row.is_same)
+        ]
+        return pd.DataFrame(rows, columns=["cell", "parameter", "left", "right"], dtype=object)
+
     def metric_table(self) -> pd.DataFrame:
         """Return all metrics of both runs next to each other.
 
@@ -491,7 +512,7 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
         cells=_per_cell(left, right, own, lambda cell: {cell.step: _facts(cell)}),
         readdressed=readdressed,
         parameters=_per_cell(left, right, own, _parameters),
-        environment=_pairs("", *(_environment(side) for side in sides)),
+        environment=_environment_pairs(left.record, right.record),
         metrics=_per_cell(left, right, own, _metrics),
         products=product_distances(
             RunProducts(run=left, stores=tuple(stores)),
@@ -638,6 +659,23 @@ def _metrics(cell: RecordedCell) -> dict[str, ComparedMetric]:
         )
         for row in cell_metrics(cell)
     }
+
+
+def _environment_pairs(left: RunRecord, right: RunRecord) -> tuple[Pair[str], ...]:
+    named = {cell.distribution for side in (left, right) for cell in side.cells} - {""}
+    used = required_distributions(frozenset({*named, DISTRIBUTION}))
+    rows = _pairs("", *map(_environment, (left, right)))
+    packages = {
+        name for side in (left, right) for one in side.environments for name in one.packages
+    }
+    return tuple(
+        row
+        for row in rows
+        if row.is_shared
+        or row.name not in packages
+        or used is None
+        or canonical_name(row.name) in used
+    )
 
 
 def _environment(record: RunRecord) -> dict[str, str]:

@@ -17,9 +17,8 @@ from orthoflow.records.runs import MetricRow, Run, parts_of
 from orthoflow.report.charts import ChartFormat, ChartPoint, as_image, line_chart
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.comparisons import comparison_columns
-from orthoflow.report.paired import middle_of, spread_of
 from orthoflow.report.pictures import Picture
-from orthoflow.report.rankings import BETTER, is_flag
+from orthoflow.report.rankings import BETTER, is_flag, middle_of, spread_of
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
@@ -265,3 +264,47 @@ def _points_text(lines: Mapping[str, _Line], column: MetricRow, n_datasets: int)
     absolute = ". Absolute values of errors are used" if column.better == "lower" else ""
     bars = ". Bars are 1.4826 times the median absolute deviation" if counts[-1] > 1 else ""
     return f"Points are medians of {counted} of {n_datasets} datasets{absolute}{bars}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Varied:
+    """Steps and parameters that vary in a run.
+
+    Attributes:
+        steps: steps with variants; `data` for datasets.
+        methods: step -> variant -> method, for steps with swept parameters.
+        swept: (step, parameter) -> variant -> value, for swept parameters.
+    """
+
+    steps: tuple[str, ...]
+    methods: Mapping[str, Mapping[str, str]]
+    swept: Mapping[tuple[str, str], Mapping[str, float]]
+
+    @classmethod
+    def of(cls, run: Run) -> Varied:
+        """Determine what varies from the cells of a run."""
+        swept: dict[tuple[str, str], dict[str, float]] = {}
+        for sweep in sweeps(run.record.cells):
+            swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
+        steps = dict.fromkeys(step for cell in run.record.cells for step in cell.assignment)
+        methods: dict[str, dict[str, str]] = {}
+        for cell in run.record.cells:
+            if any(cell.step == step for step, _ in swept) and cell.step in cell.assignment:
+                methods.setdefault(cell.step, {})[cell.assignment[cell.step]] = cell.method
+        return cls(steps=tuple(steps), methods=methods, swept=swept)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns; those of steps are as in tables of several runs."""
+        return (
+            *("dataset" if step == DATA else f"variant.{step}" for step in self.steps),
+            *(f"{step}.use" for step in self.methods),
+            *(".".join(parameter) for parameter in self.swept),
+        )
+
+    def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
+        """Return the column values of a cell or combination; None in columns that do not apply."""
+        variants = (assignment.get(step) for step in self.steps)
+        numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
+        methods = (named.get(assignment.get(step, "")) for step, named in self.methods.items())
+        return (*variants, *methods, *numbers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,13 +27,13 @@ from orthoflow.records.runs import Run, cell_metrics, parts_of
 from orthoflow.records.tables import RunSet, join_runs
 from orthoflow.records.verify import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
-from orthoflow.report.curves import sweeps
+from orthoflow.report.curves import Varied
 from orthoflow.report.differences import moved_first
+from orthoflow.report.paired import over_datasets, over_table
 from orthoflow.report.pictures import data_uri, embedded_products, thumbnail
 from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers
 from orthoflow.untrusted_text import first_few, shown
-from orthoflow.workflow.model import DATA
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,50 +42,6 @@ _THUMBNAIL_PX: Final = 640
 _FIGURES_MOST: Final = 24  # shown at once: notebooks store them in their files
 _ROWS_MOST: Final = 60  # in a table of differences
 _PARAMETERS_MOST: Final = 8
-
-
-@dataclass(frozen=True, kw_only=True)
-class Varied:
-    """Steps and parameters that vary in a run.
-
-    Attributes:
-        steps: steps with variants; `data` for datasets.
-        methods: step -> variant -> method, for steps with swept parameters.
-        swept: (step, parameter) -> variant -> value, for swept parameters.
-    """
-
-    steps: tuple[str, ...]
-    methods: Mapping[str, Mapping[str, str]]
-    swept: Mapping[tuple[str, str], Mapping[str, float]]
-
-    @classmethod
-    def of(cls, run: Run) -> Varied:
-        """Determine what varies from the cells of a run."""
-        swept: dict[tuple[str, str], dict[str, float]] = {}
-        for sweep in sweeps(run.record.cells):
-            swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
-        steps = dict.fromkeys(step for cell in run.record.cells for step in cell.assignment)
-        methods: dict[str, dict[str, str]] = {}
-        for cell in run.record.cells:
-            if any(cell.step == step for step, _ in swept) and cell.step in cell.assignment:
-                methods.setdefault(cell.step, {})[cell.assignment[cell.step]] = cell.method
-        return cls(steps=tuple(steps), methods=methods, swept=swept)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns; those of steps are as in tables of several runs."""
-        return (
-            *("dataset" if step == DATA else f"variant.{step}" for step in self.steps),
-            *(f"{step}.use" for step in self.methods),
-            *(".".join(parameter) for parameter in self.swept),
-        )
-
-    def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
-        """Return the column values of a cell or combination; None in columns that do not apply."""
-        variants = (assignment.get(step) for step in self.steps)
-        numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
-        methods = (named.get(assignment.get(step, "")) for step, named in self.methods.items())
-        return (*variants, *methods, *numbers)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -122,6 +78,18 @@ class OpenedRun(Run):
         columns = [*first, *varied.names, *last]
         return pd.DataFrame(rows, columns=columns)
 
+    def statistics(self) -> pd.DataFrame:
+        """Return the table of the report over all datasets; empty for a single dataset.
+
+        Returns:
+            One row per metric and combination of variants, with median, difference from
+            `reference`, its confidence interval, p, p after Holm's correction, and effect.
+        """
+        import pandas as pd  # noqa: PLC0415 - takes a second and is rarely needed
+
+        table = over_table(over_datasets(parts_of(self)))
+        return pd.DataFrame(table.rows, columns=[column.name for column in table.columns])
+
     @cached_property
     def figures(self) -> Figures:
         """Return all figures of the methods, by `step/name`; notebooks display them."""
@@ -134,7 +102,13 @@ class OpenedRun(Run):
         )
 
     def product(
-        self, address: str, port: str, *, store: str | Path = ".orthoflow", **variants: str
+        self,
+        address: str,
+        port: str,
+        *,
+        store: str | Path = ".orthoflow",
+        repeat: int = 0,
+        **variants: str,
     ) -> Product:
         """Return an output as an object of its product class.
 
@@ -143,6 +117,7 @@ class OpenedRun(Run):
             port: name of the output.
             store: folder of stored results, for products that the record references but does not
                 contain.
+            repeat: number of the repeat, from 0.
             variants: name of a step with variants, or `data` -> variant or dataset.
 
         Raises:
@@ -155,7 +130,7 @@ class OpenedRun(Run):
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
         from orthoflow.engine.store import stores_at  # noqa: PLC0415 - rarely needed
 
-        cell = self.cell(address, **variants)
+        cell = self.cell(address, repeat=repeat, **variants)
         address, output = cell.address, cell.outputs.get(port)
         if output is None or output.embedded:
             return super().product(address, port)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -57,8 +57,17 @@ if TYPE_CHECKING:
 
 # Columns of the table over all datasets.
 _OVER_SHOWN: Final = (
-    *("combination", "datasets", "failed", "absent", "partly", "median", "spread", "pairs"),
-    *("wins", "losses", "median_difference", "interval_low", "interval_high"),
+    *("combination", "datasets", "failed", "absent", "partly", "median", "spread"),
+    *(
+        "repeat_spread",
+        "reference",
+        "pairs",
+        "wins",
+        "losses",
+        "median_difference",
+        "interval_low",
+        "interval_high",
+    ),
     *("p", "p_holm", "effect"),
 )
 _NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
@@ -75,7 +84,12 @@ def _part(every: Mapping[str, Sequence[Any]], addresses: Collection[str]) -> Sim
 
 
 def write_page(
-    run: Run, path: Path, *, go_on: str = "", broken_seals: Mapping[Path, str] = _NONE_BROKEN
+    run: Run,
+    path: Path,
+    *,
+    go_on: str = "",
+    broken_seals: Mapping[Path, str] = _NONE_BROKEN,
+    note: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Write the report of one run, and its figures as PNG and SVG files in `figures/` next to it.
 
@@ -88,6 +102,7 @@ def write_page(
         path: output file.
         go_on: command that resumes the run, if it was interrupted.
         broken_seals: record -> why its seal is broken.
+        note: called with the name of each part.
 
     Raises:
         StoreError: a file cannot be written.
@@ -99,12 +114,14 @@ def write_page(
     pages = pages_of(run)
     with run.held_open() as opened:
         parts = parts_of(opened)
-        for name, page in pages.items():
+        for number, (name, page) in enumerate(pages.items(), start=1):
+            note(f"writing the page of {name}, {number} of {len(pages)}")
             folder = (path.parent / page).parent
             section = _section(parts[name], "r1-", folder, broken_seals)
             section.title, section.whole = f"{run.record.name}: {name}", f"../{path.name}"
             content = _content([parts[name]], [section], section.title)
             write_files(path.parent, {page: partial(bytes, content)})
+        note("writing the report")
         if pages:
             section = _overview(opened, "r1-", path.parent, pages)
         else:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.robust import median_deviation
 from orthoflow.records.runs import MetricRow, Run, is_rounding
 from orthoflow.report.combinations import (
     Combination,
@@ -22,7 +21,15 @@ from orthoflow.report.combinations import (
     group_environments,
 )
 from orthoflow.report.comparisons import comparison_columns
-from orthoflow.report.rankings import BETTER, badness, is_flag
+from orthoflow.report.curves import Varied
+from orthoflow.report.rankings import (
+    BETTER,
+    badness,
+    is_flag,
+    middle_of,
+    number_with_unit,
+    spread_of,
+)
 from orthoflow.report.tables import Column, Table
 from orthoflow.untrusted_text import Value, first_few
 from orthoflow.workflow.expand import variants_text
@@ -36,6 +43,9 @@ _MIN_RANKED: Final = 3
 _MIN_SHOWN: Final = 6
 _SHOWN_P: Final = 0.05
 _MAX_NAMED: Final = 6
+# Step and variant of each step on which a step depends.
+_Variants: TypeAlias = tuple[tuple[str, str], ...]
+_Bases: TypeAlias = dict[_Variants, _Variants]
 _TEST: Final = f"p below {_SHOWN_P:g} after Holm's correction"
 
 
@@ -76,7 +86,9 @@ class MethodOverDatasets:
 
     Attributes:
         variants: step -> variant; empty if there are no variants.
-        is_reference: whether the others are compared with this one.
+        compared_with: name of the variants with which it is compared: those of the baseline, or
+            of the baseline's methods with the same values of swept parameters; empty for the
+            baseline itself, the reference.
         n: number of datasets with a value.
         n_failed: number of datasets on which the step or one before it failed; they are not used.
         n_absent: number of datasets that have no value, although no step failed.
@@ -87,12 +99,13 @@ class MethodOverDatasets:
             the share of "yes"; NaN if there are no values.
         spread: 1.4826 times the median absolute deviation; NaN if there are no values, and for
             shares.
-        paired: comparison with the reference; None for the reference itself and for unranked
-            metrics.
+        repeat_spread: standard deviation over repeats, median over the datasets; NaN without
+            repeats.
+        paired: comparison with `compared_with`; None for the reference and for unranked metrics.
     """
 
     variants: Mapping[str, str]
-    is_reference: bool
+    compared_with: str
     n: int
     n_failed: int
     n_absent: int
@@ -100,6 +113,7 @@ class MethodOverDatasets:
     n_apart: int
     median: float
     spread: float
+    repeat_spread: float
     paired: Paired | None
 
     @property
@@ -155,32 +169,31 @@ class MetricOverDatasets:
     @property
     def reference(self) -> MethodOverDatasets:
         """Results of the reference."""
-        return next(one for one in self.methods if one.is_reference)
+        return next(one for one in self.methods if not one.compared_with)
 
-    def method_of(self, assignment: Mapping[str, str]) -> MethodOverDatasets | None:
-        """Return the results of the variants that a combination has for the step."""
-        return next(
-            (one for one in self.methods if one.variants.items() <= assignment.items()), None
+    @property
+    def lead(self) -> str:
+        """The best value and the next best, and whether they differ significantly; may be empty."""
+        better, unit = self.column.better, self.column.unit
+        # Medians of fewer datasets may be better because the difficult ones are missing.
+        most = max(one.n for one in self.methods)
+        known = [one for one in self.methods if one.n == most and math.isfinite(one.median)]
+        if better not in BETTER or len(known) < 2:
+            return ""
+        best, after = sorted(known, key=lambda one: badness(one.median, better))[:2]
+        if self.ranks is not None:
+            is_clear = best.name in self.ranks.leading and after.name not in self.ranks.leading
+        else:
+            pairs = [one.paired for one in self.methods if one.paired]
+            is_clear = len(self.methods) == 2 and any(pair.p_holm < _SHOWN_P for pair in pairs)
+        unit = "1" if is_flag(unit) else unit
+        values = [f"{one.name} ({number_with_unit(one.median, unit)})" for one in (best, after)]
+        if is_rounding(best.median, after.median):
+            return f"{values[0]} and {after.name} are level."
+        return (
+            f"{values[0]} is best, {values[1]} next; the difference is "
+            f"{'' if is_clear else 'not '}significant."
         )
-
-
-def middle_of(values: NDArray[np.float64], unit: str) -> float:
-    """Return the central value over several datasets; NaN if there are none.
-
-    This is the median; for yes/no metrics, the mean, which is the share of "yes": the median would
-    be the same for any minority.
-    """
-    if not values.size:
-        return math.nan
-    return float(np.mean(values) if is_flag(unit) else np.median(values))
-
-
-def spread_of(values: NDArray[np.float64], unit: str) -> float:
-    """Return the spread of values over several datasets; NaN if there are none.
-
-    A share has no spread, since it determines the counts of both values.
-    """
-    return math.nan if is_flag(unit) or not values.size else median_deviation(values)
 
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
@@ -197,7 +210,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
         return ()
     environments = group_environments(parts.values())
     # Step -> variants on which it depends -> dataset -> combination.
-    ways: dict[str, dict[tuple[tuple[str, str], ...], dict[str, Combination]]] = {}
+    ways: dict[str, dict[_Variants, dict[str, Combination]]] = {}
     for name, part in parts.items():
         baseline = baseline_of(part)
         for cell in part.record.cells:
@@ -205,16 +218,48 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
                 own = tuple((k, v) for k, v in cell.assignment.items() if k != DATA)
                 by_data = ways.setdefault(cell.step, {}).setdefault(own, {})
                 by_data[name] = combination_of(part, cell.assignment, baseline)
+    varied = Varied.of(next(iter(parts.values())))
     return _corrected(
-        _over(column, ways[column.step], len(parts), environments)
+        _over(column, ways[column.step], varied, len(parts), environments)
         for column in comparison_columns(every)
         if column.step in ways
     )
 
 
+def _bases(ways: Sequence[_Variants], varied: Varied, reference: _Variants) -> _Bases:
+    """Return the variants with which those of each way are compared.
+
+    These are the variants of the reference's methods with the same values of swept parameters, so
+    that methods are compared at equal settings; without any, the reference.
+    """
+    used, values = {}, {}
+    for own in ways:
+        used[own] = [varied.methods.get(step, {}).get(name, name) for step, name in own]
+        values[own] = {
+            parameter: of_variants[name]
+            for parameter, of_variants in varied.swept.items()
+            if (name := dict(own).get(parameter[0], "")) in of_variants
+        }
+    return {
+        own: next(
+            (
+                other
+                for other in ways
+                if other != own
+                and used[other] == used[reference]
+                and values[own]
+                and values[other] == values[own]
+            ),
+            reference,
+        )
+        for own in ways
+    }
+
+
 def _over(
     column: MetricRow,
-    ways: Mapping[tuple[tuple[str, str], ...], Mapping[str, Combination]],
+    ways: Mapping[_Variants, Mapping[str, Combination]],
+    varied: Varied,
     n_datasets: int,
     environments: EnvironmentGroups,
 ) -> MetricOverDatasets:
@@ -231,22 +276,21 @@ def _over(
         (own for own, by_data in ways.items() if next(iter(by_data.values())).is_baseline),
         next(iter(ways)),
     )
+    bases = _bases([*ways], varied, reference)
 
-    def comparable(own: tuple[tuple[str, str], ...]) -> dict[str, tuple[Measured, Measured]]:
-        """Return, by dataset, its value and that of the reference, if they are comparable."""
+    def comparable(own: _Variants, base: _Variants) -> dict[str, tuple[Measured, Measured]]:
+        """Return, by dataset, its value and that of another, if they are comparable."""
         found = {}
-        for name in measured[own].keys() & measured[reference].keys():
-            both = measured[own][name], measured[reference][name]
+        for name in measured[own].keys() & measured[base].keys():
+            both = measured[own][name], measured[base][name]
             # A larger error over more photos is not a worse result.
-            ours, theirs = (
-                ways[key][name].n_items(step, column.counted_by) for key in (own, reference)
-            )
+            ours, theirs = (ways[key][name].n_items(step, column.counted_by) for key in (own, base))
             is_like = environments.are_comparable(*(one.environment for one in both))
             if is_like and not abs(ours - theirs) > 0.0:
                 found[name] = both
         return {name: found[name] for name in measured[own] if name in found}
 
-    pairs = {own: comparable(own) for own in ways}
+    pairs = {own: comparable(own, bases[own]) for own in ways}
     is_judged = column.better in BETTER
     methods = []
     for own, by_data in ways.items():
@@ -255,11 +299,12 @@ def _over(
             # Errors of both signs would cancel.
             values = np.abs(values)
         n_failed = sum(one.failure is not None for one in by_data.values())
-        n_both = len(measured[own].keys() & measured[reference].keys())
+        n_both = len(measured[own].keys() & measured[bases[own]].keys())
+        scatter = [one.spread for one in measured[own].values() if math.isfinite(one.spread)]
         methods.append(
             MethodOverDatasets(
                 variants=dict(own),
-                is_reference=own == reference,
+                compared_with="" if own == reference else variants_text(dict(bases[own])),
                 n=len(values),
                 n_failed=n_failed,
                 n_absent=n_datasets - len(values) - n_failed,
@@ -267,6 +312,7 @@ def _over(
                 n_apart=n_both - len(pairs[own]) if is_judged else 0,
                 median=middle_of(values, column.unit),
                 spread=spread_of(values, column.unit),
+                repeat_spread=float(np.median(scatter)) if scatter else math.nan,
                 paired=_paired(pairs[own].values(), column)
                 if is_judged and own != reference
                 else None,
@@ -274,9 +320,10 @@ def _over(
         )
     ranks = None
     if is_judged and len(ways) >= _MIN_RANKED:
-        shared = [name for name in pairs[reference] if all(name in own for own in pairs.values())]
+        alike = [comparable(own, reference) for own in ways]
+        shared = [name for name in measured[reference] if all(name in own for own in alike)]
         rows = np.array(
-            [[badness(pairs[own][name][0].value, column.better) for own in ways] for name in shared]
+            [[badness(own[name][0].value, column.better) for own in alike] for name in shared]
         )
         if len(shared) >= _MIN_TESTED and np.isfinite(rows).all():
             ranks = mean_ranks([one.name for one in methods], rows)
@@ -347,10 +394,11 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         n_datasets: number of datasets of the run.
     """
     judged = [metric for metric in over if metric.column.better in BETTER]
-    rows = [(metric, one) for metric in judged for one in metric.methods if not one.is_reference]
+    rows = [(metric, one) for metric in judged for one in metric.methods if one.compared_with]
     if not rows:
         return ""
-    if not any(one.paired and math.isfinite(one.paired.p) for _, one in rows):
+    tested = [one.paired for _, one in rows if one.paired and math.isfinite(one.paired.p)]
+    if not tested:
         return (
             f"{n_datasets} datasets are not enough for a claim: at least {_MIN_SHOWN} are needed "
             "on which the results differ, all computed in one environment"
@@ -373,13 +421,36 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
             leads.append(f"{name} {' and '.join(words)}")
         else:
             level.append(name)
-    if not leads:
-        return f"No difference is significant in any of {len(judged)} metrics ({_TEST})"
-    rest = f". No significant difference: {first_few(level, most=_MAX_NAMED)}" if level else ""
-    return (
-        f"Significant over the datasets, compared with {judged[0].reference.name} ({_TEST}): "
-        f"{first_few(leads, most=_MAX_NAMED)}{rest}"
-    )
+    sentences = []
+    if leads:
+        bases = [*dict.fromkeys(one.compared_with for _, one in rows)]
+        named = [first_few(names, most=_MAX_NAMED) for names in (bases, leads, level)]
+        sentences.append(
+            f"Significant over the datasets, compared with {named[0]} ({_TEST}): {named[1]}"
+        )
+        sentences += [f"No significant difference: {named[2]}"] if level else []
+    else:
+        sentences.append(f"No difference is significant in any of {len(judged)} metrics ({_TEST})")
+        n, n_tests = max(pair.wins + pair.losses for pair in tested), len(tested)
+        # If all differences agree, p is 2 / 2^n.
+        if (least := n_tests * 2.0 ** (1 - n)) >= _SHOWN_P:
+            enough = 2 + math.floor(math.log2(n_tests / _SHOWN_P))
+            sentences.append(
+                f"None could be: with {n} datasets and {n_tests} comparisons, the smallest "
+                f"possible p is {min(1.0, least):.2g}; at least {enough} datasets are needed, or "
+                "fewer metrics (compare.metrics)"
+            )
+    ranked = [
+        f"{metric.column.title} ({', '.join(metric.ranks.leading)})"
+        for metric in judged
+        if metric.ranks and len(metric.ranks.leading) < len(metric.ranks.ranks)
+    ]
+    if ranked:
+        sentences.append(
+            "By Friedman's and Nemenyi's tests of each metric alone, there are differences; the "
+            f"best, and those not significantly different from it: {'; '.join(ranked)}"
+        )
+    return ". ".join(sentences)
 
 
 def _paired(pairs: Iterable[tuple[Measured, Measured]], column: MetricRow) -> Paired | None:
@@ -439,6 +510,8 @@ _OVER: Final = (
     Column("some repeats", "partly"),
     Column("median", "median"),
     Column("±", "spread", digits=2),
+    Column("± repeats", "repeat_spread", digits=2),
+    Column("compared with", "reference", is_numeric=False),
     Column("compared", "pairs"),
     Column("not compared", "apart"),
     Column("better", "wins"),
@@ -473,6 +546,7 @@ def over_table(over: Sequence[MetricOverDatasets]) -> Table:
                     *(column.step, column.metric, column.titled, column.unit, column.better),
                     *(one.name or "all", one.n, one.n_failed, one.n_absent, one.n_partly),
                     *(_known(one.median), _known(one.spread) if one.n > 1 else None),
+                    *(_known(one.repeat_spread), one.compared_with or None),
                     *(None if paired is None else paired.n, one.n_apart, *differences),
                 )
             )

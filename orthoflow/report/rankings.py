@@ -8,6 +8,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.robust import median_deviation
 from orthoflow.records.runs import is_rounding
 
 _DIGITS_MOST: Final = 6  # of a mean with its spread
@@ -199,3 +203,22 @@ def badness(value: float, better: str) -> float:
     if better == "one":
         return abs(math.log(value)) if value > 0 else math.inf
     raise ValueError("a metric without a better direction cannot be ranked")
+
+
+def middle_of(values: NDArray[np.float64], unit: str) -> float:
+    """Return the central value over several datasets; NaN if there are none.
+
+    This is the median; for yes/no metrics, the mean, which is the share of "yes": the median would
+    be the same for any minority.
+    """
+    if not values.size:
+        return math.nan
+    return float(np.mean(values) if is_flag(unit) else np.median(values))
+
+
+def spread_of(values: NDArray[np.float64], unit: str) -> float:
+    """Return the spread of values over several datasets; NaN if there are none.
+
+    A share has no spread, since it determines the counts of both values.
+    """
+    return math.nan if is_flag(unit) or not values.size else median_deviation(values)

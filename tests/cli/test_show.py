@@ -51,5 +51,8 @@ def test_over_datasets_medians_are_shown(tmp_path: Path) -> None:
         tmp_path, *cells, workflow_resolved='{"datasets": {"r0": {}, "r1": {}, "r2": {}}}'
     )
     rows = [line.split() for line in printed if line.startswith("plane.rms_mm")]
-    assert [row[1:3] for row in rows] == [["plane=a", "2"], ["plane=b", "1.5"]]
+    assert [row[1:5] for row in rows] == [
+        ["mm", "lower", "plane=a", "2"],
+        ["mm", "lower", "plane=b", "1.5"],
+    ]
     assert [row[-1] for row in rows] == ["3", "3"]

@@ -58,14 +58,14 @@ def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path)
             method="raster.toy",
             params={"gsd_m": value},
             metrics=metrics(
-                void_share=0.001 / value, scan_step_mm=7.0, sigma_median_mm=100 * value
+                empty_share=0.001 / value, scan_step_mm=7.0, sigma_median_mm=100 * value
             ),
         )
         for value in (0.005, 0.01, 0.02)
     ]
     run = held(tmp_path, cells)
     names = [curve.name for curve in curves([run])]
-    assert names == ["wall.void_share_over_wall.gsd_m", "wall.sigma_median_mm_over_wall.gsd_m"]
+    assert names == ["wall.empty_share_over_wall.gsd_m", "wall.sigma_median_mm_over_wall.gsd_m"]
     table = comparison_table([run])
     assert table is not None
     marks = {value.mark for row in table.rows for value in row.values}

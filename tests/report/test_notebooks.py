@@ -303,7 +303,7 @@ def test_a_cell_is_found_by_its_step_and_what_varies(tmp_path: Path) -> None:
         *(
             cell(address(data, plane) + again)
             for data in ("hall", "yard")
-            for plane in ("fine", "coarse")
+            for plane in ("fine", "coarse", "swept-a-2")
             for again in ("", "#1")
         ),
         cell("merge@data=yard", outputs={"cloud": stored_cloud(tmp_path / "store")}),
@@ -314,10 +314,19 @@ def test_a_cell_is_found_by_its_step_and_what_varies(tmp_path: Path) -> None:
     # What a step does not depend on chooses nothing among its cells.
     assert run.cell("scan", data="yard").address == "scan"
     assert run.cell("merge", data="yard", plane="fine").address == "merge@data=yard"
-    with pytest.raises(ArgumentError, match=r"several cells of 'plane', data=hall: plane@.*choose"):
+    again = run.cell("plane", data="yard", plane="fine", repeat=1)
+    assert again.address == f"{address('yard', 'fine')}#1"
+    # Of a sweep, the name before the value.
+    assert run.cell("plane", data="yard", plane="swept").address == address("yard", "swept-a-2")
+    with pytest.raises(
+        ArgumentError,
+        match=r"3 cells of 'plane', data=hall: choose plane= \(coarse, fine, swept-a-2",
+    ):
         run.cell("plane", data="hall")
-    with pytest.raises(ArgumentError, match=r"no step 'plane', data=attic; it has plane@data=hall"):
+    with pytest.raises(
+        ArgumentError, match=r"no cells of 'plane', data=attic: choose data= \(hall, yard\)"
+    ):
         run.cell("plane", data="attic")
-    with pytest.raises(ArgumentError, match="no step 'scan', room=hall; it has scan"):
-        run.cell("scan", room="hall")
+    with pytest.raises(ArgumentError, match="no cells of 'plane', room=hall: choose data="):
+        run.cell("plane", room="hall")
     assert len(run.product("merge", "cloud", data="yard", store=tmp_path / "store")) == 3

@@ -148,7 +148,7 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
     assert first[1:4] == first[5:8]
     assert second[1:4] == second[5:8]
     page.evaluate(f"{panel}.querySelector('[data-part=ties]').click()")
-    output = f"{panel}.querySelector('[data-part=told]').innerText"
+    output = f"{panel}.querySelector('[data-part=message]').innerText"
     assert page.evaluate(output).startswith("0 ties; 2 points without a photo")
     page.evaluate(
         f"(() => {{ const row = {panel}.querySelector('[data-part=list] > div');"

@@ -146,7 +146,7 @@ def test_more_than_rounding_and_every_count_is_a_difference() -> None:
 def test_a_method_is_summed_up_over_datasets() -> None:
     methods = {"a": (-2.0, [3.0, None], 10.0, [None]), "b": (1.0, None, [None], [None])}
     first, second = over(methods).methods
-    assert (first.name, first.is_reference, second.is_reference) == ("plane=a", True, False)
+    assert (first.name, first.compared_with, second.compared_with) == ("plane=a", "", "plane=a")
     assert (first.n, first.n_failed, first.n_absent, first.n_partly) == (3, 0, 1, 1)
     assert (second.n, second.n_failed, second.n_absent, second.n_partly) == (1, 1, 2, 0)
     # Errors of both signs would make each other small.
@@ -191,9 +191,33 @@ def test_a_step_has_a_row_per_variant_on_which_it_depends() -> None:
     assert {one.column.step: [method.name for method in one.methods] for one in found} == {
         "check": [f"plane={plane}, corner={corner}" for plane in "ab" for corner in "xy"],
     } | ({"plane": ["plane=a", "plane=b"]} if len(found) > 1 else {})
-    method = found[0].method_of({"plane": "b", "corner": "y", "other": "z"})
-    assert method is not None
-    assert method.name == "plane=b, corner=y"
+
+
+def test_methods_are_compared_at_equal_values_of_a_sweep() -> None:
+    cells = [
+        cell(
+            f"plane@data=r{room},plane={name}-{value}",
+            method=f"plane.{name}",
+            params={"tolerance_m": value},
+            metrics=(Metric(name="size", value=value, unit="mm", better="lower", headline=True),),
+        )
+        for room in range(2)
+        for name in ("hough", "ransac")
+        for value in (0.02, 0.1)
+    ]
+    resolved = {
+        "datasets": {f"r{room}": {} for room in range(2)},
+        "compare": {"baseline": {"plane": "hough-0.02"}},
+    }
+    held = record(cells, workflow_resolved=json.dumps(resolved))
+    (found,) = over_datasets(parts_of(HeldRun(path=Path("run.h5"), record=held)))
+    assert {one.name: one.compared_with for one in found.methods} == {
+        "plane=hough-0.02": "",
+        "plane=hough-0.1": "plane=hough-0.02",
+        "plane=ransac-0.02": "plane=hough-0.02",
+        "plane=ransac-0.1": "plane=hough-0.1",
+    }
+    assert found.lead == "plane=hough-0.02 (0.02 mm) and plane=ransac-0.02 are level."
 
 
 def leading(n_better: int, n_level: int, n_rooms: int = 12) -> MetricOverDatasets:
@@ -216,10 +240,14 @@ def test_what_is_shown_to_lead_is_stated_of_six_at_most() -> None:
     both = who_leads([leading(1, 1)], 12)
     assert "compared with plane=reference" in both
     assert "plane=good0 better in 1 of 1 metrics (size)" in both
-    assert both.endswith("No significant difference: plane=level0")
+    assert "No significant difference: plane=level0. By Friedman's and Nemenyi's tests" in both
+    assert both.endswith("not significantly different from it: size (plane=good0)")
+    # With six rooms, p is at least 2 / 2^6, times 2 comparisons.
+    few = who_leads([leading(2, 0, 6)], 6)
+    assert "with 6 datasets and 2 comparisons, the smallest possible p is 0.062; at least 7" in few
     six, seven = (who_leads([leading(n, 0)], 12) for n in (6, 7))
     assert (six.count(" better in "), "more" in six) == (6, False)
-    assert (seven.count(" better in "), seven.endswith(" and 1 more")) == (6, True)
+    assert (seven.count(" better in "), " and 1 more. By" in seven) == (6, True)
 
 
 def test_p_is_corrected_for_all_comparisons_of_a_run() -> None:

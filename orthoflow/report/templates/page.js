@@ -239,14 +239,14 @@
       const names = pictures.map((picture) => picture.layer);
       // If only one step has variants, its name is redundant and is omitted to save space.
       const steps = new Set(names.flatMap((name) => [...name.matchAll(/([^\s(,=]+)=/g)].map((found) => found[1])));
-      const told = steps.size === 1 ? names.map((name) => name.replace(`${[...steps][0]}=`, "")) : names;
+      const labels = steps.size === 1 ? names.map((name) => name.replace(`${[...steps][0]}=`, "")) : names;
       const at = (name, otherwise) => {
         const found = pictures.findIndex((picture) => picture.layer === name);
         return found < 0 ? otherwise : found;
       };
       const left = at(chosen.left, 0);
-      fill(part.left, told, left);
-      fill(part.right, told, at(chosen.right, left === 1 ? 0 : 1));
+      fill(part.left, labels, left);
+      fill(part.right, labels, at(chosen.right, left === 1 ? 0 : 1));
       part.stage.style.aspectRatio = ratio;
       part.stage.style.width = `min(100%, calc(75vh * ${ratio}))`;
       lay();
@@ -321,7 +321,7 @@
         box.replaceChildren(...points.filter((point) => point.id === id).map(cross));
       }
       part.checkpoints.disabled = part.ties.disabled = points.length === 0;
-      part.told.textContent = "";
+      part.message.textContent = "";
     };
     const collect = (point) => {
       const row = document.createElement("div");
@@ -339,9 +339,9 @@
         row.remove();
         update();
       });
-      const told = document.createElement("span");
-      told.textContent = `${point.of}, ${words(point)}`;
-      row.append(name, entry.photo, entry.photoU, entry.photoV, remove, told);
+      const source = document.createElement("span");
+      source.textContent = `${point.of}, ${words(point)}`;
+      row.append(name, entry.photo, entry.photoU, entry.photoV, remove, source);
       part.list.append(row);
       points.push(entry);
       update();
@@ -363,7 +363,7 @@
       // shown_x and shown_y are independent of the cell size; x, y, z are to be filled in from the survey.
       save("checkpoints.csv", ["name", "x", "y", "z", "wall", "shown_x", "shown_y", "shown_z"],
         points.map((point) => [point.name.value, ...point.world, point.wall, ...point.world]));
-      part.told.textContent = `${points.length} check points saved: add the surveyed x, y, z to the file`;
+      part.message.textContent = `${points.length} check points saved: add the surveyed x, y, z to the file`;
     });
     part.ties.addEventListener("click", () => {
       const isNumber = (input) => input.value.trim() !== "" && Number.isFinite(Number(input.value));
@@ -371,7 +371,7 @@
         point.photo.value.trim() && isNumber(point.photoU) && isNumber(point.photoV));
       const left = points.length - whole.length;
       const lacking = left ? `; ${left} points without a photo or pixel position are omitted` : "";
-      part.told.textContent = `${whole.length} ties${lacking}`;
+      part.message.textContent = `${whole.length} ties${lacking}`;
       if (whole.length) save("ties.csv", ["photo", "u_px", "v_px", "x", "y", "z"], whole.map((point) =>
         [point.photo.value, Number(point.photoU.value), Number(point.photoV.value), ...point.world]));
     });
@@ -501,8 +501,8 @@
     zoom(Math.exp(-event.deltaY / 400), event.clientX - box.left, event.clientY - box.top);
   }, { passive: false });
   const point = (event, isClick) => {
-    const told = pointing.get(now)?.(view.stage.querySelector("img"), event, isClick);
-    if (told) view.readout.textContent = told;
+    const text = pointing.get(now)?.(view.stage.querySelector("img"), event, isClick);
+    if (text) view.readout.textContent = text;
   };
   // Position of pointerdown, while it may still become a click; larger movements are drags.
   const TREMBLE_PX = 3;

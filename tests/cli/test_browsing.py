@@ -10,14 +10,14 @@ import pytest
 from orthoflow_provenance.document import RecordedFile, RecordedInput
 from orthoflow_provenance.record import write_record
 
-from orthoflow.errors import ArgumentError
-from orthoflow.report.browsing import (
+from orthoflow.cli.browsing import (
     RunSummary,
     differing_facts,
     key_metrics,
     run_folders,
     summaries,
 )
+from orthoflow.errors import ArgumentError
 from tests.report_runs import cell, metrics, record
 
 

@@ -20,8 +20,7 @@ from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run, cell_metrics, parts_of
 from orthoflow.records.verify import broken_seal
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.paired import middle_of
-from orthoflow.report.rankings import FLAG, is_flag
+from orthoflow.report.rankings import FLAG, is_flag, middle_of
 from orthoflow.report.summaries import headline_keys
 from orthoflow.untrusted_text import open_file, parse_json
 
