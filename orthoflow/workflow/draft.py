@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import re
@@ -21,7 +22,13 @@ from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images
 from orthoflow.files.images import PHOTO_SUFFIXES, RAW_SUFFIXES
-from orthoflow.files.photo_files import HOW_TO_DEVELOP, photo_format, read_exif, unreadable
+from orthoflow.files.photo_files import (
+    HOW_TO_DEVELOP,
+    photo_format,
+    read_exif,
+    stated_size,
+    unreadable,
+)
 from orthoflow.files.points import FORMATS, ScanFile, open_scan
 from orthoflow.files.points.formats import TEXT
 from orthoflow.files.points.units import refuse_degrees
@@ -64,6 +71,9 @@ class Recognised:
         n_posed: number of photos in a scan that have lens and pose.
         fields: non-empty point attributes of a scan, without coordinates.
         lens: camera and focal length of a photo, from its EXIF data.
+        size_px: width and height of a photo.
+        matrix: fx, fy, cx, cy of a text file with a camera matrix.
+        is_text: whether it is a text file that is no readable scan.
         up: up axis suggested by the surfaces, if it is clearly not z.
         advice: suggested settings and inputs, as far as they follow from the data.
     """
@@ -76,6 +86,9 @@ class Recognised:
     n_posed: int = 0
     fields: frozenset[str] = frozenset()
     lens: str = ""
+    size_px: tuple[int, int] | None = None
+    matrix: tuple[float, ...] = ()
+    is_text: bool = False
     up: str = ""
     advice: tuple[str, ...] = ()
 
@@ -156,7 +169,14 @@ def _photo(path: Path) -> Recognised:
     lengths = {"mm": exif.focal_mm, "mm (35 mm equivalent)": exif.focal_35mm}
     stated = [f"{value:g} {unit}" for unit, value in lengths.items() if value]
     lens = f"{exif.camera} {stated[0]}".strip() if stated else ""
-    return Recognised(kind="photos", path=path, summary="a photo", n_photos=1, lens=lens)
+    return Recognised(
+        kind="photos",
+        path=path,
+        summary="a photo",
+        n_photos=1,
+        lens=lens,
+        size_px=stated_size(head),
+    )
 
 
 def _scan(path: Path) -> Recognised:
@@ -259,7 +279,11 @@ _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 def _table(path: Path) -> Recognised:
     """Recognise a table of points or ties; otherwise a text scan, whose lines contain no names."""
     with path.open("rb") as file:
-        first = file.readline(_FIRST_LINE_BYTES).decode("utf-8", "replace")
+        head = file.read(_FIRST_LINE_BYTES).decode("utf-8", "replace")
+    if matrix := _matrix_in(head):
+        summary = "a camera matrix: write it into a calibration file"
+        return Recognised(kind="unknown", path=path, summary=summary, matrix=matrix)
+    first = head.partition("\n")[0]
     columns = {word.strip().lower() for word in re.split(r"[,;\t]", first)}
     for kind, reader, noun, own in _TABLES:
         try:
@@ -278,7 +302,19 @@ def _table(path: Path) -> Recognised:
     try:
         return _scan(path)
     except InputError as error:
-        return _unknown(path, error)
+        return replace(_unknown(path, error), is_text=True)
+
+
+def _matrix_in(text: str) -> tuple[float, ...]:
+    """Return fx, fy, cx and cy of a text that begins with a 3 x 3 camera matrix; else ()."""
+    try:
+        values = [float(word) for word in re.split(r"[\s,;]+", text.strip())[:9]]
+    except ValueError:
+        return ()
+    if len(values) < 9 or values[3:4] + values[6:] != [0.0, 0.0, 0.0, 1.0]:
+        return ()
+    fx, _, cx, _, fy, cy = values[:6]
+    return (fx, fy, cx, cy) if min(fx, fy, cx, cy) > 1.0 else ()
 
 
 _TABLES: Final[
@@ -336,6 +372,8 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
 _FEW_SCANS: Final = 3
+# Places beyond are easier to read as absolute paths.
+_FAR: Final = "../../.."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -380,19 +418,18 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
             f"or text); found {others or 'nothing'}"
         )
     own_formats = [scan for scan in scans if scan.path.suffix.lower() not in TEXT.suffixes]
-    if own_formats and len(own_formats) < len(scans):
+    if own_formats:
         # Text files next to scans in other formats are probably notes with numbers.
         by_kind["unknown"] = [
-            *by_kind.get("unknown", []),
-            *(
-                replace(
-                    scan,
-                    summary="text file, ignored because there are scans in other formats",
-                    advice=(),
-                )
-                for scan in scans
-                if scan not in own_formats
-            ),
+            replace(
+                item,
+                summary="text file, ignored because there are scans in other formats",
+                advice=(),
+            )
+            if item in scans or item.is_text
+            else item
+            for item in (*by_kind.get("unknown", []), *scans)
+            if item not in own_formats
         ]
         scans = by_kind["scan"] = own_formats
     own_photos = [scan for scan in scans if scan.n_photos]
@@ -467,9 +504,16 @@ def _advice(by_kind: _ByKind) -> list[str]:
     photos = [item for item in by_kind.get("photos", ()) if item.kind == "photos"]
     without = [item.path.name for item in photos if not item.lens]
     if without and not {"calibration", "cameras"} & by_kind.keys():
+        sizes = {item.size_px for item in photos if item.size_px}
+        width, height = min(sizes) if len(sizes) == 1 else ("WIDTH", "HEIGHT")
+        matrices = {item.matrix for item in by_kind.get("unknown", ()) if item.matrix}
+        known = [f"{value:g}" for value in min(matrices)] if len(matrices) == 1 else ()
+        fx, fy, cx, cy = known or ("FX", "FY", "CX", "CY")
         advice.append(
             f"{len(without)} of {len(photos)} photos have no focal length in their EXIF data: "
-            f"{_some(without)}; give a calibration if you have one"
+            f"{_some(without)}; if you have a calibration, give a file such as calibration.yaml: "
+            f'cameras: {{"*": {{width: {width}, height: {height}, fx: {fx}, fy: {fy}, cx: {cx}, '
+            f"cy: {cy}, distortion: [0, 0, 0, 0, 0]}}}}"
         )
     return advice
 
@@ -517,11 +561,12 @@ def _place(path: Path, target: Path) -> str:
     if not place.is_relative_to(here):
         # `..` after a symbolic link may lead to a different folder than the path suggests.
         here, place = here.resolve(), place.resolve()
-    return Path(os.path.relpath(place, here)).as_posix()
+    relative = Path(os.path.relpath(place, here)).as_posix()
+    return place.as_posix() if relative.startswith(_FAR) else relative
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
-    """Return paths of photos, or the path of a folder if it contains only these photos."""
+    """Return paths of photos; of a folder whose photos are all used, its path or a pattern."""
     paths = [item.path for item in items]
     places: dict[Path, None] = {}
     for path in paths:
@@ -530,8 +575,11 @@ def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
         # A folder given as input includes all its files, so it must contain only photos.
         beside = (file for file in path.parent.iterdir() if file.is_file())
         whole = whole and len(inside) > 1
-        whole = whole and all(file.suffix.lower() in PHOTO_SUFFIXES for file in beside)
-        places[path.parent if whole else path] = None
+        if whole and all(file.suffix.lower() in PHOTO_SUFFIXES for file in beside):
+            path = path.parent  # noqa: PLW2901
+        elif whole and glob.escape(str(path.parent)) == str(path.parent):
+            path = path.with_name(f"*{path.suffix}")  # noqa: PLW2901
+        places[path] = None
     return list(places)
 
 

@@ -93,6 +93,23 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     assert "next: orthoflow check 'jobs/hall 1.yaml'" in out
 
 
+def test_a_matrix_fills_a_calibration_and_notes_leave_photos_a_pattern(
+    data: Path, tmp_path: Path
+) -> None:
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    for name in ("hall.las", "photos"):
+        (data / name).rename(plain / name)
+    (plain / "photos" / "K.txt").write_text("2759 0 1520\n0 2764 1006\n0 0 1\n")
+    (plain / "photos" / "readme.txt").write_text("read me first\n1 2 3\n")
+    out = said("new", plain, "-o", "a/b/c/w.yaml")
+    assert "not used: K.txt: a camera matrix: write it into a calibration file" in out
+    assert "not used: readme.txt: text file, ignored because there are scans in other" in out
+    assert '{"*": {width: 40, height: 30, fx: 2759, fy: 2764, cx: 1520, cy: 1006, dist' in out
+    assert f'photos: {{files: "{plain}/photos/*.jpg"}}' in Path("a/b/c/w.yaml").read_text()
+    assert inputs_of(Path("a/b/c/w.yaml"))["photos"] == ["a.jpg", "b.jpg", "c.jpg"]
+
+
 def test_a_scan_alone_is_painted_from_its_own_colours_without_a_stand_in(data: Path) -> None:
     out = json.loads(said("new", data / "hall.las", data / "checks.csv", "--json"))
     assert (out["file"], out["recipe"], out["left_out"]) == ("workflow.yaml", "direct", [])

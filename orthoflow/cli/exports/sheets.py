@@ -124,7 +124,7 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `wall_<k>_sheet_<n>.pdf`."""
     text = text_of(run, "", chosen)
     results = room_results(run, chosen.cell, chosen.wall)
-    walls = chosen_walls(results, chosen)
+    walls, empty = _without_empty(chosen_walls(results, chosen), chosen)
     drawings = [_drawing(text, results, wall, chosen) for wall in walls]
 
     def drawn(scale: int) -> list[Drawing]:
@@ -134,21 +134,34 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
     scale, n_sheets = write_drawings(folder, drawn, chosen)
     _warn(walls)
     said = f"{counted(n_sheets, 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
-    return said + _coarse(walls, scale)
+    return said + _coarse(walls, scale) + empty
+
+
+def _without_empty(
+    walls: Sequence[WallResult], chosen: Choices
+) -> tuple[Sequence[WallResult], str]:
+    """Leave out walls with an empty orthoimage, unless one was chosen; also return a remark."""
+    empty = [wall for wall in walls if wall.about and wall.about.painted_share == 0.0]
+    if chosen.wall is not None or len(empty) in (0, len(walls)):
+        return walls, ""
+    names = first_few([wall.name for wall in empty], most=_MOST_NAMED)
+    return [wall for wall in walls if wall not in empty], f"; left out as empty: {names}"
 
 
 def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `elevation_<n>.pdf`."""
     results = room_results(run, chosen.cell)
     language = chosen.language or "en"
+    upright, empty = _without_empty(
+        [wall for wall in results.walls if wall.frame.raster_axes == "wall"], chosen
+    )
     walls = [
         ElevationWall(
             name=surface_name(wall.name, language),
             frame=wall.frame,
             raster=wall.rasters[_first_kind(wall)],
         )
-        for wall in results.walls
-        if wall.frame.raster_axes == "wall"
+        for wall in upright
     ]
     if results.planes is None or not walls:
         raise ArgumentError(f"the run {run.record.run_id} has no vertical walls for an elevation")
@@ -156,13 +169,12 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
     order, is_inside = unfolded(walls, up)
     # Accuracy is known per wall; walls with the same notes are listed together.
     known: dict[str, list[str]] = {}
-    for wall in results.walls:
-        if wall.frame.raster_axes == "wall":
-            about = [wall.about.accuracy if wall.about else Phrase(key="not_checked")]
-            if wall.about and wall.about.objection:
-                about.insert(0, wall.about.objection)
-            said = "; ".join(phrase.text(language) for phrase in about)
-            known.setdefault(said, []).append(surface_name(wall.name, language))
+    for wall in upright:
+        about = [wall.about.accuracy if wall.about else Phrase(key="not_checked")]
+        if wall.about and wall.about.objection:
+            about.insert(0, wall.about.objection)
+        said = "; ".join(phrase.text(language) for phrase in about)
+        known.setdefault(said, []).append(surface_name(wall.name, language))
     notes = tuple(
         Phrase(key="of_wall", values={"wall": ", ".join(names), "text": said})
         for said, names in known.items()
@@ -175,11 +187,10 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
 
     pattern = "{stem}_{number}"
     scale, n_sheets = write_drawings(folder, drawn, chosen, alone=pattern, several=pattern)
-    _warn([wall for wall in results.walls if wall.frame.raster_axes == "wall"])
+    _warn(upright)
     side = "inside" if is_inside else "outside"
-    return f"{counted(len(walls), 'wall')} as seen from {side} at 1:{scale} on " + counted(
-        n_sheets, "sheet"
-    )
+    said = f"{counted(len(walls), 'wall')} as seen from {side} at 1:{scale} on "
+    return said + counted(n_sheets, "sheet") + empty
 
 
 def _warn(walls: Sequence[WallResult]) -> None:

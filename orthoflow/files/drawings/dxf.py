@@ -295,12 +295,12 @@ def _add_points(space: Modelspace, names: Iterable[str], places: NDArray[np.floa
 
 
 def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: str) -> None:
-    """Add a text, moved down until it does not overlap other texts in plan view."""
+    """Add a text, moved down until it does not overlap others in plan view, with a leader."""
     added = space.add_text(shown(text), height=_TEXT_M, dxfattribs={"layer": layer})
     placed = space.query("TEXT")[:-1]
     others = [(*one.dxf.insert.vec2, len(one.dxf.text)) for one in placed]
     left, low, n_letters = np.array(others, dtype=np.float64).reshape(-1, 3).T
-    place = place.copy()
+    wanted, place = place, place.copy()
     while np.any(
         (left < place[0] + _LETTER_M * len(text))
         & (place[0] < left + _LETTER_M * n_letters)
@@ -308,6 +308,8 @@ def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: s
     ):
         place[1] -= _ROW_M
     added.set_placement(tuple(place.tolist()))
+    if place[1] < wanted[1]:
+        space.add_line(tuple(wanted.tolist()), tuple(place.tolist()), dxfattribs={"layer": layer})
 
 
 def save_document(document: Drawing, path: Path) -> None:

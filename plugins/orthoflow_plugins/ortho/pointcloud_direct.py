@@ -91,7 +91,7 @@ class PointcloudDirect(Method):
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("painted_share", label="covered cells"),
         MetricSpec("filled_share", label="cells filled from neighbours"),
-        MetricSpec("void_share", label="cells without a colour"),
+        MetricSpec("empty_share", label="cells without a colour"),
         MetricSpec("projection_s", label="time for the projection", better="lower"),
         MetricSpec("filling_s", label="time for filling gaps", better="lower"),
     )
@@ -304,7 +304,7 @@ def _report(ctx: StepContext, layers: list[Layer], names: Sequence[str], n_fille
     n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
     ctx.metric("painted_share", (sum(n_shown) - n_filled) / n_cells, "1")
     ctx.metric("filled_share", n_filled / n_cells, "1")
-    ctx.metric("void_share", 1.0 - sum(n_shown) / n_cells, "1")
+    ctx.metric("empty_share", 1.0 - sum(n_shown) / n_cells, "1")
     for layer, n_shown_here in zip(layers, n_shown, strict=True):
         n_void = layer.mask.size - n_shown_here
         if n_void:

@@ -105,9 +105,8 @@ class RasterGrid(Method):
             "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
         ),
         # Also reported by cause.
-        MetricSpec("void_share", label="cells without a depth"),
-        MetricSpec("void_*_share", label="cells without a depth, by cause"),
-        MetricSpec("empty*_share", label="cells without a depth, by cause"),
+        MetricSpec("empty_share", label="cells without a depth"),
+        MetricSpec("empty_*_share", label="cells without a depth, by cause"),
         MetricSpec("measured_share", label="cells with a measured depth"),
         MetricSpec("recovered_share", label="cells interpolated between measured ones"),
         MetricSpec(

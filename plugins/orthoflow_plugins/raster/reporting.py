@@ -236,7 +236,8 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
         ctx.metric("sigma_median_mm", 1000.0 * float(np.median(spread_m)), "mm")
     for state in SurfaceMask:
         share = sum(count_cells(wall.mask, state) for wall in walls) / n_cells
-        ctx.metric(f"{state.name.lower()}_share", share, "1")
+        name = "empty" if state == SurfaceMask.VOID else state.name.lower()
+        ctx.metric(f"{name}_share", share, "1")
 
 
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
@@ -244,7 +245,7 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
     for cause in _CAUSES:
         shares = [of_wall.shares[cause] for of_wall in empty]
-        ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
+        ctx.metric(f"empty_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
         if not wall.count.any() or of_wall.share < _SHARE_LEAST:
             continue

@@ -254,6 +254,8 @@ def test_cad_files_have_no_errors_and_no_text_lies_on_another(drawn: Path, name:
     if name == "room.dxf":
         marks = document.modelspace().query("INSERT")
         assert "P2\\x1b]0;" in [mark.get_attrib_text("NAME") for mark in marks]
+        leaders = document.modelspace().query('LINE[layer=="A-ANNO-TEXT"]')
+        assert {line.dxf.end for line in leaders} & {text.dxf.insert for text in texts}
 
 
 def test_the_picture_lies_on_its_wall_to_scale(drawn: Path) -> None:

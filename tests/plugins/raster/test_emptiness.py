@@ -52,8 +52,8 @@ def causes(
     """Return the shares of empty cells by cause, and diagnostics."""
     _, ctx = scenes.rastered(cloud, WALL.planes(), folder, **{"gsd_m": WALL.gsd_m, **params})
     named = scenes.numbers(ctx)
-    shares = {cause: named[f"void_{cause}_share"] for cause in CAUSES}
-    assert sum(shares.values()) == pytest.approx(named["void_share"], abs=1e-9)
+    shares = {cause: named[f"empty_{cause}_share"] for cause in CAUSES}
+    assert sum(shares.values()) == pytest.approx(named["empty_share"], abs=1e-9)
     return shares, [one for one in ctx.diagnostics if one.code in CODES]
 
 

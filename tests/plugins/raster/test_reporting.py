@@ -57,7 +57,7 @@ def test_walls_are_told_in_numbers(ctx: StepContext) -> None:
         "gsd_mm": 5.0,
         "depth_noise_mm": 0.0,
         "sigma_median_mm": pytest.approx(4.0),
-        "void_share": 0.3,
+        "empty_share": 0.3,
         "measured_share": 0.6,
         "recovered_share": 0.1,
     }
@@ -121,11 +121,11 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(ctx: StepC
     )
     assert numbers(ctx) == pytest.approx(
         {
-            "void_behind_share": 0.03,
-            "void_before_share": 0.0,
-            "void_hidden_share": 0.02,
-            "void_sparse_share": 0.0,
-            "void_unseen_share": 0.0375,
+            "empty_behind_share": 0.03,
+            "empty_before_share": 0.0,
+            "empty_hidden_share": 0.02,
+            "empty_sparse_share": 0.0,
+            "empty_unseen_share": 0.0375,
         }
     )
     # Less than a tenth of either is not reported.
