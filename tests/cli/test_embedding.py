@@ -153,7 +153,7 @@ def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:
     refused = studio("verify", "first")
     assert refused.exit_code == 3
     assert "products/metrics.csv: changed since it was published" in refused.stdout
-    assert "is intact, but published files next to it have" in refused.stderr
+    assert "is intact, but files next to it have" in refused.stderr
     table.write_text(written)
     for path, text in (
         (products / "mine.tif", ""),

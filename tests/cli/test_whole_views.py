@@ -25,6 +25,8 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
         "inputs": 0,
         "published": 0,
         "pages": 0,
+        "others": 0,
+        "not_checked": [],
         "findings": [],
         "notes": [],
         "seal": seal,
