@@ -27,19 +27,20 @@ import numpy as np
 from great_room import FULL_POINTS, great_room
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.cloud import PreparedCloud, prepare
-from orthoflow_plugins.plane.detector import DetectorParams
 from orthoflow_plugins.plane.fit import FoundPlane
-from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
-from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer
+from orthoflow_plugins.plane.hough import PlanProposer, SpaceProposer
+from orthoflow_plugins.plane.hough2d import Hough2d
+from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.planes import measure_planes
+from orthoflow_plugins.plane.proposing import DetectorParams, Proposer
 from orthoflow_plugins.plane.ransac import ConsensusProposer, Ransac
-from orthoflow_plugins.plane.region import Region, region_proposer
-from orthoflow_plugins.plane.search import Proposer, Search, find_planes
+from orthoflow_plugins.plane.region import Region, RegionProposer
+from orthoflow_plugins.plane.search import Search, find_planes
 from plane_peers import PEERS, measured
 
 from orthoflow.products import PointCloud
 
-CELL_M, SHARE = 0.02, 0.005
+SHARE = 0.005
 TOLERANCE_M, FIT_TOLERANCE_M = 0.05, 0.015
 METHODS = ("hough2d", "hough3d", "hough3d-full", "ransac", "region")
 
@@ -68,14 +69,8 @@ def detect(
 ) -> tuple[PreparedCloud, list[FoundPlane]]:
     """Run a method up to its labels, without statistics, files and figures."""
     params = {"n_planes_max": most, "min_share": SHARE}
-    plan_cell_m = CELL_M if method == "hough2d" else None
-    prepared = prepare(cloud, parts=cores, plan_cell_m=plan_cell_m)
-    search = Search(
-        cloud=prepared,
-        params=DetectorParams.model_validate(params),
-        tolerance_m=TOLERANCE_M,
-        fit_tolerance_m=FIT_TOLERANCE_M,
-    )
+    prepared = prepare(cloud, TOLERANCE_M, FIT_TOLERANCE_M, parts=cores)
+    search = Search(cloud=prepared, params=DetectorParams.model_validate(params))
     found = find_planes(search, proposer_of(method, search, params))
     labels = np.empty(len(cloud), dtype=np.int16)
     names = np.append(np.arange(len(found)), -1).astype(np.int16)
@@ -87,7 +82,7 @@ def proposer_of(method: str, search: Search, params: dict[str, float]) -> Propos
     if method == "ransac":
         return ConsensusProposer(search, Ransac.Params(**params), np.random.default_rng(0))
     if method == "region":
-        return region_proposer(search, Region.Params(**params), viewer_m=np.zeros(3))
+        return RegionProposer(search, Region.Params(**params))
     if method == "hough2d":
         return PlanProposer(search, Hough2d.Params(**params))
     mode = "full" if method == "hough3d-full" else "coarse-to-fine"
@@ -189,9 +184,7 @@ def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
     for task in (
         lambda: detect(method, cloud, most=1, cores=cores),
         lambda: detect(method, cloud, most=16, cores=cores),
-        lambda: measure_planes(
-            prepared, slabs, bounds, tolerance_m=TOLERANCE_M, fit_tolerance_m=FIT_TOLERANCE_M
-        ),
+        lambda: measure_planes(prepared, slabs, bounds),
     ):
         fastest, slowest, cpu_s = times_s(task, options.repeats)
         # Measure F next to each task, because other load on the machine slows both.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.cloud import PreparedCloud, prepare
-from orthoflow_plugins.plane.detector import DetectorParams
+from orthoflow_plugins.plane.proposing import DetectorParams
 from orthoflow_plugins.plane.search import Search
 
 from orthoflow.geometry import angle_between_deg
@@ -128,11 +128,9 @@ def errors(planes: Planes, truth: Rectangle) -> tuple[float, float]:
     return min(angle, 180.0 - angle), abs(float(found.distances_m(centre[None])[0]))
 
 
-def prepared(
-    points: NDArray[np.float64], *, parts: int = 1, plan_cell_m: float | None = None
-) -> PreparedCloud:
+def prepared(points: NDArray[np.float64], *, parts: int = 1) -> PreparedCloud:
     """A cloud of points (n, 3) as the passes take it."""
-    return prepare(cloud_of(points), parts=parts, plan_cell_m=plan_cell_m)
+    return prepare(cloud_of(points), TOLERANCE_M, FIT_TOLERANCE_M, parts=parts)
 
 
 def search_in(cloud: PreparedCloud, **params: object) -> Search:
@@ -140,6 +138,4 @@ def search_in(cloud: PreparedCloud, **params: object) -> Search:
     return Search(
         cloud=cloud,
         params=DetectorParams.model_validate({"min_share": 0.1, "n_planes_max": 10, **params}),
-        tolerance_m=TOLERANCE_M,
-        fit_tolerance_m=FIT_TOLERANCE_M,
     )

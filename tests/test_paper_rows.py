@@ -21,7 +21,8 @@ from orthoflow_plugins.inspect.key_pairs import find_key_pairs
 from orthoflow_plugins.orient.dlt import direct_linear
 from orthoflow_plugins.ortho.filling import fillable_gaps
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
-from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
+from orthoflow_plugins.plane.hough import PlanProposer
+from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.planes import normality
 from orthoflow_plugins.register.similarity import fit_similarity
 from scipy import ndimage, stats
@@ -43,7 +44,7 @@ def normal_of(omega_deg: float, phi_deg: float) -> NDArray[np.float64]:
 def test_the_fullest_bin_of_the_plan(accumulator: str) -> None:
     """Figures 10b and 10c of markiewicz2015: cells of 20 mm vote for lines at steps of 1 deg."""
     points = sampled(ROOM[:4]) @ turned(17.37).T
-    search = search_in(prepared(points, plan_cell_m=0.02), min_share=0.02)
+    search = search_in(prepared(points), min_share=0.02)
     params = Hough2d.Params.model_validate(
         {"scoring": "votes", "accumulator": accumulator, "constraint": "vertical"}
     )

@@ -1,4 +1,4 @@
-"""Preparation of a cloud for detection: blocks of points, a sample, the plan, and the noise.
+"""Preparation of a cloud for detection: blocks of points, a sample, its box, and the noise.
 
 Detectors search only the sample. Fits and labels then use all points.
 """
@@ -19,24 +19,22 @@ from orthoflow.geometry.slabs import read_only
 from orthoflow.products import PointCloud
 from orthoflow_plugins.plane.kernels import (
     BlockedPoints,
-    PlanGrid,
     assign_points,
-    count_points,
     each_part,
+    in_blocks,
     piece_of,
 )
 
 _Label = TypeVar("_Label", np.int8, np.int16)
 
 SAMPLE_POINTS: Final = 200_000
-# Maximum number of plan cells; larger plans have larger cells.
-PLAN_CELLS_MOST: Final = 8_000_000
 # Points used to find the extent of a scene.
 _BOX_POINTS: Final = 20_000
 _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
-# Cell size of the robust box for detectors that do not use the plan.
-_BOX_CELL_M: Final = 0.5
+# Margin of the robust box on each side, as a share of its size and in addition.
+_MARGIN_SHARE: Final = 0.02
+MARGIN_M: Final = 2.5
 # Share of the points allowed outside the box on each side, far below the minimum share of a plane.
 # Otherwise ghosts in mirrors and stray points (0.4 % in simulated rooms) would make the box several
 # times as large.
@@ -81,23 +79,31 @@ class PreparedCloud:
     Attributes:
         points: all points.
         sample: a sample of the points.
-        grid: the plan and the height bins.
-        up: (3,) unit vector.
+        basis: (3, 3) rows e1, e2, up (see `geometry.basis_from_up`).
+        low_m: (3,) lower corner of the robust box in the (e1, e2, up) frame of the offsets.
+        extent_m: (3,) size of this box.
+        viewpoint_m: (3,) mean of the stations, or median of the points if none is known; offsets.
+        tolerance_m: maximum distance of points that belong to a plane.
+        fit_tolerance_m: maximum distance of points used to fit a plane.
         parts: number of parts that are processed in parallel.
         claims: (n,) int8 plane of each point, -1 if not yet assigned; set by `search.label`.
-        plan: (cells along e1, cells along e2) number of points per plan cell; empty if there is no
-            plan.
-        heights: (bins,) number of points inside the plan per height bin.
     """
 
     points: BlockedPoints
     sample: Sample
-    grid: PlanGrid
-    up: NDArray[np.float64]
+    basis: NDArray[np.float64]
+    low_m: NDArray[np.float64]
+    extent_m: NDArray[np.float64]
+    viewpoint_m: NDArray[np.float64]
+    tolerance_m: float
+    fit_tolerance_m: float
     parts: int
     claims: NDArray[np.int8]
-    plan: NDArray[np.int64]
-    heights: NDArray[np.int64]
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """Unit vector (3,)."""
+        return np.asarray(self.basis[2])
 
     @property
     def sample_claims(self) -> NDArray[np.int8]:
@@ -107,7 +113,13 @@ class PreparedCloud:
     def box_corners(self) -> NDArray[np.float64]:
         """Return the corners (8, 3) of the robust box, offsets in metres."""
         steps = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
-        return (self.grid.low_m + steps * self.grid.extent_m) @ self.grid.basis
+        return (self.low_m + steps * self.extent_m) @ self.basis
+
+    def bounds_of(self, rectangles_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return bounds (..., 5) of slabs: the tolerance, and rectangles (..., 4) widened by it."""
+        wider = rectangles_m + self.tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
+        reach = np.full((*wider.shape[:-1], 1), self.tolerance_m)
+        return np.concatenate([reach, wider], axis=-1)
 
     def assign(self, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]) -> None:
         """Assign each point to the nearest of the slabs (k, 12) whose bounds (k, 5) contain it."""
@@ -140,19 +152,19 @@ class PreparedCloud:
 
 def prepare(
     cloud: PointCloud,
+    tolerance_m: float,
+    fit_tolerance_m: float,
     *,
     parts: int,
-    plan_cell_m: float | None = None,
-    box_cell_m: float = _BOX_CELL_M,
     outside_share: float = _OUTSIDE_SHARE,
 ) -> PreparedCloud:
     """Sample a cloud and find the boxes of its blocks; no point is assigned yet.
 
     Args:
         cloud: the cloud.
+        tolerance_m: maximum distance of points that belong to a plane.
+        fit_tolerance_m: maximum distance of points used to fit a plane, at most `tolerance_m`.
         parts: number of threads.
-        plan_cell_m: cell size of the plan, which is counted in the same pass; None for no plan.
-        box_cell_m: if there is no plan, the sides of the robust box are multiples of this.
         outside_share: share of the points allowed outside the box on each side.
 
     Raises:
@@ -166,22 +178,24 @@ def prepare(
         where = "coincide" if spread_m2[2] < _THINNEST_M**2 else "are collinear"
         raise MethodError(f"the {len(cloud)} points of the cloud {where}, so they define no plane")
     basis, parts = basis_from_up(cloud.up), max(1, min(parts, _PARTS_MOST))
-    cell_m = box_cell_m if plan_cell_m is None else plan_cell_m
-    grid = plan_grid(sample, basis, cell_m=cell_m, outside_share=outside_share)
-    offsets = read_only(cloud.x, cloud.y, cloud.z)
-    counted = None if plan_cell_m is None else grid
-    points, plan, heights, is_finite = count_points(offsets, counted, parts=parts)
-    if not is_finite:
+    points = in_blocks(read_only(cloud.x, cloud.y, cloud.z), parts=parts)
+    if not np.isfinite(points.boxes).all():
         cloud.require_points(3)
+    viewpoint_m = np.asarray(np.median(sample.offsets_m, axis=0))
+    if cloud.stations is not None and len(cloud.stations):
+        viewpoint_m = np.asarray(cloud.stations.mean(axis=0) - cloud.origin)
+    low_m, extent_m = robust_box(sample, basis, outside_share)
     return PreparedCloud(
         points=points,
         sample=sample,
-        grid=grid,
-        up=basis[2],
+        basis=basis,
+        low_m=low_m,
+        extent_m=extent_m,
+        viewpoint_m=viewpoint_m,
+        tolerance_m=tolerance_m,
+        fit_tolerance_m=fit_tolerance_m,
         parts=parts,
         claims=np.full(len(cloud), -1, dtype=np.int8),
-        plan=plan,
-        heights=heights,
     )
 
 
@@ -231,18 +245,17 @@ def _spread_index(n_points: int, count: int) -> NDArray[np.int64]:
 def blocked(offsets_m: NDArray[np.float64]) -> BlockedPoints:
     """Return the points (m, 3) of a sample in blocks."""
     offsets = read_only(*np.ascontiguousarray(offsets_m.T, dtype=np.float32))
-    return count_points(offsets, None, parts=1)[0]
+    return in_blocks(offsets, parts=1)
 
 
-def plan_grid(
-    sample: Sample, basis: NDArray[np.float64], *, cell_m: float, outside_share: float
-) -> PlanGrid:
-    """Return the plan of a cloud without gross outliers.
+def robust_box(
+    sample: Sample, basis: NDArray[np.float64], outside_share: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return lower corner and size (3,) of the box of a cloud without gross outliers.
 
     Args:
         sample: points of the cloud.
         basis: (3, 3) rows e1, e2, up.
-        cell_m: requested side of a cell; enlarged if the plan would have too many.
         outside_share: share of the points allowed outside on each side.
     """
     framed = sample.offsets_m[:: max(1, len(sample.index) // _BOX_POINTS)] @ basis.T
@@ -253,14 +266,8 @@ def plan_grid(
     reach_m = float((high - low).max())
     framed = framed[((framed >= low - reach_m) & (framed <= high + reach_m)).all(axis=1)]
     low, high = np.quantile(framed, (outside_share, 1.0 - outside_share), axis=0)
-    margin = 0.02 * (high - low) + 5.0 * cell_m
-    low, high = low - margin, high + margin
-    extent = high - low
-    # A long, narrow plan or a tall tower must not need millions of height bins either.
-    fewest_m = math.sqrt(float(extent[0] * extent[1]) / PLAN_CELLS_MOST)
-    cell_m = max(cell_m, fewest_m, float(extent.max()) / PLAN_CELLS_MOST)
-    a, b, c = np.maximum(1, np.ceil(extent / cell_m)).astype(int).tolist()
-    return PlanGrid(basis=basis, low_m=low, cell_m=cell_m, shape=(a, b, c))
+    margin = _MARGIN_SHARE * (high - low) + MARGIN_M
+    return low - margin, high - low + 2.0 * margin
 
 
 def measure_noise(points_m: NDArray[np.float64]) -> tuple[float, float] | None:

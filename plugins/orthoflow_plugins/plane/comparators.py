@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from pydantic import Field
 
 from orthoflow.errors import MethodError, PluginError
 from orthoflow.geometry import Plane
-from orthoflow.sdk import Method, StepContext
-from orthoflow_plugins.plane.detector import (
-    DETECTOR_METRICS,
-    Candidate,
-    DetectorIn,
-    DetectorOut,
-    DetectorParams,
-)
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.detector import Detector
+from orthoflow_plugins.plane.proposing import Candidate, DetectorParams, Proposer
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
@@ -30,6 +23,8 @@ if TYPE_CHECKING:
 PART_SHARE: Final = 0.2
 # Number of neighbours for normals and region growing.
 _NEIGHBOURS: Final = 30
+# Number of hypotheses of `segment_plane` per plane.
+_HYPOTHESES: Final = 1000
 
 
 # Any, because open3d has no types.
@@ -66,14 +61,10 @@ def load_open3d(purpose: str) -> Any:
         ) from error
 
 
-class _Open3dMethod(Method):
+class _Open3dMethod(Detector):
     """Base class of the methods of open3d."""
 
-    result_version = 2
     determinism = "loose"
-    metrics = DETECTOR_METRICS
-    In = DetectorIn
-    Out = DetectorOut
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
@@ -101,26 +92,20 @@ class Open3dRansac(_Open3dMethod):
         "Fischler, Bolles 1981: Random sample consensus, doi:10.1145/358669.358692",
     )
 
-    class Params(DetectorParams):
-        """Parameters."""
+    Params = DetectorParams
 
-        n_iterations: int = Field(1000, ge=1, le=1_000_000, description="Hypotheses per plane.")
-
-    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
-        """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.search import detect
-
+    def proposer(self, search: Search, params: DetectorParams, ctx: StepContext) -> Proposer:
+        """Load open3d and seed it."""
         open3d = load_open3d(self.id)
         open3d.utility.random.seed(int(ctx.rng.integers(2**31)))
-        proposer_of = partial(SegmentProposer, params=params, open3d=open3d)
-        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id)[0]
+        return SegmentProposer(search, params, open3d)
 
 
-class SegmentProposer:
+class SegmentProposer(Proposer):
     """Proposes the plane that `segment_plane` finds in the remaining points."""
 
     # Any: the library has no types.
-    def __init__(self, search: Search, params: Open3dRansac.Params, open3d: Any) -> None:
+    def __init__(self, search: Search, params: DetectorParams, open3d: Any) -> None:
         """Store the settings; open3d has no constraints, so unsuitable planes are refused later."""
         self._params, self._open3d = params, open3d
         self._passed_over = np.zeros(len(search.claims), dtype=bool)
@@ -133,7 +118,7 @@ class SegmentProposer:
             return None
         cloud = self._open3d.geometry.PointCloud()
         cloud.points = self._open3d.utility.Vector3dVector(search.cloud.sample.offsets_m[free])
-        model, inliers = cloud.segment_plane(search.tolerance_m, 3, self._params.n_iterations)
+        model, inliers = cloud.segment_plane(search.cloud.tolerance_m, 3, _HYPOTHESES)
         normal = np.array(model[:3], dtype=np.float64)
         length = float(np.linalg.norm(normal))
         if len(inliers) < PART_SHARE * search.least_points or not length > 0.0:
@@ -144,9 +129,8 @@ class SegmentProposer:
             constraint=self._params.constraint,
         )
 
-    def reject(self, candidate: Candidate) -> None:
+    def reject(self) -> None:
         """Exclude the inliers of the rejected plane from further searches."""
-        del candidate
         self._passed_over[self._last] = True
 
 
@@ -169,15 +153,12 @@ class Open3dPatches(_Open3dMethod):
 
     Params = DetectorParams
 
-    def run(self, inputs: DetectorIn, params: DetectorParams, ctx: StepContext) -> DetectorOut:
-        """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.search import detect
-
-        proposer_of = partial(PatchProposer, params=params, open3d=load_open3d(self.id))
-        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id)[0]
+    def proposer(self, search: Search, params: DetectorParams, ctx: StepContext) -> Proposer:
+        """Find all patches."""
+        return PatchProposer(search, params, load_open3d(self.id))
 
 
-class PatchProposer:
+class PatchProposer(Proposer):
     """Proposes the patches of `detect_planar_patches`, those with the most points first."""
 
     # Any: the library has no types.
@@ -216,6 +197,3 @@ class PatchProposer:
         normal = np.asarray(box.R, dtype=np.float64)[:, 2]
         offset_m = float(normal @ np.asarray(box.center, dtype=np.float64))
         return Candidate(plane=Plane(normal=normal, offset_m=offset_m), constraint=self._constraint)
-
-    def reject(self, candidate: Candidate) -> None:
-        """Do nothing, because each patch is proposed only once."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,9 +18,9 @@ from orthoflow.geometry import omega_phi_deg, wall_axes
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import Planes, PointCloud, Thickness
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.plane.detector import Materials
-from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS, PlanGrid
+from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS
 from orthoflow_plugins.plane.planes import Deviations, Normality
+from orthoflow_plugins.plane.proposing import Materials
 from orthoflow_plugins.plane.thickness import RowPoints
 
 if TYPE_CHECKING:
@@ -273,36 +273,39 @@ _MAP_MOST_DEG: Final = 15.0
 _MAP_PIXELS_MOST: Final = 700
 
 
-class PlanVotes(Protocol):
-    """A plan before any plane was removed from it; see `hough2d.PlanProposer`."""
-
-    grid: PlanGrid
-    plan: NDArray[np.int64]
-    centre_m: NDArray[np.float64]
-    reach_m: float
-    first: NDArray[np.int32] | None
-
-
 @in_column_style()
-def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: PointCloud) -> None:
+def draw_accumulator(
+    ctx: StepContext,
+    points_m: NDArray[np.float64],
+    votes: NDArray[np.int32],
+    centre_m: NDArray[np.float64],
+    bin_m: float,
+    planes: Planes,
+    cloud: PointCloud,
+) -> None:
     """Draw the plan with the detected walls, and the parameter space with their maxima.
 
     Args:
         ctx: receives the figure.
-        votes: the plan and its votes before any plane was removed; nothing is drawn if there are no
-            votes.
+        points_m: (s, 2) sample in the plan, e1 and e2 from the centre; NaN for points left out.
+        votes: (angles, bins) votes for lines before any plane was removed.
+        centre_m: (2,) centre of the plan, whose distance is the middle edge of the bins.
+        bin_m: width of a bin, and minimum side of a pixel of the plan.
         planes: the planes, in world coordinates.
         cloud: the cloud.
     """
-    if votes.first is None:
-        return
-    basis, grid, reach_m = basis_from_up(planes.up), votes.grid, votes.reach_m
-    low = grid.low_m[:2]
-    high = low + grid.cell_m * np.array(grid.shape[:2])
+    basis, (n_angles, n_bins) = basis_from_up(planes.up), votes.shape
+    reach_m, half_m = 0.5 * n_bins * bin_m, np.nanmax(np.abs(points_m), axis=0)
+    pixel_m = max(bin_m, 2.0 * float(half_m.max()) / _PIXELS_MOST)
+    # A margin of five pixels.
+    edges_m = [pixel_m * np.arange(-n, n + 1) for n in np.ceil(half_m / pixel_m).astype(int) + 5]
+    high = np.array([along_m[-1] for along_m in edges_m])
+    low, high = centre_m - high, centre_m + high
     plan_in = float(np.clip(2.6 * (high[1] - low[1]) / (high[0] - low[0]), 1.0, 3.2))
     figure = column_figure(plan_in + 2.6)
     above, below = figure.subplots(2, 1, height_ratios=(plan_in, 2.2))
-    image = _thinned_sum(votes.plan)
+    inside_m = points_m[np.isfinite(points_m[:, 0])]
+    image = np.histogram2d(inside_m[:, 0], inside_m[:, 1], edges_m)[0]
     plan = above.imshow(
         image.T,
         origin="lower",
@@ -311,15 +314,14 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
         norm=SymLogNorm(1.0, vmin=0.0, vmax=max(1.0, float(image.max()))),
     )
     figure.colorbar(plan, ax=above, label="points per cell", format="{x:g}")
-    n_angles, n_bins = votes.first.shape
     extent = (*_around(0.0, 180.0, n_angles), -reach_m, reach_m)
-    shown = _show_votes(below, _thinned_sum(votes.first), extent)
+    shown = _show_votes(below, _thinned_sum(votes), extent)
     figure.colorbar(shown, ax=below, label="votes")
     # The global maximum, as a line in the plan and as a point in the parameter space.
-    row, column = np.unravel_index(int(votes.first.argmax()), votes.first.shape)
+    row, column = np.unravel_index(int(votes.argmax()), votes.shape)
     angle, distance_m = math.pi * row / n_angles, reach_m * (2.0 * (column + 0.5) / n_bins - 1.0)
     across = np.array([math.cos(angle), math.sin(angle)])
-    foot = votes.centre_m + distance_m * across
+    foot = centre_m + distance_m * across
     ends = foot + np.outer([-2.0 * reach_m, 2.0 * reach_m], [-across[1], across[0]])
     above.plot(*ends.T, color="k", linestyle=":", label="maximum")
     below.plot(math.degrees(angle), distance_m, "x", color="white", markersize=7)
@@ -331,7 +333,7 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
         normal = basis @ planes.normal[index]
         angle = math.atan2(normal[1], normal[0]) % math.pi
         direction = np.array([math.cos(angle), math.sin(angle)])
-        distance_m = float(direction @ (corners.mean(axis=0)[:2] - votes.centre_m))
+        distance_m = float(direction @ (corners.mean(axis=0)[:2] - centre_m))
         ring = dict[str, Any](color=colour, fillstyle="none", markersize=6)
         below.plot(math.degrees(angle), distance_m, "o", **ring)
     above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
@@ -344,8 +346,8 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     ctx.figure(
         "accumulator",
         figure,
-        "Above: points per plan cell with the walls found. Below: votes in the parameter space; "
-        "circles mark the walls, the cross and the dotted line the "
+        "Above: points of the sample per plan cell with the walls found. Below: votes in the "
+        "parameter space; circles mark the walls, the cross and the dotted line the "
         "bin with the most votes. A wall is a sharp bright spot; a bright spot without a circle is "
         "a missed wall, and a circle on grey background may be accidental.",
     )
@@ -498,23 +500,23 @@ def draw_normals(
         planes: the planes, in world coordinates.
         cloud: the cloud.
     """
-    centroids_m = voxels.table.centroids() @ voxels.table.grid.basis
-    normals = voxels.normals.astype(np.float64) @ voxels.table.grid.basis
+    centroids_m = voxels.table.centroids() @ voxels.table.basis
+    normals = voxels.normals.astype(np.float64) @ voxels.table.basis
     first = planes.normal[0]
     away_deg = np.degrees(np.arccos(np.clip(np.abs(normals @ first), 0.0, 1.0)))
     depth_m = centroids_m @ first - (planes.offset[0] - float(first @ cloud.origin))
-    on_plane = (np.abs(depth_m) < 0.5 * voxels.table.grid.cell_m) & (away_deg < 45.0)
+    on_plane = (np.abs(depth_m) < 0.5 * voxels.table.voxel_m) & (away_deg < 45.0)
     placed = (centroids_m - (planes.corners[0, 0] - cloud.origin)) @ wall_axes(first, planes.up).T
     size_m = np.linalg.norm(planes.corners[0, [3, 1]] - planes.corners[0, 0], axis=1)
     over = ((placed >= 0.0) & (placed < size_m)).all(axis=1)
     scatter_deg = float(np.median(away_deg[on_plane & over])) if (on_plane & over).any() else 0.0
     ctx.metric("n_regions", n_regions, "1")
     ctx.metric("neighbourhood_mm", 1000.0 * voxels.neighbourhood.size_m, "mm")
-    ctx.metric("cell_mm", 1000.0 * voxels.table.grid.cell_m, "mm")
+    ctx.metric("cell_mm", 1000.0 * voxels.table.voxel_m, "mm")
     ctx.metric("normal_scatter_deg", scatter_deg, "deg")
     shown = over & (np.abs(depth_m) < _MAP_DEPTH_M) & np.isfinite(voxels.spreads[:, 0])
     # Angle at the voxel nearest to the viewer; NaN where there is none.
-    pixel_m = max(voxels.table.grid.cell_m, float(size_m.max()) / _MAP_PIXELS_MOST)
+    pixel_m = max(voxels.table.voxel_m, float(size_m.max()) / _MAP_PIXELS_MOST)
     picture = np.full(np.maximum(1, np.ceil(size_m / pixel_m).astype(int))[::-1], np.nan)
     order = np.flatnonzero(shown)[np.argsort(depth_m[shown], kind="stable")]
     columns, rows = (placed[order] / pixel_m).astype(np.int64).T
@@ -568,7 +570,7 @@ def _draw_normals(
     )
 
 
-def _thinned_sum(values: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.float64]:
+def _thinned_sum(values: NDArray[np.int32]) -> NDArray[np.float64]:
     """Return the sums of blocks of an image, so that it is small enough to draw."""
     rows, columns = (max(1, -(-size // _PIXELS_MOST)) for size in values.shape)
     padded = np.pad(values, ((0, -values.shape[0] % rows), (0, -values.shape[1] % columns)))

@@ -29,13 +29,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, basis_from_up
-from orthoflow_plugins.plane.detector import Candidate
 from orthoflow_plugins.plane.kernels import (
     FREE,
     LEVEL,
@@ -43,13 +42,13 @@ from orthoflow_plugins.plane.kernels import (
     VERTICAL,
     refine_robustly,
 )
+from orthoflow_plugins.plane.proposing import Candidate, Constraint
 from orthoflow_plugins.plane.support import CellSums, Support, SurfaceRaster
 
-# Constraint on the normal in a fit: none, exactly horizontal, or exactly along up. For each, the
-# constant of the kernel, and the unknowns among height, slope along u and slope along v.
-Freedom = Literal["free", "vertical", "horizontal"]
-_FREEDOMS: Final[dict[Freedom, tuple[int, list[int]]]] = {
-    "free": (FREE, [0, 1, 2]),
+# For each orientation that a fit keeps exactly, the constant of the kernel, and the unknowns among
+# height, slope along u and slope along v.
+_FREEDOMS: Final[dict[Constraint, tuple[int, list[int]]]] = {
+    "any": (FREE, [0, 1, 2]),
     "vertical": (VERTICAL, [0, 1]),
     "horizontal": (LEVEL, [0]),
 }
@@ -101,7 +100,7 @@ def refine_plane(
     points: NDArray[np.float64],
     start: Plane,
     *tolerances_m: float,
-    freedom: Freedom,
+    freedom: Constraint,
     up: NDArray[np.float64],
 ) -> Plane | None:
     """Move a plane to the densest layer of points near it: total least squares, reweighted.
@@ -110,16 +109,16 @@ def refine_plane(
         points: (m, 3) offsets, metres.
         start: initial plane.
         tolerances_m: tolerances of successive fits; points farther away have no weight (Tukey).
-        freedom: constraint on the normal.
+        freedom: orientation that the fit keeps exactly.
         up: (3,) unit vector.
 
     Returns:
         The plane, or None if it is supported by fewer than three points or by collinear points
         only.
     """
-    basis = np.eye(3) if freedom == "free" else basis_from_up(up)
+    basis = np.eye(3) if freedom == "any" else basis_from_up(up)
     # Always the same memory layout, so that only one version of the kernel is compiled.
-    packed = np.ascontiguousarray(points if freedom == "free" else points @ basis.T)
+    packed = np.ascontiguousarray(points if freedom == "any" else points @ basis.T)
     row = np.append(basis @ start.normal, start.offset_m)
     for tolerance_m in tolerances_m:
         if not refine_robustly(packed, row, tolerance_m, _FREEDOMS[freedom][0]):
@@ -215,14 +214,14 @@ class FoundPlane:
         support: cells that belong to the plane, its parts and rectangle.
         adjusted: the fit.
         candidate: proposal of the detector.
-        freedom: constraint of the fit.
+        freedom: orientation that the fit keeps exactly.
     """
 
     raster: SurfaceRaster
     support: Support
     adjusted: AdjustedPlane
     candidate: Candidate
-    freedom: Freedom
+    freedom: Constraint
 
 
 def adjust_plane(
@@ -231,7 +230,7 @@ def adjust_plane(
     cells: NDArray[np.bool_],
     *,
     fit_tolerance_m: float,
-    freedom: Freedom,
+    freedom: Constraint,
     settled_m: float = SETTLED_M,
 ) -> AdjustedPlane | None:
     """Fit a plane to the mean distances of cells; to second order, this is total least squares.
@@ -241,7 +240,7 @@ def adjust_plane(
         sums: sums over the points of each cell.
         cells: (rows, columns) bool, True for cells that belong to the plane.
         fit_tolerance_m: tolerance of the sums.
-        freedom: constraint on the normal.
+        freedom: orientation that the fit keeps exactly.
         settled_m: the fit has converged if no cell moves by more.
 
     Returns:
@@ -408,7 +407,7 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
         tile = rows // size * (int(columns.max()) // size + 1) + columns // size
         if np.count_nonzero(np.bincount(tile)) < _TILES_LEAST and math.isfinite(reach):
             break
-        covariance = factor * _left_out(scores, products, tile)
+        covariance = factor * jackknife_covariance(scores, products, tile)
         variance = _mean_variance(design, covariance)
         if variance > reach:
             # Extrapolation: the correlation across tile borders halves if the tile size doubles.
@@ -455,7 +454,7 @@ def _mean_variance(design: NDArray[np.float64], covariance: NDArray[np.float64])
     return float(np.sum((design @ covariance) * design)) / len(design)
 
 
-def _left_out(
+def jackknife_covariance(
     scores: NDArray[np.float64], products: NDArray[np.float64], tile: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Return the jackknife covariance, with one tile left out at a time."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
@@ -27,8 +28,7 @@ _GROUND_SHARE: Final = 0.01
 _STRAY_REPORTED: Final = 1e-3
 # Buffer of skarlatos2012: three tolerances on each side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0
-# Cell size of the robust box, and share of points outside it on each side.
-_BOX_CELL_M: Final = 0.05
+# Share of points outside the robust box on each side.
 _OUTSIDE_SHARE: Final = 0.0005
 _METRICS: Final = {"n_planes", "labelled_share", "rms_mm", "omega_deg", "phi_deg", "offset_m"}
 _EVERYWHERE_M: Final = 1e9
@@ -175,9 +175,8 @@ class GivenPlane(Method):
         ctx.progress(0.0, "placing the plane")
         # With part_min_share = 0, no points are treated as stray.
         outside_share = _OUTSIDE_SHARE if params.part_min_share else 0.0
-        prepared = prepare(
-            cloud, parts=ctx.cores, box_cell_m=_BOX_CELL_M, outside_share=outside_share
-        )
+        reaches_m = (tolerance_m, tolerance_m)
+        prepared = prepare(cloud, *reaches_m, parts=ctx.cores, outside_share=outside_share)
         placed_planes = _all_placed(params, cloud, prepared, ctx)
         ctx.progress(0.4, "labelling points")
         planes = [item.plane for item, _ in placed_planes]
@@ -190,13 +189,7 @@ class GivenPlane(Method):
         prepared.claims[:] = np.append(np.argsort(order), -1).astype(np.int8)[prepared.claims]
         labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
         labels[:] = prepared.claims
-        deviations = measure_planes(
-            prepared,
-            slabs[order],
-            everywhere,
-            tolerance_m=tolerance_m,
-            fit_tolerance_m=tolerance_m,
-        )
+        deviations = measure_planes(prepared, slabs[order], everywhere)
         faced, viewpoints = zip(*(placed_planes[k] for k in order), strict=True)
         sides = tuple(_SIDES[viewpoint] for viewpoint in viewpoints)
         found = planes_of(
@@ -259,26 +252,15 @@ def _placed(
     low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(placed) else np.zeros((2, 2))
     cell_m = cell_for(len(placed) * prepared.sample.n_represented, float(np.prod(high - low)))
     raster = SurfaceRaster.over(plane, prepared.box_corners(), up, cell_m)
-    (sums,) = measure_cells(
-        prepared.points,
-        [raster],
-        tolerance_m=reach_m,
-        fit_tolerance_m=reach_m,
-        parts=prepared.parts,
-    )
+    near_it = replace(prepared, tolerance_m=reach_m, fit_tolerance_m=reach_m)
+    (sums,) = measure_cells(near_it, [raster])
     share = params.part_min_share
     support = support_of(raster, sums.n_near > 0, sums, part_share=share)
     if support is None:
         low_m, high_m = float(distances_m.min()), float(distances_m.max())
         raise MethodError(_TOO_FAR.format(buffer=reach_m, low=low_m, high=high_m))
     prepared.assign(raster.slab()[None], np.append(reach_m, support.bounds_m)[None])
-    deviations = measure_planes(
-        prepared,
-        raster.slab()[None],
-        support.bounds_m[None],
-        tolerance_m=reach_m,
-        fit_tolerance_m=reach_m,
-    )
+    deviations = measure_planes(near_it, raster.slab()[None], support.bounds_m[None])
     extent_m = deviations.extents_m[0]
     side, viewpoint = 1, "given"
     if not is_settled:

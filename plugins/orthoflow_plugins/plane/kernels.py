@@ -1,4 +1,4 @@
-"""Kernels for points: blocks, plan, slabs, robust fit of a plane, scores of many planes.
+"""Kernels for points: blocks, slabs, robust fit of a plane, scores of many planes.
 
 Kernels read float32 offsets as three contiguous arrays, in blocks of `BLOCK_POINTS` with a bounding
 box each. Work is split into parts, one per thread, each with its own tables. All sums over parts
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -71,154 +70,21 @@ def piece_of(points: BlockedPoints, piece: slice) -> BlockedPoints:
     return BlockedPoints(points.x[piece], points.y[piece], points.z[piece], points.boxes[blocks])
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlanGrid:
-    """The cells of a plan (a map of the cloud seen from above) and bins of height.
-
-    Attributes:
-        basis: (3, 3) rows e1, e2, up (see `geometry.basis_from_up`).
-        low_m: (3,) lower corner in the (e1, e2, up) frame of the cloud's offsets, metres.
-        cell_m: side of a cell, and height of a height bin.
-        shape: numbers of cells along e1 and e2, and of bins along up.
-    """
-
-    basis: NDArray[np.float64]
-    low_m: NDArray[np.float64]
-    cell_m: float
-    shape: tuple[int, int, int]
-
-    @property
-    def extent_m(self) -> NDArray[np.float64]:
-        """Return the size (3,) of the box of all cells."""
-        return np.array(self.shape) * self.cell_m
-
-    def frame(self) -> NDArray[np.float32]:
-        """Return F (3, 4) for the cell and height bin of an offset p: `F[:, :3] @ p - F[:, 3]`."""
-        frame = np.column_stack([self.basis, self.low_m]) / self.cell_m
-        return frame.astype(np.float32, order="C")
-
-
-def count_points(
-    offsets: Offsets, grid: PlanGrid | None, *, parts: int
-) -> tuple[BlockedPoints, NDArray[np.int64], NDArray[np.int64], bool]:
-    """Compute the box of each block and count the points in a plan, in one pass.
-
-    Args:
-        offsets: the points.
-        grid: the plan; None if only boxes are needed.
-        parts: number of parts, one per thread.
-
-    Returns:
-        The points in blocks; the numbers of points per plan cell (cells along e1, cells along e2)
-        and, for points in the plan, per height bin; and whether all coordinates are finite.
-    """
-    shape = (0, 0, 0) if grid is None else grid.shape
-    frame = np.zeros((3, 4), dtype=np.float32) if grid is None else grid.frame()
-    cells = np.zeros((parts, *shape[:2]), dtype=np.int32)
-    heights = np.zeros((parts, shape[2]), dtype=np.int32)
-    n_points = len(offsets.x)
-    boxes = np.empty((-(-n_points // BLOCK_POINTS), 6), dtype=np.float32)
-    unusable = np.zeros(parts, dtype=np.int64)
+def in_blocks(offsets: Offsets, *, parts: int) -> BlockedPoints:
+    """Return points in blocks; the box of a block with NaN or infinite values has such sides."""
+    boxes = np.empty((-(-len(offsets.x) // BLOCK_POINTS), 6), dtype=np.float32)
     points = BlockedPoints(*offsets, boxes)
 
-    def count(part: int, piece: slice) -> None:
+    def enclose(_part: int, piece: slice) -> None:
         own = piece_of(points, piece)
-        sides = own.boxes.view(np.int32)
-        unusable[part] = _count_points(own, sides, frame, cells[part], heights[part])
+        starts = np.arange(0, len(own.x), BLOCK_POINTS)
+        if len(starts):
+            for axis in range(3):
+                np.minimum.reduceat(own[axis], starts, out=own.boxes[:, 2 * axis])
+                np.maximum.reduceat(own[axis], starts, out=own.boxes[:, 2 * axis + 1])
 
-    each_part(n_points, parts, count)
-    totals = cells.sum(axis=0, dtype=np.int64), heights.sum(axis=0, dtype=np.int64)
-    return points, *totals, not unusable.any()
-
-
-@kernel_part
-def _set_box(points: BlockedPoints, block: int, sides: NDArray[np.int32]) -> int:
-    """Set the box of a block; return the number of its sides with NaN or infinite values.
-
-    As integers, the bits of floats (inverted if negative) have the same order as the values.
-    Integer comparisons are vectorised, comparisons of floats that may be NaN are not. Values that
-    are not finite are at the ends of the order.
-
-    Args:
-        points: (n,) offsets in blocks.
-        block: index of the block.
-        sides: (blocks, 6) the boxes as bits.
-    """
-    start = block * BLOCK_POINTS
-    stop = min(start + BLOCK_POINTS, points.x.size)
-    turned, sign = np.int32(0x7FFFFFFF), np.int32(31)
-    infinite = np.int32(0x7F800000)
-    bad = 0
-    for axis in range(3):
-        bits = (points.x, points.y, points.z)[axis][start:stop].view(np.int32)
-        low, high = turned, np.int32(-0x80000000)
-        for i in range(bits.size):
-            ordered = np.int32(bits[i] ^ ((bits[i] >> sign) & turned))
-            low = min(low, ordered)
-            high = max(high, ordered)
-        bad += int(low < -infinite) + int(high >= infinite)
-        sides[block, 2 * axis] = low ^ ((low >> sign) & turned)
-        sides[block, 2 * axis + 1] = high ^ ((high >> sign) & turned)
-    return bad
-
-
-@kernel_part
-def _add_runs(places: NDArray[np.int32], count: int, table: NDArray[np.int32]) -> None:
-    """Count indices in a table by runs of equal ones; skip negative ones."""
-    first, place = 0, places[0]
-    for i in range(1, count):
-        if places[i] != place:
-            if place >= 0:
-                table[place] += i - first
-            first, place = i, places[i]
-    if place >= 0:
-        table[place] += count - first
-
-
-@compiled
-def _count_points(
-    points: BlockedPoints,
-    sides: NDArray[np.int32],
-    frame: NDArray[np.float32],
-    cells: NDArray[np.int32],
-    heights: NDArray[np.int32],
-) -> int:
-    """Set boxes, count cells and heights; return the number of box sides that are not finite.
-
-    Cells are computed in a separate loop without branches, which the compiler vectorises; the
-    counting loop cannot be vectorised.
-    """
-    flat = cells.reshape(cells.size)
-    cell = np.empty(BLOCK_POINTS, dtype=np.int32)
-    storey = np.empty(BLOCK_POINTS, dtype=np.int32)
-    a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
-    b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
-    c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
-    zero, top_storey = np.float32(0.0), np.float32(heights.size)
-    top_first, top_second = np.float32(cells.shape[0]), np.float32(cells.shape[1])
-    width, nowhere = np.int32(cells.shape[1]), np.int32(-1)
-    bad = 0
-    for block in range(sides.shape[0]):
-        bad += _set_box(points, block, sides)
-        if cells.size == 0:
-            continue
-        start = block * BLOCK_POINTS
-        stop = min(start + BLOCK_POINTS, points.x.size)
-        xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
-        for i in range(xs.size):
-            first = a0 * xs[i] + a1 * ys[i] + a2 * zs[i] - a3
-            second = b0 * xs[i] + b1 * ys[i] + b2 * zs[i] - b3
-            height = c0 * xs[i] + c1 * ys[i] + c2 * zs[i] - c3
-            over = (first >= zero) & (first < top_first) & (second >= zero) & (second < top_second)
-            within = over & (height >= zero) & (height < top_storey)
-            row = np.int32(first if over else zero)
-            column = np.int32(second if over else zero)
-            level = np.int32(height if within else zero)
-            cell[i] = row * width + column if over else nowhere
-            storey[i] = level if within else nowhere
-        _add_runs(cell, xs.size, flat)
-        _add_runs(storey, xs.size, heights)
-    return bad
+    each_part(len(offsets.x), parts, enclose)
+    return points
 
 
 # --- points against slabs ---
@@ -630,41 +496,32 @@ def refine_robustly(
 
 
 @compiled
-def consensus_sums(
+def bin_distances(
     points: NDArray[np.float32],
     planes: NDArray[np.float32],
     reach_m: float,
-    n_bins: int,
-    sums: NDArray[np.int64],
+    histograms: NDArray[np.int64],
 ) -> None:
-    """Score many planes by the points near each of them, using bins of distance.
+    """Count the points near many planes in bins of distance.
 
     Args:
         points: (3, m) metres.
         planes: (h, 4) normal and offset.
         reach_m: maximum distance.
-        n_bins: bins of 0..reach.
-        sums: (h, 2) added to: number of points within reach, and the sum of 4 n^2 - (2 b + 1)^2
-            with the bin b of each point, which is 4 n^2 (1 - d^2) for the distance d of the bin
-            centre as a share of the reach.
+        histograms: (h, bins) number of points per bin of 0..reach; added to.
     """
+    n_bins = histograms.shape[1]
     per_m, top = np.float32(n_bins / reach_m), np.float32(n_bins)
-    most, one = np.int32(4 * n_bins * n_bins), np.int32(1)
-    last, nothing = np.int32(n_bins), np.int32(0)
+    places = np.empty(BLOCK_POINTS, dtype=np.int32)
     for h in range(planes.shape[0]):
         a, b, c = planes[h, 0] * per_m, planes[h, 1] * per_m, planes[h, 2] * per_m
-        d = planes[h, 3] * per_m
+        d, own = planes[h, 3] * per_m, histograms[h]
         for start in range(0, points.shape[1], BLOCK_POINTS):
             stop = min(start + BLOCK_POINTS, points.shape[1])
             xs, ys, zs = points[0, start:stop], points[1, start:stop], points[2, start:stop]
-            # 32-bit integers, so that the compiler vectorises the loop.
-            count, worth = nothing, nothing
+            # A separate loop, which the compiler vectorises.
             for i in range(xs.size):
-                place = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))
-                is_near = place < last
-                middle = np.int32(place + place + one)
-                count = np.int32(count + (one if is_near else nothing))
-                here = np.int32(most - np.int32(middle * middle))
-                worth = np.int32(worth + (here if is_near else nothing))
-            sums[h, 0] += count
-            sums[h, 1] += worth
+                places[i] = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))
+            for i in range(xs.size):
+                if places[i] < n_bins:
+                    own[places[i]] += 1

@@ -151,8 +151,6 @@ def assemble(
     found: list[FoundPlane],
     prepared: PreparedCloud,
     cloud: PointCloud,
-    tolerance_m: float,
-    fit_tolerance_m: float,
 ) -> tuple[Planes, Deviations, list[Normality | None], NDArray[np.intp]]:
     """Measure planes on their points, and determine their visible sides, order and names.
 
@@ -164,8 +162,6 @@ def assemble(
         prepared,
         np.array([item.raster.slab() for item in found]),
         np.array([item.support.bounds_m for item in found]),
-        tolerance_m=tolerance_m,
-        fit_tolerance_m=fit_tolerance_m,
     )
     order = np.argsort(-deviations.n_points, kind="stable")
     ordered = deviations.take(order)
@@ -185,7 +181,7 @@ def assemble(
             }
         )
     normalities = [
-        normality(row, tolerance_m=tolerance_m, fit_tolerance_m=ordered.fit_tolerance_m)
+        normality(row, tolerance_m=prepared.tolerance_m, fit_tolerance_m=prepared.fit_tolerance_m)
         for row in ordered.histogram
     ]
     # Normal and offset change sign together, which leaves their covariance unchanged.
@@ -333,12 +329,7 @@ def plane_names(
 
 
 def measure_planes(
-    cloud: PreparedCloud,
-    slabs: NDArray[np.float64],
-    bounds_m: NDArray[np.float64],
-    *,
-    tolerance_m: float,
-    fit_tolerance_m: float,
+    cloud: PreparedCloud, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]
 ) -> Deviations:
     """Measure the deviations of all points on planes in one pass.
 
@@ -346,15 +337,12 @@ def measure_planes(
         cloud: the cloud with its claims.
         slabs: (k, 12) the planes.
         bounds_m: (k, 4) their rectangles, smallest and largest u, smallest and largest v.
-        tolerance_m: maximum distance of points that belong to a plane.
-        fit_tolerance_m: maximum distance of points used in the fit.
     """
     parts, count = cloud.parts, len(slabs)
     sums = np.zeros((parts, count, 6), dtype=np.int64)
     histogram = np.zeros((parts, count, HISTOGRAM_BINS), dtype=np.int64)
     extents = np.tile([np.inf, -np.inf, np.inf, -np.inf], (parts, count, 1))
-    fit_tolerance_m = min(fit_tolerance_m, tolerance_m)
-    reaches_m = np.tile([tolerance_m, fit_tolerance_m], (count, 1))
+    reaches_m = np.tile([cloud.tolerance_m, cloud.fit_tolerance_m], (count, 1))
     limits = np.column_stack([reaches_m, bounds_m])
 
     def measure(part: int, piece: slice) -> None:
@@ -364,7 +352,7 @@ def measure_planes(
 
     each_part(len(cloud.claims), parts, measure)
     n_points, _, squares, n_fit, steps_fit, squares_fit = sums.sum(axis=0).T
-    step_m = fit_tolerance_m / STEPS_PER_TOLERANCE
+    step_m = cloud.fit_tolerance_m / STEPS_PER_TOLERANCE
     low, high = extents.min(axis=0), extents.max(axis=0)
     reached = np.column_stack([low[:, 0], high[:, 1], low[:, 2], high[:, 3]])
     return Deviations(
@@ -376,8 +364,8 @@ def measure_planes(
         histogram=histogram.sum(axis=0),
         # All points within the tolerance of the fit may be nearer to another plane.
         extents_m=np.where(np.isfinite(reached), reached, bounds_m),
-        tolerance_m=tolerance_m,
-        fit_tolerance_m=fit_tolerance_m,
+        tolerance_m=cloud.tolerance_m,
+        fit_tolerance_m=cloud.fit_tolerance_m,
     )
 
 
@@ -430,13 +418,6 @@ def known_viewpoint(cloud: PointCloud) -> Viewpoint:
     if cloud.stations is None or len(cloud.stations) == 0:
         return "guess"
     return "view_from" if cloud.stations_source == "view_from" else "stations"
-
-
-def middle_viewpoint_m(cloud: PointCloud, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean (3,) of the stations, or the median of points if none is known; offsets."""
-    if cloud.stations is None or len(cloud.stations) == 0:
-        return np.asarray(np.median(points_m, axis=0))
-    return np.asarray(cloud.stations.mean(axis=0) - cloud.origin)
 
 
 def rectangle_m(

@@ -29,14 +29,12 @@ from pydantic import Field, model_validator
 from orthoflow.geometry import Plane
 from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.threads import even_parts, in_threads
-from orthoflow.sdk import Method, MetricSpec, StepContext
-from orthoflow_plugins.plane.detector import (
-    DETECTOR_METRICS,
-    PAPER,
+from orthoflow.sdk import MetricSpec, StepContext
+from orthoflow_plugins.plane.detector import DETECTOR_METRICS, PAPER, Detector
+from orthoflow_plugins.plane.proposing import (
     Candidate,
-    DetectorIn,
-    DetectorOut,
     DetectorParams,
+    Proposer,
     leans_as_asked,
 )
 
@@ -46,6 +44,8 @@ if TYPE_CHECKING:
 Model = Literal["3d", "2d"]
 Scoring = Literal["count", "msac", "a-contrario"]
 
+# Number of hypotheses for the first plane; half as many for each further plane.
+_HYPOTHESES: Final = 1000
 # Number of bins for distances from 0 to the tolerance.
 _BINS: Final = 100
 # Maximum number of points from which hypotheses are drawn, and on which they are scored.
@@ -80,7 +80,7 @@ _SIMILAR_DEG: Final = 2.0
 _LOST_SHARE: Final = 0.05
 
 
-class Ransac(Method):
+class Ransac(Detector):
     """Find planes by random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or the plan.
 
     Planes through random points are scored with a sample of the cloud. The best is refined with a
@@ -96,7 +96,6 @@ class Ransac(Method):
     """
 
     id = "plane.ransac"
-    result_version = 2
     determinism = "seeded"
     metrics = (
         *DETECTOR_METRICS,
@@ -124,13 +123,6 @@ class Ransac(Method):
             "weighted by distance; a-contrario: how unlikely so many points are by chance, "
             "at an estimated tolerance.",
         )
-        n_hypotheses: int = Field(
-            1000,
-            ge=10,
-            le=1_000_000,
-            description="Number of hypotheses for the first plane; half as many for each further "
-            "plane.",
-        )
 
         @model_validator(mode="after")
         def _upright_planes_are_walls(self) -> Self:
@@ -138,43 +130,12 @@ class Ransac(Method):
                 raise ValueError("model: 2d finds only vertical planes, got constraint: horizontal")
             return self
 
-    In = DetectorIn
-    Out = DetectorOut
-
-    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
-        """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.search import detect
-
-        proposer_of = partial(ConsensusProposer, params=params, rng=ctx.rng)
-        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id)[0]
+    def proposer(self, search: Search, params: Params, ctx: StepContext) -> ConsensusProposer:
+        """Return a proposer that draws from the step's random numbers."""
+        return ConsensusProposer(search, params, ctx.rng)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Hypotheses(Rows):
-    """Planes in the frame of the points from which they were drawn.
-
-    Attributes:
-        normals: (h, 3) unit vectors.
-        offsets_m: (h,) product of the normal and a point.
-    """
-
-    normals: NDArray[np.float64]
-    offsets_m: NDArray[np.float64]
-
-    def are_near(self, others: Hypotheses, tolerance_m: float) -> NDArray[np.bool_]:
-        """Return (h, o) whether hypotheses are similar to others."""
-        cosines = self.normals @ others.normals.T
-        apart_m = np.abs(self.offsets_m[:, None] - np.copysign(1.0, cosines) * others.offsets_m)
-        limit = math.cos(math.radians(_SIMILAR_DEG))
-        return (np.abs(cosines) > limit) & (apart_m < tolerance_m)
-
-    def plane(self, place: int) -> Plane:
-        """Return one of the planes."""
-        normal = self.normals[place]
-        return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(self.offsets_m[place]))
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Scores(Rows):
     """Scores of hypotheses.
 
@@ -189,73 +150,64 @@ class Scores(Rows):
     n_points: NDArray[np.int64]
 
 
-class ConsensusProposer:
+class ConsensusProposer(Proposer):
     """Proposes planes that contain many points of a sample.
 
-    Good hypotheses are kept for the next plane and scored again with the remaining points. Rejected
-    ones are excluded until points near them are removed, because the verification depends only on
-    these points.
+    Hypotheses are rows (h, 4) of a unit normal and an offset, relative to the median of the sample.
+    Good ones are kept for the next plane and scored again with the remaining points. Rejected ones
+    are excluded until points near them are removed, because the verification depends only on these
+    points.
     """
 
     def __init__(self, search: Search, params: Ransac.Params, rng: np.random.Generator) -> None:
         """Order the sample along a curve; `rng` draws the hypotheses."""
-        self._params, self._rng, self._search = params, rng, search
+        self._params, self._rng = params, rng
         points_m = search.cloud.sample.offsets_m
         self._centre_m = np.median(points_m, axis=0)
+        self._points_m = points_m - self._centre_m
         # Shuffled once, so that any initial part of the free points represents all of them.
         self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
         drawn = self._shuffled[:_DRAWN_MOST]
         self._order = drawn[curve_order(points_m[drawn])]
-        self._ordered_m = points_m[self._order] - self._centre_m
         corners = search.box_corners_m
         self._box_m = corners.max(axis=0) - corners.min(axis=0)
-        self._drawn_for = -1
-        self._hypotheses: Hypotheses | None = None
         # Scores of the hypotheses, the best first, for the points in `_asked_m`.
-        self._scores = Scores(value=np.zeros(0), tolerance_m=np.zeros(0), n_points=np.zeros(0, int))
-        self._asked_m = points_m[:0]
-        self._witnesses = self._shuffled[:_SECOND_POINTS]
-        self._witnesses_m = points_m[self._witnesses] - self._centre_m
-        self._free_m = self._witnesses_m
-        self._rejected = Hypotheses(normals=np.zeros((0, 3)), offsets_m=np.zeros(0))
-        self._n_near = np.zeros(0, dtype=np.int64)
+        self._hypotheses, self._scores = np.zeros((0, 4)), Scores(*np.zeros((3, 0)))
+        self._asked_m = self._points_m[:0]
+        # Rejected hypotheses, and the number of points near each when it was rejected.
+        self._rejected, self._n_near = np.zeros((0, 4)), np.zeros(0, dtype=np.int64)
+        self._drawn_for = -1
 
     def propose(self, search: Search) -> Candidate | None:
         """Return the best hypothesis for the remaining points."""
+        n_draws = 0
         if self._drawn_for != search.n_points:
-            self._free_m = self._witnesses_m[search.claims[self._witnesses] < 0]
-            stays = self._count_near(self._rejected) >= (1.0 - _LOST_SHARE) * self._n_near
-            self._rejected, self._n_near = self._rejected.take(stays), self._n_near[stays]
+            stays = self._count_near(self._rejected, search) >= (1.0 - _LOST_SHARE) * self._n_near
+            self._rejected, self._n_near = self._rejected[stays], self._n_near[stays]
             self._drawn_for = search.n_points
-            self._draw()
-        for _ in range(_REDRAWS):
-            candidate = self._best()
-            if candidate is not None:
-                return candidate
-            self._draw()
-        return self._best()
+            self._draw(search)
+        while (candidate := self._best(search)) is None and n_draws < _REDRAWS:
+            self._draw(search)
+            n_draws += 1
+        self._searched = search
+        return candidate
 
-    def reject(self, candidate: Candidate) -> None:
-        """Exclude hypotheses similar to a rejected one."""
-        plane = candidate.plane
-        offset_m = plane.offset_m - float(plane.normal @ self._centre_m)
-        self._bar(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
+    def reject(self) -> None:
+        """Exclude hypotheses similar to the last one."""
+        self._bar(self._last, self._searched)
 
-    def _bar(self, hypothesis: Hypotheses) -> None:
-        self._rejected = Hypotheses.joined([self._rejected, hypothesis])
-        self._n_near = np.append(self._n_near, self._count_near(hypothesis))
+    def _bar(self, hypothesis: NDArray[np.float64], search: Search) -> None:
+        self._rejected = np.vstack([self._rejected, hypothesis])
+        self._n_near = np.append(self._n_near, self._count_near(hypothesis[None], search))
 
-    def _is_barred(self, hypotheses: Hypotheses) -> NDArray[np.bool_]:
-        """Return (h,) whether hypotheses are similar to a rejected one."""
-        near = hypotheses.are_near(self._rejected, self._search.tolerance_m)
-        return np.asarray(np.logical_or.reduce(near, axis=1))
-
-    def _count_near(self, hypotheses: Hypotheses) -> NDArray[np.int64]:
+    def _count_near(self, hypotheses: NDArray[np.float64], search: Search) -> NDArray[np.int64]:
         """Return the number (h,) of free test points near each hypothesis."""
-        apart_m = np.abs(self._free_m @ hypotheses.normals.T - hypotheses.offsets_m)
-        return np.asarray(np.sum(apart_m <= self._search.tolerance_m, axis=0, dtype=np.int64))
+        asked = self._shuffled[:_SECOND_POINTS]
+        free_m = self._points_m[asked[search.claims[asked] < 0]]
+        apart_m = np.abs(free_m @ hypotheses[:, :3].T - hypotheses[:, 3])
+        return np.asarray(np.sum(apart_m <= search.cloud.tolerance_m, axis=0, dtype=np.int64))
 
-    def _best(self) -> Candidate | None:
+    def _best(self, search: Search) -> Candidate | None:
         """Return the best hypothesis with enough points that concentrate on its plane.
 
         A plane through mouldings and clutter has many points too, but they are distributed over its
@@ -264,147 +216,131 @@ class ConsensusProposer:
         from orthoflow_plugins.plane.fit import refine_plane
         from orthoflow_plugins.plane.support import INNER_SHARE
 
-        hypotheses, search, params = self._hypotheses, self._search, self._params
-        if hypotheses is None:
-            return None
-        is_own = params.scoring == "a-contrario"
-        asked = max(1, min(_SECOND_POINTS, search.n_points))
-        n_points = self._scores.n_points / asked * search.n_points
+        params, reach_m, up = self._params, search.cloud.tolerance_m, search.cloud.up
+        n_points = self._scores.n_points / max(1, len(self._asked_m)) * search.n_points
         is_open = n_points >= _SUPPORT_CAUTION * search.least_points
+        is_own = params.scoring == "a-contrario"
         is_open &= (self._scores.value > 0.0) | (not is_own)
-        is_open &= ~self._is_barred(hypotheses)
-        reach_m = search.tolerance_m
-        for place in range(len(hypotheses)):
+        is_open &= ~are_near(self._hypotheses, self._rejected, reach_m).any(axis=1)
+        for place in range(len(is_open)):
             if not is_open[place]:
                 continue
-            hypothesis = hypotheses.take(np.array([place]))
-            start, up = hypothesis.plane(0), search.cloud.up
-            layer = refine_plane(self._asked_m, start, reach_m, freedom="free", up=up)
+            self._last = self._hypotheses[place]
+            layer = refine_plane(self._asked_m, plane_of(self._last), reach_m, freedom="any", up=up)
+            is_crowded = False
             if layer is not None:
                 sizes_m = np.abs(layer.distances_m(self._asked_m))
                 n_inner = np.count_nonzero(sizes_m <= INNER_SHARE * reach_m)
-                if n_inner < _CROWDED_SHARE * np.count_nonzero(sizes_m <= reach_m):
-                    layer = None
-            if layer is None:
-                self._bar(hypothesis)
-                is_open &= ~hypotheses.are_near(hypothesis, reach_m)[:, 0]
+                n_near = np.count_nonzero(sizes_m <= reach_m)
+                is_crowded = bool(n_inner >= _CROWDED_SHARE * n_near)
+            if layer is None or not is_crowded:
+                self._bar(self._last, search)
+                is_open &= ~are_near(self._hypotheses, self._last[None], reach_m)[:, 0]
                 continue
-            own_m = None
-            if is_own:
-                hypothesis, own_m = self._polished(hypothesis)
+            hypothesis, own_m = self._polished(search) if is_own else (self._last, None)
             return Candidate(
-                plane=self._in_offsets(hypothesis.plane(0)),
+                plane=self._in_offsets(plane_of(hypothesis)),
                 constraint="vertical" if params.model == "2d" else params.constraint,
                 own_tolerance_m=own_m,
                 start=self._in_offsets(layer),
             )
         return None
 
-    def _draw(self) -> None:
+    def _draw(self, search: Search) -> None:
         """Draw hypotheses; score them and the earlier ones with few points, the best with more."""
-        search, params = self._search, self._params
-        points_m, claims = search.cloud.sample.offsets_m, search.claims
-        free = np.flatnonzero(claims[self._order] < 0)
-        earlier, self._hypotheses = self._hypotheses, None
+        claims, up, params = search.claims, search.cloud.up, self._params
+        free = self._order[claims[self._order] < 0]
+        earlier, self._hypotheses = self._hypotheses, self._hypotheses[:0]
+        self._scores = Scores(*np.zeros((3, 0)))
         if len(free) < 3:
             return
-        hypotheses = draw_hypotheses(
-            self._ordered_m.take(free, axis=0),
-            params.n_hypotheses if earlier is None else params.n_hypotheses // 2,
-            params.model,
-            search.cloud.up,
-            self._rng,
-        )
-        if earlier is not None:
-            hypotheses = Hypotheses.joined([hypotheses, earlier])
+        count = _HYPOTHESES // 2 if len(earlier) else _HYPOTHESES
+        drawn = draw_hypotheses(self._points_m[free], count, params.model, up, self._rng)
+        hypotheses = np.vstack([drawn, earlier])
         limit_deg = params.max_tilt_deg + _LEAN_CAUTION_DEG
-        hypotheses = hypotheses.take(
-            leans_as_asked(hypotheses.normals, search.cloud.up, params.constraint, limit_deg)
-        )
-        hypotheses = hypotheses.take(~self._is_barred(hypotheses))
-        if len(hypotheses) == 0:
-            return
-        # These nearly always include enough free points.
-        asked = self._shuffled[: 4 * _SECOND_POINTS]
-        asked = asked[claims[asked] < 0]
-        if len(asked) < _SECOND_POINTS:
-            asked = self._shuffled[claims[self._shuffled] < 0]
-        self._asked_m = points_m.take(asked[:_SECOND_POINTS], axis=0) - self._centre_m
-        first = self._scored(hypotheses, self._asked_m[:_FIRST_POINTS])
-        n_kept = max(_SECOND_LEAST, round(_SECOND_SHARE * len(hypotheses)))
-        kept = self._distinct(hypotheses, np.argsort(-first.value, kind="stable"), n_kept)
-        hypotheses = hypotheses.take(kept)
-        scores = self._scored(hypotheses, self._asked_m)
-        ranked = np.argsort(-scores.value, kind="stable")
-        self._hypotheses, self._scores = hypotheses.take(ranked), scores.take(ranked)
+        chosen = leans_as_asked(hypotheses[:, :3], up, params.constraint, limit_deg)
+        chosen &= ~are_near(hypotheses, self._rejected, search.cloud.tolerance_m).any(axis=1)
+        hypotheses = hypotheses[chosen]
+        asked = self._shuffled[claims[self._shuffled] < 0][:_SECOND_POINTS]
+        self._asked_m = self._points_m[asked]
+        first = self._scored(hypotheses, self._asked_m[:_FIRST_POINTS], search)
+        ranked = hypotheses[np.argsort(-first.value, kind="stable")]
+        hypotheses = ranked[_distinct(ranked, search.cloud.tolerance_m)]
+        scores = self._scored(hypotheses, self._asked_m, search)
+        order = np.argsort(-scores.value, kind="stable")
+        self._hypotheses = hypotheses[order]
+        self._scores = scores.take(order)
 
-    def _scored(self, hypotheses: Hypotheses, points_m: NDArray[np.float64]) -> Scores:
-        from orthoflow_plugins.plane.kernels import consensus_sums
+    def _scored(
+        self, hypotheses: NDArray[np.float64], points_m: NDArray[np.float64], search: Search
+    ) -> Scores:
+        """Score hypotheses by the distances of points."""
+        from orthoflow_plugins.plane.kernels import bin_distances
 
+        rows = hypotheses.astype(np.float32)
         columns = np.ascontiguousarray(points_m.T, dtype=np.float32)
-        rows = np.column_stack([hypotheses.normals, hypotheses.offsets_m]).astype(np.float32)
-        reach_m = self._search.tolerance_m
-        if self._params.scoring == "a-contrario":
-            places = ((np.abs(row[:3] @ columns - row[3]) / reach_m) * _BINS for row in rows)
-            histograms = np.array(
-                [np.bincount(np.minimum(p, _BINS).astype(int), minlength=_BINS + 1) for p in places]
-            )
-            extents_m = np.abs(hypotheses.normals) @ self._box_m
-            n_corners = 3 if self._params.model == "3d" else 2
-            return fewest_false_alarms(
-                histograms[:, :_BINS], reach_m, len(points_m), extents_m, n_corners
-            )
-        sums = np.zeros((len(rows), 2), dtype=np.int64)
-        add = partial(consensus_sums, columns)
-        shares = even_parts(len(rows), self._search.cloud.parts)
-        in_threads([partial(add, rows[k], reach_m, _BINS, sums[k]) for k in shares])
-        n_points = sums[:, 0].copy()
-        is_msac = self._params.scoring == "msac"
-        return Scores(
-            value=sums[:, 1] / (4.0 * _BINS**2) if is_msac else n_points.astype(np.float64),
-            tolerance_m=np.full(len(rows), reach_m),
-            n_points=n_points,
+        reach_m, histograms = search.cloud.tolerance_m, np.zeros((len(rows), _BINS), dtype=np.int64)
+        shares = even_parts(len(rows), search.cloud.parts)
+        in_threads(
+            [partial(bin_distances, columns, rows[k], reach_m, histograms[k]) for k in shares]
         )
-
-    def _distinct(
-        self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
-    ) -> NDArray[np.intp]:
-        """Return the best of ranked hypotheses, with at most `_SIMILAR_MOST` similar ones."""
-        # The best ones nearly always include enough different ones.
-        for n_asked in (min(len(ranked), _SIMILAR_MOST * n_most), len(ranked)):
-            asked = ranked[:n_asked]
-            some = hypotheses.take(asked)
-            near = some.are_near(some, self._search.tolerance_m)
-            kept: list[int] = []
-            n_similar = np.zeros(n_asked, dtype=np.int64)
-            for place in range(n_asked):
-                if n_similar[place] < _SIMILAR_MOST and len(kept) < n_most:
-                    kept.append(place)
-                    n_similar += near[place]
-            if len(kept) == n_most:
-                break
-        return asked[kept]
+        if self._params.scoring == "a-contrario":
+            extents_m = np.abs(hypotheses[:, :3]) @ self._box_m
+            n_corners = 3 if self._params.model == "3d" else 2
+            return fewest_false_alarms(histograms, reach_m, len(points_m), extents_m, n_corners)
+        ratios = (np.arange(_BINS) + 0.5) / _BINS
+        worth = 1.0 - ratios**2 if self._params.scoring == "msac" else np.ones(_BINS)
+        return Scores(histograms @ worth, np.full(len(rows), reach_m), histograms.sum(axis=1))
 
     def _in_offsets(self, plane: Plane) -> Plane:
         offset_m = plane.offset_m + float(plane.normal @ self._centre_m)
         return Plane(normal=plane.normal, offset_m=offset_m)
 
-    def _polished(self, hypothesis: Hypotheses) -> tuple[Hypotheses, float]:
+    def _polished(self, search: Search) -> tuple[NDArray[np.float64], float]:
         """Fit to the points within the tolerance and re-estimate it, while the score improves."""
-        search = self._search
-        relative_m = (search.cloud.sample.offsets_m - self._centre_m)[search.claims < 0]
-        best = self._scored(hypothesis, relative_m)
+        hypothesis, points_m = self._last, self._points_m[search.claims < 0]
+        best = self._scored(hypothesis[None], points_m, search)
         for _ in range(_POLISHED):
-            distances_m = relative_m @ hypothesis.normals[0] - hypothesis.offsets_m[0]
-            near_m = relative_m[np.abs(distances_m) <= best.tolerance_m[0]]
+            distances_m = points_m @ hypothesis[:3] - hypothesis[3]
+            near_m = points_m[np.abs(distances_m) <= best.tolerance_m[0]]
             fitted = _fitted(near_m, self._params.model, search.cloud.up)
             if fitted is None:
                 break
-            score = self._scored(fitted, relative_m)
+            score = self._scored(fitted[None], points_m, search)
             if score.value[0] <= best.value[0]:
                 break
             hypothesis, best = fitted, score
         return hypothesis, float(best.tolerance_m[0])
+
+
+def plane_of(hypothesis: NDArray[np.float64]) -> Plane:
+    """Return the plane of a row (4,)."""
+    normal = hypothesis[:3]
+    return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(hypothesis[3]))
+
+
+def are_near(
+    hypotheses: NDArray[np.float64], others: NDArray[np.float64], tolerance_m: float
+) -> NDArray[np.bool_]:
+    """Return (h, o) whether hypotheses (h, 4) are similar to others (o, 4)."""
+    cosines = hypotheses[:, :3] @ others[:, :3].T
+    apart_m = np.abs(hypotheses[:, 3, None] - np.copysign(1.0, cosines) * others[:, 3])
+    return (np.abs(cosines) > math.cos(math.radians(_SIMILAR_DEG))) & (apart_m < tolerance_m)
+
+
+def _distinct(ranked: NDArray[np.float64], tolerance_m: float) -> list[int]:
+    """Return the places of the best of ranked hypotheses (h, 4), with few similar ones."""
+    n_most = max(_SECOND_LEAST, round(_SECOND_SHARE * len(ranked)))
+    # These nearly always include enough different ones.
+    asked = ranked[: _SIMILAR_MOST * n_most]
+    near = are_near(asked, asked, tolerance_m)
+    kept: list[int] = []
+    n_similar = np.zeros(len(near), dtype=np.int64)
+    for place, similar in enumerate(near):
+        if n_similar[place] < _SIMILAR_MOST and len(kept) < n_most:
+            kept.append(place)
+            n_similar += similar
+    return kept
 
 
 def draw_hypotheses(
@@ -413,8 +349,8 @@ def draw_hypotheses(
     model: Model,
     up: NDArray[np.float64],
     rng: np.random.Generator,
-) -> Hypotheses:
-    """Draw planes through points.
+) -> NDArray[np.float64]:
+    """Draw planes through points; return unit normals and offsets (h, 4).
 
     Args:
         points_m: (m, 3) in curve order.
@@ -437,9 +373,8 @@ def draw_hypotheses(
     longest = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
     fixed = lengths > (_FLATTEST * longest**2 if model == "3d" else 1e-6)
     normals = normals[fixed] / lengths[fixed, None]
-    return Hypotheses(
-        normals=normals, offsets_m=np.einsum("ij,ij->i", normals, corners[fixed].mean(axis=1))
-    )
+    offsets_m = np.einsum("ij,ij->i", normals, corners[fixed].mean(axis=1))
+    return np.column_stack([normals, offsets_m])
 
 
 def curve_order(points_m: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -486,11 +421,8 @@ def fewest_false_alarms(
     log_alarms = np.where(within > n_corners, log_alarms, np.inf)
     best = np.argmin(log_alarms, axis=1)
     rows = np.arange(len(within))
-    return Scores(
-        value=-log_alarms[rows, best] / np.log(10.0),
-        tolerance_m=tolerances_m[best],
-        n_points=within[rows, best],
-    )
+    value = -log_alarms[rows, best] / np.log(10.0)
+    return Scores(value, tolerances_m[best], within[rows, best])
 
 
 def _log_choose(
@@ -504,8 +436,8 @@ def _log_choose(
 
 def _fitted(
     points_m: NDArray[np.float64], model: Model, up: NDArray[np.float64]
-) -> Hypotheses | None:
-    """Return the total least squares plane; vertical for the 2D model."""
+) -> NDArray[np.float64] | None:
+    """Return the total least squares plane (4,); vertical for the 2D model."""
     if len(points_m) < 4:
         return None
     mean = points_m.mean(axis=0)
@@ -516,4 +448,4 @@ def _fitted(
     normal = directions[:, 1 if model == "2d" else 0]
     if values[1] <= 0.0 or abs(float(normal @ up)) > 1.0:
         return None
-    return Hypotheses(normals=normal[None], offsets_m=np.array([float(normal @ mean)]))
+    return np.append(normal, normal @ mean)

@@ -7,7 +7,6 @@ region with the most free points is proposed first. Points may also be labelled 
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
@@ -15,14 +14,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.geometry import Plane
-from orthoflow.sdk import Method, MetricSpec, StepContext
-from orthoflow_plugins.plane.detector import (
-    DETECTOR_METRICS,
-    PAPER,
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import MetricSpec, StepContext
+from orthoflow_plugins.plane.detector import DETECTOR_METRICS, PAPER, Detector
+from orthoflow_plugins.plane.proposing import (
     Candidate,
-    DetectorIn,
-    DetectorOut,
     DetectorParams,
+    Proposer,
     leans_as_asked,
 )
 
@@ -30,7 +28,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.plane.cloud import PreparedCloud
     from orthoflow_plugins.plane.fit import FoundPlane
     from orthoflow_plugins.plane.search import Search
-    from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels
+    from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels, VoxelTable
 
 # Values of `preset: paper` for parameters that are not set (markiewicz2015, 4.1.2).
 _PAPER_PRESET: Final[dict[str, object]] = {
@@ -68,7 +66,7 @@ _WIDENINGS: Final = 2
 _THIN: Final = 3.0
 
 
-class Region(Method):
+class Region(Detector):
     """Find planes by region growing with normals of neighbourhoods, using all points.
 
     The points are summed into cells once; the sums of neighbouring cells give the normal of each
@@ -89,7 +87,6 @@ class Region(Method):
     """
 
     id = "plane.region"
-    result_version = 2
     determinism = "exact"
     metrics = (
         *DETECTOR_METRICS,
@@ -117,7 +114,7 @@ class Region(Method):
         neighbourhood: Literal["cube", "radius", "knn"] = Field(
             "cube",
             description="Points from which a normal is computed. cube: those in a cube; radius: "
-            "in a sphere; knn: in the nearest cells that contain `n_neighbours` points.",
+            "in a sphere; knn: in the nearest cells that contain 30 points.",
         )
         neighbourhood_m: Annotated[float, Field(gt=0.0, le=2.0)] | Literal["auto"] = Field(
             "auto",
@@ -171,66 +168,44 @@ class Region(Method):
                 voxel_m=share * size_m if self.cell_m is None else self.cell_m,
             )
 
-    In = DetectorIn
-    Out = DetectorOut
-
-    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
-        """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.figures import draw_normals
-        from orthoflow_plugins.plane.planes import middle_viewpoint_m
-        from orthoflow_plugins.plane.search import detect
-
-        cloud = inputs.cloud
-
-        def proposer_of(search: Search) -> RegionProposer:
-            ctx.progress(0.1, "growing regions")
-            viewer_m = middle_viewpoint_m(cloud, search.cloud.sample.offsets_m)
-            return region_proposer(search, params, viewer_m=viewer_m)
-
-        relabel = RegionProposer.relabel if params.labels == "region" else None
-        out, proposer = detect(cloud, params, ctx, proposer_of, method=self.id, relabel=relabel)
-        draw_normals(ctx, proposer.voxels, len(proposer.planes), out.planes, cloud)
-        return out
+    def proposer(self, search: Search, params: Params, ctx: StepContext) -> RegionProposer:
+        """Grow the regions of a cloud."""
+        ctx.progress(0.1, "growing regions")
+        return RegionProposer(search, params)
 
 
-class RegionProposer:
+class RegionProposer(Proposer):
     """Proposes the planes of regions grown on all points.
 
     Attributes:
-        voxels: the voxels.
-        region_of_voxel: (m,) int32 region of each voxel, -1 for none.
         n_points: (r,) int64 number of points of each region.
         planes: total least squares planes of the regions with enough points, by region, in the
             cloud's offsets.
-        starts: planes at the densest layer of each region; same as `planes` if points are selected
-            by distance.
     """
 
-    def __init__(
-        self,
-        search: Search,
-        params: Region.Params,
-        voxels: SurfaceVoxels,
-        region_of_voxel: NDArray[np.int32],
-        n_regions: int,
-    ) -> None:
-        """Compute the planes of regions of voxels."""
-        self._params, self.voxels, self.region_of_voxel = params, voxels, region_of_voxel
-        sums = voxels.table.sums_of(region_of_voxel, n_regions)
+    def __init__(self, search: Search, params: Region.Params) -> None:
+        """Grow regions using all points of the cloud of a search."""
+        from orthoflow_plugins.plane.voxels import surface_voxels
+
+        cloud, self._params = search.cloud, params
+        self._voxels = surface_voxels(cloud, params.neighbourhood_of(search.cloud.fit_tolerance_m))
+        # Minimum size of a region.
+        least_points = _PART_SHARE * params.min_share * len(cloud.claims)
+        if params.criterion == "normal":
+            regions = _grouped(self._voxels, params.angle_deg, least_points, cloud.viewpoint_m)
+        else:
+            # Noise must not keep cells from the plane that they are on.
+            distance_m = max(_DISTANCE_M, 0.5 * search.cloud.fit_tolerance_m)
+            regions = _grown(self._voxels, params.angle_deg, distance_m, least_points)
+        self._region_of_voxel, n_regions = regions
+        sums = self._voxels.table.sums_of(self._region_of_voxel, n_regions)
         self.n_points = sums[:, 0].astype(np.int64)
-        least_points = _PART_SHARE * params.min_share * len(search.cloud.claims)
         self.planes = {
             int(region): plane
             for region in np.flatnonzero(self.n_points >= least_points)
-            if (plane := _plane(sums[region], voxels)) is not None
+            if (plane := _plane(sums[region], self._voxels.table)) is not None
         }
-        self.starts = self.planes
-        if params.criterion == "normal":
-            self.starts = {
-                region: _densest(voxels, region_of_voxel == region, plane)
-                for region, plane in self.planes.items()
-            }
-        self._region_of_sample = self._region_of(search.cloud)
+        self._region_of_sample = self._region_of(cloud)
         self._barred: set[int] = set()
         self._last = -1
 
@@ -239,137 +214,85 @@ class RegionProposer:
         from orthoflow_plugins.plane.cloud import blocked
 
         # The last entry is for points in no voxel.
-        regions = np.append(self.region_of_voxel, np.int32(_NONE))
-        return regions[self.voxels.table.voxel_of(blocked(cloud.sample.offsets_m))]
+        regions = np.append(self._region_of_voxel, np.int32(_NONE))
+        return regions[self._voxels.table.voxel_of(blocked(cloud.sample.offsets_m))]
 
     def propose(self, search: Search) -> Candidate | None:
         """Return the plane of the region with the most free points."""
         free = self._region_of_sample[(search.claims < 0) & (self._region_of_sample >= 0)]
         counts = np.bincount(free, minlength=len(self.n_points))
-        constraint = self._params.constraint
+        constraint, by_normal = self._params.constraint, self._params.criterion == "normal"
         limit_deg = self._params.max_tilt_deg + _LEAN_CAUTION_DEG
         for region in np.argsort(-counts, kind="stable").tolist():
             if counts[region] < _PART_SHARE * search.least_points:
-                return None
+                break
             plane = self.planes.get(region)
             if plane is None or region in self._barred:
                 continue
-            leans = leans_as_asked(plane.normal[None], search.cloud.up, constraint, limit_deg)
+            leans = leans_as_asked(plane.normal[None], search.cloud.up, constraint, limit_deg).all()
             # If only the normal counts, a region is proposed once, even if many of its points are
             # off its plane.
-            if self._params.criterion == "normal" or not leans.all():
+            if by_normal or not leans:
                 self._barred.add(region)
-            if not leans.all():
-                continue
-            self._last = region
-            return Candidate(
-                plane=plane,
-                constraint=constraint,
-                start=self.starts[region],
-            )
+            if leans:
+                self._last = region
+                member = self._region_of_voxel == region
+                start = _densest(self._voxels, member, plane) if by_normal else None
+                return Candidate(plane=plane, constraint=constraint, start=start)
         return None
 
-    def reject(self, candidate: Candidate) -> None:
+    def reject(self) -> None:
         """Exclude the last region."""
-        del candidate
         self._barred.add(self._last)
 
     def relabel(self, found: list[FoundPlane], cloud: PreparedCloud) -> None:
-        """Assign each point to the plane of its region instead of the nearest plane.
+        """Assign each point to the plane of its region instead of the nearest plane, if asked.
 
         A region belongs to the plane that contains most of its points, if more than half of its
         points are on a plane.
         """
         from orthoflow_plugins.plane.kernels import each_part, piece_of
 
-        claims, n_regions = cloud.sample_claims, len(self.n_points)
-        region_of_sample = self._region_of(cloud)
+        if self._params.labels == "plane":
+            return
+        claims, region_of_sample = cloud.sample_claims, self._region_of(cloud)
         near = (region_of_sample >= 0) & (claims >= 0)
-        joint = np.zeros((n_regions, len(found)), dtype=np.int64)
+        joint = np.zeros((len(self.n_points), len(found)), dtype=np.int64)
         np.add.at(joint, (region_of_sample[near], claims[near]), 1)
-        n_sampled = np.bincount(region_of_sample[region_of_sample >= 0], minlength=n_regions)
+        n_sampled = np.bincount(region_of_sample[region_of_sample >= 0], minlength=len(joint))
         owner = np.where(joint.sum(axis=1) * 2 > n_sampled, joint.argmax(axis=1), -1)
         # The last entries are for voxels in no region, and for points in no voxel.
-        owners = np.append(np.append(owner, -1)[self.region_of_voxel], -1).astype(np.int8)
+        owners = np.append(np.append(owner, -1)[self._region_of_voxel], -1).astype(np.int8)
 
         def claim(_part: int, piece: slice) -> None:
-            cloud.claims[piece] = owners[self.voxels.table.voxel_of(piece_of(cloud.points, piece))]
+            voxel_of_point = self._voxels.table.voxel_of(piece_of(cloud.points, piece))
+            cloud.claims[piece] = owners[voxel_of_point]
 
         each_part(len(cloud.claims), cloud.parts, claim)
 
+    def draw(self, ctx: StepContext, planes: Planes, cloud: PointCloud) -> None:
+        """Report the scatter of the normals and draw them."""
+        from orthoflow_plugins.plane.figures import draw_normals
 
-def region_proposer(
-    search: Search, params: Region.Params, *, viewer_m: NDArray[np.float64]
-) -> RegionProposer:
-    """Grow regions using all points of the cloud of a search.
-
-    Args:
-        search: the search.
-        params: parameters of the growth.
-        viewer_m: (3,) viewpoint that defines the sign of normals for `criterion: normal`, relative
-            to the cloud's origin.
-    """
-    from orthoflow_plugins.plane.voxels import surface_voxels
-
-    fit_tolerance_m = search.fit_tolerance_m
-    voxels = surface_voxels(search.cloud, params.neighbourhood_of(fit_tolerance_m))
-    # Minimum size of a group.
-    least_points = _PART_SHARE * params.min_share * len(search.cloud.claims)
-    if params.criterion == "normal":
-        regions = _grouped(voxels, params.angle_deg, least_points, viewer_m)
-    else:
-        # Noise must not keep cells from the plane that they are on.
-        distance_m = max(_DISTANCE_M, 0.5 * fit_tolerance_m)
-        once = partial(_grown_once, angle_deg=params.angle_deg, distance_m=distance_m)
-        regions = _grown(voxels, once, least_points)
-    return RegionProposer(search, params, voxels, *regions)
+        draw_normals(ctx, self._voxels, len(self.planes), planes, cloud)
 
 
 def _grown(
     voxels: SurfaceVoxels,
-    once: partial[tuple[NDArray[np.int32], int]],
+    angle_deg: float,
+    distance_m: float,
     least_points: float,
+    n_widenings: int = _WIDENINGS,
 ) -> tuple[NDArray[np.int32], int]:
-    """Grow regions; in a sparse cloud, also grow regions of larger voxels."""
-    from orthoflow_plugins.plane.voxels import POINTS_LEAST, SurfaceVoxels
+    """Grow regions; in a sparse cloud, also grow regions of larger voxels.
 
-    def crumbs_of(some: SurfaceVoxels, own: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return the voxels in no region, or in one with too few points."""
-        too_few = np.bincount(own + 1, some.counts) < least_points
-        too_few[0] = True
-        return np.asarray(too_few[own + 1])
-
-    regions, n_regions = once(voxels)
-    crumbs = np.flatnonzero(crumbs_of(voxels, regions))
-    left, wide_of_voxel = voxels, np.arange(len(regions))
-    for _ in range(_WIDENINGS):
-        n_left = left.counts[crumbs]
-        if n_left.sum() < least_points:
-            break
-        in_neighbourhood = float(n_left.mean()) * left.neighbourhood.width_voxels() ** 2
-        if in_neighbourhood >= _THIN * POINTS_LEAST:
-            break
-        table, of_crumb = left.table.coarser(crumbs)
-        wider = SurfaceVoxels.of(table, left.neighbourhood, parts=1)
-        found, n_found = once(wider)
-        of_left = np.full(len(left.counts), -1)
-        of_left[crumbs] = of_crumb
-        wide_of_voxel = np.where(wide_of_voxel >= 0, of_left[wide_of_voxel], -1)
-        is_crumb = crumbs_of(wider, found)
-        joins = (wide_of_voxel >= 0) & ~is_crumb[wide_of_voxel]
-        regions[joins] = n_regions + found[wide_of_voxel[joins]]
-        n_regions += n_found
-        left, crumbs = wider, np.flatnonzero(is_crumb)
-    return regions, n_regions
-
-
-def _grown_once(
-    voxels: SurfaceVoxels, *, angle_deg: float, distance_m: float
-) -> tuple[NDArray[np.int32], int]:
-    from orthoflow_plugins.plane.voxels import grow_regions
+    Returns:
+        The region (m,) of each voxel, negative for none, and the number of regions.
+    """
+    from orthoflow_plugins.plane.voxels import POINTS_LEAST, SurfaceVoxels, grow_regions
 
     table = voxels.table
-    reach = distance_m / table.grid.cell_m
+    reach = distance_m / table.voxel_m
     deviation, width = voxels.spreads[:, 0], voxels.spreads[:, 1]
     may_join = (deviation <= reach) & (deviation <= _ROUNDEST * width) & (width > _NARROWEST)
     regions = np.where(may_join, np.int32(_FREE), np.int32(_NONE))
@@ -386,7 +309,24 @@ def _grown_once(
         np.array([math.cos(math.radians(angle_deg)), reach]),
         regions,
     )
-    return regions, n_regions
+
+    def small(own: NDArray[np.int32], counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether voxels are in no region, or in one with too few points."""
+        is_small = np.bincount(own + 1, counts) < least_points
+        return np.asarray(is_small[own + 1] | (own < 0))
+
+    crumbs = np.flatnonzero(small(regions, voxels.counts))
+    n_left = voxels.counts[crumbs]
+    if n_widenings == 0 or n_left.sum() < least_points:
+        return regions, n_regions
+    if float(n_left.mean()) * voxels.neighbourhood.width_voxels() ** 2 >= _THIN * POINTS_LEAST:
+        return regions, n_regions
+    coarser, wide_of_crumb = table.coarser(crumbs)
+    wider = SurfaceVoxels.of(coarser, voxels.neighbourhood, parts=1)
+    own, n_wide = _grown(wider, angle_deg, distance_m, least_points, n_widenings - 1)
+    joins = ~small(own, wider.counts)[wide_of_crumb]
+    regions[crumbs[joins]] = n_regions + own[wide_of_crumb[joins]]
+    return regions, n_regions + n_wide
 
 
 def _grouped(
@@ -397,7 +337,7 @@ def _grouped(
     usable &= voxels.spreads[:, 1] > _NARROWEST
     # Normals point towards the viewer.
     normals: NDArray[np.float64] = voxels.normals.astype(np.float64)
-    to_viewer = voxels.table.grid.basis @ viewer_m - voxels.table.centroids()
+    to_viewer = voxels.table.basis @ viewer_m - voxels.table.centroids()
     normals *= np.where(np.einsum("ij,ij->i", normals, to_viewer) < 0.0, -1.0, 1.0)[:, None]
     regions = np.full(len(normals), _NONE, dtype=np.int32)
     free = np.flatnonzero(usable)
@@ -440,30 +380,28 @@ def _unit_mean(normals: NDArray[np.float64], weights: NDArray[np.float64]) -> ND
     return total / max(float(np.linalg.norm(total)), 1e-12)
 
 
-def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
+def _plane(sums: NDArray[np.float64], table: VoxelTable) -> Plane | None:
     """Return the total least squares plane of a region's points, in the cloud's offsets."""
     mean = sums[1:4] / sums[0]
     second = sums[[[4, 5, 6], [5, 7, 8], [6, 8, 9]]]
     variances, directions = np.linalg.eigh(second / sums[0] - np.outer(mean, mean))
     if variances[1] <= 0.0:
         return None
-    basis, side_m = voxels.table.grid.basis, voxels.table.grid.cell_m
-    middle_m = (voxels.table.grid.low_m + side_m * mean) @ basis
-    normal = directions[:, 0] @ basis
+    middle_m = (table.low_m + table.voxel_m * mean) @ table.basis
+    normal = directions[:, 0] @ table.basis
     normal /= np.linalg.norm(normal)
     return Plane(normal=normal, offset_m=float(normal @ middle_m))
 
 
 def _densest(voxels: SurfaceVoxels, member: NDArray[np.bool_], plane: Plane) -> Plane:
     """Return the plane with the mean normal of a group, at the distance of its densest layer."""
-    basis, side_m = voxels.table.grid.basis, voxels.table.grid.cell_m
-    weights = voxels.counts[member].astype(np.float64)
+    table, weights = voxels.table, voxels.counts[member].astype(np.float64)
     normals = voxels.normals[member].astype(np.float64)
-    best = int(np.argmax(np.abs(normals @ (basis @ plane.normal))))
+    best = int(np.argmax(np.abs(normals @ (table.basis @ plane.normal))))
     signs = np.where(normals @ normals[best] < 0.0, -1.0, 1.0)
-    direction = _unit_mean(normals, weights * signs) @ basis
-    along_m = voxels.table.centroids()[member] @ basis @ direction
-    bins = ((along_m - float(along_m.min())) / side_m).astype(np.int64)
+    direction = _unit_mean(normals, weights * signs)
+    along_m = table.centroids()[member] @ direction
+    bins = ((along_m - float(along_m.min())) / table.voxel_m).astype(np.int64)
     inside = bins == int(np.argmax(np.bincount(bins, weights)))
     offset_m = float(np.average(along_m[inside], weights=weights[inside]))
-    return Plane(normal=direction, offset_m=offset_m)
+    return Plane(normal=direction @ table.basis, offset_m=offset_m)

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Final, Literal, NamedTuple, Protocol, TypeVar
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,33 +21,35 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.threads import in_order
-from orthoflow.products import PointCloud, PointLabels
+from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.plane.cloud import (
+    MARGIN_M,
     PreparedCloud,
     blocked,
+    draw_sample,
     measure_noise,
     prepare,
     thinned,
-)
-from orthoflow_plugins.plane.detector import (
-    Candidate,
-    DetectorOut,
-    DetectorParams,
-    leans_as_asked,
 )
 from orthoflow_plugins.plane.figures import draw_deviations, draw_planes, draw_thickness
 from orthoflow_plugins.plane.fit import (
     SETTLED_M,
     AdjustedPlane,
     FoundPlane,
-    Freedom,
     adjust_plane,
     refine_plane,
     shrinking_tolerances,
 )
 from orthoflow_plugins.plane.kernels import BlockedPoints
 from orthoflow_plugins.plane.planes import assemble, report_first, report_planes
+from orthoflow_plugins.plane.proposing import (
+    Candidate,
+    Constraint,
+    DetectorParams,
+    Proposer,
+    leans_as_asked,
+)
 from orthoflow_plugins.plane.support import (
     CellSums,
     Support,
@@ -55,7 +57,6 @@ from orthoflow_plugins.plane.support import (
     cell_for,
     covering_rectangles,
     crowded_cells,
-    grown,
     measure_cells,
     support_of,
 )
@@ -69,7 +70,7 @@ _STRIP_CELLS: Final = 2.5
 # Surfaces with a smaller radius are not planes, if the curvature explains this share of the
 # variance of their cells.
 _RADIUS_LEAST_M: Final = 5.0
-_BENT_SHARE: Final = 0.5
+_BENT_SHARE: Final = 0.3
 # Maximum number of passes over the points for one plane, and the share of the fit tolerance by
 # which a fit may move without another pass.
 _PASSES_MOST: Final = 3
@@ -144,18 +145,6 @@ UNEXPLAINED: Final = DiagnosticSpec(
 )
 
 
-class Claim(NamedTuple):
-    """A region to which points are assigned: slab (12,) and bounds (5,), see `kernels`."""
-
-    slab: NDArray[np.float64]
-    bounds_m: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, raster: SurfaceRaster, support: Support, tolerance_m: float) -> Claim:
-        """Return the region within the tolerance of a plane and of its rectangle."""
-        return cls(raster.slab(), grown(support.bounds_m, tolerance_m))
-
-
 @dataclass(kw_only=True)
 class Search:
     """State of a greedy search: the points of the sample that are still free.
@@ -163,10 +152,8 @@ class Search:
     Attributes:
         cloud: the cloud.
         params: criteria for planes and for the end of the search.
-        tolerance_m: `params.tolerance_m`, or the estimated value if that is `auto`.
-        fit_tolerance_m: `params.fit_tolerance_m`, or the estimated value if that is `auto`.
         claims: (m,) int16 plane of each point of the sample, -1 if not yet assigned.
-        taken: the regions from which points were removed, in order.
+        n_taken: number of planes and clutter whose points were assigned.
         n_points: number of free points of the sample.
         refusals: for each rejected candidate, the criterion and the candidate's share of all
             points.
@@ -174,10 +161,8 @@ class Search:
 
     cloud: PreparedCloud
     params: DetectorParams
-    tolerance_m: float
-    fit_tolerance_m: float
     claims: NDArray[np.int16] = field(init=False)
-    taken: list[Claim] = field(init=False, default_factory=list)
+    n_taken: int = field(init=False, default=0)
     n_points: int = field(init=False)
     refusals: list[tuple[Criterion, float]] = field(init=False, default_factory=list)
     _free: tuple[NDArray[np.float64], BlockedPoints] | None = field(init=False, default=None)
@@ -191,7 +176,7 @@ class Search:
     @property
     def min_area_m2(self) -> float:
         """Return the minimum area of a plane."""
-        _, middle, high = np.sort(self.cloud.grid.extent_m)
+        _, middle, high = np.sort(self.cloud.extent_m - 2.0 * MARGIN_M)
         return min(self.params.min_area_m2, _SIDE_SHARE * float(middle * high))
 
     @property
@@ -206,18 +191,16 @@ class Search:
             self._free = offsets_m, blocked(offsets_m)
         return self._free
 
-    def claim(self, claim: Claim) -> None:
+    def claim(self, raster: SurfaceRaster, support: Support) -> None:
         """Assign points to a plane, except points that are nearer to an earlier plane."""
-        rows, bounds = claim.slab.reshape(3, 4), claim.bounds_m
-        points_m = self.cloud.sample.offsets_m
-        x, y, z = points_m.T
-        away_m = np.abs(rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z - rows[0, 3])
-        near = np.flatnonzero((away_m <= bounds[0]) & (away_m < self._away_m))
-        u, v = (points_m[near] @ rows[1:, :3].T - rows[1:, 3]).T
-        held = (u >= bounds[1]) & (u <= bounds[2]) & (v >= bounds[3]) & (v <= bounds[4])
-        self.claims[near[held]] = len(self.taken)
+        points_m, bounds_m = self.cloud.sample.offsets_m, self.cloud.bounds_of(support.bounds_m)
+        away_m = np.abs(raster.plane.distances_m(points_m))
+        near = np.flatnonzero((away_m <= bounds_m[0]) & (away_m < self._away_m))
+        u, v = (points_m[near] @ raster.axes.T).T
+        held = (u >= bounds_m[1]) & (u <= bounds_m[2]) & (v >= bounds_m[3]) & (v <= bounds_m[4])
+        self.claims[near[held]] = self.n_taken
         self._away_m[near[held]] = away_m[near[held]]
-        self.taken.append(claim)
+        self.n_taken += 1
         self.n_points = int(np.count_nonzero(self.claims < 0))
         self._free = None
 
@@ -226,46 +209,22 @@ class Search:
         self.refusals.append((criterion, n_points / max(1, len(self.claims))))
 
 
-class Proposer(Protocol):
-    """Interface of a detector."""
-
-    def propose(self, search: Search) -> Candidate | None:
-        """Return the best candidate among the free points, or None."""
-
-    def reject(self, candidate: Candidate) -> None:
-        """Exclude the last candidate from further proposals."""
-
-
-P = TypeVar("P", bound=Proposer)
-# The criterion that rejects a plane, the cells that belong to it, and its fit.
-_Verdict = tuple[Criterion | None, Support | None, AdjustedPlane | None]
-# Creates the proposer at the beginning of a search.
-ProposerOf = Callable[[Search], P]
-
-
 def detect(
     cloud: PointCloud,
     params: DetectorParams,
     ctx: StepContext,
-    proposer_of: ProposerOf[P],
+    proposer_of: Callable[[Search], Proposer],
     *,
     method: str,
-    plan_cell_m: float | None = None,
-    relabel: Callable[[P, list[FoundPlane], PreparedCloud], None] | None = None,
-) -> tuple[DetectorOut, P]:
+) -> tuple[Planes, PointLabels]:
     """Find the planes of a cloud and turn them into products.
 
     Args:
         cloud: the cloud.
-        params: parameters of every detector.
+        params: parameters of the detector.
         ctx: the step's context.
-        proposer_of: creates the proposer.
-        method: id of the method, for messages.
-        plan_cell_m: side of the plan's cells; None for detectors that do not use the plan.
-        relabel: changes the claims of the whole cloud after all points are labelled.
-
-    Returns:
-        Planes and labels, and the proposer.
+        proposer_of: creates the proposer at the beginning of a search.
+        method: id of the detector, for messages.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -276,13 +235,11 @@ def detect(
         raise MethodError(_NO_INTENSITY.format(method=method))
     moments_s = [(ctx.clock_s(), ctx.processor_s())]
     ctx.progress(0.0, "preparing the points")
-    prepared = partial(prepare, parts=ctx.cores, plan_cell_m=plan_cell_m)
-    whole = prepared(thinned(cloud, params.thinning))
-    noise = measure_noise(whole.sample.offsets_m)
-    tolerance_m, fit_tolerance_m = params.tolerances_m(*(noise or (0.0, 0.0)))
-    search = Search(
-        cloud=whole, params=params, tolerance_m=tolerance_m, fit_tolerance_m=fit_tolerance_m
-    )
+    part = thinned(cloud, params.thinning)
+    noise_m = measure_noise(draw_sample(part).offsets_m)
+    tolerances_m = params.tolerances_m(*(noise_m or (0.0, 0.0)))
+    whole = prepare(part, *tolerances_m, parts=ctx.cores)
+    search = Search(cloud=whole, params=params)
     proposer = proposer_of(search)
 
     def on_found(n_found: int) -> None:
@@ -291,22 +248,24 @@ def detect(
 
     found = find_planes(search, proposer, on_found)
     if not found:
-        raise MethodError(_why_none(cloud, search, proposer_of, method))
+        wider_m = _wider_tolerance_m(search, noise_m or (0.0, 0.0), proposer_of)
+        raise MethodError(_why_none(cloud, search, wider_m, method))
     if params.thinning > 1:
-        whole = prepared(cloud)
+        whole = prepare(cloud, *tolerances_m, parts=ctx.cores)
     if not params.refit:
         found = [_as_proposed(item, whole.up) for item in found]
     if params.thinning > 1 or not params.refit:
-        label(found, whole, tolerance_m)
-    if relabel is not None:
-        relabel(proposer, found, whole)
+        label(found, whole)
+    proposer.relabel(found, whole)
     _report_times(ctx, np.diff([*moments_s, (ctx.clock_s(), ctx.processor_s())], axis=0))
-    if noise is not None:
-        ctx.metric("noise_mm", 1000.0 * noise[0], "mm")
-    ctx.metric("tolerance_m", tolerance_m, "m")
-    ctx.metric("fit_tolerance_m", fit_tolerance_m, "m")
+    if noise_m is not None:
+        ctx.metric("noise_mm", 1000.0 * noise_m[0], "mm")
+    ctx.metric("tolerance_m", tolerances_m[0], "m")
+    ctx.metric("fit_tolerance_m", tolerances_m[1], "m")
     ctx.metric("thinning", params.thinning, "1")
-    return _products(cloud, whole, found, search, ctx), proposer
+    planes, labels = _products(cloud, whole, found, search, ctx)
+    proposer.draw(ctx, planes, cloud)
+    return planes, labels
 
 
 def _products(
@@ -315,12 +274,10 @@ def _products(
     found: list[FoundPlane],
     search: Search,
     ctx: StepContext,
-) -> DetectorOut:
+) -> tuple[Planes, PointLabels]:
     """Measure, assemble, report and draw the detected planes."""
     ctx.progress(0.8, "measuring deviations")
-    planes, deviations, normalities, order = assemble(
-        found, whole, cloud, search.tolerance_m, search.fit_tolerance_m
-    )
+    planes, deviations, normalities, order = assemble(found, whole, cloud)
     # The last name is for points on no plane, which have a claim of -1.
     names = np.append(np.argsort(order), -1).astype(np.int16)
     labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
@@ -335,20 +292,20 @@ def _products(
             share=n_left / len(cloud),
             largest=largest / len(cloud),
             min_share=search.params.min_share / 2.0,
-            tolerance_m=2.0 * search.tolerance_m,
+            tolerance_m=2.0 * whole.tolerance_m,
         )
     ctx.progress(0.9, "drawing")
     draw_deviations(ctx, planes, deviations, normalities)
     plane_of_sample = names[whole.sample_claims].astype(np.int64)
     draw_planes(ctx, planes, whole.sample.offsets_m, plane_of_sample, cloud)
-    materials, reach_m = search.params.materials, search.fit_tolerance_m
-    thickness = measure_thickness(planes, plane_of_sample, whole, cloud, reach_m, materials)
+    materials = search.params.materials
+    thickness = measure_thickness(planes, plane_of_sample, whole, cloud, materials)
     row = row_points(planes, plane_of_sample, whole, cloud)
     report_thickness(ctx, thickness)
     draw_thickness(ctx, planes, thickness, row, materials)
     scan_row = None if row is None else row.measured(materials)
     planes = replace(planes, thickness=thickness, scan_row=scan_row)
-    return DetectorOut(planes=planes, labels=PointLabels(plane_index=labels))
+    return planes, PointLabels(plane_index=labels)
 
 
 def find_planes(
@@ -362,7 +319,7 @@ def find_planes(
         on_found: called after each plane with the number of planes so far.
     """
     found = fit_to_all(greedy_search(search, proposer, on_found), search)
-    label(found, search.cloud, search.tolerance_m)
+    label(found, search.cloud)
     return found
 
 
@@ -380,12 +337,12 @@ def greedy_search(
             break
         plane = verify(candidate, search)
         if plane is None:
-            proposer.reject(candidate)
+            proposer.reject()
             n_rejected += 1
             continue
         found.append(plane)
         n_rejected = 0
-        search.claim(Claim.of(plane.raster, plane.support, search.tolerance_m))
+        search.claim(plane.raster, plane.support)
         on_found(len(found))
     return found
 
@@ -400,7 +357,7 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
     """
     up, params = search.cloud.up, search.params
     leans = partial(leans_as_asked, up=up, max_tilt_deg=params.max_tilt_deg)
-    freedom: Freedom = "free"
+    freedom: Constraint = "any"
     if params.exact:
         normal = candidate.plane.normal[None]
         if candidate.constraint == "vertical" or leans(normal, constraint="vertical").all():
@@ -415,46 +372,56 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
         search.refuse("tilt")
         return None
     for nth in range(_PASSES_MOST):
-        raster = SurfaceRaster.over(plane, search.box_corners_m, up, cell_m)
-        sums = _cells_of(search, raster, search.cloud.parts)
-        criterion, support, adjusted = _judged(
-            raster, sums, search, freedom, search.least_points, settled_m=_SETTLED_ON_SAMPLE_M
-        )
+        raster, sums, support = _observed(search, plane, cell_m)
+        adjusted = _judged(raster, sums, support, search, freedom, settled_m=_SETTLED_ON_SAMPLE_M)
         if adjusted is None or support is None:
-            if support is not None and criterion in _SET_ASIDE:
-                search.claim(Claim.of(raster, support, search.tolerance_m))
+            if support is not None and search.refusals[-1][0] in _SET_ASIDE:
+                search.claim(raster, support)
             return None
         plane, cell_m = adjusted.plane, raster.cell_m
         # If the plane has moved, its points were selected by a tilted slab, so repeat.
-        is_settled = adjusted.moved_m < _SETTLED_SHARE * search.fit_tolerance_m
-        if is_settled or nth == _PASSES_MOST - 1:
+        if _is_settled(adjusted, search) or nth == _PASSES_MOST - 1:
             raster = raster.moved_to(plane, up)
             return FoundPlane(raster, support, adjusted, candidate, freedom)
     return None
 
 
-def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Plane, float] | None:
+def _is_settled(adjusted: AdjustedPlane, search: Search) -> bool:
+    return adjusted.moved_m < _SETTLED_SHARE * search.cloud.fit_tolerance_m
+
+
+def _observed(
+    search: Search, plane: Plane, cell_m: float
+) -> tuple[SurfaceRaster, CellSums, Support | None]:
+    """Return a raster on a plane, the sums of the free points per cell, and the plane's cells."""
+    raster = SurfaceRaster.over(plane, search.box_corners_m, search.cloud.up, cell_m)
+    (sums,) = measure_cells(search.cloud, [raster], points=search.free()[1])
+    join_parts = search.params.join_parts
+    return raster, sums, support_of(raster, crowded_cells(sums), sums, join_parts=join_parts)
+
+
+def _refined(
+    candidate: Candidate, search: Search, freedom: Constraint
+) -> tuple[Plane, float] | None:
     """Move a candidate to the nearby surface; return the plane and a suitable cell size.
 
     Returns None if too few points of the sample concentrate there.
     """
-    free_points, up = search.free()[0], search.cloud.up
-    fit = partial(refine_plane, freedom=freedom, up=up)
-    first, *rest = shrinking_tolerances(search.tolerance_m, search.fit_tolerance_m)
+    cloud, free_points = search.cloud, search.free()[0]
+    fit = partial(refine_plane, freedom=freedom, up=cloud.up)
+    first, *rest = shrinking_tolerances(cloud.tolerance_m, cloud.fit_tolerance_m)
     start = candidate.plane if candidate.start is None else candidate.start
     plane = fit(_some(free_points, _FIT_POINTS), start, first)
     if plane is None:
         search.refuse("scattered")
         return None
-    near = np.abs(free_points @ plane.normal - plane.offset_m) <= search.tolerance_m
+    near = np.abs(free_points @ plane.normal - plane.offset_m) <= cloud.tolerance_m
     near_m = free_points.take(np.flatnonzero(near), axis=0)
     # The cell size depends on the extent of the points.
-    placed = _some(near_m @ wall_axes(plane.normal, up).T, _SPREAD_POINTS)
+    placed = _some(near_m @ wall_axes(plane.normal, cloud.up).T, _SPREAD_POINTS)
     low, high = np.quantile(placed, (0.02, 0.98), axis=0) if len(near_m) else np.zeros((2, 2))
-    cell_m = max(search.tolerance_m, cell_for(len(near_m), float(np.prod(high - low))))
-    raster = SurfaceRaster.over(plane, search.box_corners_m, up, cell_m)
-    sums = _cells_of(search, raster, 1)
-    support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
+    cell_m = max(cloud.tolerance_m, cell_for(len(near_m), float(np.prod(high - low))))
+    raster, sums, support = _observed(search, plane, cell_m)
     if support is None or support.n_points < _SAMPLE_CAUTION * search.least_points:
         search.refuse("scattered" if support is None else "few", support.n_points if support else 0)
         return None
@@ -465,14 +432,11 @@ def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Pl
     if len(support.parts_m) > 1:
         largest_m = near_m[raster.covers(near_m, support.part_of_cell == 0)]
         alone = fit(largest_m, plane, first, *rest)
-        if together is not None and alone is not None:
-            joint_m, own_m = (
-                float(np.median(np.abs(fitted.distances_m(largest_m))))
-                for fitted in (together, alone)
-            )
-            if joint_m > _ASKEW * own_m + _SAME_M:
-                together = alone
-        else:
+        away_m = [
+            math.inf if fitted is None else float(np.median(np.abs(fitted.distances_m(largest_m))))
+            for fitted in (together, alone)
+        ]
+        if away_m[0] > _ASKEW * away_m[1] + _SAME_M or alone is None:
             together = alone
     if together is None:
         search.refuse("scattered")
@@ -486,37 +450,37 @@ def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     return points[:: max(1, len(points) // most)]
 
 
-def _cells_of(search: Search, raster: SurfaceRaster, parts: int) -> CellSums:
-    """Return the sums of the free sample points per cell on a plane."""
-    return measure_cells(
-        search.free()[1],
-        [raster],
-        tolerance_m=search.tolerance_m,
-        fit_tolerance_m=search.fit_tolerance_m,
-        parts=parts,
-    )[0]
-
-
 def _judged(
     raster: SurfaceRaster,
     sums: CellSums,
+    support: Support | None,
     search: Search,
-    freedom: Freedom,
-    least_points: float,
+    freedom: Constraint,
     *,
+    every: float | None = None,
     settled_m: float = SETTLED_M,
-) -> _Verdict:
-    """Return the criterion that rejects a plane, the cells that belong to it, and its fit."""
-    support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
+) -> AdjustedPlane | None:
+    """Fit a plane to its cells, or record the criterion that rejects it.
+
+    Args:
+        raster: cells on the plane.
+        sums: sums of the points per cell.
+        support: the cells that belong to the plane.
+        search: receives the criterion.
+        freedom: orientation that the fit keeps exactly.
+        every: number of points of the cloud per summed point; None for free points of the sample.
+        settled_m: the fit has converged if no cell moves by more.
+    """
     if support is None:
         search.refuse("scattered")
-        return "scattered", None, None
-    adjusted: AdjustedPlane | None = None
-    criterion: Criterion | None = None
+        return None
+    scale = 1.0 if every is None else every / search.cloud.sample.n_represented
+    n_points, adjusted = scale * support.n_points, None
     u, v = raster.centres_m()
     left, right, top, bottom = support.bounds_m
     near_it = sums.n_near[(u > left) & (u < right) & (v > top) & (v < bottom)]
-    if support.n_points < least_points:
+    criterion: Criterion = "bent"
+    if n_points < search.least_points:
         criterion = "few"
     elif min(right - left, bottom - top) < _STRIP_CELLS * raster.cell_m:
         criterion = "strip"
@@ -529,96 +493,83 @@ def _judged(
             raster,
             sums,
             support.cells,
-            fit_tolerance_m=search.fit_tolerance_m,
+            fit_tolerance_m=search.cloud.fit_tolerance_m,
             freedom=freedom,
             settled_m=settled_m,
         )
-        # The surface is a column or barrel that the plane only touches.
-        if adjusted is None or (
-            adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
-        ):
-            criterion, adjusted = "bent", None
-    if criterion is not None:
-        # As a share of all points, even if not all of them were used.
-        share = support.n_points / max(least_points, 1e-9)
-        search.refuse(criterion, share * search.least_points)
-    return criterion, support, adjusted
+    # The surface may be a column or barrel that the plane only touches.
+    if adjusted is None or (
+        adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
+    ):
+        search.refuse(criterion, n_points)
+        return None
+    return adjusted
 
 
 def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
     """Fit planes of the sample to all points; omit planes that are not confirmed by them."""
     cloud = search.cloud
     every = max(1, len(cloud.claims) // _FITTED_MOST)
-    least_points = search.params.min_share * len(cloud.claims) / every
     # A fixed step would coincide with scan columns and omit stripes.
     drawn = np.random.default_rng(0).permutation(len(cloud.points.boxes)) % every == 0
-    is_open = [True] * len(found)
-
-    def judged(asked: tuple[SurfaceRaster, CellSums, Freedom]) -> _Verdict:
-        raster, sums, freedom = asked
-        return _judged(raster, sums, search, freedom, least_points)
-
+    settled = [False] * len(found)
     for _ in range(_PASSES_MOST):
         rasters = [
-            _fine_raster(item, search, every) if wanted else replace(item.raster, shape=(0, 0))
-            for item, wanted in zip(found, is_open, strict=True)
+            replace(item.raster, shape=(0, 0)) if done else _fine_raster(item, cloud, every)
+            for item, done in zip(found, settled, strict=True)
         ]
-        sums = measure_cells(
-            cloud.points,
-            rasters,
-            tolerance_m=search.tolerance_m,
-            fit_tolerance_m=search.fit_tolerance_m,
-            parts=cloud.parts,
-            bounds_m=_bounds(found, search.tolerance_m),
-            drawn=drawn,
-        )
-        asked = [k for k in range(len(found)) if is_open[k]]
-        verdicts = in_order(
-            judged, [(rasters[k], sums[k], found[k].freedom) for k in asked], threads=cloud.parts
-        )
-        fitted = dict(zip(asked, verdicts, strict=True))
-        kept, moves = [], []
-        for k, before in enumerate(found):
-            item = before
-            _, support, adjusted = fitted.get(k, (None, item.support, item.adjusted))
-            if support is None or adjusted is None:
-                continue
-            moves.append(is_open[k] and adjusted.moved_m > _SETTLED_SHARE * search.fit_tolerance_m)
-            if is_open[k]:
-                raster = rasters[k].moved_to(adjusted.plane, cloud.up)
-                item = replace(item, raster=raster, support=support, adjusted=adjusted)
-            kept.append(item)
-        found, is_open = kept, moves
-        if not any(is_open):
+        sums = measure_cells(cloud, rasters, bounds_m=_bounds(found, cloud), drawn=drawn)
+
+        refit = partial(_refitted, search=search, every=every)
+        fitted = in_order(refit, zip(found, rasters, sums, strict=True), threads=cloud.parts)
+        found = [item for item in fitted if item is not None]
+        settled = [_is_settled(item.adjusted, search) for item in found]
+        if all(settled):
             break
     return found
 
 
-def _fine_raster(item: FoundPlane, search: Search, every: int) -> SurfaceRaster:
+def _refitted(
+    part: tuple[FoundPlane, SurfaceRaster, CellSums], search: Search, every: int
+) -> FoundPlane | None:
+    """Return a plane fitted to its cells; unchanged if nothing was summed, None if rejected."""
+    item, raster, sums = part
+    if not math.prod(raster.shape):
+        return item
+    join_parts = search.params.join_parts
+    support = support_of(raster, crowded_cells(sums), sums, join_parts=join_parts)
+    adjusted = _judged(raster, sums, support, search, item.freedom, every=every)
+    if adjusted is None or support is None:
+        return None
+    raster = raster.moved_to(adjusted.plane, search.cloud.up)
+    return replace(item, raster=raster, support=support, adjusted=adjusted)
+
+
+def _fine_raster(item: FoundPlane, cloud: PreparedCloud, every: int) -> SurfaceRaster:
     """Return a raster of the plane's rectangle, as fine as the number of points permits."""
     area_m2 = float(item.support.cells.sum()) * item.raster.cell_m**2
-    share = search.cloud.sample.n_represented / every
+    share = cloud.sample.n_represented / every
     cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
-    left, right, top, bottom = grown(item.support.bounds_m, search.tolerance_m)[1:]
+    _, left, right, top, bottom = cloud.bounds_of(item.support.bounds_m)
     rows, columns = math.ceil((bottom - top) / cell_m), math.ceil((right - left) / cell_m)
     shape = (max(1, rows), max(1, columns))
     return replace(item.raster, low_m=np.array([left, top]), cell_m=cell_m, shape=shape)
 
 
-def _bounds(found: list[FoundPlane], tolerance_m: float) -> list[NDArray[np.float64]]:
+def _bounds(found: list[FoundPlane], cloud: PreparedCloud) -> list[NDArray[np.float64]]:
     """Return bounds (r, 5) of each plane: one rectangle, or several if that is sparsely covered."""
     bounds, n_spare = [], _SLABS_MOST - len(found)
     for item in found:
         most = min(_RECTANGLES_MOST, n_spare + 1)
         own = covering_rectangles(item.raster, item.support.cells, most)
         n_spare -= len(own) - 1
-        bounds.append(grown(own if len(own) > 1 else item.support.bounds_m[None], tolerance_m))
+        bounds.append(cloud.bounds_of(own if len(own) > 1 else item.support.bounds_m[None]))
     return bounds
 
 
-def label(found: list[FoundPlane], cloud: PreparedCloud, tolerance_m: float) -> None:
+def label(found: list[FoundPlane], cloud: PreparedCloud) -> None:
     """Assign all points to the nearest plane whose rectangles contain them."""
-    bounds = _bounds(found, tolerance_m)
+    bounds = _bounds(found, cloud)
     plane_of_slab = np.repeat(np.arange(len(found)), [len(own) for own in bounds])
     slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)[plane_of_slab]
     cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]))
@@ -635,28 +586,35 @@ def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
     return replace(item, raster=item.raster.moved_to(plane, up))
 
 
-def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], method: str) -> str:
+def _wider_tolerance_m(
+    search: Search, noise_m: tuple[float, float], proposer_of: Callable[[Search], Proposer]
+) -> float | None:
+    """Return a larger `tolerance_m` with which a plane is found, None if there is none."""
+    for times in _WIDER:
+        update = {"n_planes_max": 1, "tolerance_m": times * search.cloud.tolerance_m}
+        params = search.params.model_copy(update=update)
+        tolerance_m, fit_m = params.tolerances_m(*noise_m)
+        cloud = replace(search.cloud, tolerance_m=tolerance_m, fit_tolerance_m=fit_m)
+        wider = replace(search, cloud=cloud, params=params)
+        if fit_to_all(greedy_search(wider, proposer_of(wider)), wider):
+            return tolerance_m
+    return None
+
+
+def _why_none(cloud: PointCloud, search: Search, wider_m: float | None, method: str) -> str:
     """Return the message for no plane: why the largest candidate was rejected, and advice."""
-    why = _NO_CANDIDATE
+    why, tolerance_m = _NO_CANDIDATE, search.cloud.tolerance_m
     if search.refusals:
         criterion, share = max(search.refusals, key=lambda refusal: refusal[1])
         why = _CRITERIA[criterion].format(share=share, area=search.min_area_m2)
-    advice = _ADVICE.format(wider=_WIDER[-1] * search.tolerance_m)
-    for times in _WIDER:
-        wider = replace(
-            search,
-            params=search.params.model_copy(update={"n_planes_max": 1}),
-            tolerance_m=times * search.tolerance_m,
-            fit_tolerance_m=max(search.fit_tolerance_m, 0.3 * times * search.tolerance_m),
-        )
-        if greedy_search(wider, proposer_of(wider)):
-            advice = _ADVICE_WIDER.format(wider=wider.tolerance_m)
-            break
+    advice = _ADVICE.format(wider=_WIDER[-1] * tolerance_m)
+    if wider_m is not None:
+        advice = _ADVICE_WIDER.format(wider=wider_m)
     sides_m = (float(np.ptp(axis)) for axis in (cloud.x, cloud.y, cloud.z))
     return _NO_PLANE.format(
         count=len(cloud),
         size=" x ".join(f"{side_m:.3g}" for side_m in sides_m) + " m",
-        tolerance=search.tolerance_m,
+        tolerance=tolerance_m,
         share=search.params.min_share,
         why=why,
         advice=advice,

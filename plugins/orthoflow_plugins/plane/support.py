@@ -8,7 +8,7 @@ distinguishes walls from planes that cut floors and ceilings.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
+from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
     BlockedPoints,
@@ -153,12 +154,6 @@ def slab_of(plane: Plane, axes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
 
 
-def grown(bounds_m: NDArray[np.float64], tolerance_m: float) -> NDArray[np.float64]:
-    """Return bounds (..., 5) of slabs: the tolerance, and rectangles (..., 4) widened by it."""
-    wider = bounds_m + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
-    return np.concatenate([np.full((*wider.shape[:-1], 1), tolerance_m), wider], axis=-1)
-
-
 def cell_for(n_points: float, area_m2: float) -> float:
     """Return a cell size in metres with enough points per cell, for points spread over an area."""
     if n_points <= 0.0 or area_m2 <= 0.0:
@@ -167,33 +162,29 @@ def cell_for(n_points: float, area_m2: float) -> float:
 
 
 def measure_cells(
-    points: BlockedPoints,
+    cloud: PreparedCloud,
     rasters: Sequence[SurfaceRaster],
     *,
-    tolerance_m: float,
-    fit_tolerance_m: float,
-    parts: int,
+    points: BlockedPoints | None = None,
     bounds_m: Sequence[NDArray[np.float64]] | None = None,
     drawn: NDArray[np.bool_] | None = None,
 ) -> list[CellSums]:
     """Sum the points near planes per cell in one pass, each point on its nearest plane.
 
     Args:
-        points: the points.
+        cloud: the cloud.
         rasters: cells on each plane; planes without rows receive points, but these are not summed.
-        tolerance_m: maximum distance of points that belong to a plane.
-        fit_tolerance_m: maximum distance of points used in the fit.
-        parts: number of parts, one per thread.
+        points: points that are summed; those of the cloud by default.
         bounds_m: (r, 5) rectangles of each plane that contain its points; by default its raster.
         drawn: (blocks,) True for blocks that are summed; None for all.
     """
+    points = cloud.points if points is None else points
     if bounds_m is None:
-        bounds_m = [np.append(tolerance_m, raster.bounds_m())[None] for raster in rasters]
+        bounds_m = [np.append(cloud.tolerance_m, raster.bounds_m())[None] for raster in rasters]
     if drawn is None:
         drawn = np.ones(len(points.boxes), dtype=bool)
     starts = np.cumsum([0, *(math.prod(raster.shape) for raster in rasters)])
-    fit_tolerance_m = min(fit_tolerance_m, tolerance_m)
-    limits = (fit_tolerance_m, INNER_SHARE * tolerance_m)
+    limits = (cloud.fit_tolerance_m, INNER_SHARE * cloud.tolerance_m)
     tables = np.array(
         [
             (*r.low_m, 1.0 / r.cell_m, *r.shape, start, *limits)
@@ -204,15 +195,15 @@ def measure_cells(
     slabs = np.array([raster.slab() for raster in rasters]).reshape(-1, 12)
     rows = [np.repeat(table, repeats, axis=0) for table in (slabs, tables)]
     slabs, tables, bounds = *rows, np.concatenate([np.zeros((0, 5)), *bounds_m])
-    counts = np.zeros((parts, int(starts[-1]), 3), dtype=np.int32)
-    sums = np.zeros((parts, int(starts[-1]), 2), dtype=np.int64)
+    counts = np.zeros((cloud.parts, int(starts[-1]), 3), dtype=np.int32)
+    sums = np.zeros((cloud.parts, int(starts[-1]), 2), dtype=np.int64)
 
     def add(part: int, piece: slice) -> None:
         blocks = drawn[piece.start // BLOCK_POINTS :]
         own = (blocks, counts[part], sums[part])
         sum_assigned(piece_of(points, piece), slabs, bounds, tables, *own)
 
-    each_part(len(points.x), parts, add)
+    each_part(len(points.x), cloud.parts, add)
     columns = [*counts.sum(axis=0, dtype=np.int64).T, *sums.sum(axis=0).T]
     return [
         CellSums(
@@ -306,15 +297,15 @@ def covering_rectangles(
     padded = np.zeros((rows * every, columns * every), dtype=bool)
     padded[: cells.shape[0], : cells.shape[1]] = cells
     coarse = np.asarray(padded.reshape(rows, every, columns, every).any(axis=(1, 3)))
-    rectangles = [_tight(coarse, (0, rows, 0, columns))]
-    while len(rectangles) < most and coarse.sum() < _FILLED_SHARE * _area(rectangles):
-        cuts = [_best_cut(coarse, rectangle) for rectangle in rectangles]
-        saved = [_area([old]) - _area(new) for old, new in zip(rectangles, cuts, strict=True)]
-        best = int(np.argmax(saved))
+    whole = _tight(coarse, (0, rows, 0, columns))
+    cuts = {whole: _best_cut(coarse, whole)}
+    while len(cuts) < most and coarse.sum() < _FILLED_SHARE * _area(cuts):
+        saved = {old: _area([old]) - _area(new) for old, new in cuts.items()}
+        best = max(cuts, key=saved.__getitem__)
         if saved[best] <= 0:
             break
-        rectangles[best : best + 1] = cuts[best]
-    edges = np.array(rectangles, dtype=np.float64)[:, [2, 3, 0, 1]]
+        cuts |= {new: _best_cut(coarse, new) for new in cuts.pop(best)}
+    edges = np.array(list(cuts), dtype=np.float64)[:, [2, 3, 0, 1]]
     return np.asarray(raster.low_m[[0, 0, 1, 1]] + every * raster.cell_m * edges)
 
 
@@ -334,12 +325,12 @@ def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangl
 def _tight(cells: NDArray[np.bool_], rectangle: _Rectangle) -> _Rectangle:
     """Return the smallest rectangle that contains the cells; its area is zero if there are none."""
     top, bottom, left, right = rectangle
-    rows, columns = np.nonzero(cells[top:bottom, left:right])
-    if not len(rows):
+    part = cells[top:bottom, left:right]
+    rows, columns = (np.flatnonzero(part.any(axis=axis)).tolist() for axis in (1, 0))
+    if not rows:
         return (top, top, left, left)
-    low, high = int(rows.min()), int(rows.max()) + 1
-    return (top + low, top + high, left + int(columns.min()), left + int(columns.max()) + 1)
+    return (top + rows[0], top + rows[-1] + 1, left + columns[0], left + columns[-1] + 1)
 
 
-def _area(rectangles: list[_Rectangle]) -> int:
+def _area(rectangles: Iterable[_Rectangle]) -> int:
     return sum((bottom - top) * (right - left) for top, bottom, left, right in rectangles)

@@ -20,7 +20,7 @@ from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Planes, PointCloud, ScanRow, Spread, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.cloud import PreparedCloud
-from orthoflow_plugins.plane.detector import Materials
+from orthoflow_plugins.plane.proposing import Materials
 
 # Side of the tiles of a wall, and length of the pieces of a row, to whose means distances refer.
 _TILE_M: Final = 0.1
@@ -75,7 +75,6 @@ def measure_thickness(
     plane_of_sample: NDArray[np.int64],
     prepared: PreparedCloud,
     cloud: PointCloud,
-    reach_m: float,
     materials: Materials,
 ) -> tuple[Thickness | None, ...]:
     """Measure the thickness of each plane; None for a plane with too few points.
@@ -85,7 +84,6 @@ def measure_thickness(
         plane_of_sample: (s,) plane of each sample point, -1 for none.
         prepared: the prepared cloud with its sample.
         cloud: the cloud.
-        reach_m: points farther from their plane are relief or belong to other surfaces.
         materials: lowest and highest intensity of each material.
     """
     sample, found = prepared.sample, list[Thickness | None]()
@@ -93,7 +91,8 @@ def measure_thickness(
         members = np.flatnonzero(plane_of_sample == k)
         offset_m = planes.offset[k] - float(normal @ cloud.origin)
         distance_m = sample.offsets_m[members] @ normal - offset_m
-        near = np.abs(distance_m) <= reach_m
+        # Points farther from the plane are relief or belong to other surfaces.
+        near = np.abs(distance_m) <= prepared.fit_tolerance_m
         members, distance_m = members[near], distance_m[near]
         axes = wall_axes(normal, planes.up)
         placed = np.floor(sample.offsets_m[members] @ axes.T / _TILE_M).astype(np.int64)

@@ -2,8 +2,7 @@
 
 Region growing needs the neighbours of each point. Voxels make this fast: one pass adds each point
 to ten sums of its voxel, and the sums of neighbouring voxels give the exact plane through all their
-points. A room with fifty million points has half a million voxels. Hough transforms need only the
-first sum, the number of points.
+points. A room with fifty million points has half a million voxels.
 
 Voxels are stored in bricks of 8 x 8 x 8, and only bricks with points are stored, because a full
 table of 2 cm voxels would be larger than the scan. Moments are sums of integer steps from the
@@ -29,7 +28,6 @@ from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
     BlockedPoints,
-    PlanGrid,
     each_part,
     flattest,
     piece_of,
@@ -114,37 +112,40 @@ class VoxelTable:
     """The non-empty voxels of a cloud, numbered by position.
 
     Attributes:
-        grid: axes, corner and side of the voxels.
+        basis: (3, 3) rows e1, e2, up, the axes of the voxels.
+        low_m: (3,) lower corner of the first voxel in the (e1, e2, up) frame of the offsets.
+        voxel_m: side of a voxel.
         bricks: (a, b, c) int32 row of each brick in `numbers`, -1 for bricks without points.
         numbers: (rows, VOXELS) int32 number of each voxel, -1 for voxels without points.
         places: (m, 3) int32 position of each voxel along e1, e2, up.
-        sums: (m, N_SUMS) int64 moments, or (m, 1) numbers of points.
+        sums: (m, N_SUMS) int64 moments.
     """
 
-    grid: PlanGrid
+    basis: NDArray[np.float64]
+    low_m: NDArray[np.float64]
+    voxel_m: float
     bricks: NDArray[np.int32]
     numbers: NDArray[np.int32]
     places: NDArray[np.int32]
     sums: NDArray[np.int64]
 
     @classmethod
-    def over(cls, cloud: PreparedCloud, voxel_m: float, *, n_sums: int = N_SUMS) -> VoxelTable:
+    def over(cls, cloud: PreparedCloud, voxel_m: float) -> VoxelTable:
         """Sum the points of a cloud into voxels over its box; enlarge these if there are too many.
 
         Each part of the pass has its own tables, which are then merged.
         """
-        extent_m = cloud.grid.extent_m
-        brick_m3 = float(np.prod(extent_m + BRICK_SIDE * voxel_m)) / _BRICKS_MOST
+        brick_m3 = float(np.prod(cloud.extent_m + BRICK_SIDE * voxel_m)) / _BRICKS_MOST
         voxel_m = max(voxel_m, math.cbrt(brick_m3) / BRICK_SIDE)
-        a, b, c = np.maximum(1, np.ceil(extent_m / voxel_m)).astype(int).tolist()
-        grid = replace(cloud.grid, cell_m=voxel_m, shape=(a, b, c))
-        frame, shape = grid.frame(), (-(-a // BRICK_SIDE), -(-b // BRICK_SIDE), -(-c // BRICK_SIDE))
+        frame = _frame(cloud.basis, cloud.low_m, voxel_m)
+        a, b, c = np.ceil(cloud.extent_m / (BRICK_SIDE * voxel_m)).astype(int).tolist()
+        shape = (a, b, c)
         n_bricks = math.prod(shape)
         tables = [
             (
                 np.full(n_bricks, -1, dtype=np.int32),
                 np.zeros((_ROWS_FIRST, VOXELS), dtype=np.int32),
-                np.zeros((_VOXELS_FIRST, n_sums), dtype=np.int64),
+                np.zeros((_VOXELS_FIRST, N_SUMS), dtype=np.int64),
                 np.zeros(2, dtype=np.int64),
             )
             for _ in range(cloud.parts)
@@ -179,13 +180,15 @@ class VoxelTable:
         filled = np.flatnonzero(held)
         numbers = np.full(len(held), -1, dtype=np.int32)
         numbers[filled] = np.arange(len(filled), dtype=np.int32)
-        sums = np.zeros((len(filled), n_sums), dtype=np.int64)
+        sums = np.zeros((len(filled), N_SUMS), dtype=np.int64)
         for keys, own_sums in met:
             sums[numbers[keys]] += own_sums
         corners = np.stack(np.unravel_index(occupied, shape), axis=1) * BRICK_SIDE
         within = np.stack(np.unravel_index(filled % VOXELS, (BRICK_SIDE,) * 3), axis=1)
         return cls(
-            grid=grid,
+            basis=cloud.basis,
+            low_m=cloud.low_m,
+            voxel_m=voxel_m,
             bricks=bricks.reshape(shape),
             numbers=numbers.reshape(-1, VOXELS),
             places=(corners[filled // VOXELS] + within).astype(np.int32),
@@ -195,8 +198,7 @@ class VoxelTable:
     def coarser(self, member: NDArray[np.int64]) -> tuple[VoxelTable, NDArray[np.int64]]:
         """Merge voxels (k,) into voxels twice as wide; return these and (k,) their new voxels."""
         places, odd = np.divmod(self.places[member].astype(np.int64), 2)
-        a, b, c = (math.ceil(size / 2) for size in self.grid.shape)
-        shape = tuple(-(-size // BRICK_SIDE) for size in (a, b, c))
+        shape = tuple(-(-size // 2) for size in self.bricks.shape)
         brick, within = np.divmod(places, BRICK_SIDE)
         brick_key = np.ravel_multi_index(tuple(brick.T), shape)
         voxel = np.ravel_multi_index(tuple(within.T), (BRICK_SIDE,) * 3)
@@ -212,8 +214,9 @@ class VoxelTable:
         moved = _moved(self.sums[member], (2 * odd - 1) * HALF_STEPS)
         moved *= 0.5 ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
         sums = np.rint(_totals(moved, of_member, len(keys))).astype(np.int64)
-        wider = VoxelTable(
-            grid=replace(self.grid, cell_m=2.0 * self.grid.cell_m, shape=(a, b, c)),
+        wider = replace(
+            self,
+            voxel_m=2.0 * self.voxel_m,
             bricks=bricks.reshape(shape),
             numbers=numbers,
             places=places[first].astype(np.int32),
@@ -233,13 +236,21 @@ class VoxelTable:
         """Return centroids (m, 3) of voxels along e1, e2, up, in metres from the cloud's origin."""
         half_steps = self.sums[:, 1:4] / self.sums[:, :1]
         middles = self.places + 0.5 + half_steps / (2 * HALF_STEPS)
-        return self.grid.low_m + self.grid.cell_m * middles
+        return self.low_m + self.voxel_m * middles
 
     def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
         """Return the voxels (n,) of points, -1 for none."""
         found = np.empty(len(points.x), dtype=np.int32)
-        find_voxels(points, self.grid.frame(), self.bricks, self.numbers, found)
+        frame = _frame(self.basis, self.low_m, self.voxel_m)
+        find_voxels(points, frame, self.bricks, self.numbers, found)
         return found
+
+
+def _frame(
+    basis: NDArray[np.float64], low_m: NDArray[np.float64], voxel_m: float
+) -> NDArray[np.float32]:
+    """Return F (3, 4) for the position of an offset p in voxels: `F[:, :3] @ p - F[:, 3]`."""
+    return (np.column_stack([basis, low_m]) / voxel_m).astype(np.float32, order="C")
 
 
 def _with_room(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
@@ -286,7 +297,7 @@ class SurfaceVoxels:
     @classmethod
     def of(cls, table: VoxelTable, wanted: Neighbourhood, *, parts: int) -> SurfaceVoxels:
         """Fit a plane to the neighbourhood of each voxel."""
-        neighbourhood = wanted.with_voxels(table.grid.cell_m)
+        neighbourhood = wanted.with_voxels(table.voxel_m)
         places, around = table.places, neighbourhood.around()
         normals, spreads = np.empty((2, len(places), 3), dtype=np.float32)
         # Number of points that completes a knn neighbourhood; the others use all their voxels.
@@ -312,17 +323,17 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
     If the cloud is so sparse that neighbourhoods would have too few points, voxels and
     neighbourhoods are larger than requested.
     """
-    grid, sample = cloud.grid, cloud.sample
-    placed = np.floor((sample.offsets_m @ grid.basis.T - grid.low_m) / wanted.voxel_m)
-    inside = ((placed >= 0) & (placed * wanted.voxel_m < grid.extent_m)).all(axis=1)
-    shape = np.ceil(grid.extent_m / wanted.voxel_m).astype(np.int64) + 1
+    sample = cloud.sample
+    placed = np.floor((sample.offsets_m @ cloud.basis.T - cloud.low_m) / wanted.voxel_m)
+    inside = ((placed >= 0) & (placed * wanted.voxel_m < cloud.extent_m)).all(axis=1)
+    shape = np.ceil(cloud.extent_m / wanted.voxel_m).astype(np.int64) + 1
     keys = np.sort(np.ravel_multi_index(tuple(placed[inside].astype(np.int64).T), tuple(shape)))
     counts = np.diff(np.flatnonzero(np.diff(keys, prepend=-1, append=-1)))
     # Mean number of other sample points in the voxel of a point.
     others = float((counts * (counts - 1)).sum()) / max(1, len(sample.index))
     in_neighbourhood = others * sample.n_represented * wanted.width_voxels() ** 2
     voxel_m = wanted.voxel_m * max(1.0, math.sqrt(POINTS_LEAST / max(in_neighbourhood, 1e-9)))
-    most_m = max(wanted.voxel_m, _VOXEL_SHARE_MOST * float(grid.extent_m.max()))
+    most_m = max(wanted.voxel_m, _VOXEL_SHARE_MOST * float(cloud.extent_m.max()))
     table = VoxelTable.over(cloud, min(voxel_m, most_m))
     return SurfaceVoxels.of(table, wanted, parts=cloud.parts)
 
@@ -412,7 +423,7 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
         shape: bricks along a, b, c.
         bricks: (a * b * c,) row of each brick in `numbers`, -1 if not yet assigned.
         numbers: (rows, VOXELS) number of each voxel, -1 if not yet assigned.
-        sums: (voxels, N_SUMS) added to; (voxels, 1) if only points are counted.
+        sums: (voxels, N_SUMS) added to.
         n_used: numbers of rows and voxels in use.
 
     Returns:
@@ -420,7 +431,6 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
     """
     keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     places = np.zeros((3, BLOCK_POINTS), dtype=np.float32)
-    has_moments = sums.shape[1] > 1
     fine, one, middle = np.float32(HALF_STEPS), np.int64(1), np.int64(HALF_STEPS - 1)
     while start < points.x.size:
         if n_used[0] + BLOCK_POINTS > numbers.shape[0] or n_used[1] + BLOCK_POINTS > sums.shape[0]:
@@ -435,19 +445,18 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
             if key >= 0:
                 k = _voxel(key, bricks, numbers, n_used)
                 sums[k, 0] += last - first
-                if has_moments:
-                    sa = sb = sc = aa = ab = ac = bb = bc = cc = np.int64(0)
-                    for i in range(first, last):
-                        p, q, r = places[0, i], places[1, i], places[2, i]
-                        a = (np.int64((p - np.float32(np.int32(p))) * fine) << one) - middle
-                        b = (np.int64((q - np.float32(np.int32(q))) * fine) << one) - middle
-                        c = (np.int64((r - np.float32(np.int32(r))) * fine) << one) - middle
-                        sa, sb, sc = sa + a, sb + b, sc + c
-                        aa, ab, ac = aa + a * a, ab + a * b, ac + a * c
-                        bb, bc, cc = bb + b * b, bc + b * c, cc + c * c
-                    total = (sa, sb, sc, aa, ab, ac, bb, bc, cc)
-                    for place in range(9):
-                        sums[k, 1 + place] += total[place]
+                sa = sb = sc = aa = ab = ac = bb = bc = cc = np.int64(0)
+                for i in range(first, last):
+                    p, q, r = places[0, i], places[1, i], places[2, i]
+                    a = (np.int64((p - np.float32(np.int32(p))) * fine) << one) - middle
+                    b = (np.int64((q - np.float32(np.int32(q))) * fine) << one) - middle
+                    c = (np.int64((r - np.float32(np.int32(r))) * fine) << one) - middle
+                    sa, sb, sc = sa + a, sb + b, sc + c
+                    aa, ab, ac = aa + a * a, ab + a * b, ac + a * c
+                    bb, bc, cc = bb + b * b, bc + b * c, cc + c * c
+                total = (sa, sb, sc, aa, ab, ac, bb, bc, cc)
+                for place in range(9):
+                    sums[k, 1 + place] += total[place]
             first = last
         start += BLOCK_POINTS
     return points.x.size

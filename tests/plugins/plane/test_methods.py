@@ -9,21 +9,27 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane.cloud import prepare
 from orthoflow_plugins.plane.comparators import Open3dPatches, Open3dRansac, load_open3d
-from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
-from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer, directions_over
+from orthoflow_plugins.plane.hough import (
+    PlanProposer,
+    SpaceProposer,
+    directions_over,
+    normals_of,
+)
+from orthoflow_plugins.plane.hough2d import Hough2d
+from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import (
     Ransac,
     curve_order,
     draw_hypotheses,
     fewest_false_alarms,
 )
-from orthoflow_plugins.plane.region import Region, RegionProposer, region_proposer
+from orthoflow_plugins.plane.region import Region, RegionProposer
 from orthoflow_plugins.plane.voxels import (
     HALF_STEPS,
     Neighbourhood,
     SurfaceVoxels,
-    VoxelTable,
     surface_voxels,
 )
 from pydantic import ValidationError
@@ -35,8 +41,10 @@ from orthoflow.sdk import Method
 from tests import plane_scenes
 from tests.long_loops import long_only
 from tests.plane_scenes import (
+    FIT_TOLERANCE_M,
     ROOM,
     STATION,
+    TOLERANCE_M,
     Rectangle,
     cloud_of,
     detect,
@@ -122,7 +130,7 @@ def test_with_one_vote_per_cell_the_plain_maximum_is_no_wall() -> None:
         Rectangle(r.name, r.centre, r.half_a, r.half_b, 5 * r.n_points) for r in ROOM[4:6]
     )
     points = sampled((*ROOM[:4], *floors)) @ turned(17.37).T
-    search = search_in(prepared(points, plan_cell_m=0.05), min_share=0.02)
+    search = search_in(prepared(points), min_share=0.02)
     away_deg = []
     for accumulator in ("unit", "counts"):
         params = {"cell_m": 0.05, "constraint": "vertical", "scoring": "votes"}
@@ -153,7 +161,7 @@ def test_a_slope_is_found_whatever_its_inclination(slope_deg: float, tmp_path: P
 
 @pytest.mark.parametrize("step_deg", [1.0, 5.0])
 def test_directions_cover_the_hemisphere_evenly_and_the_pole_once(step_deg: float) -> None:
-    normals = directions_over(step_deg, "any", 10.0).normals
+    normals = normals_of(*directions_over(round(180.0 / step_deg), "any", 10.0).T)
     wanted = np.random.default_rng(0).normal(size=(2_000, 3))
     wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
     chords, _ = KDTree(np.vstack([normals, -normals])).query(wanted)
@@ -167,9 +175,9 @@ def test_directions_cover_the_hemisphere_evenly_and_the_pole_once(step_deg: floa
 def test_voxels_grow_where_a_scene_would_have_too_many() -> None:
     search = search_in(prepared(np.random.default_rng(0).uniform(-300.0, 300.0, (20_000, 3))))
     proposer = SpaceProposer(search, Hough3d.Params(angle_step_deg=5.0, min_share=0.05))
-    assert proposer._voxel_m > 0.3
+    assert proposer.bin_m > 0.3
     found = proposer.propose(search)
-    assert found is None or proposer._votes.nbytes < 500_000_000
+    assert found is None or proposer.votes.nbytes < 500_000_000
 
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -228,12 +236,13 @@ def test_hypotheses_pass_through_points_near_each_other() -> None:
     points_m = sampled()[::10]
     points = points_m[curve_order(points_m)]
     drawn = draw_hypotheses(points, 2_000, "3d", UP, rng)
-    np.testing.assert_allclose(np.linalg.norm(drawn.normals, axis=1), 1.0, atol=1e-12)
-    distances_m = np.abs(points @ drawn.normals.T - drawn.offsets_m)
+    normals, offsets_m = drawn[:, :3], drawn[:, 3]
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+    distances_m = np.abs(points @ normals.T - offsets_m)
     assert ((distances_m < 1e-9).sum(axis=0) >= 3).all()
     # Three points at random lie on the table, with 3 % of the points, once in 40 000 times.
-    table_m = np.abs(drawn.offsets_m * drawn.normals[:, 2] + 0.75)
-    assert np.mean((np.abs(drawn.normals[:, 2]) > 0.999) & (table_m < 0.01)) > 0.001
+    table_m = np.abs(offsets_m * normals[:, 2] + 0.75)
+    assert np.mean((np.abs(normals[:, 2]) > 0.999) & (table_m < 0.01)) > 0.001
 
 
 @pytest.mark.parametrize("thinning", [1, 3])
@@ -296,9 +305,10 @@ def voxels_of(points: NDArray[np.float64], *, parts: int = 1) -> SurfaceVoxels:
 
 def grown(points: NDArray[np.float64], min_share: float, **params: Any) -> RegionProposer:
     """Regions of a cloud in cubes of 15 cm; a fifth of the share has to be in each."""
-    search = search_in(prepared(points))
+    cloud = cloud_of(points, stations=VIEWER)
+    search = search_in(prepare(cloud, TOLERANCE_M, FIT_TOLERANCE_M, parts=1))
     settled = {"neighbourhood_m": 0.15, "min_share": min_share, **params}
-    return region_proposer(search, Region.Params(**settled), viewer_m=VIEWER[0])
+    return RegionProposer(search, Region.Params(**settled))
 
 
 def detect_regions(
@@ -313,7 +323,7 @@ def test_voxels_and_wider_ones_hold_the_moments_of_their_points() -> None:
     points = sampled((WALL, NICHE))[::7]
     voxels, cloud = voxels_of(points), prepared(points)
     wide, of_member = voxels.table.coarser(np.arange(len(voxels.counts)))
-    assert wide.grid.cell_m == 2.0 * voxels.table.grid.cell_m
+    assert wide.voxel_m == 2.0 * voxels.table.voxel_m
     voxel_of = voxels.table.voxel_of(cloud.points)
     inside = voxel_of >= 0
     assert inside.mean() > 0.99  # the robust box may leave out a few at its edge
@@ -325,12 +335,9 @@ def test_voxels_and_wider_ones_hold_the_moments_of_their_points() -> None:
         np.testing.assert_array_equal(table.sums[:, 0], n_points)
         means = np.column_stack([np.bincount(of_point, axis) for axis in points[inside].T])
         # Places within a voxel are kept in steps.
-        step_m = table.grid.cell_m / HALF_STEPS
-        centroids = table.centroids() @ table.grid.basis
+        step_m = table.voxel_m / HALF_STEPS
+        centroids = table.centroids() @ table.basis
         np.testing.assert_allclose(centroids, means / n_points[:, None], atol=0.6 * step_m)
-    counts = VoxelTable.over(cloud, voxels.table.grid.cell_m, n_sums=1)
-    np.testing.assert_array_equal(counts.sums[:, 0], voxels.table.sums[:, 0])
-    np.testing.assert_array_equal(counts.places, voxels.table.places)
 
 
 @pytest.mark.parametrize(

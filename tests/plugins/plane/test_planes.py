@@ -225,18 +225,19 @@ def test_sides_that_no_station_knows_are_guessed(
 @pytest.mark.parametrize("parts", [1, 3])
 def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
     rng = np.random.default_rng(3)
+    find_m, fit_m = 0.2, 0.1
     cloud = prepared(rng.uniform(-1.0, 1.0, (3_000, 3)), parts=parts)
+    cloud = replace(cloud, tolerance_m=find_m, fit_tolerance_m=fit_m)
     seen = cloud.sample.offsets_m
     # The planes are level, at -0.5, 0 and 0.5; the last has no points.
     heights = np.array([-0.5, 0.0, 0.5])
     slabs = np.array([[0, 0, 1.0, h, 1.0, 0, 0, 0.1, 0, 1.0, 0, -0.2] for h in heights])
-    find_m, fit_m = 0.2, 0.1
     claims = np.full(3_000, -1)
     for k in range(2):
         claims[np.abs(seen[:, 2] - heights[k]) <= find_m] = k
     cloud.claims[:] = claims
     bounds = np.array([[-0.9, 0.8, -0.7, 0.9]] * 3)
-    found = measure_planes(cloud, slabs, bounds, tolerance_m=find_m, fit_tolerance_m=fit_m)
+    found = measure_planes(cloud, slabs, bounds)
     for k in range(2):
         away = seen[claims == k, 2] - heights[k]
         fits = np.abs(away) <= fit_m

@@ -12,9 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane import fit
-from orthoflow_plugins.plane.detector import Candidate, Constraint
-from orthoflow_plugins.plane.fit import FoundPlane, adjust_plane, independent_covariance
+from orthoflow_plugins.plane.fit import (
+    FoundPlane,
+    adjust_plane,
+    independent_covariance,
+    jackknife_covariance,
+)
 from orthoflow_plugins.plane.kernels import STEPS_PER_TOLERANCE
+from orthoflow_plugins.plane.proposing import Candidate, Constraint, Proposer
 from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.search import (
     Search,
@@ -31,7 +36,6 @@ from scipy import ndimage
 from orthoflow.geometry import Plane, angle_between_deg, wall_axes
 from tests.plane_scenes import (
     ROOM,
-    TOLERANCE_M,
     Rectangle,
     context,
     detect,
@@ -128,7 +132,7 @@ def test_exact_walls_and_floors_lean_by_nothing(exact: bool) -> None:
         assert not exact or abs(normal[2]) == pytest.approx(rise, abs=1e-12)
 
 
-class Listed:
+class Listed(Proposer):
     """Proposes what it is given, one after the other."""
 
     def __init__(self, surfaces: tuple[Rectangle, ...]) -> None:
@@ -137,9 +141,6 @@ class Listed:
     def propose(self, search: Search) -> Candidate | None:
         del search
         return self._left.pop(0) if self._left else None
-
-    def reject(self, candidate: Candidate) -> None:
-        del candidate
 
 
 @pytest.mark.parametrize(
@@ -204,7 +205,7 @@ def test_a_frame_around_a_wall_leaves_the_wall_its_points(gap_m: float) -> None:
         for truth, points in ((wall(60_000), on_wall), (frame[0], on_frame))
     ]
     search = search_in(prepared(np.concatenate([on_wall, on_frame]), parts=2), min_share=0.01)
-    label(fit_to_all(alone, search), search.cloud, TOLERANCE_M)
+    label(fit_to_all(alone, search), search.cloud)
     claims = search.cloud.claims
     assert (claims[: len(on_wall)] == 0).mean() > 0.95
     assert (claims[len(on_wall) :] == 1).mean() > 0.95
@@ -230,7 +231,7 @@ def tilted_heights() -> NDArray[np.float64]:
 
 def adjusted(
     heights_m: NDArray[np.float64],
-    freedom: fit.Freedom = "free",
+    freedom: Constraint = "any",
     cells: NDArray[np.bool_] | None = None,
 ) -> fit.AdjustedPlane | None:
     """The fit to cells of 16 points each, half of them a millimetre above and half below."""
@@ -427,7 +428,7 @@ def test_stated_sigmas_of_walls_are_their_errors(
         sums = wall_of_cells(
             seed, reach_cells=reach_cells, relief_m=relief_m, mixed_share=mixed_share
         )
-        fit = adjust_plane(WALL_CELLS, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="free")
+        fit = adjust_plane(WALL_CELLS, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="any")
         assert fit is not None
         u, v = WALL_CELLS.centres_m()
         middle = np.array([u.mean(), v.mean()]) @ WALL_CELLS.axes - 2.0 * WALL.normal
@@ -450,12 +451,24 @@ def test_cells_that_fade_state_what_their_plane_scatters_by(tails: str) -> None:
         noise = (0.0002 * STEPS_PER_TOLERANCE / reach_m) ** 2
         sums = sums_of_steps(steps, np.rint(steps**2 / 25 + 25 * noise).astype(np.int64))
         cells = np.ones(shape, dtype=np.bool_)
-        found = adjust_plane(raster, sums, cells, fit_tolerance_m=reach_m, freedom="free")
+        found = adjust_plane(raster, sums, cells, fit_tolerance_m=reach_m, freedom="any")
         assert found is not None
         # The true unknowns are zero.
         covariance = independent_covariance(found.fit)
         squares.append(found.fit.solution**2 / np.diag(covariance))
     assert math.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_covariance_from_a_few_tiles_is_the_scatter_of_the_mean() -> None:
+    # Four tiles of nine cells whose errors are nearly the same within a tile.
+    rng, tile = np.random.default_rng(0), np.repeat(np.arange(4), 9)
+    means_m, stated_m2 = [], []
+    for _ in range(4_000):
+        heights_m = rng.normal(0.0, 0.001, 4)[tile] + rng.normal(0.0, 0.0003, 36)
+        residuals = (heights_m - heights_m.mean())[:, None]
+        means_m.append(heights_m.mean())
+        stated_m2.append(jackknife_covariance(residuals, np.ones((36, 1, 1)), tile)[0, 0])
+    assert np.mean(stated_m2) == pytest.approx(np.var(means_m), rel=0.08)
 
 
 def room_ratios(seed: int, folder: Path) -> list[list[float]]:
