@@ -142,7 +142,7 @@ def open_file(path: Path) -> BufferedReader:
     """Open a file for reading without blocking.
 
     Raises:
-        OSError: it cannot be read, or is a folder, a pipe or a device.
+        OSError: the file cannot be read, or is a folder, a pipe or a device.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -181,7 +181,7 @@ def open_text(path: Path) -> TextIOWrapper:
     """Open a UTF-8 text file, with or without a byte order mark.
 
     Raises:
-        OSError: it cannot be read, or is a folder, a pipe or a device.
+        OSError: the file cannot be read, or is a folder, a pipe or a device.
     """
     return TextIOWrapper(open_file(path), encoding="utf-8-sig")
 

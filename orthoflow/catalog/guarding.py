@@ -1,6 +1,6 @@
 """Protection from side effects of third-party code while it is being loaded.
 
-This module has no heavy imports, like all of the catalog.
+Like the whole catalog, this module imports no heavy libraries.
 """
 
 from __future__ import annotations

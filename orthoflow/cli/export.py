@@ -1,4 +1,4 @@
-"""`orthoflow export`: write the results of a run in formats of other programs."""
+"""`orthoflow export`: write the results of a run for other programs."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def echo(*lines: str, err: bool = False) -> None:
 
 
 def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool = False) -> None:
-    """Print what limits the results of cells, the most severe first, one line per code.
+    """Print the diagnostics that limit the results of cells, the most severe first, one per code.
 
     Args:
         cells: cells of the run.

@@ -269,7 +269,7 @@ class DaskExecutor:
             return failed_result(task, error)
         except TimeoutError as error:
             raise self._lost() from error
-        except Exception as error:  # noqa: BLE001 - whatever befell the worker
+        except Exception as error:  # noqa: BLE001 - any error of the worker
             reason = f"{type(error).__name__}: {one_line(error)}"
             return failed_result(
                 task, StepFailedError(f"{task.who} could not be run on its worker ({reason})")
@@ -309,7 +309,7 @@ class DaskExecutor:
         """Return address -> properties of the workers that report their cores."""
         try:
             known = self._client.scheduler_info(n_workers=-1)["workers"]
-        except Exception:  # noqa: BLE001 - whatever keeps it from answering: it does not
+        except Exception:  # noqa: BLE001 - any error means no answer
             return {}
         return {address: facts for address, facts in known.items() if facts["resources"].get(CORES)}
 

@@ -99,7 +99,7 @@ class JournalLine:
         event: `run` in the first line; `resumed`, `interrupted` or `ended` for the run; `started`
             or `finished` for a cell.
         time: ISO 8601, UTC.
-        format: name and version of the file format; first line only, as are `run_id` and
+        format: name and version of the file format; only in the first line, as are `run_id` and
             `workflow`.
         run_id: id of the run.
         workflow: name of the workflow.

@@ -244,7 +244,7 @@ class _Planner:
         if planned.status == "unknown yet" and cell.step in self.force:
             planned = replace(planned, status="will run", reason=_FORCED)
         elif planned.status == "unknown yet" and took_s is None:
-            # If a method has no results in the store, none can be found whatever its inputs are.
+            # If a method has no results in the store, none can be found for any inputs.
             reason = "no result of this method is stored"
             planned = replace(planned, status="will run", reason=reason)
         self.planned[cell.address] = replace(planned, took_s=took_s)

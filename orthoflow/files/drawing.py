@@ -56,7 +56,7 @@ _STYLE: Final[Mapping[Any, Any]] = {
     "pdf.fonttype": 42,
     "text.parse_math": False,
 }
-# For figures with several panels and pictures with axes.
+# Settings for figures with several panels and for pictures with axes.
 _PANELS: Final[Mapping[Any, Any]] = {
     "figure.dpi": DPI,
     "font.size": 7.0,

@@ -187,7 +187,7 @@ def _map_crs(crs: str) -> CRS:
     """Return the coordinate system of a map.
 
     Raises:
-        InputError: it does not exist.
+        InputError: the coordinate system does not exist.
     """
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
@@ -478,7 +478,7 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
     """Refuse a file that references other files, or declares more data than its size allows.
 
     Raises:
-        InputError: it is such a file.
+        InputError: the file references other files or declares too much data.
     """
     # GDAL would read overviews from that file, even over the network.
     if dataset.tags(ns="OVERVIEWS"):

@@ -313,7 +313,7 @@ def rotation_of(values: Sequence[float], path: Path, whose: str) -> NDArray[np.f
     """Return the rotation matrix closest to nine numbers.
 
     Raises:
-        InputError: they are far from a rotation.
+        InputError: the numbers are far from a rotation.
     """
     matrix = np.array(values, dtype=np.float64).reshape(3, 3)
     # LAPACK may not terminate if values are infinite.
@@ -329,7 +329,7 @@ def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
     """Return a lens after checking that it is valid.
 
     Raises:
-        InputError: it is invalid.
+        InputError: the lens is invalid.
     """
     values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew or 0.0, *lens.distortion)
     if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):

@@ -72,7 +72,7 @@ def decode_levels(encoded: bytes, name: str = "image") -> Colours:
     """Decode like `decode_image`, but to uint16 if a PNG or TIFF file has more than 8 bits.
 
     Raises:
-        InputError: as for `decode_image`.
+        InputError: the same conditions as for `decode_image`.
     """
     return _decoded(encoded, name, is_deep=True)
 
@@ -113,7 +113,7 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
 
 
 def encode_png(image: Colours) -> bytes:
-    """Encode (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA as PNG, same depth."""
+    """Encode grey, RGB or RGBA (rows, cols[, 3 or 4]) as PNG with the same bit depth."""
     return _encode(".png", image, [])
 
 

@@ -164,7 +164,7 @@ def tiff_pages(encoded: bytes) -> list[tuple[int, ImageFileDirectory_v2]]:
                 page.load(source)
                 pages.append((start, page))
                 start = page.next
-        except Exception:  # noqa: BLE001 - Pillow raises whatever its parsing of damaged tags meets
+        except Exception:  # noqa: BLE001 - Pillow raises various errors for damaged tags
             return pages
     return pages
 
@@ -646,7 +646,7 @@ def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], b
                 content = directory()
                 for tag in _TAGS & set(content):
                     tags[tag] = content[tag]
-        except Exception:  # noqa: BLE001 - Pillow raises whatever its parsing of damaged tags meets
+        except Exception:  # noqa: BLE001 - Pillow raises various errors for damaged tags
             is_damaged = True
     return tags, is_damaged or bool(noticed)
 

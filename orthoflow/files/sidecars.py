@@ -107,7 +107,7 @@ def sidecar_of(text: str, name: str) -> dict[str, object]:
     """Parse the text of a sidecar.
 
     Raises:
-        InputError: it is not a JSON object, too deeply nested, or has numbers with too many digits.
+        InputError: the text is not a JSON object, is nested too deeply, or has too long numbers.
     """
     try:
         content = parse_json(text)

@@ -1,4 +1,4 @@
-"""Search for the input files of a record by content, and extraction of embedded ones."""
+"""Search for the input files of a record by content, and extraction of embedded input files."""
 
 from __future__ import annotations
 

@@ -425,7 +425,7 @@ def _page_note(folder: Path, name: str) -> Note:
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
-    """Return what was changed in a record since it was sealed; empty if nothing was found.
+    """Return the changes to a record since it was sealed; empty if none were found.
 
     This is fast because the arrays of products and the input files are not checked: reading a
     product checks its digest (`Run.payloads`), and `verify_run` checks everything.

@@ -168,7 +168,7 @@ class WallResult:
         frame: frame of its largest raster.
         rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, if present.
         accuracy: phrases on the expected error of its orthoimage, the noise of its plane, and the
-            inspections of this wall; each is based on data of this wall only.
+            inspections of this wall; each is based only on data of this wall.
         colours: how the colours of the photos were changed; None if there is no orthoimage.
         intensity_source: `laser`, or `luminance` if it is the grey value of the colours.
     """

@@ -350,7 +350,7 @@ def _data_of(record: RunRecord, data: str) -> tuple[str, ...]:
     digests = [
         file.sha256
         for given in record.inputs
-        # `scan@hall` is an input of the dataset hall only.
+        # `scan@hall` is an input only of the dataset hall.
         if given.name.partition("@")[2] in {"", data}
         for file in given.files
     ]

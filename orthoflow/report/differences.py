@@ -43,7 +43,7 @@ class DifferenceTable:
         n_different: number of those that differ.
         rows: values that differ, and values that only one run has; equal rows are grouped.
         n_alone: number of values that only one run has.
-        n_rounded: number of values that differ by rounding only; they have no row.
+        n_rounded: number of values that differ only by rounding; they have no row.
         whose: steps to which the table is restricted; empty for all.
     """
 

@@ -171,7 +171,7 @@ def figure_groups(
 
     Args:
         run: the run.
-        share: share of the page's limit that they may use.
+        share: share of the size limit of a page that the figures may use.
         with_files: whether the figures of `baseline_addresses` are also files in `FIGURES_FOLDER`.
     """
     named = figure_files(run, baseline_addresses(run)) if with_files else {}

@@ -46,7 +46,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
     Args:
         run: the run.
         walls: pictures of its walls, used as backgrounds.
-        share: share of the page's limit that the drawings may use.
+        share: share of the size limit of a page that the drawings may use.
     """
     cameras, inspections = (embedded_products(run, name) for name in ("cameras", "inspection"))
     # Digest of a walls product -> first picture of each of its walls.
@@ -73,7 +73,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
                     ),
                     f"Displacements in the orthoimage of {ground.name}, {address}",
                     side,
-                    # The metrics of the method exclude these.
+                    # The metrics of the method exclude these points.
                     remark="points next to depth steps are included; ",
                 )
 

@@ -227,7 +227,7 @@ def _section(
         prefix: prefix of the anchors.
         folder: folder of the page; paths of files are relative to it.
         broken_seals: record -> why its seal is broken.
-        share: share of the page's limit that pictures may use.
+        share: share of the size limit of a page that pictures may use.
         with_files: whether files of the figures are written next to the page.
     """
     from_page = Path(os.path.relpath(run.folder, folder))

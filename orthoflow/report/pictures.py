@@ -131,7 +131,7 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
 
     Args:
         run: the run.
-        share: share of the page's limit that they may use.
+        share: share of the size limit of a page that the pictures may use.
     """
     n_products = len(embedded_products(run, "orthoimages"))
     baseline = {cell.address for cell in baseline_cells(run)}
@@ -158,7 +158,7 @@ def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
 
     Args:
         run: the run.
-        share: share of the page's limit that they may use.
+        share: share of the size limit of a page that the pictures may use.
     """
     n_products = len(embedded_products(run, "walls"))
     for address, product in products_of(run, Walls):
@@ -308,7 +308,7 @@ def frame_words(frame: WallFrame) -> str:
 def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
     """Return cells and ports with a product of a type in the record; identical products once.
 
-    Repeats of a random method are omitted: they differ in their metrics only.
+    Repeats of a random method are omitted: they differ only in their metrics.
     """
     found: dict[str, tuple[str, str]] = {}
     for address, cell in run.cells.items():

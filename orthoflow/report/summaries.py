@@ -40,7 +40,7 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A sentence on what limits the result, its cells, and whether they failed."""
+    """A sentence on a limitation of the result, its cells, and whether they failed."""
 
     text: str
     cells: tuple[str, ...]
@@ -105,7 +105,7 @@ def has_measured_lengths(run: Run) -> bool:
 
 
 def limits(run: Run) -> tuple[Limit, ...]:
-    """Return what limits the results: failures, combinations of different walls, and diagnostics.
+    """Return the limitations of the results: failures, unequal walls, and diagnostics.
 
     Diagnostics that a later step resolved are omitted. The remaining ones are grouped by code,
     errors first; diagnostics that concern only planes without an orthoimage come last.

@@ -155,7 +155,7 @@ class StepContext:
             content: content of a PNG or WebP file, a function that returns it and is called only if
                 figures are needed, or a matplotlib figure. Charts are PNG; images that look like
                 photos are WebP, a tenth of the size.
-            caption: one sentence on what the figure shows.
+            caption: one sentence on the content of the figure.
 
         Raises:
             ProductError: the name is invalid or was used before, or the content is not such an

@@ -1,4 +1,4 @@
-"""Drafting of a workflow: recognises given files and fills them into a shipped recipe."""
+"""Drafting of a workflow: recognises the given files and inserts them into a shipped recipe."""
 
 from __future__ import annotations
 

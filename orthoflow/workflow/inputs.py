@@ -488,8 +488,8 @@ def choose_data(
             else:
                 log.report_option(
                     f"--only-data {text}",
-                    f"there is no dataset {name or 'without a name'}"
-                    f"{did_you_mean(name, datasets)}; datasets: {some_of(datasets)}",
+                    f"there is no dataset {name or '(empty name)'}{did_you_mean(name, datasets)}; "
+                    f"datasets: {some_of(datasets)}",
                 )
     return tuple(chosen)
 

@@ -34,12 +34,12 @@ from orthoflow.workflow.source import Problem
 FORMAT: Final = 1
 #: `repeat` of a method call
 MOST_REPEATS: Final = 10_000
-# Limit of what is readable in a curve and practical to run.
+# More values would be unreadable in a curve and impractical to run.
 #: values of a sweep
 MOST_SWEPT: Final = 100
 #: combinations in `exclude`
 MOST_EXCLUDED: Final = 500
-# All readers of JSON take such numbers exactly.
+# Every JSON reader represents integers up to this one exactly.
 _MOST_OF_A_NUMBER: Final = 10**15
 INPUTS: Final = "inputs"
 # Factors in addresses besides the steps: dataset and seed.

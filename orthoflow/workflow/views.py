@@ -1,4 +1,4 @@
-"""Representations of a workflow: JSON for records, a JSON Schema for editors, a flowchart."""
+"""Representations of a workflow: JSON for records, a JSON Schema for editors, and a flowchart."""
 
 from __future__ import annotations
 

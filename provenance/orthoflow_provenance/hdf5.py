@@ -184,7 +184,8 @@ def read_whole(dataset: h5py.Dataset) -> object:
     """Read a dataset (text, table or figure) as a whole.
 
     Raises:
-        RecordFormatError: it is damaged, or expands to far more than its stored size allows.
+        RecordFormatError: the dataset is damaged, or expands to far more than its stored size
+            allows.
     """
     with reading(dataset.name):
         if dataset.nbytes > max(_PACKED_BYTES_MOST, dataset.id.get_storage_size()):

@@ -211,7 +211,7 @@ def record_of(file: h5py.File) -> RunRecord:
     """Read the document of a file whose format has been checked.
 
     Raises:
-        RecordFormatError: something required is missing or damaged.
+        RecordFormatError: a required part is missing or damaged.
     """
 
     def contents(sha256: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Consistency checks of a record: the seal, all digests, all objects, all required fields."""
+"""Consistency checks of a record: the seal, all digests, all objects and all required fields."""
 
 from __future__ import annotations
 
@@ -300,7 +300,9 @@ def _name_findings(record: RunRecord) -> Iterator[Finding]:
         named += [(f"{place}/outputs/{port}", port) for port in cell.outputs]
         for figure in cell.figures:
             if figure.media_type not in FIGURE_SUFFIXES:
-                problem = f"the figure {figure.name!r} has the media type {figure.media_type!r}"
+                problem = (
+                    f"the figure {figure.name!r} must not have the media type {figure.media_type!r}"
+                )
                 yield Finding("field", f"{place}/figures", problem)
             suffix = FIGURE_SUFFIXES.get(figure.media_type, "")
             named.append((f"{place}/figures", f"{figure.name}{suffix}"))

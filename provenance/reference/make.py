@@ -20,7 +20,7 @@ HERE: Final = Path(__file__).resolve().parent
 MINUTE: Final = "2026-01-02T03:04:"
 
 
-# Record -> its workflow, what is set, and whether everything lies in it.
+# Record -> its workflow, the settings, and whether the record contains everything.
 RECORDS: Final = {
     "studio": ("studio", ("paint.grey=131",), False),
     "comparison": ("comparison", (), False),

@@ -205,7 +205,7 @@ def test_a_scene_with_arrays_that_disagree_is_refused() -> None:
     scene = wall_with_screen()
     with pytest.raises(GeometryError, match=r"scene.extent must have shape \(3, 4\), got \(2, 4\)"):
         replace(scene, extent=scene.extent[:2])
-    with pytest.raises(GeometryError, match="hole_rectangle must ascend"):
+    with pytest.raises(GeometryError, match="hole_rectangle must be in ascending"):
         replace(
             scene,
             hole_rectangle=np.array([1, 0], dtype=np.int32),

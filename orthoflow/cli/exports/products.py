@@ -1,4 +1,4 @@
-"""Access of exports to a run: products by type or digest, and creation of an empty folder."""
+"""Access to the products of a run by type or digest, and creation of output folders."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
     """Return a product from the record, or from the store if the record does not contain it.
 
     Raises:
-        ArgumentError: neither contains it.
+        ArgumentError: neither the record nor the store contains the product.
     """
     from orthoflow.engine.store import Store
 
@@ -147,7 +147,7 @@ def make_empty(folder: Path) -> None:
     """Create a folder and its parents.
 
     Raises:
-        ArgumentError: it cannot be created.
+        ArgumentError: the folder cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -174,7 +174,7 @@ def last_product(
     """Return the product of a type from the last of the cells that has one, or None.
 
     Raises:
-        ArgumentError: neither the record nor the store contains it.
+        ArgumentError: neither the record nor the store contains the product.
     """
     found = [
         output.digest

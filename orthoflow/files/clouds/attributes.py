@@ -47,7 +47,7 @@ class AttributedCloud:
 
     Attributes:
         cloud: the points.
-        colouring: what the colours represent.
+        colouring: meaning of the colours.
         neighbourhoods: neighbourhoods of the cloud.
         planes: planes of the run; None if there are no planes, and thus no deviations.
         labels: labels of the points, or None, as for `planes`.

@@ -1,7 +1,7 @@
 """Files for GIS programs: GeoJSON of walls and rooms, and a QGIS project of the walls.
 
 Every wall has its own coordinate system, which cannot be transformed into another. The project
-therefore opens each raster through a GDAL virtual raster that shifts X only; Y remains the height.
+therefore opens each raster through a GDAL virtual raster that only shifts X; Y remains the height.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ _STRAIGHT: Final = 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch:
-    """Values shown black and white, standard deviation of their noise, and contour interval."""
+    """The values shown as black and white, the noise of the values, and the contour interval."""
 
     low: float
     high: float

@@ -498,7 +498,7 @@ class SectionDrawing:
 
     @property
     def notes(self) -> tuple[Phrase, ...]:
-        """Notes on what is drawn, and from how many points."""
+        """Notes on the content of the drawing and the number of points used."""
         if not self.section.slab_m:
             return (Phrase(key="thickness"),)
         values = {"mm": f"{1e3 * self.section.slab_m:.0f}", "count": f"{self.section.n_points:,}"}
@@ -560,7 +560,7 @@ def write_section(folder: Path, name: str, drawing: SectionDrawing) -> None:
 
 
 def _draw(drawing: SectionDrawing, placed: Placed) -> None:
-    """Draw a plan or section from its document into a picture."""
+    """Draw the document of a plan or section on a picture."""
     from ezdxf.addons.drawing import recorder
 
     left, _, _, top = drawing.bounds_m

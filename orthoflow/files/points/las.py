@@ -295,7 +295,7 @@ def _check_header(path: Path) -> None:
     """Compare counts and offsets in the header with the size of the file.
 
     Raises:
-        InputError: they are inconsistent.
+        InputError: the header is inconsistent with the file.
     """
     n_file = path.stat().st_size
     with path.open("rb") as file:

@@ -254,7 +254,7 @@ def load_library(name: str, path: Path) -> Any:
     """Import a library for reading, not before a file needs it.
 
     Raises:
-        PluginError: it is not installed, or its import fails.
+        PluginError: the library is not installed, or its import fails.
     """
     try:
         return import_module(name)

@@ -77,9 +77,9 @@ MISSED: Final = DiagnosticSpec(
 CAPPED_RULE: Final = DiagnosticSpec(
     code="outlier-rule-capped",
     severity="warning",
-    text="the iterated outlier rule stopped at its cap of a quarter of the points ({numbers}), "
-    "although more exceed twice the RMS of the remaining points: the points seem to fall "
-    "into two groups, which the rule cannot separate",
+    text="the iterated outlier rule stopped at its limit of a quarter of the points ({numbers}), "
+    "although more exceed twice the RMS of the remaining points: the points seem to fall into two "
+    "groups, which the rule cannot separate",
     remedy="use n_outliers_once instead",
 )
 

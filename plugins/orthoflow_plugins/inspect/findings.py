@@ -63,11 +63,12 @@ CHECK_TABLE: Final = (
     MetricSpec("mean_shift_share", label="mean shift divided by the RMS"),
     MetricSpec("n_outliers_once", label="outliers, rule applied once"),
     MetricSpec("n_outliers_iterated", label="outliers, rule iterated"),
-    MetricSpec("n_outliers_iterated_capped", label="outliers, rule iterated up to the cap"),
+    MetricSpec("n_outliers_iterated_capped", label="outliers, rule iterated up to the limit"),
     lower("rms_after_once_mm", label="RMS without outliers, rule applied once"),
     lower("rms_after_iterated_mm", label="RMS without outliers, rule iterated"),
     lower(
-        "rms_after_iterated_capped_mm", label="RMS without outliers, rule iterated up to the cap"
+        "rms_after_iterated_capped_mm",
+        label="RMS without outliers, rule iterated up to the limit of a quarter",
     ),
 )
 IMAGE_QUALITY: Final = (

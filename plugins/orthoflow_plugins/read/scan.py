@@ -124,8 +124,8 @@ class ReadScan(Method):
         gsd_m: float | None = Field(
             None,
             gt=0,
-            description="Point spacing down to which COPC files are read, in metres: the levels of "
-            "the octree up to the first with this spacing or less. None reads all points.",
+            description="Point spacing in metres that is sufficient. COPC files are read down to "
+            "the first level of the octree with this spacing or less. None: all points are read.",
         )
         classes: tuple[Annotated[int, Field(ge=0, le=255)], ...] = Field(
             (),

@@ -81,7 +81,7 @@ def test_photos_that_are_not_oriented_or_look_elsewhere_are_refused(tmp_path: Pa
     with pytest.raises(MethodError, match="none of the photos is oriented"):
         coloured(tmp_path, ortho_scenes.cloud(where), photos, lost)
     away = ortho_scenes.cloud(ortho_scenes.frame(at_survey=True))
-    with pytest.raises(MethodError, match="no photo sees any point"):
+    with pytest.raises(MethodError, match="no photo shows a point"):
         coloured(tmp_path, away, photos, ortho_scenes.cameras(viewer))
 
 

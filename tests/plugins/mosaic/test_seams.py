@@ -97,7 +97,7 @@ def test_every_wall_of_the_layers_gets_an_orthoimage(tmp_path: Path) -> None:
     images = joined(tmp_path, *layers, names=("a", "b", "c"))[0].images
     found = [(image.wall, image.name, len(image.sources)) for image in images]
     assert found == [(0, "a", 2), (2, "c", 1)]
-    with pytest.raises(MethodError, match="no layer to make"):
+    with pytest.raises(MethodError, match="there are no layers"):
         joined(tmp_path)
 
 

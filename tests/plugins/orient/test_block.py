@@ -162,7 +162,7 @@ def test_the_adjustment_finds_the_least_sum_of_huber_losses() -> None:
 def test_too_few_observations_determine_no_block() -> None:
     block = block_of()
     few = replace(block, seen=block.seen.take(np.arange(12)))
-    with pytest.raises(GeometryError, match="do not determine the block"):
+    with pytest.raises(GeometryError, match="do not suffice to orient the block"):
         adjustment.block_covariance(few, soft_limit=3.0)
 
 

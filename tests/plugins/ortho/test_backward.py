@@ -241,8 +241,8 @@ def test_what_cannot_be_painted_is_refused_with_the_reason(tmp_path: Path) -> No
     behind = scenes.camera(where).shifted(4.0 * where.normal_world)
     for known, reason in (
         ({"cameras": lost}, "no photo is oriented.*0.png: only 3 ties agree"),
-        ({"cameras": scenes.cameras(turned_away(where))}, "no oriented photo sees a wall"),
-        ({"cameras": scenes.cameras(behind)}, "no oriented photo sees a wall"),
+        ({"cameras": scenes.cameras(turned_away(where))}, "no oriented photo shows a wall"),
+        ({"cameras": scenes.cameras(behind)}, "no oriented photo shows a wall"),
         ({"cameras": other}, "x.png, which are not among the photos"),
         ({"photos": scenes.photos(scenes.rendered()[:-1])}, "0.png has 1000 x 799 pixels"),
         ({"walls": replace(walls, walls=())}, "there are no walls"),

@@ -250,7 +250,7 @@ def test_all_photos_that_are_cut_off_are_named_at_once(read: PhotoReader) -> Non
         read.files({"0.jpg": encode_jpeg(image), **cut})
     lines = str(caught.value).splitlines()
     assert [line.split()[1] for line in lines] == sorted(cut)
-    assert all("is damaged or cut off" in line or "cannot be decoded" in line for line in lines)
+    assert all("is damaged or truncated" in line or "cannot be decoded" in line for line in lines)
 
 
 def test_bytes_that_a_decoder_passes_over_are_reported(read: PhotoReader) -> None:
