@@ -1,14 +1,14 @@
 """Commands of the command line as processes, forked from one that has loaded it.
 
-    python tests/forked_commands.py
+    python tests/forked_commands.py [libraries]
 
 Loading takes most of the time of many a command. Reads orders from stdin, a JSON object per line:
 `arguments`, `folder`, `environment`, `streams`, two files for what is written to stdout and stderr,
 `forgone`, numbers of rights of root that it gives up, and `draws`; answers each with the exit code.
 A command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
-what the interpreter reads from the environment when it starts is as it was when the first command
-was asked for. The servers that steps are forked from serve all commands, unless they gave up
-rights.
+what the interpreter, and the libraries that steps need if they are loaded, read from the
+environment is as it was when the first command was asked for. The servers that steps are forked
+from serve all commands, unless they gave up rights.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def run_command(
             "forgone": [*forgone],
             "draws": draws,
         }
-        server = _server(_framework_path(environment.get("PYTHONPATH", "")))
+        # Without rights of root, also the libraries are loaded as that user loads them.
+        server = _server(_framework_path(environment.get("PYTHONPATH", "")), loads=not forgone)
         assert server.stdin is not None
         assert server.stdout is not None
         server.stdin.write(json.dumps(order) + "\n")
@@ -83,11 +84,11 @@ def _framework_path(python_path: str) -> str:
 
 
 @cache
-def _server(python_path: str) -> subprocess.Popen[str]:
+def _server(python_path: str, *, loads: bool) -> subprocess.Popen[str]:
     from tests.kept_memory import KEPT_MEMORY  # who is started has no `tests`
 
     server = subprocess.Popen(
-        [sys.executable, __file__],
+        [sys.executable, __file__, *(["libraries"] if loads else [])],
         env={**os.environ, **KEPT_MEMORY, "PYTHONPATH": python_path},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -111,6 +112,9 @@ def _serve() -> None:
     import orthoflow.workflow.views
     from orthoflow.engine.environment import cpu_name, git_commit
     from orthoflow.report.rendering import environment
+
+    if sys.argv[1:]:
+        import orthoflow.engine.preload
 
     cpu_name()
     git_commit()
