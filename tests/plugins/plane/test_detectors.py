@@ -73,7 +73,7 @@ def test_every_surface_of_a_room_is_found_and_nothing_else(
 ) -> None:
     planes, labels = rooms[detector].planes, rooms[detector].labels.plane_index
     assert len(planes) == len(ROOM)
-    # The plane that the detector itself proposed for the largest wall.
+    # This is the plane that the detector itself proposed for the largest wall.
     raw, front = planes.details["raw"][nearest(planes, ROOM[0].normal, ROOM[0].centre)], ROOM[0]
     assert np.abs(raw["normal"] @ front.normal) > np.cos(np.radians(1.0))
     assert abs(np.abs(raw["normal"] @ np.array(front.centre)) - abs(raw["offset_m"])) < 0.02

@@ -1,4 +1,4 @@
-"""Samples, boxes and compiled passes against plain formulations of the same, on random input."""
+"""Samples, boxes and compiled passes, compared with simple implementations on random input."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.long_loops import seeds
 from tests.plane_scenes import cloud_of, prepared, search_in
 
 UP: Final = np.array([0.0, 0.0, 1.0])
-# Three blocks and a piece of one.
+# Three blocks and a part of one.
 N_POINTS: Final = 3 * BLOCK_POINTS + 61
 
 
@@ -54,17 +54,17 @@ def points_of(points_m: NDArray[np.float64]) -> BlockedPoints:
 
 
 def exact(points: BlockedPoints) -> NDArray[np.float64]:
-    """(n, 3) what the passes see."""
+    """Return the positions (n, 3) as the passes see them."""
     return np.column_stack([points.x, points.y, points.z]).astype(np.float64)
 
 
 def runs_of(rng: np.random.Generator, values: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """(n, ...) values, each a few times in turn, as a scan's neighbours."""
+    """Repeat values (n, ...) a few times each, like neighbouring points of a scan."""
     return np.repeat(values, rng.integers(1, 5, len(values)), axis=0)[:n]
 
 
 def slab_rows(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """(count, 12) slabs through a box at random."""
+    """Return random slabs (count, 12) through a box."""
     rows = []
     for _ in range(count):
         normal = rng.normal(size=3)
@@ -76,7 +76,7 @@ def slab_rows(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
 
 
 def along(slab: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) places along the slab's normal, u and v."""
+    """Return positions (n, 3) along the slab's normal, u and v."""
     rows = slab.reshape(3, 4)
     return points_m @ rows[:, :3].T - rows[:, 3]
 
@@ -100,7 +100,7 @@ def test_boxes_enclose_the_points_of_their_block(parts: int) -> None:
 def summed_cells(
     placed: NDArray[np.float64], cells: NDArray[np.int64], n_cells: int, limits_m: list[float]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Counts within three tolerances, and sums of steps and their squares, per cell."""
+    """Return counts within three tolerances, and sums of steps and their squares, per cell."""
     find_m, inner_m, fit_m = limits_m
     sizes = np.abs(placed[:, 0])
     steps = np.floor(placed[:, 0] * (STEPS_PER_TOLERANCE / fit_m) + 0.5).astype(np.int64)
@@ -119,7 +119,7 @@ def test_all_planes_at_once_sum_the_points_that_they_own(seed: int) -> None:
     rng = np.random.default_rng(seed)
     slabs = slab_rows(rng, 4)
     points_m = runs_of(rng, rng.uniform(-1.0, 1.0, (N_POINTS, 3)), N_POINTS)
-    # A block on one plane alone, of which no point has to be asked.
+    # All points of this block are on a single plane, so they need not be tested one by one.
     slabs[3, 3] = 9.0
     points_m[:BLOCK_POINTS] = 0.1 * points_m[:BLOCK_POINTS] + 9.0 * slabs[3, :3]
     points = points_of(points_m)
@@ -135,7 +135,8 @@ def test_all_planes_at_once_sum_the_points_that_they_own(seed: int) -> None:
     owner = np.where(held.any(axis=0), away.argmin(axis=0), -1)
     np.testing.assert_array_equal(claims, owner)
     assert (np.bincount(owner + 1, minlength=5) > 9).all()
-    # Slab 1 has no rows: its points are not summed. What lies beyond the raster goes to its edge.
+    # Slab 1 has no rows, so its points are not summed. Points outside the raster are added to cells
+    # at its edge.
     shapes = [(5, 6), (0, 0), (7, 3), (4, 4)]
     starts = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
     per_m = 1.0 / 0.2
@@ -202,7 +203,7 @@ def test_the_flattest_plane_is_the_smallest_eigenvector(seed: int) -> None:
     np.testing.assert_allclose(plane[6:], variances, rtol=1e-6, atol=1e-9)
     assert abs(plane[:3] @ directions[:, 0]) == pytest.approx(1.0, abs=1e-8)
     assert np.linalg.norm(plane[:3]) == pytest.approx(1.0, abs=1e-12)
-    # Moments without a flattest plane have the level one.
+    # The result is a level plane if the moments have no flattest plane.
     flattest(moments(np.full((4, 3), 2.0), np.ones(4)), plane)
     np.testing.assert_array_equal(plane, [0, 0, 1, 2, 2, 2, 0, 0, 0])
     line = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -213,7 +214,7 @@ def test_the_flattest_plane_is_the_smallest_eigenvector(seed: int) -> None:
 def reweighted(
     points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float, freedom: int
 ) -> NDArray[np.float64]:
-    """(4,) total least squares with Tukey's weights, settled, by the library's eigenvectors."""
+    """Return the plane (4,) by total least squares with Tukey's weights, until convergence."""
     normal, offset_m = plane[:3], plane[3]
     for _ in range(20):
         ratios = (points @ normal - offset_m) / tolerance_m
@@ -251,7 +252,7 @@ def test_robust_fits_are_reweighted_least_squares(seed: int, freedom: int) -> No
     if freedom != LEVEL:
         turned = normal + 0.01 * np.cross(UP if freedom == VERTICAL else axes[0], normal)
         start[:3] = turned / np.linalg.norm(turned)
-    # Whichever side the start's normal is on, it stays.
+    # The normal keeps the side that it has at the start.
     for plane in (start, -start if freedom != LEVEL else start):
         found = plane.copy()
         assert refine_robustly(points, found, tolerance_m, freedom)
@@ -321,7 +322,8 @@ def test_a_maximum_lies_at_the_top_of_a_parabola_through_its_neighbours() -> Non
     votes[1, 14:17] = (40, 100, 70)
     row, place = sharpest(votes)
     assert row == 1
-    # Windows of three bins hold 140, 210, 170 about the middle, and nothing beside them.
+    # Windows of three bins around the middle contain 140, 210 and 170 votes, and those beside them
+    # contain none.
     assert place == pytest.approx(15.5 + 0.5 * (140 - 170) / (140 - 420 + 170), abs=1e-9)
 
 
@@ -335,7 +337,7 @@ def test_the_best_bin_stands_out_most_from_the_emptier_window_beside_it(
     barred = (rng.random(votes.shape) < 0.3).astype(np.uint8)
     barred[4] = 1
     votes[5], barred[5] = 0, 0
-    # The best window may lie at either side.
+    # The best window may be at either end.
     votes[6, 0] = votes[7, -1] = 99
     barred[6] = barred[7] = 0
     asked = np.array([0, 1, 2, 4, 5, 6, 7, 8])
@@ -358,7 +360,7 @@ FIND_M = 0.3
 
 
 def crossing_rasters(rng: np.random.Generator, count: int) -> list[SurfaceRaster]:
-    """Planes through the box at random, with rectangles that do not cover it."""
+    """Return random planes through the box, with rectangles that do not cover it."""
     rasters = []
     for normal in rng.normal(size=(count, 3)):
         plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=rng.uniform(-0.5, 0.5))
@@ -368,7 +370,7 @@ def crossing_rasters(rng: np.random.Generator, count: int) -> list[SurfaceRaster
 
 
 def nearest_holder(points_m: NDArray[np.float64], rasters: list[SurfaceRaster]) -> NDArray[np.int8]:
-    """(n,) the nearest plane in whose slab and rectangle a point lies, point by point."""
+    """Return, for each point, the nearest plane whose slab and rectangle contain it."""
     distances = np.full((len(rasters), len(points_m)), np.inf)
     for k, raster in enumerate(rasters):
         away_m = np.abs(raster.plane.distances_m(points_m))
@@ -405,13 +407,13 @@ def test_planes_that_cross_share_the_sample_by_distance(seed: int) -> None:
         offsets_m, points = search.free()
         np.testing.assert_array_equal(offsets_m, points_m[expected < 0])
         np.testing.assert_array_equal(points.x, points_m[expected < 0, 0].astype(np.float32))
-    # One pass for all planes assigns as one plane after the other.
+    # A pass for all planes gives the same result as one pass per plane.
     bounds_m = [search.cloud.bounds_of(support.bounds_m) for support in supports]
     search.cloud.assign(np.array([raster.slab() for raster in rasters]), np.array(bounds_m))
     np.testing.assert_array_equal(search.cloud.claims, expected)
 
 
-# --- which points stand for all, and where the scene ends ---
+# --- the sample, and the extent of the scene ---
 
 
 def test_one_point_of_each_of_200000_stretches_is_drawn_at_places_of_the_golden_ratio() -> None:
@@ -428,7 +430,7 @@ def test_one_point_of_each_of_200000_stretches_is_drawn_at_places_of_the_golden_
 def boxed_scene(
     low: tuple[float, float, float], high: tuple[float, float, float]
 ) -> NDArray[np.float64]:
-    """Points in a box, its corners among them."""
+    """Return points in a box, including its corners."""
     points = np.random.default_rng(2).uniform(low, high, (4_000, 3))
     points[0], points[1] = low, high
     return points
@@ -442,7 +444,8 @@ def test_a_box_has_a_margin_of_250_cm_and_a_fiftieth_about_the_scene() -> None:
     low_m, extent_m = box_of(boxed_scene((-2.0, 1.0, 0.0), (4.0, 4.0, 2.0)))
     np.testing.assert_allclose(low_m, [-4.62, -1.56, -2.54], atol=1e-6)
     np.testing.assert_allclose(extent_m, [11.24, 8.12, 7.08], atol=1e-6)
-    # What is farther off than the scene is long does not widen it: nine tenths are within 9 m.
+    # Points farther away than the length of the scene do not enlarge the box. Nine tenths of the
+    # points are within 9 m.
     points = boxed_scene((0.0, 0.0, 0.0), (10.0, 4.0, 2.0))
     for beyond_m, length_m in ((8.0, 26.0), (10.5, 10.0)):
         points[2:4] = [[10.0 + beyond_m, 2.0, 1.0], [-beyond_m, 2.0, 1.0]]

@@ -1,4 +1,4 @@
-"""What each detector has of its own: accumulators, scores, regions, comparators."""
+"""Parts of single detectors: accumulators, scores, regions and comparators."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ from tests.plane_scenes import (
 @pytest.mark.parametrize(
     ("method", "options", "n_true"),
     [
-        # By cells that vote once, floor and ceiling drown the walls beside them.
+        # If each cell votes once, floor and ceiling obscure the walls next to them.
         (Hough2d, {"accumulator": "unit"}, 1),
         (Hough2d, {"accumulator": "canny"}, 1),
         # "Identical result, considerably longer" (markiewicz2015).
@@ -106,7 +106,7 @@ def test_a_perfectly_flat_wall_is_found(tmp_path: Path) -> None:
 def test_the_plain_maximum_lies_in_the_middle_of_a_bin_and_of_a_step(
     method: Any, options: dict[str, Any], step_deg: float, tmp_path: Path
 ) -> None:
-    """markiewicz2015 takes the fullest bin as it is, half a bin and half a step off at most."""
+    """markiewicz2015 uses the centre of the fullest bin, off by up to half a bin and step."""
     turn = turned(17.37)
     cloud = cloud_of(sampled()[::2] @ turn.T, stations=STATION)
     found = []
@@ -125,7 +125,7 @@ def test_the_plain_maximum_lies_in_the_middle_of_a_bin_and_of_a_step(
 
 
 def test_with_one_vote_per_cell_the_plain_maximum_is_no_wall() -> None:
-    """Figure 10b of markiewicz2015: floor and ceiling drown the walls; "no clear maximum"."""
+    """In Figure 10b of markiewicz2015, floor and ceiling obscure the walls ("no clear maximum")."""
     floors = tuple(
         Rectangle(r.name, r.centre, r.half_a, r.half_b, 5 * r.n_points) for r in ROOM[4:6]
     )
@@ -140,7 +140,7 @@ def test_with_one_vote_per_cell_the_plain_maximum_is_no_wall() -> None:
         normals = turned(17.37) @ np.array([wall.normal for wall in ROOM[:4]]).T
         cosines = np.abs(candidate.plane.normal @ normals)
         away_deg.append(np.degrees(np.arccos(cosines.max())))
-    # A diagonal through the middle of the room.
+    # The maximum is a diagonal through the middle of the room.
     assert away_deg[0] > 5.0
     assert away_deg[1] < 1.0
 
@@ -168,7 +168,7 @@ def test_directions_cover_the_hemisphere_evenly_and_the_pole_once(step_deg: floa
     nearest_deg = np.degrees(2.0 * np.arcsin(0.5 * chords))
     assert nearest_deg.max() < 1.1 * step_deg
     assert np.count_nonzero(np.abs(normals[:, 2]) > np.cos(np.radians(0.5 * step_deg))) == 1
-    # Of the hemisphere's 2 pi each direction has a square of one step.
+    # Each direction has a square of one step of the hemisphere's solid angle of 2 pi.
     assert len(normals) == pytest.approx(2.0 * np.pi / np.radians(step_deg) ** 2, rel=0.1)
 
 
@@ -191,7 +191,7 @@ def test_no_seed_misses_a_wall(seed: int, tmp_path: Path) -> None:
         angle_deg, miss_m = errors(out.planes, truth)
         assert angle_deg < 0.02
         assert miss_m < 2e-4
-    # Scores but a-contrario have no tolerance of their own.
+    # Only the a-contrario score determines its own tolerance.
     assert "own_tolerance_mm" not in {metric.name for metric in ctx.metrics}
     assert out.planes.details["raw"][0]["own_tolerance_m"] is None
 
@@ -212,7 +212,7 @@ def test_the_tolerance_found_by_itself_follows_the_noise(noise_m: float, tmp_pat
     cloud = cloud_of(sampled(noise_m=noise_m), stations=STATION)
     out, ctx = detect(Ransac, cloud, tmp_path, scoring="a-contrario")
     own_m = {m.name: m.value for m in ctx.metrics}["own_tolerance_mm"] / 1000.0
-    # Of a normal distribution 2 sigma hold 95 %: where each further millimetre adds too little.
+    # In a normal distribution, 2 sigma contain 95 %, and each further millimetre adds too little.
     assert 1.3 * noise_m < own_m < 3.5 * noise_m
     assert out.planes.details["raw"][0]["own_tolerance_m"] == pytest.approx(own_m)
 
@@ -240,7 +240,7 @@ def test_hypotheses_pass_through_points_near_each_other() -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
     distances_m = np.abs(points @ normals.T - offsets_m)
     assert ((distances_m < 1e-9).sum(axis=0) >= 3).all()
-    # Three points at random lie on the table, with 3 % of the points, once in 40 000 times.
+    # Three random points are on the table, which has 3 % of the points, once in 40,000 times.
     table_m = np.abs(offsets_m * normals[:, 2] + 0.75)
     assert np.mean((np.abs(normals[:, 2]) > 0.999) & (table_m < 0.01)) > 0.001
 
@@ -272,14 +272,14 @@ def test_without_refit_planes_stay_as_the_detector_gave_them(tmp_path: Path, thi
 def test_comparators_find_the_large_planes_of_a_room(method: type[Method], tmp_path: Path) -> None:
     cloud = cloud_of(sampled()[::2], stations=STATION)
     out, _ = detect(method, cloud, tmp_path / "all")
-    # open3d's own word: chance decides about small planes, patches need denser ones.
+    # Chance decides whether open3d finds small planes, and its patches need a higher density.
     for truth in (ROOM[0], ROOM[4], ROOM[5]):
         angle_deg, miss_m = errors(out.planes, truth)
         assert angle_deg < 0.03
         assert miss_m < 3e-4
     own = out.labels.plane_index[: ROOM[0].n_points // 2]
     assert np.mean(own == np.bincount(own[own >= 0]).argmax()) > 0.97
-    # A constraint passes over what open3d finds first.
+    # With a constraint, the planes that open3d finds first are skipped.
     planes = detect(method, cloud, tmp_path, constraint="horizontal")[0].planes
     assert len(planes) >= 2
     assert (np.abs(planes.normal @ planes.up) > 0.99).all()
@@ -293,7 +293,7 @@ def test_an_open3d_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPat
 
 VIEWER = np.array([[0.0, -1.5, 0.0]])
 CUBE = Neighbourhood(shape="cube", size_m=0.15, n_points=30, voxel_m=0.05)
-# A wall with a niche a quarter of a metre deep, and a floor before them.
+# The wall has a niche a quarter of a metre deep, and a floor in front of it.
 WALL = Rectangle("wall", (0, 2, 0), (1.5, 0, 0), (0, 0, 1.0), 60_000)
 NICHE = Rectangle("niche", (2.0, 2.25, 0), (0.4, 0, 0), (0, 0, 0.8), 13_000)
 FLOOR = Rectangle("floor", (0, 1, -1.0), (1.5, 0, 0), (0, 1, 0), 20_000)
@@ -304,7 +304,7 @@ def voxels_of(points: NDArray[np.float64], *, parts: int = 1) -> SurfaceVoxels:
 
 
 def grown(points: NDArray[np.float64], min_share: float, **params: Any) -> RegionProposer:
-    """Regions of a cloud in cubes of 15 cm; a fifth of the share has to be in each."""
+    """Return the regions of a cloud in cubes of 15 cm; each has at least a fifth of `min_share`."""
     cloud = cloud_of(points, stations=VIEWER)
     search = search_in(prepare(cloud, TOLERANCE_M, FIT_TOLERANCE_M, parts=1))
     settled = {"neighbourhood_m": 0.15, "min_share": min_share, **params}
@@ -326,15 +326,15 @@ def test_voxels_and_wider_ones_hold_the_moments_of_their_points() -> None:
     assert wide.voxel_m == 2.0 * voxels.table.voxel_m
     voxel_of = voxels.table.voxel_of(cloud.points)
     inside = voxel_of >= 0
-    assert inside.mean() > 0.99  # the robust box may leave out a few at its edge
-    # The kernels find each wide voxel where its points are.
+    assert inside.mean() > 0.99  # the robust box may exclude a few points at its edge
+    # The kernels find the wide voxel of each point.
     wide_of = wide.voxel_of(cloud.points)[inside]
     np.testing.assert_array_equal(wide_of, of_member[voxel_of[inside]])
     for table, of_point in ((voxels.table, voxel_of[inside]), (wide, wide_of)):
         n_points = np.bincount(of_point)
         np.testing.assert_array_equal(table.sums[:, 0], n_points)
         means = np.column_stack([np.bincount(of_point, axis) for axis in points[inside].T])
-        # Places within a voxel are kept in steps.
+        # Positions in a voxel are stored in steps.
         step_m = table.voxel_m / HALF_STEPS
         centroids = table.centroids() @ table.basis
         np.testing.assert_allclose(centroids, means / n_points[:, None], atol=0.6 * step_m)
@@ -348,7 +348,7 @@ def test_neighbourhoods_have_the_cells_of_their_shape(
     shape: Any, size_m: float, count: int
 ) -> None:
     around = Neighbourhood(shape=shape, size_m=size_m, n_points=9, voxel_m=0.01).around()
-    assert len(around) == count - 1  # the voxel itself is there without being listed
+    assert len(around) == count - 1  # the voxel itself is not listed
     assert (np.diff(around[:, 3]) >= 0).all()
 
 
@@ -358,13 +358,14 @@ def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
     points = sampled((wall,), noise_m=0.001)
     (plane,) = grown(points, 0.005).planes.values()
     expected = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
-    # A few voxels at the edges do not join, and places are rounded to 50 micrometres.
+    # A few voxels at the edges are not in the region, and positions are rounded to 50 micrometres.
     assert min(angle_between_deg(plane.normal, s * expected) for s in (1, -1)) < 0.002
     assert abs(plane.distances_m(points.mean(axis=0)[None])[0]) < 2e-5
 
 
 def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
-    # A point per decimetre: neighbourhoods of 10 cm that suit the dense wall hold one of them.
+    # Its points are a decimetre apart, so neighbourhoods of 10 cm, which suit the dense wall,
+    # contain one of them.
     thin = Rectangle("thin", (3.0, 1.0, 0.0), (0, 3.0, 0), (0, 0, 2.0), 2_400)
     dense = Rectangle("dense", (0.0, 4.0, 0.0), (2.0, 0, 0), (0, 0, 2.0), 90_000)
     points = sampled((thin, dense), noise_m=0.002)
@@ -382,12 +383,12 @@ def test_a_step_of_three_centimetres_parts_regions() -> None:
     points = sampled((upper, lower), noise_m=0.001)
     assert len(grown(points, 0.18).planes) == 2
     either_depth = grown(points, 0.18, criterion="normal")
-    # All but the voxels at the step itself, whose neighbourhoods lean.
+    # The region lacks only the voxels at the step, whose neighbourhoods are inclined.
     assert either_depth.n_points.max() > 0.85 * 55_000
 
 
 def test_the_paper_s_preset_does_not_tell_a_niche_from_its_wall(tmp_path: Path) -> None:
-    """Figure 8: normals alone know no depth."""
+    """As in Figure 8, normals alone contain no depth."""
     points = sampled((WALL, NICHE, FLOOR), noise_m=2e-5)
     paper, metrics = detect_regions(points, tmp_path / "paper", preset="paper", thinning=1)
     ours, by_region = (
@@ -403,13 +404,13 @@ def test_the_paper_s_preset_does_not_tell_a_niche_from_its_wall(tmp_path: Path) 
     own = np.bincount(ours[niche] + 1).argmax() - 1
     assert np.mean(ours[niche] == own) > 0.98
     assert own not in ours[: WALL.n_points]
-    # The raw plane lies between the two, as R in Table 1 does; the common fit is on the wall.
+    # The raw plane is between the two, like R in Table 1; the common fit is on the wall.
     raw = paper.planes.details["raw"][wall]
     between_m = abs(np.array(raw["normal"]) @ (0, 2, 0) - raw["offset_m"])
     assert 0.02 < between_m < 0.1
     assert abs(paper.planes.normal[wall] @ (0, 2, 0) - paper.planes.offset[wall]) < 1e-4
     assert metrics["neighbourhood_mm"] >= 10.0
-    # Labels by region leave out what lies on the plane but not in the region.
+    # Labels by region exclude points that are on the plane but not in the region.
     on, within = ours >= 0, by_region >= 0
     assert 0.9 < np.mean(within) < np.mean(on)
     assert (ours[within & on] == by_region[within & on]).mean() > 0.99
@@ -422,6 +423,6 @@ def test_the_paper_s_preset_does_not_tell_a_niche_from_its_wall(tmp_path: Path) 
 def test_neighbourhoods_follow_the_density(tmp_path: Path) -> None:
     thin = Rectangle("thin", (0, 2, 0), (3, 0, 0), (0, 0, 1.5), 2_000)  # 111 points per m2
     _, metrics = detect_regions(sampled((thin,)), tmp_path)
-    # 16 points at 111 per m2: 38 cm.
+    # With 111 points per m2, a neighbourhood of 16 points has 38 cm.
     assert metrics["neighbourhood_mm"] == pytest.approx(380.0, rel=0.15)
     assert metrics["cell_mm"] == pytest.approx(metrics["neighbourhood_mm"] / 3.0)

@@ -1,4 +1,4 @@
-"""What becomes of candidates: fits, cells and parts, criteria, labels, stated uncertainty."""
+"""Processing of candidates: fits, cells and parts, criteria, labels and predicted errors."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def surface(truth: Rectangle) -> Candidate:
 
 
 def wall(n_points: int = 8_000, *, half_m: tuple[float, float] = (2.0, 1.0)) -> Rectangle:
-    """At y = 2, upright."""
+    """Return an upright wall at y = 2."""
     return Rectangle("wall", (0, 2, 0), (half_m[0], 0, 0), (0, 0, half_m[1]), n_points)
 
 
 def barrel(radius_m: float) -> NDArray[np.float64]:
-    """Half a metre of arc of an upright cylinder whose nearest line is at y = 2."""
+    """Return an arc of 1.2 m of an upright cylinder whose nearest line is at y = 2."""
     rng = np.random.default_rng(2)
     turn = rng.uniform(-0.6, 0.6, 8_000) / radius_m
     x, y = radius_m * np.sin(turn), 2.0 + radius_m * (1.0 - np.cos(turn))
@@ -83,7 +83,7 @@ RAMP = Rectangle("ramp", (0, 2, 0), (2, 0, 0), (0, 0.3, 1), 8_000)
 
 
 def crowd_in_a_slab() -> NDArray[np.float64]:
-    """A slab filled evenly whose middle third is a wall."""
+    """Return an evenly filled slab whose middle third is a wall."""
     rng = np.random.default_rng(4)
     thin = rng.uniform([-0.7, 1.999, -1.0], [0.7, 2.001, 1.0], (4_000, 3))
     corners = rng.uniform([-2.0, 1.9, -1.0], [2.0, 2.1, 1.0], (60_000, 3))
@@ -133,7 +133,7 @@ def test_exact_walls_and_floors_lean_by_nothing(exact: bool) -> None:
 
 
 class Listed(Proposer):
-    """Proposes what it is given, one after the other."""
+    """Proposes given surfaces, one after the other."""
 
     def __init__(self, surfaces: tuple[Rectangle, ...]) -> None:
         self._left = [surface(truth) for truth in surfaces]
@@ -148,10 +148,10 @@ class Listed(Proposer):
     [
         ({"min_share": 0.005}, 7),
         ({"min_share": 0.05}, 6),
-        # The table has 1.6 m2, in a room whose floor has 24.
+        # The table has an area of 1.6 m2, and the floor of the room 24 m2.
         ({"min_share": 0.005, "min_area_m2": 1.7}, 7),
         ({"min_share": 0.005, "n_planes_max": 3}, 3),
-        # The four walls hold 62 % of the points.
+        # The four walls have 62 % of the points.
         ({"min_share": 0.005, "stop_unclassified_share": 0.4}, 4),
     ],
 )
@@ -183,7 +183,7 @@ def test_points_belong_to_the_nearest_plane_whose_rectangle_holds_them() -> None
     names, labels = np.array([7, 3, -1], dtype=np.int16), np.empty(len(points), dtype=np.int16)
     search.cloud.write_labels(names, labels)
     np.testing.assert_array_equal(labels, names[claims])
-    # Planes that all points together do not support are left out.
+    # Planes that are not supported by all points together are omitted.
     for share, n_left in ((0.3, 1), (0.8, 0)):
         strict = search_in(search.cloud, min_share=share)
         assert len(fit_to_all(found, strict)) == n_left
@@ -192,7 +192,8 @@ def test_points_belong_to_the_nearest_plane_whose_rectangle_holds_them() -> None
 
 @pytest.mark.parametrize("gap_m", [0.0, 0.8], ids=["connected", "in two parts"])
 def test_a_frame_around_a_wall_leaves_the_wall_its_points(gap_m: float) -> None:
-    # Its rectangle covers the wall, and its plane runs through the wall at an angle of one degree.
+    # The rectangle of the frame covers the wall, and its plane intersects the wall at an angle of
+    # one degree.
     lean = 0.02
     below = (-gap_m, 1.98 - 1.25 * lean, -1.25)
     frame = (
@@ -234,7 +235,7 @@ def adjusted(
     freedom: Constraint = "any",
     cells: NDArray[np.bool_] | None = None,
 ) -> fit.AdjustedPlane | None:
-    """The fit to cells of 16 points each, half of them a millimetre above and half below."""
+    """Return the fit to cells of 16 points, half of them a millimetre above and half below."""
     fit_m, n = 0.015, 16
     steps_per_m = STEPS_PER_TOLERANCE / fit_m
     number = np.full(heights_m.shape, n, dtype=np.int64)
@@ -252,14 +253,14 @@ def adjusted(
 @pytest.mark.parametrize("outliers", [0, 120])
 def test_cells_on_a_plane_give_that_plane_whatever_some_stand_out(outliers: int) -> None:
     heights = tilted_heights()
-    # A moulding over a fifth of the wall, on one side of it.
+    # Add a moulding on a fifth of the wall, at one side.
     heights.reshape(-1)[:outliers] += 0.011
     fitted = adjusted(heights)
     assert fitted is not None
     corners = np.array([[2.0, -1.0, 0], [5.0, -1.0, 0], [5.0, 1.0, 0], [2.0, 1.0, 0]])
     corners[:, 2] = 1.002 + 0.001 * (corners[:, 0] - 3.5) - 0.002 * corners[:, 1]
     np.testing.assert_allclose(fitted.plane.distances_m(corners), 0.0, atol=2e-5)
-    # Of the cells' centres, half a cell inside.
+    # The displacement refers to the centres of cells, half a cell from the edges.
     assert fitted.moved_m == pytest.approx(0.002 + 0.001 * 1.45 + 0.002 * 0.95, abs=3e-5)
     assert outliers or fitted.bend_per_m == pytest.approx(0.0, abs=1e-5)
 
@@ -284,7 +285,7 @@ def test_a_raster_covers_the_box_with_cells_of_the_side_asked_for() -> None:
     corners = np.array(list(itertools.product((-3.0, 2.0), (1.0, 2.5), (0.0, 1.05))))
     raster = SurfaceRaster.over(WALL, corners, UP, 0.1)
     low_m = (corners @ raster.axes.T).min(axis=0)
-    # 5 m across, 1.05 m down.
+    # The box is 5 m wide and 1.05 m high.
     assert raster.shape == (11, 50)
     u, v = raster.centres_m()
     np.testing.assert_allclose([u[0, 0], v[0, 0]], low_m + 0.05)
@@ -301,15 +302,15 @@ def test_a_raster_covers_the_box_with_cells_of_the_side_asked_for() -> None:
 
 def test_crowded_cells_have_most_points_in_the_inner_slab_and_like_neighbours() -> None:
     n_near = np.full((9, 9), 25)
-    # 0.6 of 25 points and half their root: 17.5.
+    # At least 0.6 of 25 points plus half of their root are needed, which is 17.5.
     assert not crowded_cells(sums_of(n_near, np.full((9, 9), 17))).any()
     assert crowded_cells(sums_of(n_near, np.full((9, 9), 18))).all()
     inner = np.zeros((9, 9), dtype=np.int64)
-    # A cell with three neighbours, one with two.
+    # Cells in the first group have three neighbours, those in the second two.
     inner[1:3, 1:3] = inner[6, 6] = inner[6, 7] = inner[7, 6] = 25
     found = crowded_cells(sums_of(n_near, inner))
     np.testing.assert_array_equal(np.argwhere(found), [[1, 1], [1, 2], [2, 1], [2, 2]])
-    # Cells with two points or far fewer than the others are not: a fiftieth of 400 is 8.
+    # Cells with two points or far fewer than the others are not crowded; a fiftieth of 400 is 8.
     n_near = np.full((6, 6), 400)
     n_near[0, :3] = [2, 7, 9]
     found = crowded_cells(sums_of(n_near))
@@ -317,14 +318,14 @@ def test_crowded_cells_have_most_points_in_the_inner_slab_and_like_neighbours() 
     assert found[1:].all()
     pairs = np.full((6, 6), 2)
     assert not crowded_cells(sums_of(pairs)).any()
-    # All three of three are within: 2.7 would do.
+    # All three points are in the inner slab, where 2.7 would suffice.
     assert crowded_cells(sums_of(pairs + 1)).all()
 
 
 def test_parts_are_joined_over_gaps_of_four_cells_and_listed_by_points() -> None:
     belongs = np.zeros((12, 40), dtype=bool)
     belongs[2:6, 3:8] = True
-    belongs[2:6, 12:15] = True  # four cells further on
+    belongs[2:6, 12:15] = True  # four cells farther to the right
     belongs[3:9, 20:30] = True  # five cells
     belongs[11, 39] = True  # one of 93 cells
     n_near = np.where(belongs, 1, 7)
@@ -337,7 +338,7 @@ def test_parts_are_joined_over_gaps_of_four_cells_and_listed_by_points() -> None
     expected[11, 39] = -1
     np.testing.assert_array_equal(support.part_of_cell, expected)
     np.testing.assert_array_equal(support.cells, expected >= 0)
-    # Columns from -1 m, rows from 3 m.
+    # Columns begin at -1 m, rows at 3 m.
     parts_m = np.array([[-0.7, 0.5, 3.2, 3.6], [1.0, 2.0, 3.3, 3.9]])
     np.testing.assert_allclose(support.parts_m, parts_m, atol=1e-12)
     np.testing.assert_allclose(support.bounds_m, [-0.7, 2.0, 3.2, 3.9], atol=1e-12)
@@ -350,7 +351,8 @@ def test_parts_are_joined_over_gaps_of_four_cells_and_listed_by_points() -> None
 
 
 def test_cells_that_all_lie_scattered_support_nothing() -> None:
-    # 7 x 7 single cells, eleven apart: no gap is closed, and each is one of forty-nine.
+    # Single cells are eleven cells apart, so that no gap is closed and each part has 1/49 of the
+    # cells.
     belongs = np.zeros((77, 77), dtype=bool)
     raster = raster_of(WALL, (-1.0, 3.0), (77, 77))
     assert support_of(raster, belongs, sums_of(belongs.astype(np.int64))) is None
@@ -362,7 +364,7 @@ def test_cells_that_all_lie_scattered_support_nothing() -> None:
 
 
 FIT_M = 0.015
-# What stated and true errors may differ by, over many trials.
+# Permitted range of the ratio of true to predicted errors, over many trials.
 CALIBRATED = (0.7, 1.4)
 SHAPE = (30, 45)
 WALL_CELLS = raster_of(WALL, (-1.0, -1.5), SHAPE)
@@ -371,17 +373,17 @@ WALL_CELLS = raster_of(WALL, (-1.0, -1.5), SHAPE)
 def wall_of_cells(
     seed: int, *, reach_cells: float, relief_m: float, mixed_share: float = 0.0
 ) -> CellSums:
-    """Cells of a flat wall, 30 x 45, 25 points of 2 mm noise each, with waves of plaster on it.
+    """Return 30 x 45 cells of a flat wall with uneven plaster; each has 25 points with 2 mm noise.
 
     Args:
-        seed: which wall.
-        reach_cells: over how many cells the waves are similar.
+        seed: seed of the wall.
+        reach_cells: correlation length of the waves in cells.
         relief_m: standard deviation of the waves.
-        mixed_share: so much of the points of a cell in ten lies between the wall and 15 mm before.
+        mixed_share: in one of ten cells, share of the points up to 15 mm in front of the wall.
     """
     rng = np.random.default_rng(seed)
     waves = ndimage.gaussian_filter(rng.normal(size=SHAPE), reach_cells, mode="wrap")
-    # By what the filter leaves on average, not by what it left of this wall.
+    # Scale by the mean effect of the filter, not by its effect on this wall.
     waves *= relief_m * (2.0 * np.sqrt(np.pi) * max(reach_cells, 0.3))
     points = waves[..., None] + rng.normal(0.0, 0.002, (*SHAPE, 25))
     spoilt = rng.uniform(size=(*SHAPE, 25)) < mixed_share
@@ -399,7 +401,7 @@ def sums_of_steps(steps: NDArray[np.int64], squared: NDArray[np.int64]) -> CellS
 def ratios(
     found: Plane, covariance: NDArray[np.float64], true: Plane, middle: NDArray[np.float64]
 ) -> list[float]:
-    """Errors over stated sigmas: offset at a place, and the direction about two axes."""
+    """Return errors over predicted sigmas, of the offset and of the direction about two axes."""
     at_middle = np.append(middle, -1.0)
     off_m = float(found.distances_m(middle[None])[0] - true.distances_m(middle[None])[0])
     turned = found.normal - true.normal
@@ -439,7 +441,7 @@ def test_stated_sigmas_of_walls_are_their_errors(
 
 @pytest.mark.parametrize("tails", ["laplace", "two widths"])
 def test_cells_that_fade_state_what_their_plane_scatters_by(tails: str) -> None:
-    """A fifth to a quarter of what the weights say is lost where many cells lose theirs."""
+    """If many cells fade, the weights overstate the information by a fifth to a quarter."""
     shape, squares, reach_m = (40, 60), [], 0.03
     raster = replace(WALL_CELLS, shape=shape)
     for seed in range(250):
@@ -472,7 +474,7 @@ def test_the_covariance_from_a_few_tiles_is_the_scatter_of_the_mean() -> None:
 
 
 def room_ratios(seed: int, folder: Path) -> list[list[float]]:
-    """Of walls, floor and ceiling of a room drawn and scanned by a seed."""
+    """Return ratios for walls, floor and ceiling of a room generated and scanned with a seed."""
     chosen = {"geometry": "drawn", "scan_step_m": 0.04}
     ctx = replace(context(folder), rng=np.random.default_rng(seed))
     room = SimulateRoom().run(SimulateRoom.In(), SimulateRoom.Params.model_validate(chosen), ctx)
