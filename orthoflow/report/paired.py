@@ -162,11 +162,6 @@ class MetricOverDatasets:
     ranks: MeanRanks | None = None
 
     @property
-    def middle(self) -> str:
-        """Name of the central value: the median, or the share for yes/no metrics."""
-        return "share" if is_flag(self.column.unit) else "median"
-
-    @property
     def reference(self) -> MethodOverDatasets:
         """Results of the reference."""
         return next(one for one in self.methods if not one.compared_with)

@@ -162,7 +162,7 @@ def test_of_what_is_found_or_not_the_share_of_datasets_is_stated() -> None:
     found = over({"a": (1.0, 1.0, 1.0), "b": (1.0, 0.0, 0.5)}, "higher", unit="yes/no")
     first, second = found.methods
     # Their medians would be 1 and 0.5.
-    assert (found.middle, first.median, second.median) == ("share", 1.0, 0.5)
+    assert (first.median, second.median) == (1.0, 0.5)
     assert math.isnan(second.spread)
     assert second.paired is not None
     assert (second.paired.median, second.paired.losses) == (-0.5, 2)
