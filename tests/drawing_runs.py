@@ -90,14 +90,16 @@ def wall_frame(planes: Planes) -> WallFrame:
     return replace(frame, up=(east, north, top), name=planes.names[WALL])
 
 
-def box_products(image: Orthoimage | None = None) -> dict[str, Product]:
+def box_products(
+    image: Orthoimage | None = None, others: tuple[Orthoimage, ...] = ()
+) -> dict[str, Product]:
     """What the steps of the run give."""
     planes = box_planes()
     frame = wall_frame(planes)
     return {
         "plane": planes,
         "wall": samples.walls(_wall(frame), buffer_m=0.3, intensity_source="laser"),
-        "mosaic": Orthoimages(images=(image or box_image(),)),
+        "mosaic": Orthoimages(images=(image or box_image(), *others)),
         "openings": box_openings(),
         "check": _inspection(frame),
         "points": _checkpoints(frame),
@@ -133,9 +135,11 @@ def box_openings() -> Openings:
     )
 
 
-def publish_box(folder: Path, image: Orthoimage | None = None) -> tuple[PublishedFile, ...]:
+def publish_box(
+    folder: Path, image: Orthoimage | None = None, others: tuple[Orthoimage, ...] = ()
+) -> tuple[PublishedFile, ...]:
     """Write `products/` of a run folder, and say what lies there."""
-    products = box_products(image)
+    products = box_products(image, others)
     for step, publish in (
         ("plane", publish_planes),
         ("wall", publish_walls),
@@ -174,6 +178,7 @@ def write_drawing_run(
     gains: str = "none",
     differ: bool = False,
     image: Orthoimage | None = None,
+    others: tuple[Orthoimage, ...] = (),
     before: Mapping[str, Product] | None = None,
     labels: PointLabels | None = None,
     change: Callable[[Payload], Payload] = lambda payload: payload,
@@ -186,7 +191,7 @@ def write_drawing_run(
     """
     folder.mkdir(parents=True)
     shelf = ProductShelf(folder)
-    products = {**(before or {}), **box_products(image)}
+    products = {**(before or {}), **box_products(image, others)}
     given = {step: _recorded(shelf, change(item.to_payload())) for step, item in products.items()}
     more = {"plane": [_recorded(shelf, change(labels.to_payload()))]} if labels else {}
     cells = [
@@ -204,7 +209,7 @@ def write_drawing_run(
         )
         for step in (*(before or {}), "points", "plane", "wall", "openings", "mosaic", "check")
     ]
-    made = record(cells, name="box", published=publish_box(folder, image), environments=())
+    made = record(cells, name="box", published=publish_box(folder, image, others), environments=())
     write_record(folder / "run.h5", made, shelf.find)
     return folder
 

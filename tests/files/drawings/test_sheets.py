@@ -504,6 +504,25 @@ def test_numbers_have_the_separators_of_the_language(
             assert part in text, part
 
 
+def test_a_wall_with_an_empty_image_has_a_sheet_only_where_it_is_asked_for(tmp_path: Path) -> None:
+    image = box_image()
+    empty = replace(
+        image,
+        name="wall 1",
+        plane_index=1,
+        mask=np.zeros_like(image.mask),
+        rgb=np.zeros_like(image.rgb),
+        source=np.full_like(image.source, -1),
+    )
+    run = write_drawing_run(tmp_path / "run", others=(empty,))
+    for options, number in ((), WALL), (("--wall", 1), 1):
+        done = export(run, tmp_path / str(number), "--scale", 25, *options)
+        assert done.exit_code == 0, done.output
+        assert ("; left out as empty: wall 1" in done.output) == (not options)
+        names = [path.name for path in (tmp_path / str(number)).iterdir()]
+        assert names == [f"wall_{number}_sheet_1.pdf"]
+
+
 @pytest.mark.parametrize(
     ("share", "has_ties", "said", "note"),
     [
