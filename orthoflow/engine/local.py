@@ -59,11 +59,12 @@ _THREAD_VARIABLES: Final = (
 # Environment variables that are read when Python starts or the server loads libraries. A module in
 # the working folder must not replace a standard module. OpenBLAS threads spin for 2**26 clock
 # cycles when they start and after each product, about 0.05 s of processor time; 2**20 cycles take
-# less than 1 ms.
+# less than 1 ms. Numba would compose coloured error messages for all functions that it tries.
 _AT_START: Final = {
     "PYTHONSAFEPATH": "1",
     "PYTHONHASHSEED": "0",
     "OPENBLAS_THREAD_TIMEOUT": "20",
+    "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1",
 }
 _starting: Final = threading.Lock()
 

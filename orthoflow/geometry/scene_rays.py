@@ -21,11 +21,8 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_part
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.scenes import Scene
-
-# Small functions have explicit types, since numba would otherwise compile a separate version for
-# each constant argument, which takes seconds in the first run.
 
 
 class Shade(NamedTuple):
@@ -69,7 +66,7 @@ class Pattern(NamedTuple):
     other: float
 
 
-@typed_kernel_part("u8(u8)")
+@kernel_part
 def mixed_bits(value: np.uint64) -> np.uint64:
     """Scramble 64 bits (splitmix64's finaliser); neighbouring inputs give unrelated outputs."""
     bits = np.uint64(value)
@@ -78,32 +75,32 @@ def mixed_bits(value: np.uint64) -> np.uint64:
     return bits ^ (bits >> np.uint64(31))
 
 
-@typed_kernel_part("f8(u8, i8)")
+@kernel_part
 def uniform(state: np.uint64, draw: int) -> float:
     """Return a number in [0, 1) that depends only on the 64-bit state and the index of the draw."""
     bits = mixed_bits(np.uint64(state) + np.uint64(draw + 1) * np.uint64(0x9E3779B97F4A7C15))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@typed_kernel_part("u8(i8, i8)")
+@kernel_part
 def _column_state(i: int, seed: int) -> np.uint64:
     return mixed_bits(np.uint64(i) * np.uint64(0xD1B54A32D192ED03) + np.uint64(seed))
 
 
-@typed_kernel_part("u8(i8, i8, i8)")
+@kernel_part
 def cell_state(i: int, j: int, seed: int) -> np.uint64:
     """Return the random 64-bit state of the lattice cell (i, j)."""
     return mixed_bits(_column_state(i, seed) ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
 
 
-@typed_kernel_part("f8(u8, i8)")
+@kernel_part
 def _lattice_value(column: np.uint64, j: int) -> float:
     """Return a random number in [0, 1) for the lattice point j of a column."""
     bits = mixed_bits(column ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@typed_kernel_part("f8(f8, f8, i8)")
+@kernel_part
 def _value_noise(a: float, b: float, seed: int) -> float:
     """Return smooth noise, -1..1, on the unit lattice."""
     i, j = math.floor(a), math.floor(b)
@@ -116,7 +113,7 @@ def _value_noise(a: float, b: float, seed: int) -> float:
     return 2.0 * ((1.0 - t) * low + t * high) - 1.0
 
 
-@typed_kernel_part("f8(f8, f8, f8, i8)")
+@kernel_part
 def _stains(a: float, b: float, period: float, seed: int) -> float:
     """Return three octaves of noise, about -1..1; the finest lattice is a sixth of the period."""
     return (
@@ -126,7 +123,7 @@ def _stains(a: float, b: float, period: float, seed: int) -> float:
     )
 
 
-@typed_kernel_part("f8(f8, f8, i8)")
+@kernel_part
 def _wear(a: float, b: float, seed: int) -> float:
     """Return fine detail of a surface: grain on an 11 mm lattice and cracks 2 to 4 mm wide."""
     grain = 0.3 * _value_noise(a / 0.011, b / 0.011, seed)
@@ -134,7 +131,7 @@ def _wear(a: float, b: float, seed: int) -> float:
     return grain - 0.8 * max(0.0, 1.0 - crack / 0.03)
 
 
-@typed_kernel_part("UniTuple(f8, 2)(f8, f8, f8, i8)")
+@kernel_part
 def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float]:
     """Return the ornament of the lattice cell at (a, b): (paint 0 or 1, hue 0..1).
 
@@ -163,7 +160,7 @@ def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float
     return 0.0, 0.0
 
 
-@typed_kernel_part("f8(f8, f8, f8)")
+@kernel_part
 def _motif(a: float, b: float, period: float) -> float:
     """Return a damask motif, exactly periodic; alternate columns are shifted by half a period."""
     i = math.floor(a / period)
@@ -176,7 +173,7 @@ def _motif(a: float, b: float, period: float) -> float:
     return 0.6 if abs(x) > 0.94 else 0.0
 
 
-@typed_kernel_part("f8(f8, f8, f8, i8)")
+@kernel_part
 def _grain(a: float, b: float, period: float, seed: int) -> float:
     """Return wood grain along b, -1..1."""
     bend = 0.35 * _value_noise(a / period, 0.25 * b / period, seed)
@@ -347,13 +344,13 @@ def _misses_box(nodes: NDArray[np.float64], node: Index, ray: Ray, t_max: float)
     return misses
 
 
-@typed_kernel_part("f8(f8[:, ::1], i8, f8, f8, f8)")
+@kernel_part
 def _along(axes: NDArray[np.float64], axis: int, x: float, y: float, z: float) -> float:
     length: float = axes[axis, 0] * x + axes[axis, 1] * y + axes[axis, 2] * z
     return length
 
 
-@typed_kernel_part("f8(f8)")
+@kernel_part
 def _inverse(value: float) -> float:
     # Use a large number instead of infinity, since 0 times infinity is NaN for a ray in the plane
     # of a slab.

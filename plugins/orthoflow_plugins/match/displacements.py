@@ -67,7 +67,8 @@ def search_shifts(
         if is_mixed:
             to = (at[0] + int(found[i, 1]), at[1] + int(found[i, 0]))
             _mixed(first, second, (at, to, reach[0]), gains)
-            found[i, 4:] = gains
+            for k in range(3):
+                found[i, 4 + k] = gains[k]
 
 
 @kernel_part

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.rastering import Entries, is_own
 from orthoflow.geometry.slabs import Offsets
 
@@ -167,7 +167,7 @@ def median_depths(
             medians_m[cell] = _layer_median(depths, layer_m)
 
 
-@compiled
+@kernel_part
 def _sort(values: NDArray[np.float32]) -> None:
     """Sort by Shell's method with gap ratio 3, because numba's sort takes seconds to compile."""
     gap = 1
@@ -184,7 +184,7 @@ def _sort(values: NDArray[np.float32]) -> None:
         gap //= 3
 
 
-@compiled
+@kernel_part
 def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
     best_size, best_first, first = 1, 0, 0
     for k in range(1, depths.size + 1):
@@ -366,7 +366,7 @@ def recover_between(
                     _fill(corners, chosen, intensity, rgb, is_void, sums)
 
 
-@compiled
+@kernel_part
 def _place(grid: ScanGrid, point: int, place: NDArray[np.float64]) -> None:
     """Set `place` to the column, row and depth of a point."""
     offsets = grid.offsets
@@ -376,7 +376,7 @@ def _place(grid: ScanGrid, point: int, place: NDArray[np.float64]) -> None:
         place[axis] = m[axis, 0] * x + m[axis, 1] * y + m[axis, 2] * z + m[axis, 3]
 
 
-@compiled
+@kernel_part
 def _is_one_surface(corners: NDArray[np.float64], reach: Reach) -> bool:
     for axis in range(3):
         a, b, c = corners[0, axis], corners[1, axis], corners[2, axis]
@@ -386,7 +386,7 @@ def _is_one_surface(corners: NDArray[np.float64], reach: Reach) -> bool:
     return True
 
 
-@compiled
+@kernel_part
 def _fill(
     corners: NDArray[np.float64],
     chosen: NDArray[np.int64],

@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
 from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.geometry.rastering import (
@@ -495,7 +495,7 @@ def _find_specks(
             is_speck[row, column] = n_agreeing < _AGREEING_LEAST and n_known >= _KNOWN_LEAST
 
 
-@compiled
+@kernel_part
 def _count_around(
     depth_m: NDArray[np.float32],
     row: int,
