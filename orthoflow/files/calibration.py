@@ -41,7 +41,7 @@ from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 from orthoflow.untrusted_text import text_of_file
 
-# Such a file takes some seconds to parse; a calibration of a thousand cameras has about 150 kB.
+# Parsing a file of this size takes a few seconds; a thousand cameras need about 150 kB.
 #: bytes of a calibration file
 MOST_BYTES: Final = 400_000
 #: entries of a calibration file
@@ -120,7 +120,7 @@ def calibration_text(calibration: Calibration) -> str:
 
 
 def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
-    """Return the first pattern that equals the photo's name or matches it as in a shell.
+    """Return the first pattern that equals the photo's name, or matches it as a shell pattern.
 
     Matching is case-sensitive. A name with brackets matches itself, and a name with folders is also
     matched without them.

@@ -225,7 +225,7 @@ def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
     Raises:
         InputError: the file is damaged.
     """
-    # Only the cameras; the points after them may be many.
+    # Read only the cameras, because many points may follow them.
     values = numbers_of(
         list(islice(_words_of(path), 2, 2 + 15 * len(names))), path, "the parameters of cameras"
     )
@@ -253,7 +253,7 @@ def _words_of(path: Path) -> Iterator[str]:
 
 
 def _head_of(lines: Sequence[str]) -> tuple[int, list[str]] | None:
-    """Return line and columns of the header of a RealityCapture list; None if it has none."""
+    """Return line index and columns of a RealityCapture list's header; None if there is none."""
     for number, line in enumerate(lines):
         columns = [word.strip().lower() for word in _SEPARATORS.split(line.lstrip("# \ufeff"))]
         if {"name", "heading"} <= set(columns):

@@ -44,7 +44,7 @@ _BROWN: Final = frozenset(
 _FISHEYES: Final = frozenset(
     {"SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}
 )
-# The files of a model; rigs and frames were added in version 3.12. Its points are not read.
+# The files of a model; rigs and frames were added in version 3.12. The points are not read.
 COLMAP_PARTS: Final = ("cameras", "images", "rigs", "frames")
 _OBSERVATION_BYTES: Final = 24
 _POSE_BYTES: Final = 64
@@ -112,7 +112,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
         image.points2D = [pycolmap.Point2D(xy) for xy in ties[:, :2]]
         pose = pycolmap.Rigid3d(np.column_stack([viewer.rotation, viewer.translation]))
         model.add_image_with_trivial_frame(image, pose)
-    # A position that is a tie of several photos becomes one point.
+    # Ties of several photos at the same position become one point.
     image_of = np.concatenate([np.full(len(ties), k) for k, ties in enumerate(seen, start=1)])
     nth = np.concatenate([np.arange(len(ties)) for ties in seen])
     tied = np.concatenate(seen)
@@ -184,7 +184,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     with tempfile.TemporaryDirectory() as folder:
         for path in parts:
             (Path(folder) / f"{path.stem.lower()}{suffix}").symlink_to(path.absolute())
-        # An empty file, because points are many and not needed.
+        # Replace the points by an empty file, because they are many and not needed.
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)
@@ -212,7 +212,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
 def _require_whole(path: Path) -> None:
     """Refuse a binary file that is truncated or declares more items than its size allows.
 
-    pycolmap allocates memory for the declared number, and reads past the end of the file.
+    pycolmap allocates memory for the declared number of items, and reads past the end of the file.
     """
     end_of = {"images": _end_of_image, "rigs": _end_of_rig, "frames": _end_of_frame}
     content, at = path.read_bytes(), 8
@@ -247,7 +247,7 @@ def _end_of_rig(content: bytes, at: int) -> int:
 
 
 def _whole_names(images: Path) -> dict[int, str]:
-    """Return photo names by image number, from a text file; pycolmap ends a name at a space."""
+    """Return photo names by image number, read from a text file; pycolmap cuts them at spaces."""
     names: dict[int, str] = {}
     with open_file(images) as content:
         stream = TextIOWrapper(content, encoding="utf-8", errors="replace")

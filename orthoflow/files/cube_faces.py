@@ -39,7 +39,7 @@ FACES: Final[Mapping[str, NDArray[np.float64]]] = {
 MOST_PX: Final = 32_766
 WIDEST_DEG: Final = 180.0
 _FULL_TURN_DEG: Final = 360.0
-# Number of directions per side for finding the part of a face that the lens sees.
+# Directions sampled per side of a face to find the part that the lens sees.
 _TRIED: Final = 65
 # A face with less than this share of the largest face's visible area is omitted.
 _LEAST_SHARE: Final = 0.02
@@ -141,7 +141,7 @@ class FisheyeLens:
         return min(math.radians(0.5 * self.field_of_view_deg), _fold_rad(self.radial))
 
     def finest_px(self, theta_rad: float) -> float:
-        """Return the higher of radial and tangential resolution at an angle, pixels per radian."""
+        """Return the higher of radial and tangential resolution at an angle, in px/rad."""
         theta = min(theta_rad, self.limit_rad)
         around = _bent(self, theta) / math.sin(theta) if theta > 0.0 else 1.0
         with np.errstate(all="ignore"):
@@ -229,7 +229,7 @@ def _bent(lens: FisheyeLens, theta_rad: float) -> float:
 def face_lenses(lens: WideLens) -> Mapping[str, Intrinsics]:
     """Return the lenses of the faces that a lens sees, each cropped to the visible part.
 
-    The faces of a panorama have its resolution at the centre of a face.
+    At its centre, a face of a panorama has the resolution of the panorama.
     """
     if isinstance(lens, PanoramaLens):
         side = max(1, round(lens.width / math.pi))
@@ -263,7 +263,7 @@ def _lens_of_face(side: int, ends: tuple[int, int, int, int]) -> Intrinsics:
 def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
     """Return the lens of the part of a face within the outermost visible directions plus a margin.
 
-    A face has the resolution of the photo at the centre of the face.
+    At its centre, the face has the resolution of the photo.
     """
     off_axis = 0.0 if face == "front" else 0.5 * math.pi
     side = max(1, round(2.0 * lens.finest_px(off_axis)))
@@ -284,7 +284,7 @@ class CubeFace:
 
     Attributes:
         name: photo name of the face.
-        photo: content of the file of the wide photo, unmodified.
+        photo: unmodified content of the wide photo's file.
         face: key of `FACES`.
         lens: lens of the face, without distortion.
         whole: lens of the wide photo.
@@ -299,7 +299,7 @@ class CubeFace:
     used: NDArray[np.bool_] | None = None
 
     def encoded(self) -> bytes:
-        """Return the face as a PNG file, black where the wide photo shows nothing."""
+        """Return the face as a PNG file, black outside the wide photo's field of view."""
         return encode_png(self.picture(decode_levels(self.photo, self.name)))
 
     def mask(self) -> NDArray[np.bool_] | None:
@@ -317,7 +317,7 @@ class CubeFace:
         pixels = self._pixels()
         seen = self.whole.sees(pixels)
         if isinstance(self.whole, PanoramaLens):
-            # Repeat the last column left of the first, and the first row above itself.
+            # Add a column on each side, copied from the opposite side.
             whole = np.concatenate([whole[:, -1:], whole, whole[:, :1]], axis=1)
             pixels[..., 0] += 1.0
         pixels[~seen] = 0.0
@@ -328,7 +328,7 @@ class CubeFace:
         return np.asarray(found, dtype=whole.dtype)
 
     def _pixels(self) -> NDArray[np.float64]:
-        """Return the pixels of the wide photo (height, width, 2) that the face's pixels show."""
+        """Return the position (height, width, 2) in the wide photo of each pixel of the face."""
         return self.whole.project(face_rays(self.lens) @ FACES[self.face])
 
 

@@ -68,8 +68,8 @@ class _Collected:
         self.found.append((position, f"{path}: {message}" if path else message))
 
 
-# pydantic's error code -> expected value, in terms of a file instead of Python. Our own validators
-# raise custom errors with a `form`.
+# pydantic's error code -> expected value, in terms of YAML or JSON instead of Python. Our own
+# validators raise custom errors with a `form`.
 _FORMS: Final[Mapping[str, str]] = {
     "bool_type": "true or false",
     "dict_type": "a mapping",
@@ -91,20 +91,20 @@ _OF_NUMBERS: Final = frozenset(
     ("finite_number", "float_type", "int_from_float", "int_type", "time")
 )
 _OF_LISTS: Final = frozenset(("tuple_type", "list_type", "missing", "too_long", "too_short"))
-# Keys of a method call that are often written among its parameters by mistake.
+# Keys of a method call that users often write among its parameters by mistake.
 _BESIDE: Final = ("use", "repeat", "resources", "timeout")
 
 
 def mistakes(
     error: ValidationError, model: type[BaseModel], data: JsonValue, owner: str = ""
 ) -> Iterator[tuple[Location, str, bool]]:
-    """Yield each mistake once: location in the data, message, and whether it concerns a key.
+    """Yield each mistake once: its location, a message, and whether the key itself is wrong.
 
     Args:
         error: the validation error.
         model: the model that failed.
         data: the validated data.
-        owner: owner of the parameters; empty for sections of a file.
+        owner: name of the method with these parameters; empty for sections of a file.
     """
     # Each alternative of a type union reports its own error.
     places: dict[tuple[Location, bool], list[ErrorDetails]] = {}
@@ -125,8 +125,9 @@ def mistakes(
                 del places[key]
     keys = {loc for loc, at_key in places if at_key}
     for (loc, at_key), alternatives in places.items():
-        # Skip consequences: a list too short because of invalid items, a wrong value of an invalid
-        # key (but not the key itself), a key that is missing because it is misspelt.
+        # Skip errors that follow from others: a list that is too short because some items are
+        # invalid, a wrong value of an invalid key (but not the key itself), and a key that is
+        # missing because it is misspelt.
         is_outer = any(len(other) > len(loc) and other[: len(loc)] == loc for other, _ in places)
         follows = is_outer and not at_key
         is_missing = alternatives[0]["type"] == "missing"
@@ -183,7 +184,7 @@ def _shown(value: JsonValue) -> str:
 
 
 def _list_form(model: type[BaseModel], name: str) -> str:
-    """Return how a list parameter is written; empty for other parameters."""
+    """Return an example of how to write a list parameter; empty for other parameters."""
     schema = model.model_json_schema()
     form = type_text(schema.get("properties", {}).get(name, {}), schema.get("$defs", {}))
     return form if "[" in form else ""
@@ -234,7 +235,7 @@ def _literals_at(model: type[BaseModel], loc: Location) -> list[str]:
 
 
 def _annotations_at(model: type[BaseModel], loc: Location) -> list[object]:
-    """Return the types at a location, and the containing types if its last parts are not fields."""
+    """Return the types at a location; if its last parts are not fields, those that contain it."""
     found: list[object] = [model]
     for part in loc:
         fields: list[object] = [
@@ -278,7 +279,7 @@ _NUMBER: Final = re.compile(r"([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([a-zÂµÂ
 
 
 def meant_number(parameter: str, text: object) -> str:
-    """Return a hint on how to write a number given as text; empty if it looks like none.
+    """Return a hint on how to write a number given as text; empty if the text is not a number.
 
     >>> meant_number("tolerance_m", "0,02")
     '; write a decimal point: 0.02'
@@ -301,7 +302,7 @@ def meant_number(parameter: str, text: object) -> str:
 
 
 def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
-    """Return a hint to the parameter with the same meaning in another unit; empty if none exists.
+    """Return a hint naming the parameter that takes this quantity in another unit; else empty.
 
     >>> meant_parameter("gsd_mm", ["gsd_m", "crs"], 50)
     ' (it is gsd_m, in metres: gsd_m: 0.05)'

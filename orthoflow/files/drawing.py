@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-# Two columns of a journal are 85 mm wide each.
+# Each of the two columns of a journal page is 85 mm wide.
 COLUMN_INCHES: Final = 85.0 / 25.4
 DPI: Final = 300
 # A higher picture would not leave room for its caption on a page.
@@ -51,7 +51,7 @@ _STYLE: Final[Mapping[Any, Any]] = {
     "legend.frameon": False,
     "legend.fontsize": 7.0,
     "savefig.dpi": DPI,
-    # The same numbers give the same bytes, and text remains text in PDF.
+    # Equal data give equal bytes, and text in PDF can be searched.
     "svg.hashsalt": "orthoflow",
     "pdf.fonttype": 42,
     "text.parse_math": False,
@@ -93,7 +93,7 @@ def styled(settings: Mapping[Any, Any]) -> Iterator[None]:
 
 @contextmanager
 def in_column_style() -> Iterator[None]:
-    """Use the style of figures with several panels and pictures with axes; also as a decorator."""
+    """Use the style for several panels or pictures with axes; also serves as a decorator."""
     with styled(_PANELS):
         yield
 
@@ -115,7 +115,7 @@ def picture_figure(
 
     Args:
         picture: (rows, cols) grey or (rows, cols, 3) RGB.
-        extra_inches: height for a legend or a colour bar.
+        extra_inches: additional height for a legend or a colour bar.
         frame: frame of the wall that the picture shows; it may have more cells than the picture
             has pixels.
     """
@@ -184,7 +184,7 @@ def map_chart(
 
 
 def encode_chart(figure: Figure) -> bytes:
-    """Encode a figure as WebP, which for photos needs a tenth of the bytes of PNG."""
+    """Encode a figure as WebP, which for photos is a tenth of the size of PNG."""
     stream = io.BytesIO()
     figure.savefig(stream, format="webp", pil_kwargs={"quality": 90})
     return stream.getvalue()
@@ -221,7 +221,7 @@ def plane_ink(index: int) -> tuple[float, float, float]:
 
 
 def _shrunk(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return values averaged to the pixels of a column, ignoring NaN."""
+    """Return values averaged to the pixels that a column can show, ignoring NaN."""
     import cv2
 
     shown = np.asarray(values, dtype=np.float64)

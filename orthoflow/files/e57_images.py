@@ -1,6 +1,6 @@
 """Photos in E57 files (`images2D`), with lenses and poses if the file contains them.
 
-The camera axes of a pinhole image are x right, y up and z backwards (ASTM E2807); its pose
+The camera axes of a pinhole image are x right, y up and z backwards (ASTM E2807); the pose
 transforms them to the file's world. Principal points are relative to the outer corner of the first
 pixel, as in orthoflow. The axes of a spherical image are x forwards, y left and z up.
 """
@@ -26,7 +26,7 @@ from orthoflow.products import Intrinsics
 
 SUFFIX: Final = ".e57"
 _FROM_Y_UP: Final = np.diag([1.0, -1.0, -1.0])
-# From the axes x forwards, y left, z up to camera axes.
+# Rotation to camera axes from the axes of a spherical image.
 _FROM_PANORAMA: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _REPRESENTATIONS: Final = ("pinhole", "spherical", "cylindrical", "visualReference")
 _CONTENTS: Final = {"jpegImage": ".jpg", "pngImage": ".png"}
@@ -42,7 +42,7 @@ class E57Image:
     """A photo in an E57 file.
 
     Attributes:
-        name: photo name: name of the file, name of the image, and suffix of the content.
+        name: photo name, composed of file name, image name, and the suffix for the image format.
         content: JPEG or PNG data, as in the file.
         camera: lens and pose, or the reason why they are missing.
     """
@@ -83,7 +83,7 @@ class E57ImageCount:
 
 
 def count_e57_images(path: Path) -> E57ImageCount:
-    """Count the photos and panoramas of an E57 file, without reading them.
+    """Count the photos and panoramas in an E57 file without reading them.
 
     Raises:
         InputError: the file is damaged.
@@ -108,7 +108,7 @@ def _children(vector: Any) -> Iterator[Any]:
 
 
 def _image(path: Path, index: int, node: Any) -> Iterator[E57Image]:
-    """Yield the photo of an image; nothing if it has no JPEG or PNG data."""
+    """Yield the photo of an image node; nothing if the node has no JPEG or PNG data."""
     for kind in _REPRESENTATIONS:
         field = f"{kind}Representation"
         shown = node[field] if node.isDefined(field) else None
@@ -121,7 +121,7 @@ def _image(path: Path, index: int, node: Any) -> Iterator[E57Image]:
 
 
 def _is_whole(shown: Any) -> bool:
-    """Whether a spherical image covers the whole sphere, within half a pixel."""
+    """Return whether a spherical image covers the whole sphere, to within half a pixel."""
     width, height, across, up = (
         number_of(shown[name])
         for name in ("imageWidth", "imageHeight", "pixelWidth", "pixelHeight")

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
-# Exactly as GDAL returns it from a GeoTIFF, so that comparisons with it succeed.
+# Exactly the text that GDAL returns from a GeoTIFF, so that comparisons succeed.
 _LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["{},'
     ' metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
@@ -46,7 +46,7 @@ _ANY_RUN: Final = "00000000-000000-000000"
 SITE_CRS_WKT: Final = _LOCAL_CRS_WKT.format("coordinates of the scan")
 _NAMED_SUFFIXES: Final = (".tif", ".json", ".geojson", ".html")
 _NO_NAME: Final = re.compile(r"[^\w .,()-]", re.ASCII)
-# The data are kept in memory, with copies.
+# The pixels are kept in memory, with copies.
 #: pixels of an imported orthoimage
 MOST_CELLS: Final = 1 << 28
 #: bands of an imported orthoimage
@@ -66,7 +66,8 @@ _COG_OPTIONS: Final[dict[str, object]] = {
     "compress": "DEFLATE",
     "predictor": "YES",
     "blocksize": TILE_PX,
-    # The driver creates the overviews: odd factors with a mask crashed older builds.
+    # The driver creates the overviews, because explicit odd factors with a mask crashed older
+    # builds.
     "overviews": "AUTO",
     "resampling": "AVERAGE",
 }
@@ -105,8 +106,8 @@ class RasterFile:
 
     Attributes:
         values: (rows, cols) for one band, (rows, cols, bands) for several; stored type.
-        shown: (rows, cols) True where the dataset mask is valid.
-        place: position of the raster; its coordinate system is not included.
+        shown: (rows, cols) dataset mask, True where the file has content.
+        place: position of the raster, without its coordinate system.
         tags: tags of the dataset.
         crs_wkt: coordinate system, as returned by GDAL.
     """
@@ -152,7 +153,7 @@ def require_map_crs(crs: str) -> None:
         InputError: the coordinate system is unknown, or not in metres.
     """
     found = _map_crs(crs)
-    # For the local system of the site, GDAL reports the unit, but not a projection.
+    # For the local system `site`, GDAL reports a unit, but no projection.
     if crs != SITE_CRS and not (found.is_projected and found.linear_units_factor[1] == 1.0):
         raise InputError(
             f"{crs} is not a coordinate system in metres: expected a projected system, such as "
@@ -214,7 +215,7 @@ def write_raster(
     place: GridPlace,
     tags: Mapping[str, str],
 ) -> None:
-    """Write a single-band raster: values, labels or classes, a row of tiles at a time.
+    """Write a single-band raster of values, labels or classes, a row of tiles at a time.
 
     No data is NaN for values and -1 for labels; classes have no nodata value.
 
@@ -260,11 +261,11 @@ def write_orthoimage(
 
     Args:
         path: output file in an existing folder.
-        rgb: (rows, cols, 3) with 8 or 16 bits, which the file keeps.
-        shown: (rows, cols) True where the image has content (painted or filled).
+        rgb: (rows, cols, 3) colours of 8 or 16 bits; the file has the same depth.
+        shown: (rows, cols) True where the image has content (coloured from photos or filled).
         place: position of the raster.
         tags: texts stored in the file.
-        icc_profile: colour profile; None for sRGB or unknown.
+        icc_profile: colour profile; None if it is sRGB or unknown.
 
     Raises:
         StoreError: the file cannot be written.
@@ -277,7 +278,7 @@ def write_orthoimage(
         )
     from rasterio.shutil import copy
 
-    # The driver for cloud-optimised files can only copy another file.
+    # GDAL's driver for cloud-optimised files can only copy another file.
     plain = path.with_name(f"{path.name}.plain")
     profile = {"count": 3, "dtype": rgb.dtype.name} | _placed(shown.shape, place)
     try:
@@ -301,7 +302,7 @@ def _rows(window: Window) -> slice:
 
 
 def _require_written(path: Path, values: NDArray[np.generic]) -> None:
-    """Read the file back: if the disk is full when closing the file, GDAL only logs it."""
+    """Read the file back, because GDAL only logs an error if the disk is full on closing."""
     import rasterio
 
     with rasterio.open(path) as dataset:
@@ -366,7 +367,8 @@ def _reading(path: Path) -> Iterator[None]:
         with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
             yield
     except (RasterioError, OSError, UnicodeDecodeError) as error:
-        # UnicodeDecodeError: GDAL's messages and tags can contain bytes of the file.
+        # UnicodeDecodeError is caught because GDAL's messages and tags can contain bytes of the
+        # file.
         raise InputError(
             f"{path} cannot be read as a GeoTIFF: {error}; expected a complete TIFF file"
         ) from error
@@ -480,7 +482,7 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
     Raises:
         InputError: the file references other files or declares too much data.
     """
-    # GDAL would read overviews from that file, even over the network.
+    # GDAL would read overviews from the referenced file, even over the network.
     if dataset.tags(ns="OVERVIEWS"):
         raise InputError(
             f"{path.name} stores its overviews in another file: expected a self-contained TIFF file"
@@ -557,7 +559,7 @@ def _write(
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert errors of GDAL or the disk while writing a file into an error about the file.
+    """Convert errors from GDAL or the disk while a file is written into one that names the file.
 
     Raises:
         StoreError: the file cannot be written.
@@ -590,7 +592,7 @@ def quiet() -> Iterator[None]:
 
 @cache
 def let_go_of_untrusted_text() -> None:
-    """Suppress tracebacks if rasterio cannot decode bytes of a file in a message of GDAL.
+    """Suppress tracebacks if rasterio cannot decode a file's bytes in a message from GDAL.
 
     This happens in a callback, which cannot raise, so Python prints the error through both hooks.
     GDAL's own error about the file is raised afterwards.
@@ -605,7 +607,7 @@ def let_go_of_untrusted_text() -> None:
     def show_others(
         kind: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
-        # An error that ends the program has a traceback.
+        # Errors that end the program have a traceback and are not suppressed.
         if not (trace is None and isinstance(error, UnicodeDecodeError)):
             show_exception(kind, error, trace)
 
@@ -619,11 +621,11 @@ class RasterPlace:
     Attributes:
         shape: rows and columns.
         transform: six numbers: X per column, X per row, X of the corner, and the same for Y.
-        epsg: code of the coordinate system, or None.
+        epsg: EPSG code of the coordinate system, or None.
         wkt: coordinate system, as returned by GDAL.
-        wkt2: the same as WKT 2.
+        wkt2: coordinate system as WKT 2.
         bounds: smallest X and Y, largest X and Y, in the coordinate system.
-        outline_lonlat: corners on Earth, counter-clockwise and closed, longitude and latitude in
+        outline_lonlat: closed ring of the corners, counter-clockwise, longitude and latitude in
             degrees; empty if the coordinate system has no position on Earth.
         bands: data type of each band.
         tags: tags of the dataset.

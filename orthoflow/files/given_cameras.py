@@ -29,23 +29,23 @@ from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.products import Intrinsics
 from orthoflow.untrusted_text import open_text, reading, text_of_file
 
-# Larger limits for models that contain the observations of each photo, as they are read line by
-# line; smaller ones for other files.
-#: bytes of a file of a COLMAP model, or Bundler's
+# The limit is larger for models that contain the observations of each photo, since they are read
+# line by line.
+#: bytes of a file of a COLMAP or Bundler model
 MOST_MODEL_BYTES: Final = 500_000_000
-#: bytes of a file of cameras (`cameras.json`, Metashape's XML, RealityCapture's list)
+#: bytes of another camera file (`cameras.json`, Metashape's XML, RealityCapture's list)
 MOST_BYTES: Final = 50_000_000
-#: characters of a line of a file of cameras
+#: characters of a line of a camera file
 MOST_LINE: Final = 20_000_000
 _WHAT: Final = "a camera file"
-#: cameras of one file
+#: cameras in one file
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
 _ORTHONORMAL: Final = 1e-4
-# A lens that differs by no more is equivalent for matching; beyond the other limit the error is
-# visible in an orthoimage.
+# Up to the first limit, a lens is equivalent for matching; beyond the second, the error is visible
+# in an orthoimage.
 NEGLIGIBLE_PX: Final = 0.05
-#: error in pixels due to lens terms of a file of cameras that cannot be represented
+#: error in pixels due to lens terms in a camera file that cannot be represented
 MAX_LEFT_OUT_PX: Final = 0.5
 _FEWEST_DIRECTIONS: Final = 30
 _FAR_PX: Final = 1e4
@@ -56,14 +56,14 @@ _BROWN_TERMS, _FISHEYE_TERMS = 5, 6
 
 @dataclass(frozen=True, kw_only=True)
 class CentredLens:
-    """A lens from a file that does not contain the photo's size and measures from its centre.
+    """A lens from a file without the photo's size, with positions relative to the photo's centre.
 
     Attributes:
         focal_px: focal length in pixels, or None if it is relative to the photo's longer side.
         focal_share: focal length as a fraction of the photo's longer side, or None.
-        off_middle: principal point relative to the centre, right and down, as a fraction of that
-            side.
-        radial: k1, k2, k3, k4.
+        off_middle: principal point relative to the centre, right and down, as a fraction of the
+            longer side.
+        radial: coefficients k1, k2, k3, k4.
         tangential: two terms whose order and signs the file does not define; they are ignored.
     """
 
@@ -90,17 +90,17 @@ class CentredLens:
 
 @dataclass(frozen=True, kw_only=True)
 class GivenCamera:
-    """The orientation of one photo, as in a file.
+    """The orientation of one photo, as given in a file.
 
     Attributes:
         name: photo name, including folders in the file, separated by slashes; some programs omit
             the suffix.
         lens: interior orientation, or None if the file does not contain it.
-        rotation: (3, 3) camera_from_world; None if the file only gives the reason for its absence.
+        rotation: (3, 3) camera_from_world; None if the photo has no orientation.
         translation: (3,) camera_from_world, in the unit of the file.
-        covariance: (6, 6) as in `Camera`, its translation in the unit of the file, or None.
+        covariance: (6, 6) as in `Camera`, with the translation in the unit of the file, or None.
         sigma_wall_m: predicted error on the wall, or None if the file does not contain it.
-        reason: reason why the photo has no orientation; empty if it has one.
+        reason: reason why the photo has no orientation; empty if it is oriented.
         note: remarks on approximations and conversions; may be empty.
     """
 
@@ -144,7 +144,7 @@ def text_of(path: Path) -> str:
 
 
 def lines_of(path: Path) -> Iterator[str]:
-    """Yield the lines of a model, without line ends.
+    """Yield the lines of a camera file, without line ends.
 
     Raises:
         InputError: the file cannot be read, is not text, is too large, or has too long a line.
@@ -162,7 +162,7 @@ def photo_path(text: str) -> str:
 
 
 def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
-    """Return points (n, 2) that cover the image of a lens, as x / z and y / z."""
+    """Return directions (n, 2), as x / z and y / z, that cover the image of a lens."""
     u, v = np.meshgrid(np.linspace(0, lens.width, 25), np.linspace(0, lens.height, 19))
     return np.column_stack([(u.ravel() - lens.cx) / lens.fx, (v.ravel() - lens.cy) / lens.fy])
 
@@ -170,7 +170,7 @@ def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
 def lens_of_terms(
     terms: Mapping[str, float], width: int, height: int, *, is_fisheye: bool = False
 ) -> tuple[Intrinsics | FisheyeLens, float]:
-    """Return the lens for another program's parameters, approximated where our model lacks some.
+    """Return the lens for another program's parameters, approximated if our model lacks some.
 
     Args:
         terms: `fx`, `fy`, `cx`, `cy` and `skew` in pixels; `k1` to `k4`, `p1` and `p2` as in
@@ -178,7 +178,7 @@ def lens_of_terms(
             1 + p3 r^2 + p4 r^4. Missing parameters are 0.
         width: image width in pixels.
         height: image height in pixels.
-        is_fisheye: the distortion is a function of the angle from the axis.
+        is_fisheye: whether the distortion is a function of the angle from the axis.
 
     Returns:
         The lens, which may be invalid, and its largest deviation in pixels.
@@ -236,12 +236,12 @@ def nearest_lens(
 
     Args:
         start: focal length, principal point and size of the other lens.
-        rays: (n, 3) directions that cover its image.
-        pixels: (n, 2) pixels of these directions.
+        rays: (n, 3) directions that cover the other lens's image.
+        pixels: (n, 2) positions of these directions in that image.
 
     Returns:
-        The lens in OpenCV's model, or in its fisheye model if the former deviates too much, and
-        its largest deviation.
+        The lens in OpenCV's model, or in its fisheye model if the former deviates too much, and the
+        largest deviation of the lens returned.
     """
     from scipy.optimize import least_squares
 

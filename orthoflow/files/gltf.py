@@ -1,4 +1,4 @@
-"""A room as binary glTF 2.0: walls with orthoimages, flat or in relief, in metres, y up."""
+"""Export of a room as binary glTF 2.0: flat or relief walls with orthoimages, in metres, y up."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from orthoflow.products import JsonValue
 from orthoflow.untrusted_text import json_bytes
 from orthoflow.version import __version__
 
-# Largest texture that the graphics of current phones support.
+# Largest texture that the GPUs of current phones support.
 LONGEST_TEXTURE_PX: Final = 4096
-# Browsers can open pages of some hundred megabytes; base64 adds a third.
+# Browsers can open pages of a few hundred megabytes; base64 adds a third.
 _INSIDE_MOST_BYTES: Final = 1 << 27
 _COMPONENTS: Final = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 _VERTICES, _INDICES = 34962, 34963
@@ -39,7 +39,7 @@ def write_room(
     up: NDArray[np.float64],
     depths: Mapping[int, Path] | None = None,
 ) -> None:
-    """Write the walls; one texture at a time is in memory, besides the file itself.
+    """Write the walls; the file and one texture at a time are kept in memory.
 
     Each wall is a node with a matrix. Its vertices are in metres on the wall; the matrix positions
     them relative to `extras.offset_world` of the root and makes the world's up direction y, so that
@@ -100,7 +100,7 @@ def write_page(path: Path, model: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Document:
-    """A glTF document under construction, with its binary data."""
+    """A glTF document that is being built, with its binary data."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[JsonValue] = field(default_factory=list)
@@ -198,7 +198,7 @@ class _Document:
             },
             "extensions": {"KHR_materials_unlit": {}},
         }
-        # No shading: photos contain the actual lighting.
+        # Disable shading, because photos contain the actual lighting.
         if not is_whole:
             material |= {"alphaMode": "MASK", "alphaCutoff": 0.5}
         self.materials.append(material)
@@ -224,17 +224,18 @@ class _Document:
             "byteLength": len(content),
         }
         self.views.append(view if target is None else {**view, "target": target})
-        # Each view begins at a multiple of four bytes, and the data end at one.
+        # Each view must begin, and the data must end, at a multiple of four bytes.
         self.data.extend(content + bytes(-len(content) % 4))
         return len(self.views) - 1
 
 
 def _columns(matrix: NDArray[np.float64]) -> JsonValue:
-    """Return the sixteen numbers column by column, as glTF requires for matrices."""
+    """Return a matrix's sixteen elements column by column, as glTF requires."""
     return numbers(matrix.T.ravel())
 
 
-# Along the longer side of a wall: about 300,000 triangles, which phones can still display.
+# Number of nodes along a wall's longer side: at most about 500,000 triangles, which phones can
+# display.
 LONGEST_NODES: Final = 512
 
 
@@ -244,7 +245,7 @@ class WallMesh:
 
     Attributes:
         vertices: (n, 3) float32 metres: x right, y up, z towards the viewer.
-        places: (n, 2) float32 texture coordinates, from (0, 0) top-left to (1, 1).
+        places: (n, 2) float32 texture coordinates of the vertices, from (0, 0) top-left to (1, 1).
         triangles: (m, 3) vertex indices, counterclockwise for the viewer; uint16 or uint32.
     """
 
@@ -271,7 +272,7 @@ def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
 
     Args:
         frame: frame of the wall.
-        depth: GeoTIFF of its depths in metres, positive towards the viewer.
+        depth: GeoTIFF of the wall's depths in metres, positive towards the viewer.
 
     Raises:
         InputError: the file cannot be read, or its size differs from the wall's.

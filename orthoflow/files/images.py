@@ -31,7 +31,7 @@ from orthoflow.products import Photo
 if TYPE_CHECKING:
     from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# Suffixes of photos; files with other suffixes are not photos, or must be converted first.
+# Suffixes of photos that can be read; other files are not photos, or must be converted first.
 PHOTO_SUFFIXES: Final = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"),
     *(".webp", ".heic", ".heif", ".hif", ".avif"),
@@ -42,7 +42,8 @@ RAW_SUFFIXES: Final = frozenset(
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
 PREVIEW_SIDE_PX: Final = 1600
-# Larger images are averaged before they are reduced, in bands of this many rows of the result.
+# Images with more pixels are averaged before they are reduced, in bands of `_BAND_PX` rows of the
+# result.
 _IN_MEMORY_PX: Final = 1 << 26
 _BAND_PX: Final = 64
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
@@ -78,7 +79,7 @@ def decode_levels(encoded: bytes, name: str = "image") -> Colours:
 
 
 def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
-    """Decode an image to RGB; a 16-bit PNG to 8 bits unless `is_deep`."""
+    """Decode an image to RGB; a 16-bit PNG is reduced to 8 bits unless `is_deep`."""
     import cv2
 
     problem = unreadable(encoded)
@@ -134,7 +135,7 @@ def encode_jpeg(image: NDArray[np.uint8], *, quality: int = 90) -> bytes:
 
 
 def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
-    """Encode an image as lossy WebP, which for photos needs a tenth of the bytes of PNG.
+    """Encode an image as lossy WebP, which for photos is a tenth of the size of PNG.
 
     Args:
         image: (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA.
@@ -157,12 +158,12 @@ def cells_per_preview_px(shape: tuple[int, ...]) -> tuple[float, float]:
 
 
 def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return a grey picture of a raster, with the 1st percentile and NaN black, the 99th white."""
+    """Return a grey picture of a raster: 1st percentile and NaN black, 99th percentile white."""
     return _stretched(values, _stretch_of(values))
 
 
 def grey_cells(values: NDArray[np.floating]) -> Cells:
-    """Return a function for parts of the picture of `stretch_to_grey`; NaN cells are empty.
+    """Return a function that computes parts of `stretch_to_grey`'s picture; NaN cells are empty.
 
     For a raster (rows, cols) of more than 64 million cells, percentiles are estimated from some of
     its rows.
@@ -172,12 +173,12 @@ def grey_cells(values: NDArray[np.floating]) -> Cells:
 
 
 def sampled_rows(values: NDArray[Sampled]) -> NDArray[Sampled]:
-    """Return evenly spaced rows of a raster, with at most 64 million cells."""
+    """Return evenly spaced rows of a raster, with at most 64 million cells in total."""
     return values[:: max(1, -(-values.size // _IN_MEMORY_PX))]
 
 
 def _stretch_of(values: NDArray[np.floating]) -> tuple[float, float] | None:
-    """Return the value shown black and the range up to white; None if there are no data."""
+    """Return the value shown as black and its distance to white; None if there are no data."""
     known = values[np.isfinite(values)]
     if not known.size:
         return None
@@ -198,7 +199,7 @@ def _stretched(
 def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
     """Return a small PNG of a raster computed in parts, transparent where it is empty.
 
-    It is averaged down to `PREVIEW_SIDE_PX`; a smaller one keeps its size.
+    A raster larger than `PREVIEW_SIDE_PX` is averaged down to this size.
     """
     return encode_png(_preview(shape, cells, PREVIEW_SIDE_PX))
 
@@ -229,7 +230,7 @@ def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
 
 def _preview(shape: tuple[int, ...], cells: Cells, longest_side_px: int) -> NDArray[np.uint8]:
     if max(shape) > longest_side_px:
-        # Averaged within the mask, so that the black of empty cells does not darken the border.
+        # Average only cells with content, so that black empty cells do not darken the border.
         summed, weight = _weighted(shape, cells, _averaged_px(shape, longest_side_px))
         summed = _shrink(summed, longest_side_px)
         weight = _shrink(weight, longest_side_px)
@@ -247,8 +248,8 @@ def _weighted(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return weighted colours and weights, averaged over squares of `factor` pixels.
 
-    One band of squares at a time, since a large image would not fit into memory as float32.
-    Incomplete squares at the right and bottom are cut off.
+    The squares are averaged one band at a time, since a large image would not fit into memory as
+    float32. Incomplete squares at the right and bottom are cut off.
     """
     import cv2
 
@@ -318,7 +319,7 @@ def _not_an_image(encoded: bytes, name: str, reason: str = "") -> str:
     )
 
 
-# Masks are black and white; this limit removes compression artefacts.
+# Masks are black and white; this threshold removes compression artefacts.
 _USED_LEAST: Final = 128
 _LONGEST_SIDE_PX: Final = 2048
 
@@ -347,9 +348,9 @@ def photo_grey(photo: Photo) -> NDArray[np.uint8]:
 
 
 def reduced(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Reduce a picture by a factor below 1, low-pass filtered; (u, v) becomes factor * (u, v).
+    """Low-pass filter a picture and scale it by a factor below 1; (u, v) becomes factor * (u, v).
 
-    Warping is used because resizing would scale by the rounded size.
+    The image is warped, because resizing would scale it by the ratio of rounded sizes.
     """
     import cv2
 
@@ -384,7 +385,7 @@ def used_pixels(photo: Photo) -> NDArray[np.bool_] | None:
 
 
 def before_masks(buffer: DepthBuffer, photo: Photo) -> DepthBuffer:
-    """Close the depth buffer in front of the lens where the photo is masked."""
+    """Set the depth buffer to a surface directly in front of the lens where the photo is masked."""
     used = used_pixels(photo)
     if used is None:
         return buffer
@@ -395,6 +396,6 @@ def before_masks(buffer: DepthBuffer, photo: Photo) -> DepthBuffer:
         nearest = np.full(shape, buffer.nearest[0, 0], dtype=np.float32)
     rows, columns = (np.arange(0, side, reduction) for side in used.shape)
     whole = np.logical_and.reduceat(np.logical_and.reduceat(used, rows, axis=0), columns, axis=1)
-    # Nearer than anything else, even if the camera is within the buffer of a wall.
+    # This is nearer than anything else, even if the camera is within the buffer of a wall.
     nearest = np.where(whole, nearest, np.float32(-np.inf))
     return buffer._replace(nearest=np.ascontiguousarray(nearest), reduction=float(reduction))

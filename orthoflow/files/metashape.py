@@ -4,9 +4,9 @@ Metashape has orthoflow's axes (x right, y down, z forward) and pixel coordinate
 first pixel at (0.5, 0.5)), but measures the principal point from the centre of the photo, and its
 P1 and P2 are p2 and p1 in OpenCV (Metashape Pro manual, appendix on camera models). A camera's
 matrix transforms to the chunk; the chunk's own transform leads to the world. For chunks with a
-geographic or projected coordinate system, the world is geocentric in metres of the system's datum,
-and the poses are converted from there. In a rig, only the master camera has a matrix; the sensors
-of the other cameras contain their pose relative to the master.
+geographic or projected coordinate system, the world is geocentric, in metres and in the system's
+datum, and the poses are converted from there. In a rig, only the master camera has a matrix; the
+pose of each other camera relative to the master is stored in its sensor.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from orthoflow.products import Intrinsics
 MOST_TAGS: Final = 2_000_000
 _TERMS: Final = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 _SINCE_EXPORT: Final = "optimise the cameras without k4, p3 and p4 and export again"
-# Half the distance in metres over which the local axes of a coordinate system are computed.
+# Half the baseline over which the local axes of a coordinate system are computed.
 _STEP_M: Final = 50.0
 _SINCE: Final = "Metashape 1.2 or newer writes f, cx, cy, k1 ... for each sensor"
 
@@ -65,7 +65,7 @@ def read_metashape_xml(path: Path) -> tuple[GivenCamera, ...]:
 
 
 def _root(path: Path) -> ET.Element:
-    """Parse XML without its dangerous features."""
+    """Parse XML; document types and entities are refused."""
     text = text_of(path)
     # Entities can expand without limit, and only a document type can define them.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -116,7 +116,7 @@ _OFF: Final = ("false", "0")
 
 
 def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
-    """Return the transform from geocentric metres to the chunk's system; None if it has none.
+    """Return the transform from geocentric metres to the chunk's system, or None.
 
     Raises:
         InputError: the system is in degrees, or unknown.
@@ -154,7 +154,7 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
         there = to_site(np.vstack([centre, places]))
         if not np.isfinite(there).all():
             raise damaged(path, f"{given.name} has no position in {crs.name}")
-        # Axes of the system at the camera, without the remaining scale and shear.
+        # Rotation to the axes of the system at the camera; scale and shear are removed.
         left, _, right = np.linalg.svd((there[1:4] - there[4:]).T / (2.0 * _STEP_M))
         turned = rotation @ (left @ right).T
         return replace(
@@ -208,7 +208,7 @@ def _from_geocentric(crs: Any, path: Path) -> Any:
 
 
 class _Similarity:
-    """World from chunk: scale, rotation and translation; identity without a transform."""
+    """Transform from chunk to world: scale, rotation and translation; identity by default."""
 
     def __init__(self, transform: ET.Element | None, path: Path) -> None:
         self.rotation, self.shift, self.scale = np.eye(3), np.zeros(3), 1.0
@@ -226,7 +226,7 @@ class _Similarity:
 def _pose(
     element: ET.Element, places: Sequence[str], path: Path, whose: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotation and translation of an element; the translation may have several names."""
+    """Return rotation and translation of an element; the translation may have any of `places`."""
     rotation, shift = np.eye(3), np.zeros(3)
     if words := element.findtext("rotation", "").split():
         rotation = rotation_of(_some(words, 9, path, "rotation", whose), path, whose)
@@ -243,7 +243,7 @@ def _some(words: list[str], count: int, path: Path, what: str, whose: str) -> li
 
 
 class _Sensor:
-    """A sensor: its lens, or the reason why it has none, and its pose in its rig."""
+    """A sensor: its lens, or the reason why the lens is missing, and its pose in the rig."""
 
     def __init__(self, element: ET.Element, path: Path) -> None:
         self.label = element.get("label", element.get("id", ""))

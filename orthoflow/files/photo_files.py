@@ -1,4 +1,4 @@
-"""Photo files: format, page, size, EXIF, profile, transparency and damage; TIFF pixels.
+"""Photo files: format, page, size, EXIF, colour profile, transparency, damage, and TIFF pixels.
 
 Pillow reads the containers, GDAL the pages of TIFF files. simplejpeg (libjpeg-turbo) detects damage
 in the scan data of a JPEG, which other decoders fill with grey or noise. EXIF tags are as in CIPA
@@ -33,13 +33,14 @@ if TYPE_CHECKING:
 READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
 HOW_TO_DEVELOP: Final = "develop it first to 16-bit TIFF or JPEG, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
-# 800 MB as RGB, twice the size of the largest sensors; a PNG of 100 kB can declare more.
+# Such a photo has 800 MB as RGB, twice the size of the largest sensors; a 100 kB PNG can declare
+# more.
 #: pixels declared by a photo, before it is decoded
 MOST_PIXELS: Final = 1 << 28
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
 _TIFF_MAGICS: Final = {b"II*\0": "TIFF", b"MM\0*": "TIFF", b"II+\0": "BigTIFF", b"MM\0+": "BigTIFF"}
-# First bytes of unsupported files that have a photo's suffix.
+# First bytes of unsupported formats that may have a photo's suffix.
 _MAGICS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"GIF8", "GIF"),
     (b"BM", "BMP"),
@@ -65,15 +66,16 @@ _AVIF_BRANDS: Final = frozenset({b"avif", b"avis"})
 _SUBFILE_TAG: Final = 254
 _PREVIEW, _MASK = 1, 4
 _WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _PHOTOMETRIC_TAG = 256, 257, 258, 262
-# Values of grey, RGB, palette, CMYK (which GDAL converts to RGB) and YCbCr.
+# Values of the photometric interpretation: grey, RGB, palette, CMYK (which GDAL converts to RGB)
+# and YCbCr.
 _WHITE_IS_ZERO, _PALETTE = 0, 3
 _COLOURS_OF_TIFF: Final = (_WHITE_IS_ZERO, 1, 2, _PALETTE, 5, 6)
 _SUB_IFDS_TAG: Final = 330
 _DNG_TAG: Final = 50706
 _COLOUR_FILTER_ARRAY, _LINEAR_RAW = 32803, 34892
 _MAX_PAGES: Final = 200
-# Warnings of libjpeg about headers, which affect no pixel. After any other warning, the remaining
-# part of the photo is noise.
+# Warnings of libjpeg about headers, which affect no pixel. After any other warning, the rest of the
+# photo is noise.
 _HARMLESS: Final = ("jfif revision", "adobe color transform", "icc marker")
 _EXTRA_BYTES: Final = "extraneous bytes before marker 0xd9"
 _PADDING: Final = b"\0\xff"
@@ -101,7 +103,7 @@ def photo_format(encoded: bytes) -> str | None:
 
 
 def unreadable(encoded: bytes) -> str:
-    """Return the format of an unreadable file and how to convert it; empty for photos."""
+    """Return the format of an unreadable file and how to convert it; empty for readable photos."""
     kind = photo_format(encoded)
     if kind is None:
         return (
@@ -180,7 +182,7 @@ def _is_photo(page: ImageFileDirectory_v2) -> bool:
 
 
 def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
-    """Return the page of a TIFF file with the photo: the largest page that is not a preview."""
+    """Return the page of a TIFF file that has the photo: the largest that is not a preview."""
     pages = tiff_pages(encoded)
     return max(
         [item for item in pages if _is_photo(item[1])] or pages,
@@ -197,7 +199,7 @@ def count_pages(encoded: bytes) -> int:
 
 
 def _from_page(encoded: bytes, start: int) -> bytes:
-    """Return a TIFF file that begins with a given page, because decoders read the first one."""
+    """Return a TIFF file that begins with a given page, because decoders read only the first."""
     order: Literal["little", "big"] = "little" if encoded[:2] == b"II" else "big"
     place, size = (8, 8) if encoded[2:4] in (b"+\0", b"\0+") else (4, 4)
     return encoded[:place] + start.to_bytes(size, order) + encoded[place + size :]
@@ -283,7 +285,7 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
             if is_stated or np.isin(alpha, (0, full)).all():
                 opaque = alpha > full // 2
         if opaque is None and page.nodata is not None:
-            # GDAL's nodata tag, used e.g. for the margins of undistorted photos.
+            # This evaluates GDAL's nodata tag, which e.g. marks the margins of undistorted photos.
             opaque = page.dataset_mask() > 0
     for at in masks:
         with _tiff_page(encoded, at) as page:
@@ -294,7 +296,7 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
 
 @contextmanager
 def opened(encoded: bytes) -> Iterator[Image | None]:
-    """Open a photo with Pillow without decoding it; yields None if this fails."""
+    """Open a photo with Pillow without decoding it; yield None if this fails."""
     from PIL import Image
 
     found = photo_page(encoded) if encoded[:4] in _TIFF_MAGICS else None
@@ -321,7 +323,7 @@ def opened(encoded: bytes) -> Iterator[Image | None]:
 
 
 def _register_heic() -> None:
-    """Register HEIC with Pillow if its plugin is installed."""
+    """Register the HEIC plugin with Pillow if it is installed."""
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
@@ -332,7 +334,7 @@ def _register_heic() -> None:
 def stated_size(encoded: bytes) -> tuple[int, int] | None:
     """Return width and height declared in a file, or None."""
     if encoded.startswith(_PNG_MAGIC):
-        # Not with Pillow, which refuses large files.
+        # The size is not read with Pillow, which refuses large files.
         width, height = (int.from_bytes(encoded[at : at + 4], "big") for at in (16, 20))
         return (width, height) if encoded[12:16] == b"IHDR" else None
     if encoded[:4] in _TIFF_MAGICS:
@@ -377,7 +379,7 @@ def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
 
 
 def is_whole_png(encoded: bytes) -> bool:
-    """Return whether a PNG contains all chunks; decoders allocate their declared sizes."""
+    """Return whether a PNG is complete; decoders allocate the declared sizes of its chunks."""
     position = len(_PNG_MAGIC)
     while position + 12 <= len(encoded):
         if encoded[position + 4 : position + 8] == b"IEND":
@@ -387,17 +389,18 @@ def is_whole_png(encoded: bytes) -> bool:
 
 
 def damage(encoded: bytes) -> tuple[str, bool]:
-    """Decode a photo and return its damage, and whether pixels are lost.
+    """Decode a photo; return a description of its damage, and whether pixels are lost.
 
     Returns:
-        A description of the damage, empty for an intact file, and True if a part of the photo is
-        missing or noise. Always empty for TIFF files, for which `tiff_pixels` raises.
+        The description, empty for an intact file, and True if a part of the photo is missing or
+        noise. The description is always empty for TIFF files; `tiff_pixels` raises an error for
+        damaged ones.
     """
     if encoded[:4] in _TIFF_MAGICS:
         return "", False
     size = stated_size(encoded)
     if size is not None and size[0] * size[1] > MOST_PIXELS:
-        # Too large to be decoded, here or later.
+        # The photo is too large to be decoded, here or later.
         return "", False
     if photo_format(encoded) == "JPEG":
         import simplejpeg
@@ -430,10 +433,10 @@ def damage(encoded: bytes) -> tuple[str, bool]:
 
 
 def _is_padded(encoded: bytes, text: str) -> bool:
-    """Whether libjpeg only skipped bytes between scan and end of file, as some cameras write them.
+    """Return whether libjpeg only skipped bytes after the scan, as some cameras write them.
 
-    These are a few bytes of any value, or a long padding. If libjpeg decoded a part of the padding
-    as pixels, these replace a part of the scan.
+    Some cameras write a few arbitrary bytes, or a long padding. If libjpeg decoded a part of the
+    padding as pixels, however, a part of the scan is missing.
     """
     if _EXTRA_BYTES not in text:
         return False
@@ -443,25 +446,25 @@ def _is_padded(encoded: bytes, text: str) -> bool:
     return abs(passed_over - n_padding) <= _FEW_BYTES
 
 
-# Limit in grey levels for a step between two blocks of a JPEG, beyond the gradient on both sides,
-# and limit for the share of such steps in one direction along a row of blocks. None of 32 intact
-# photos exceeds a share of 0.13; 20 of 23 photos with a visible flipped bit exceed 0.5.
+# Minimum step between two blocks of a JPEG, in grey levels beyond the gradient on both sides, and
+# minimum share of such steps in one direction along a row of blocks. None of 32 intact photos
+# exceeds a share of 0.13; 20 of 23 photos with a visible flipped bit exceed 0.5.
 _STEP_LEVELS: Final = 3
 _SHIFTED_SHARE: Final = 0.4
 _SHORTEST_SEAM: Final = 0.05
 _FEWEST_PARTS: Final = 8
-# If more rows have such steps, they belong to the image content.
+# If a larger share of rows has such steps, they belong to the image content.
 _MOST_ROWS: Final = 0.05
 _SEAM_PX: Final = 16
 
 
 def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
-    """Return the row where the colours of a JPEG begin to be shifted; None if they are not.
+    """Return the first row of a JPEG with a colour shift due to damage; None if there is none.
 
-    A flipped bit that decoders do not notice changes all subsequent blocks by the same amount.
-    Therefore, the colours have a step along the upper edge of the blocks to the right of it, and
-    along the lower edge of the blocks to the left of it. Photographed objects are not aligned with
-    the block grid in this way.
+    A flipped bit that decoders do not detect changes all subsequent blocks by the same amount.
+    Therefore, the colours have a step along the upper edge of the blocks to the right of the
+    flipped bit, and along the lower edge of the blocks to its left. Photographed objects are not
+    aligned with the block grid in this way.
 
     Args:
         encoded: content of the file.
@@ -498,14 +501,14 @@ def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
     return int(rows[share.argmax()]) if is_damage else None
 
 
-# Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by an equal angle over the
-# diagonal, and the tested cameras comply: a Redmi Note 9S (4.74 mm, sensor diagonal 8.0 mm) writes
-# 26, where the diagonal gives 25.6 and the width 26.7; a Kodak C743 (6.0 mm, 7.18 mm) writes 36,
-# where the diagonal gives 36.2 and the width 37.5. For an aspect ratio of 3:2, both are the same.
+# Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by an equal diagonal angle of
+# view, and the tested cameras comply: a Redmi Note 9S (4.74 mm, sensor diagonal 8.0 mm) writes 26,
+# where the diagonal gives 25.6 and the width 26.7; a Kodak C743 (6.0 mm, 7.18 mm) writes 36, where
+# the diagonal gives 36.2 and the width 37.5. For an aspect ratio of 3:2, both are the same.
 FULL_FRAME_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 
 _ORIENTATION: Final = 0x0112
-# Orientations are 1 to 8.
+# EXIF orientations are 1 to 8.
 _ORIENTATIONS: Final = 9.0
 _MAKE: Final = 0x010F
 _MODEL: Final = 0x0110
@@ -527,7 +530,7 @@ _MAX_TEXT: Final = 200
 _ZEROS_BEHIND: Final = 1 << 16
 _UNIT_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH: Final = 2
-# Range of the longer side of sensors, from the smallest phones to large format scanning backs.
+# Range of the longer side of sensors, from the smallest phones to large-format scanning backs.
 _SENSOR_MM: Final = (1.5, 130.0)
 # Range from fisheye to telephoto lenses, for any sensor; cameras without a value write 0, 1 or
 # 65535.
@@ -542,15 +545,15 @@ class Exif:
     """The EXIF data of a photo; missing values are None or an empty text.
 
     Attributes:
-        orientation: 1..8, how to rotate the stored array for display.
+        orientation: 1..8, rotation and reflection of the stored array for display.
         make: manufacturer of the camera.
         model: model of the camera.
-        focal_mm: focal length.
-        focal_35mm: full-frame equivalent of the focal length.
+        focal_mm: focal length in millimetres.
+        focal_35mm: full-frame equivalent of the focal length in millimetres.
         resolution_px_per_mm: pixels of the original image per millimetre on the sensor.
-        width: width in pixels of the original image, which may have been reduced since.
+        width: width in pixels of the original image, which may have been reduced since then.
         height: height in pixels of the original image.
-        is_damaged: some of the data could not be read.
+        is_damaged: whether some of the data could not be read.
     """
 
     orientation: int = 1
@@ -578,7 +581,7 @@ class FocalLength:
     Attributes:
         value_px: focal length in pixels of the stored array, or None if unknown.
         reason: data from which it was computed, or the reason why it is unknown.
-        doubt: message about an impossible EXIF value, which is ignored; else empty.
+        doubt: message about an impossible EXIF value, which is ignored; empty otherwise.
     """
 
     value_px: float | None
@@ -589,8 +592,8 @@ class FocalLength:
 def read_exif(encoded: bytes) -> Exif:
     """Read the EXIF data of a photo; all fields are empty if there are none.
 
-    They are not read from photos of more than `MOST_PIXELS` pixels, which are refused: Pillow
-    decodes a PNG file to find data after its pixels.
+    EXIF data are not read from photos of more than `MOST_PIXELS` pixels, which are refused anyway:
+    Pillow would decode a PNG file to find data after its pixels.
     """
     with opened(encoded) as image:
         if image is None or image.width * image.height > MOST_PIXELS:
@@ -611,7 +614,7 @@ def read_exif(encoded: bytes) -> Exif:
 
 
 def _tags(image: Image) -> tuple[Mapping[int, object], bool]:
-    """Return relevant tags, as far as readable, and whether the EXIF block is damaged."""
+    """Return the relevant tags, if readable, and whether the EXIF block is damaged."""
     block = image.info.get("exif")
     if not isinstance(block, bytes):
         return _readable_tags(image.getexif)
@@ -655,8 +658,8 @@ def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     """Return the focal length of a photo in pixels of its stored array.
 
     The pixel pitch of the focal plane has priority, since it is exact if it is correct; it is
-    scaled if the image was reduced or rotated since. It is ignored if it contradicts the 35 mm
-    equivalent, which does not depend on the image size and refers to the diagonal (see
+    adapted if the image was reduced or rotated since then. It is ignored if it contradicts the 35
+    mm equivalent, which does not depend on the image size and refers to the diagonal (see
     `FULL_FRAME_DIAGONAL_MM`). Impossible values are reported and ignored.
 
     Args:
@@ -678,7 +681,7 @@ def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
 
 
 def _doubt(what: str, value_mm: float | None, possible_mm: tuple[float, float]) -> str:
-    """Return why a value is impossible; empty if it is possible or missing."""
+    """Return the reason why a value is impossible; empty if it is possible or missing."""
     shortest, longest = possible_mm
     if value_mm is None or shortest <= value_mm <= longest:
         return ""
@@ -714,7 +717,7 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
 
 
 def _positive(value: object) -> float | None:
-    """Return the (first) number in a tag if it is finite and positive, else None."""
+    """Return the first number in a tag if it is finite and positive, else None."""
     if isinstance(value, bytes):
         value = tuple(value)
     first = value[0] if isinstance(value, tuple) and value else value
@@ -736,7 +739,7 @@ def _is_cropped(exif: Exif, width: int, height: int) -> bool:
         return False
     taken = max(exif.width, exif.height) / min(exif.width, exif.height)
     stored = max(width, height) / min(width, height)
-    # The tolerance includes one pixel of rounding, for strongly reduced images.
+    # The tolerance includes a rounding error of one pixel, for strongly reduced images.
     return abs(taken / stored - 1.0) > _CROPPED + 1.0 / min(width, height)
 
 

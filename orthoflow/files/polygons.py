@@ -19,10 +19,10 @@ from orthoflow.untrusted_text import json_bytes, open_file, parse_json
 
 Feature: TypeAlias = dict[str, JsonValue]
 
-#: bytes of a GeoJSON file of masks or seams
+#: bytes of a GeoJSON file with masks or seams
 MOST_BYTES: Final = 50_000_000
 # Each polygon may cover a whole photo.
-#: polygons of a GeoJSON file of masks or seams
+#: polygons in a GeoJSON file with masks or seams
 MOST_POLYGONS: Final = 10_000
 _CORNERS_LEAST: Final = 3
 
@@ -33,7 +33,7 @@ class NamedPolygon:
 
     Attributes:
         name: value of the property that contains the name.
-        rings: (n, 2) float64 each, the outer ring first, then holes.
+        rings: corners (n, 2) of each ring, float64, the outer ring first, then holes.
         properties: all properties of the feature.
     """
 
@@ -48,7 +48,7 @@ def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
     Args:
         path: the file.
         name: key of the property that contains the name of a polygon.
-        what: expected content of the file, for error messages, e.g. "a mask of photos".
+        what: expected content of the file, for error messages, such as "a mask of photos".
 
     Raises:
         InputError: the file has another content.
@@ -94,7 +94,7 @@ def _polygons_of(feature: Any, name: str) -> Iterator[NamedPolygon]:
 
 
 def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the cells (rows, cols) whose centre is in a polygon and not in its holes.
+    """Return a mask (rows, cols) of the cells whose centre is in a polygon and not in its holes.
 
     Args:
         rings: (n, 2) corners as (column, row), with the centre of the first cell at (0.5, 0.5).
@@ -110,7 +110,7 @@ def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> ND
 def outlines(
     values: NDArray[np.int16 | np.int32],
 ) -> list[tuple[int, tuple[NDArray[np.float64], ...]]]:
-    """Return areas of equal value, as rings (n, 2) of (column, row) along cell edges.
+    """Return the areas of equal value as rings (n, 2) of (column, row) along cell edges.
 
     The outer ring comes first, then holes; each ring ends with its first corner, as in GeoJSON.
 
@@ -137,7 +137,7 @@ def write_features(
     """Write a GeoJSON FeatureCollection in metres.
 
     The file contains the name of its coordinate system in the form that GDAL reads, although RFC
-    7946 only allows degrees: without it, a GIS would take metres for degrees.
+    7946 only allows degrees: without the name, a GIS would interpret metres as degrees.
 
     Args:
         path: the file.

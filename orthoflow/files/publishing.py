@@ -71,7 +71,7 @@ from orthoflow.products import (
 )
 from orthoflow.untrusted_text import Value, csv_text
 
-# Maximum number of characters of a source that are used in a file name.
+# Maximum number of characters of a source's name that are used in a file name.
 _LONGEST_SOURCE: Final = 100
 ERROR_CONTENT: Final = (
     "expected error of a point measured in the orthoimage, one standard deviation along u and "
@@ -81,13 +81,13 @@ PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is a
 TIE_COLUMNS: Final = (
     *("photo", "wall", "u_px", "v_px", "x", "y", "z"),
     *("role", "residual_u_px", "residual_v_px", "sigma_px"),
-    # A comment line would break simple CSV readers, so the pixel convention is a column.
+    # The pixel convention is a column, because simple CSV readers do not support comments.
     "opencv_pixel_convention",
 )
 
 
 def publish_cloud(product: PointCloud, folder: Path, digest: str) -> None:
-    """Write `scans.json`: data of each scan, and which points and fields were used or omitted."""
+    """Write `scans.json`: data on each scan, and which points and fields were used or omitted."""
     scans = product.source.get("scans")
     if isinstance(scans, list):
         write_json(
@@ -161,9 +161,9 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
 
 
 def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars, preview, and world files.
+    """Write `wall_<k>_ortho.tif`, a raster of its mask, sidecars, a preview, and world files.
 
-    If requested, layers are written as in `publish_layers`.
+    If requested, layers are written as by `publish_layers`.
     """
     if product.layers:
         called = {image.wall: (image.number, image.name) for image in product.images}
@@ -201,7 +201,8 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
 def publish_layers(product: Layers, folder: Path, digest: str) -> None:
     """Write `wall_<k>_layer_<n>_<source>.tif` and its sidecar for the layer of each source.
 
-    `n` counts the sources of a wall from 0, since photo names may become identical in file names.
+    `n` counts the sources of a wall from 0, since different photo names may become identical in
+    file names.
     """
     called = {
         layer.wall: (product.number(layer.wall), product.name(layer.wall))
@@ -248,7 +249,7 @@ def _write_layers(
 
 
 def publish_ties(product: Ties, folder: Path, digest: str) -> None:
-    """Write `ties.csv`: pixels in OpenCV's convention, residuals observed minus computed."""
+    """Write `ties.csv`, with pixels in OpenCV's convention and residuals (observed - computed)."""
     del digest  # A table of numbers has no field for it; the record contains it.
     pixels = to_opencv(product.pixels_photo)
     rows: Iterator[Sequence[Value]] = (
@@ -270,7 +271,7 @@ def publish_ties(product: Ties, folder: Path, digest: str) -> None:
 def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
     """Write `cameras.json` and other results of the orientation.
 
-    These are `calibration.yaml` with estimated lenses, for orienting other photos from the same
+    These are `calibration.yaml` with the estimated lenses, for orienting other photos from the same
     cameras, `ties.csv` with the residuals if the ties were kept, and `residuals.csv` with the table
     of residuals.
     """
@@ -302,7 +303,7 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
 
 
 def _table_text(rows: Sequence[ResidualRow]) -> str:
-    """Return rows as CSV; missing values are empty. u and v differ between walls and photos."""
+    """Return rows as CSV; missing values are empty. The axes of walls are also called u and v."""
     columns = [
         "photo_axis" if column.name == "axis" else column.name for column in fields(ResidualRow)
     ]
@@ -319,11 +320,11 @@ def _publish_raster(
     tags: Mapping[str, str],
     digest: str,
 ) -> None:
-    """Write one float raster of a wall with its sidecar and preview.
+    """Write a float raster of a wall, with its sidecar and preview.
 
     Args:
         stem: path without suffix.
-        values: (rows, cols).
+        values: (rows, cols) values of the raster.
         wall: wall of the raster.
         about: further content of the sidecar.
         content: description of the values.
@@ -354,7 +355,7 @@ def _publish_raster(
 
 
 def _cells_of(image: Orthoimage, shown: NDArray[np.bool_]) -> Cells:
-    """Return the source of a preview; deep images are converted part by part."""
+    """Return the source of a preview's cells; images with 16 bits are converted part by part."""
     return lambda part: (eight_bits(image.rgb[part]), shown[part])
 
 
@@ -386,7 +387,7 @@ def _write_ortho_sidecars(
 
 
 def accuracy_json(image: Orthoimage) -> dict[str, JsonValue]:
-    """Return the accuracy of an orthoimage, as far as it is known from its own wall."""
+    """Return the accuracy of an orthoimage, as far as it is known from checks on its own wall."""
     median, high = image.expected_mm
     is_assessed = math.isfinite(median)
     return {
@@ -427,7 +428,7 @@ def _camera_json(camera: Camera) -> JsonValue:
 
 
 def _cell(value: float) -> float | None:
-    """Return the number; None, an empty cell, for NaN and infinity."""
+    """Return a number for a CSV cell; None, i.e. an empty cell, for NaN and infinity."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -440,8 +441,8 @@ _DIGITS: Final = 4
 def publish_openings(product: Openings, folder: Path, digest: str) -> None:
     """Write `wall_<k>_openings.geojson` per wall with openings, `openings.geojson`, `openings.csv`.
 
-    The files of a wall are in the coordinates of its GeoTIFF; `openings.geojson` is in those of the
-    scan, with x, y, z on the planes of the walls.
+    The files of a wall are in the coordinates of its GeoTIFF; `openings.geojson` is in scan
+    coordinates, with x, y, z on the planes of the walls.
     """
     for wall in product.walls:
         own = product.of_wall(wall)

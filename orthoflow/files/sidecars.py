@@ -1,4 +1,4 @@
-"""JSON sidecars of rasters: the position of a wall's raster in the world, and its values."""
+"""JSON sidecars of rasters: position of a wall's raster in the world, and meaning of its values."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
 from orthoflow.untrusted_text import json_bytes, parse_json, text_of_file
 
-#: bytes of the JSON file of a raster
+#: bytes of the JSON sidecar of a raster
 MOST_SIDECAR_BYTES: Final = 1 << 20
 # Wall numbers are stored in 16 bits.
-#: largest number of a wall
+#: largest wall number
 MOST_WALLS: Final = 32_000
 _LONGEST_SHOWN: Final = 100
 _UNIT: Final = 1e-6
@@ -81,7 +81,7 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         "height": frame.height,
         "plane": {"normal": numbers(plane.normal), "offset_m": plane.offset_m},
         "corners_world": numbers(frame.corners_world()),
-        # X and Y of the top-left corner; for a wall, metres along it, and height.
+        # X and Y of the top-left corner; for a wall, distance along it and height, in metres.
         "x_of_left_m": left_m,
         "height_of_top_m" if frame.raster_axes == "wall" else "y_of_top_m": top_m,
         "crs": frame.map_crs or local_crs_name(frame.crs),
@@ -119,7 +119,7 @@ def sidecar_of(text: str, name: str) -> dict[str, object]:
 
 
 def shown_value(value: object) -> str:
-    """Return a value of a sidecar for a message, truncated if it is long."""
+    """Return a sidecar's value as text for a message, truncated if it is long."""
     text = repr(value)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]} ..."
 
@@ -137,7 +137,7 @@ def frame_of_raster(
         content: sidecar with `origin_world`, `u_world`, `v_world` (down) and `normal_world` of
             the plane, as written by orthoflow. X increases along u and Y against v, starting from
             the values at the origin: `x_of_left_m` and `height_of_top_m` (or `y_of_top_m`), 0 if
-            they are missing, or its map coordinates if `map_crs` is given.
+                they are missing, or the map coordinates of the origin if `map_crs` is given.
         raster: position of the GeoTIFF.
         shape: rows and columns of the GeoTIFF.
         name: name of the file in error messages.
@@ -209,14 +209,14 @@ def placed_raster(path: Path) -> tuple[WallFrame, dict[str, object]]:
 
 
 def _number(value: object) -> float:
-    """Return a number of a sidecar; 0 if it is not a number or not a plausible position."""
+    """Return a sidecar's value if it is a number and plausible as a position, else 0."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return 0.0
     return float(value) if abs(value) < FARTHEST_M else 0.0
 
 
 def _vector(value: object) -> NDArray[np.float64]:
-    """Return the numbers of a list; an empty array for any other value."""
+    """Return a list of numbers as an array; an empty array for any other value."""
     if not isinstance(value, list) or any(isinstance(item, bool) for item in value):
         return np.zeros(0)
     try:
@@ -228,7 +228,7 @@ def _vector(value: object) -> NDArray[np.float64]:
 def raster_tags(
     frame: WallFrame, *, digest: str, name: str, content: str, extra: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the tags of a GeoTIFF; they define its position in the world without the sidecar."""
+    """Return the tags of a GeoTIFF, which define its world position even without the sidecar."""
     plane = frame.plane
     of_frame = ("map_crs", "up_world", "origin_world", "u_world", "v_world", "normal_world")
     of_raster = ("x_of_left_m", "height_of_top_m", "y_of_top_m")
@@ -252,12 +252,12 @@ def raster_tags(
 def mask_meanings(
     meanings: Mapping[SurfaceMask, str] | Mapping[OrthoMask, str] | Mapping[LayerMask, str],
 ) -> JsonValue:
-    """Return the meanings of mask values, with the values as text, since they are JSON keys."""
+    """Return the meanings of mask values, with the values as text, since JSON keys are texts."""
     return {str(int(value)): text for value, text in meanings.items()}
 
 
 def numbers(values: NDArray[np.generic]) -> JsonValue:
-    """Return an array as nested lists; values that are not finite become null, for JSON."""
+    """Return an array as nested lists for JSON; values that are not finite become None."""
     return _finite(values.tolist())
 
 
@@ -309,13 +309,13 @@ _COLOURS: Final = 3
 
 @dataclass(frozen=True, kw_only=True)
 class OrthoFile:
-    """One published orthoimage.
+    """A published orthoimage.
 
     Attributes:
-        path: its GeoTIFF.
+        path: path of the GeoTIFF.
         about: description of the wall, with size and accuracy.
         frame: frame of the raster.
-        digest: digest of the product; empty if missing in the sidecar.
+        digest: digest of the product; empty if the sidecar does not contain it.
     """
 
     path: Path
@@ -347,10 +347,10 @@ class OrthoFile:
     def part(
         self, cells: tuple[int, int, int, int], shape: tuple[int, int]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return colours (r, c, 3) and content (r, c) of a part, averaged to fewer pixels.
+        """Return colours (r, c, 3) and their mask (r, c) of a part, averaged to fewer pixels.
 
         Args:
-            cells: left, top, right and bottom of the part.
+            cells: left, top, right and bottom of the part in cells.
             shape: requested rows and columns, at most the number of cells.
 
         Raises:
@@ -368,7 +368,7 @@ class OrthoFile:
 
 
 def ortho_files(paths: Iterable[Path]) -> tuple[OrthoFile, ...]:
-    """Open those files that are orthoimages, ordered by wall.
+    """Open the orthoimages among some files, ordered by wall.
 
     Raises:
         InputError: an orthoimage or its sidecar cannot be read.

@@ -1,4 +1,4 @@
-"""Tables of points, exported by surveyors or written by hand: a header, then a point per line."""
+"""Tables of points from surveyors or written by hand: a header, then one point per line."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _SEPARATORS: Final = (";", "\t", ",")
 MOST_BYTES: Final = 20_000_000
 #: lines of a file of check points
 MOST_POINTS: Final = 100_000
-#: lines of a file of ties; runs with many photos write long ones
+#: lines of a tie file; runs with many photos write long ones
 MOST_TIES: Final = 1_000_000
-#: bytes of a file of ties
+#: bytes of a tie file
 MOST_TIE_BYTES: Final = 200_000_000
 _MAX_PROBLEMS: Final = 20
 #: characters of a line of a file of check points
 MOST_LINE: Final = 10_000
-# Columns of ties.csv, as written by orthoflow, besides those of measured ties.
+# Columns that the `ties.csv` of a run has in addition to those of measured ties.
 _RESIDUALS: Final = ("residual_u_px", "residual_v_px")
 _OF_WRITTEN_TIES: Final = ("wall", "role", *_RESIDUALS, "opencv_pixel_convention")
 
@@ -45,9 +45,9 @@ class SurveyPoint:
         position: x, y, z as given in the file.
         class_name: class of the point; empty if none is given.
         wall: wall in whose orthoimage the point was measured, or None.
-        pixel_wall: measured column and row in that orthoimage, or None.
-        place_m: measured X and Y in the coordinates of its GeoTIFF, or None.
-        shown_m: x, y, z in metres of the measured point in that orthoimage, or None.
+        pixel_wall: measured column and row in the wall's orthoimage, or None.
+        place_m: measured X and Y in the coordinates of the orthoimage's GeoTIFF, or None.
+        shown_m: x, y, z in metres at which the orthoimage shows the point, or None.
     """
 
     name: str
@@ -64,13 +64,13 @@ class MeasuredTie:
     """A point measured in a photo, by hand or in a run.
 
     Attributes:
-        where: file and line, for messages.
+        where: file and line of the tie, for messages.
         photo: photo name.
         pixel: column and row as given in the file.
         position: x, y, z as given in the file.
         sigma_px: standard deviation of each pixel coordinate, or None.
-        is_check: whether a run withheld it from the orientation.
-        residual_px: residuals in a run, or None.
+        is_check: whether a run withheld the tie from the orientation.
+        residual_px: residuals along u and v in a run, or None.
     """
 
     where: str
@@ -83,9 +83,9 @@ class MeasuredTie:
 
 
 def read_measured_ties(path: Path) -> tuple[MeasuredTie, ...]:
-    """Read a tie file: `photo,u_px,v_px,x,y,z[,sigma_px]`, in the form of `read_survey_points`.
+    """Read a tie file: `photo,u_px,v_px,x,y,z[,sigma_px]`, in the format of `read_survey_points`.
 
-    In a `ties.csv` of orthoflow, rejected ties are left out.
+    In a `ties.csv` written by orthoflow, rejected ties are skipped.
 
     Raises:
         InputError: the file is invalid; one line per problem, `file:line: ...`.
@@ -135,7 +135,7 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
 
     Columns are separated by commas, semicolons or tabs and named in the first line, in any order:
     `name,x,y,z[,class][,wall,u_px,v_px]`. Instead of the last three, `map_x,map_y` or
-    `shown_x,shown_y,shown_z` are possible, each with or without `wall`. Without a header, there are
+    `shown_x,shown_y,shown_z` are possible, each with or without `wall`. A file without a header has
     four or five columns in this order. Empty lines and lines that begin with # are skipped.
 
     Raises:
@@ -185,15 +185,15 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
 
 @dataclass(kw_only=True)
 class _Table:
-    """The rows of a file, and its problems.
+    """The rows of a file, and the problems found in it.
 
     Attributes:
         path: the file.
-        content: kind of its rows, for messages.
+        content: content of the rows, for messages.
         required: columns that must be present.
-        single: optional columns, also possible without a header.
+        single: optional columns, which are also possible without a header.
         measured: further optional columns, some of which belong together.
-        of_runs: further columns that orthoflow writes.
+        of_runs: further columns of files written by orthoflow.
         max_rows: maximum number of rows; `MOST_POINTS` if None.
         max_bytes: maximum size of the file; `MOST_BYTES` if None.
     """
@@ -235,7 +235,7 @@ class _Table:
                     f"{self.path.name} contains no {self.content}: expected {names} per line"
                 )
             return
-        # In a header, the columns of numbers contain no numbers.
+        # In a header, even the columns for numbers contain no numbers.
         is_header = not any(_as_number(cell) is not None for cell in first[1:4])
         columns = self._columns(line, [cell.lower() for cell in first], is_header=is_header)
         if not columns:
@@ -253,7 +253,7 @@ class _Table:
             self.add(line, f"there is only a header, but no {self.content}")
 
     def numbers(self, line: int, cells: Mapping[str, str], keys: Collection[str]) -> list[float]:
-        """Return numbers; NaN for cells that are not finite numbers."""
+        """Return the numbers in some columns; NaN for cells that are not finite numbers."""
         found = []
         for key in keys:
             cell = cells[key]
@@ -294,7 +294,7 @@ class _Table:
             for number, line in enumerate(lines, start=1)
             if line.strip() and line.strip()[0] != "#"
         ]
-        # Last, because a comma may also be a decimal comma.
+        # The comma is tried last, because it may also be a decimal separator.
         first = numbered[0][1] if numbered else ""
         max_rows = self.max_rows or MOST_POINTS
         separator = next((mark for mark in _SEPARATORS if mark in first), ",")
@@ -346,7 +346,7 @@ class _Table:
 
 def _as_number(cell: str) -> float | None:
     try:
-        # Digits grouped by underscores, which Python accepts, are not numbers here.
+        # Python accepts digits grouped by underscores, but they are not numbers here.
         return None if "_" in cell else float(cell)
     except ValueError:
         return None

@@ -1,4 +1,4 @@
-"""Description of a wall's orthoimage for pages, sheets, tiles, tables and catalogues."""
+"""Descriptions of a wall's orthoimage for pages, sheets, tiles, tables and catalogues."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ class WallDescription(BaseModel):
     """A wall and its orthoimage: size, covered share, expected error, recommendation.
 
     Attributes:
-        number: number of the wall: index of its plane in `planes.json`.
+        number: number of the wall, i.e. the index of its plane in `planes.json`.
         name: name of the wall, including its number.
         kind: `wall`, `floor`, `ceiling`, or another kind defined by the method.
         recommended: whether the orthoimage should be delivered.
         reason: reason for the recommendation.
-        width_m: width of the image; like the following numbers, None if there is no image.
-        height_m: height of the image.
-        area_m2: area of the image.
-        painted_share: share of covered cells in the image.
-        height_of_top_m: height of the upper edge along the world's up; None for horizontal
-            surfaces.
-        expected_mm_median: expected error of a point measured in the image, one standard deviation,
-            median over the image; None if it was not checked.
-        expected_mm_p95: the same, exceeded in 5 % of the image.
+        width_m: width of the image in metres; None if there is no image, as for the numbers below.
+        height_m: height of the image in metres.
+        area_m2: area of the image in square metres.
+        painted_share: share of cells with a colour in the image.
+        height_of_top_m: height of the upper edge in scan coordinates, in metres; None for
+            horizontal surfaces.
+        expected_mm_median: median over the image of the expected error (one standard deviation) of
+            a point measured in it; None if the image was not checked.
+        expected_mm_p95: 95th percentile of the expected error over the image.
         n_withheld_ties: number of withheld tie points on this wall; 0 if there is no image.
         errors: errors of the run because of which the orthoimage should not be delivered.
         orthoimage: path of the GeoTIFF, relative to the file with this description.
@@ -80,7 +80,7 @@ class WallDescription(BaseModel):
 
     @property
     def sentence(self) -> str:
-        """Size, covered share, expected error, and the reason if it should not be delivered."""
+        """Size, covered share, expected error, and any reason not to deliver the image."""
         parts = [self.accuracy.text()]
         if self.painted_share is not None:
             parts.insert(0, f"{self.width_m:.2f} x {self.height_m:.2f} m")
@@ -154,6 +154,6 @@ def _table(value: object) -> Mapping[str, object]:
 
 
 def _number(value: object) -> float | None:
-    """Return a number of a sidecar; None if it is not a finite number."""
+    """Return a sidecar's value as a number; None if it is not a finite number."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(str(value)) if is_number and abs(float(str(value))) < 1e15 else None

@@ -1,4 +1,4 @@
-"""YAML 1.2 text converted to values with line and column; unusual features are refused.
+"""Conversion of YAML 1.2 text to values with line and column; unusual features are refused.
 
 ruamel.yaml composes the nodes. They are converted to values here, so that duplicate keys, tags and
 alias bombs are reported together with other problems instead of as a single exception.
@@ -28,14 +28,14 @@ from ruamel.yaml.tag import Tag
 
 from orthoflow.products.product import JsonValue
 
-#: levels of a workflow or calibration file
+#: nesting levels of a workflow or calibration file
 DEEPEST: Final = 60
 #: digits of an integer in a workflow or calibration file
 MOST_DIGITS: Final = 1000
 #: values of a workflow file, aliases expanded
 MOST_VALUES: Final = 10_000
 _LONGEST_SHOWN: Final = 100
-# In characters; the limit is YAML's own.
+# Maximum length of a key in characters; the limit is YAML's own.
 _LONGEST_KEY: Final = 1024
 _TAG: Final = "tag:yaml.org,2002:"
 
@@ -70,7 +70,7 @@ class Document:
     keys: Mapping[Location, Position] = field(default_factory=dict)
 
     def resolve(self, location: Location) -> tuple[Location, Location]:
-        """Return a location without indices of single values, and the part of it that exists."""
+        """Return a location without indices into single values, and the part of it that exists."""
         value, stated, found = self.value, list[str | int](), Location()
         is_found = True
         for part in location:
@@ -93,19 +93,19 @@ class Document:
         return value if found == stated else None
 
     def position(self, location: Location, *, at_key: bool = False) -> Position:
-        """Return the position of a value or its key; if missing, that of the enclosing value."""
+        """Return the position of a value or its key; if missing, the enclosing value's position."""
         _, found = self.resolve(location)
-        # For values that come from Python, only the position of the whole document is known.
+        # For values that were passed from Python, only the position of the whole document is known.
         while found not in self.places:
             found = found[:-1]
         return (at_key and self.keys.get(found)) or self.places[found]
 
 
 class Problems(Protocol):
-    """Receiver of problems with a document."""
+    """Interface that collects the problems of a document."""
 
     def add(self, position: Position, path: str, message: str) -> None:
-        """Add a problem: its position, the path of keys joined by dots, and a sentence."""
+        """Add a problem with its position, the path of keys joined by dots, and a sentence."""
 
 
 def path_text(location: Location) -> str:
@@ -140,7 +140,7 @@ def _cut(text: str) -> str:
 
 
 def read_yaml(text: str, log: Problems, most_values: int = MOST_VALUES) -> Document | None:
-    """Read a document; problems go to the log. Returns None if the text is unreadable."""
+    """Read a document and add its problems to `log`; return None if the text is unreadable."""
     try:
         converter = _Converter(log=log, most_values=most_values)
         value = converter.convert(_compose(text, most_values), ())
@@ -197,7 +197,7 @@ _CORE_SCHEMA: Final = (
 
 
 class _CoreResolver(VersionedResolver):
-    """Determines the type of plain scalars by the core schema."""
+    """A resolver that determines the type of plain scalars by the core schema."""
 
     # Any: as in ruamel.yaml.
     def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
@@ -210,10 +210,10 @@ class _CoreResolver(VersionedResolver):
 
 
 class _QuickScanner(Scanner):
-    """A scanner that checks its position only once per token, even if many brackets are open."""
+    """A scanner that remains fast if many brackets are open."""
 
     def stale_possible_simple_keys(self) -> None:
-        """Discard candidates that can no longer be keys."""
+        """Discard the candidates that can no longer be keys."""
         line, index = self.reader.line, self.reader.index
         for key in self.possible_simple_keys.values():
             if key.line != line or index - key.index > _LONGEST_KEY:
@@ -222,7 +222,7 @@ class _QuickScanner(Scanner):
 
 
 class _LimitedParser(Parser):
-    """Passes events to the composer one by one; stops where composing would take minutes.
+    """A parser that stops, with an error, at documents that would take minutes to compose.
 
     Attributes:
         most_values: maximum number of values in a document.
@@ -239,7 +239,7 @@ class _LimitedParser(Parser):
         """Return the next event.
 
         Raises:
-            _UnreadableError: the document is too large or too deep.
+            _UnreadableError: the document is too large or nested too deeply.
         """
         event = super().get_event()
         if isinstance(event, MappingEndEvent | SequenceEndEvent):
@@ -276,7 +276,7 @@ _OPENED: Final = {
 
 
 def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
-    """Return an error with the position of the mistake, not of its detection by the parser."""
+    """Return an error at the mistake rather than at the position where the parser detected it."""
     problem, context = str(error.problem or ""), str(error.context or "")
     noticed = _mark_position(error.problem_mark)
     words = ", ".join(" ".join(part.split()) for part in (context, problem) if part)
@@ -287,7 +287,7 @@ def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
     stumbled = int(getattr(error.problem_mark, "index", 0) or 0)
     if re.search(r":[\[{]$", text[: stumbled + 1]):
         return _UnreadableError(noticed, "this is not YAML: put a space after the colon")
-    # `key:value` in the line above is a text, which cannot be followed by a key.
+    # `key:value` in the line above is a single text, after which no key may follow.
     above = noticed.line - 1
     if "mapping values" in problem and (glued := _GLUED.match(text.splitlines()[above - 1])):
         position = Position(line=above, column=glued.end())
@@ -307,7 +307,7 @@ def _first_line(error: YAMLError) -> str:
 
 @dataclass
 class _Converter:
-    """Converts composed nodes to values; aliases are expanded and counted."""
+    """Converter of composed nodes to values; aliases are expanded, and all values are counted."""
 
     log: Problems
     most_values: int
@@ -371,7 +371,7 @@ class _Converter:
     def _joined_entries(
         self, entries: list[tuple[Node, Node]], at: Location
     ) -> list[tuple[Node, Node]]:
-        """Join them in braces, where `{a: 0,003}` is the value 0 and a key without a value."""
+        """Join such numbers in braces: `{a: 0,003}` is the value 0 and a key without a value."""
         joined = entries[:1]
         for key, value in entries[1:]:
             name, before = joined[-1]
@@ -382,7 +382,7 @@ class _Converter:
         return joined
 
     def _is_split(self, before: Node, behind: Node) -> bool:
-        """Whether there is nothing but a comma between two whole numbers."""
+        """Return whether there is nothing but a comma between two integers."""
         return (
             isinstance(before, ScalarNode)
             and isinstance(behind, ScalarNode)
@@ -391,7 +391,7 @@ class _Converter:
         )
 
     def _join(self, before: Node, behind: Node, at: Location) -> Node:
-        """Report the comma and return the intended number."""
+        """Report the decimal comma, and return the intended number."""
         meant = f"{before.value}.{behind.value}"
         self._report(
             before,
@@ -435,7 +435,8 @@ def _parse_scalar(kind: str, text: str) -> Scalar:
             return {"true": True, "false": False}[text.lower()]
         case "int":
             if len(text) > MOST_DIGITS:
-                # Python itself refuses only long decimal numbers, but can print no long ones.
+                # Python itself refuses only long decimal integers, but cannot print any long
+                # integer.
                 raise ValueError(f"more than {MOST_DIGITS} digits")
             return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
         case "float":

@@ -22,13 +22,13 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import JsonValue, Planes, PointCloud, PointLabels
 
 Colouring: TypeAlias = Literal["photos", "rgb", "intensity", "plane", "deviation"]
-# Points per block: ten copies need some hundred megabytes.
+# Points per block: ten copies need a few hundred megabytes.
 BLOCK: Final = 1 << 20
 _SCALE_PERCENT: Final = 99.0
 _NOTHING: Final = np.zeros(0, dtype=np.float32)
 
 
-# Columns of a point, in the order of the files.
+# Columns of a point, in the order in which files store them.
 _COLUMNS: Final = {
     **dict.fromkeys("xyz", "<f8"),
     **dict.fromkeys(("nx", "ny", "nz"), "<f4"),
@@ -50,13 +50,14 @@ class AttributedCloud:
         colouring: meaning of the colours.
         neighbourhoods: neighbourhoods of the cloud.
         planes: planes of the run; None if there are no planes, and thus no deviations.
-        labels: labels of the points, or None, as for `planes`.
+        labels: plane labels of the points; None if `planes` is None.
         photo_colours: colours for the colouring `photos`.
         photo_names: names of these photos, by number.
         wall: if given, only points over this raster and within its buffer are written, and
             deviations are measured from its plane.
         wall_plane: number of the plane of that wall.
-        box_world: (2, 3) if given, only points between these corners are written.
+        box_world: (2, 3) lowest and highest corner of a box; points outside are omitted. None for
+            all points.
         is_cleaned: whether isolated points are omitted.
         crs_wkt: coordinate system of the world, as WKT; empty if unknown.
         name: name of the cloud in files.
@@ -78,7 +79,7 @@ class AttributedCloud:
 
     @cached_property
     def scale_m(self) -> float:
-        """Return the deviation with full colour: the 99th percentile, rounded up to 1-2-5.
+        """Return the deviation shown in full colour: the 99th percentile, rounded up to 1-2-5.
 
         It is estimated from selected points in short sections all over the cloud.
         """
@@ -117,7 +118,7 @@ class AttributedCloud:
         return np.asarray(cloud.stations[scan], dtype=np.float64)
 
     def bounds_world(self, scan: int | None = None) -> NDArray[np.float64] | None:
-        """Return smallest and largest coordinates (2, 3) of the selected points, or None."""
+        """Return the bounding box (2, 3) of the selected points; None if there are none."""
         found = [
             (world.min(axis=0), world.max(axis=0))
             for part in self._parts()
@@ -136,7 +137,7 @@ class AttributedCloud:
 
         World coordinates in metres; unit normals towards the viewer, 0 0 0 where there is no
         surface; colours; intensity 0..1; scan; plane, or -1; deviation from the plane in metres,
-        positive towards the viewer, or NaN; photo with the colour, or -1.
+        positive towards the viewer, or NaN; number of the photo that provides the colour, or -1.
         """
         photos, is_labelled = self.photo_colours, self.labels is not None
         is_known = {
@@ -149,7 +150,7 @@ class AttributedCloud:
         return np.dtype([item for item in _COLUMNS.items() if is_known.get(item[0], True)])
 
     def blocks(self, scan: int | None = None) -> Iterator[NDArray[np.void]]:
-        """Yield the selected points (n,) of one scan or all, with their `columns`, in order."""
+        """Yield the selected points of one or all scans, in order, as (n,) arrays of `columns`."""
         for part in self._parts():
             chosen = self._chosen(part, scan)
             if chosen.any():
@@ -255,7 +256,7 @@ class AttributedCloud:
         scan: NDArray[np.uint16] | None,
         plane: NDArray[np.int16] | None,
     ) -> NDArray[np.float32]:
-        """Return 1 or -1 (n,), to orient normals to the scanner, like the plane's, or upwards."""
+        """Return signs (n,) that turn normals towards the scanner, like the plane's, or upwards."""
         stations = self.cloud.stations
         towards = np.broadcast_to(self.cloud.up, world.shape)
         if self.station(0) is not None and stations is not None:
@@ -281,7 +282,7 @@ class AttributedCloud:
         return np.array([plane_colour(k) for k in range(-1, highest + 1)], dtype=np.float64)
 
 
-# Hues differ by the golden ratio, so planes with similar numbers have different colours.
+# Successive hues differ by the golden ratio, so planes with similar numbers have different colours.
 _HUE_STEP: Final = 0.618033988749895
 _SATURATION: Final = 0.6
 UNKNOWN: Final = (128, 128, 128)
@@ -310,7 +311,7 @@ def plane_colour(index: int) -> tuple[int, int, int]:
 def plane_colours(
     plane: NDArray[np.int16], palette: NDArray[np.float64], grey: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Return colours (n, 3) of points on planes, darkened by their grey values.
+    """Return colours (n, 3) of points on planes, darkened according to the points' brightness.
 
     Args:
         plane: (n,) number of the plane, or -1.
@@ -348,7 +349,7 @@ def round_scale_m(largest_m: float) -> float:
 
 
 def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
-    """Return the brightness (n,) of points: root of intensity, or mean of the colours, or 1."""
+    """Return the brightness (n,) of points: square root of intensity, mean of the colours, or 1."""
     if cloud.intensity is not None:
         intensity = np.nan_to_num(np.asarray(cloud.intensity[part], dtype=np.float64))
         return np.sqrt(np.maximum(intensity, 0.0))
@@ -359,7 +360,7 @@ def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
 
 
 def grey_range(cloud: PointCloud) -> tuple[float, float]:
-    """Return the range of grey of most points, estimated from sections all over the cloud."""
+    """Return the 1st and 99th percentile of brightness, from sections all over the cloud."""
     if (cloud.intensity is None and cloud.rgb is None) or not len(cloud):
         return 0.0, 1.0
     sample = np.concatenate([greys(cloud, piece) for piece in sampled_pieces(len(cloud))])

@@ -186,7 +186,7 @@ def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path)
 
 
 def _codes(waiting: _Waiting, part: slice) -> NDArray[np.uint64]:
-    """Return positions along the curve: the bits of x, y and z, interleaved, lowest first."""
+    """Return each point's position on the curve: interleaved bits of x, y and z, lowest first."""
     records = waiting.records[part]
     codes = np.zeros(len(records), dtype=np.uint64)
     for axis, name in enumerate("XYZ"):
@@ -203,7 +203,7 @@ def _root_cells(codes: NDArray[np.uint64]) -> NDArray[np.int64]:
 
 
 def _ancestors(codes: NDArray[np.uint64], level: int) -> NDArray[np.uint64]:
-    """Return the nodes of a level (8^level in total) that contain positions."""
+    """Return the nodes of a level (8^level in total) that contain the given positions."""
     return codes >> np.uint64(3 * (_PLACE_BITS - level))
 
 
@@ -212,7 +212,7 @@ def _nodes(waiting: _Waiting) -> _Nodes:
     counts, order = waiting.counts, waiting.order
     totals = [counts.reshape(8**level, -1).sum(axis=1) for level in range(_GRID_BITS + 1)]
     sizes = np.bincount(waiting.groups, weights=counts).astype(np.int64)
-    # A cell with more points than a group leaves the following group numbers unused.
+    # A cell with more points than fit into a group leaves the following group numbers unused.
     sizes = sizes[sizes > 0]
     keys, firsts, runs = [], [], []
     for end, size in zip(np.cumsum(sizes), sizes, strict=True):
@@ -269,12 +269,12 @@ def _points_of(waiting: _Waiting, nodes: _Nodes) -> Iterator[NDArray[np.int64]]:
     for begin, end in itertools.pairwise([*begins.tolist(), len(nodes.key)]):
         runs = zip(nodes.first[begin:end], nodes.count[begin:end], strict=True)
         index = np.concatenate([waiting.order[first : first + count] for first, count in runs])
-        # The order of the cloud compresses best and does not reveal the groups.
+        # The original order of the points compresses best and does not reveal the groups.
         yield np.sort(index)
 
 
 def _tree(nodes: _Nodes, chunks: Sequence[tuple[int, int]], offset: int) -> bytes:
-    """Return the hierarchy: level, x, y, z, offset, bytes and points of each chunk, in order."""
+    """Return the hierarchy: level, x, y, z, offset, byte count and point count of each chunk."""
     entries = []
     for key, (n_points, n_bytes) in zip(np.unique(nodes.key).tolist(), chunks, strict=True):
         # A position on level n has n bits per axis.

@@ -1,7 +1,7 @@
 """Neighbourhoods of points in a cloud: surface normal, and whether a point is isolated.
 
-The cloud is read in sections. Voxels accumulate count and moments of their points, so memory
-depends on the number of voxels, about a million at most.
+The cloud is read in sections. Each voxel accumulates the number and the moments of its points, so
+memory depends only on the number of voxels, which is about a million at most.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from orthoflow.files.clouds.photo_colours import spacing_of
 from orthoflow.products import PointCloud
 
-# Side of a voxel in point spacings; a voxel and its 26 neighbours cover twelve spacings.
+# Side of a voxel in point spacings; a voxel with its 26 neighbours is twelve spacings wide.
 _VOXEL_SPACINGS: Final = 4.0
 _VOXELS_MOST: Final = 1_000_000
-# For outliers, 3 x 3 x 3 voxels are merged, since sparse ends of a scan have few neighbours, too.
+# To detect outliers, 3 x 3 x 3 voxels are merged, since points in sparse, distant parts of a scan
+# also have few neighbours.
 _COARSER: Final = 3
 _ALONE_FEWER_THAN: Final = 10
 _POINTS_LEAST: Final = 6
-# Maximum ratio of the variances across the surface and along its narrower side (spreads: 1/2).
+# Maximum ratio of the variance across the surface to the variance along its narrower side.
 _FLAT: Final = 0.25
 _AT_ONCE: Final = 1 << 20
 # A voxel index has 21 bits per axis.
@@ -85,7 +86,7 @@ def _keys(
 def _moments(
     cloud: PointCloud, low: NDArray[np.float64], side_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return sorted voxels with count, sums and sums of products of their points."""
+    """Return sorted voxel keys, and the count, sums and sums of products of the points in each."""
     keys = np.zeros(0, dtype=np.int64)
     moments = np.zeros((0, 10))
     for first in range(0, len(cloud), _AT_ONCE):

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Box
 
 UNSEEN_GREY: Final = 128
-# Points up to this distance behind the nearest one are visible, too.
+# Points up to this distance behind the nearest one are also visible.
 _TOLERANCE_M: Final = 0.05
-# Lens models are less accurate near a photo's border: quality decreases to 0 over this share.
+# Lens models are less accurate near a photo's border, where the quality decreases to 0; width of
+# this zone relative to the photo's shorter side.
 _BORDER_SHARE: Final = 0.05
 # OpenCV requires images with fewer than 32,767 rows.
 _REMAPPED_AT_ONCE: Final = 30_000
@@ -39,7 +40,7 @@ class PointColours:
     Attributes:
         rgb: (n, 3) uint8, `UNSEEN_GREY` for points that no photo sees.
         best: (n,) float32 quality of the chosen photo, 0 if no photo sees the point.
-        photo: (n,) int16 chosen photo, or -1; None if not requested.
+        photo: (n,) int16 number of the chosen photo, or -1; None if not requested.
     """
 
     rgb: NDArray[np.uint8]
@@ -64,7 +65,7 @@ def colour_points(
     Args:
         cloud: the points.
         oriented: photos with their cameras.
-        colours: output.
+        colours: arrays to fill.
         threads: number of threads; the result does not depend on it.
         progress: called before each photo with the completed fraction and the photo's name.
     """
@@ -116,7 +117,7 @@ def _colour(
         inside = np.flatnonzero(camera.sees(projected[:, :2]))
         pixels, depth_m = projected[inside, :2], projected[inside, 2]
         index = start + inside
-        # Visible unless a surface is nearer by more than the tolerance.
+        # A point is visible unless a surface is nearer by more than the tolerance.
         cells = (pixels / buffer.reduction).astype(np.int64)
         is_seen = depth_m <= buffer.nearest[cells[:, 1], cells[:, 0]] + _TOLERANCE_M
         # Pixels per metre, squared, decreasing near the photo's border.
@@ -157,7 +158,7 @@ def _extent(
 
 
 def _box_of(cloud: PointCloud, cameras: Sequence[ViewingCamera]) -> Box:
-    """Return the box around cameras and cloud without outliers, with the point spacing."""
+    """Return the box around the cameras and the cloud without outliers, and the point spacing."""
     from orthoflow.geometry.occluders import Box
 
     low, high, side_m, spacing_m = _extent(cloud)

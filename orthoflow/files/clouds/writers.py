@@ -1,8 +1,9 @@
 """Writers of clouds, block by block: LAZ 1.4, binary PLY with double coordinates, and E57.
 
-LAZ stores the scan as point source and plane, deviation, normals and photo as extra bytes. E57 has
-a Data3D with pose for each scan, and extensions for normals, plane and deviation. PLY is written
-without a library, because libraries need all points at once or do not support custom fields.
+LAZ stores the scan number as the point source, and plane, deviation, normals and photo number as
+extra bytes. E57 has a Data3D with a pose for each scan, and extensions for normals, plane and
+deviation. PLY is written without a library, because libraries need all points at once or do not
+support custom fields.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ def _scale_m(cloud: PointCloud) -> float:
 
 
 _TYPES: Final = {"f8": "double", "f4": "float", "u1": "uchar", "u2": "ushort", "i2": "short"}
-# Wide enough for any number of points; overwritten once the number is known.
+# Width reserved for the point count, which is overwritten once it is known.
 _DIGITS: Final = 12
 
 
@@ -146,7 +147,7 @@ EXTENSIONS: Final = {
 }
 _COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 _STATE: Final = "cartesianInvalidState"
-# The scan is not a field, since each has its own Data3D.
+# The scan number is not a field, since each scan has its own Data3D.
 _E57_NAMES: Final = {
     **{axis: f"cartesian{axis.upper()}" for axis in "xyz"},
     **dict(zip(("red", "green", "blue"), _COLOURS, strict=True)),
@@ -158,7 +159,7 @@ _E57_NAMES: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class _Writer:
-    """An E57 file under construction."""
+    """An E57 file that is being written."""
 
     # Any: libE57 has no types.
     libe57: Any
@@ -195,7 +196,7 @@ def write_e57(path: Path, attributed: AttributedCloud) -> int:
 
 
 def _write_head(writer: _Writer, attributed: AttributedCloud) -> Any:
-    """Write the data before the scans, independent of the date; return the list of scans."""
+    """Write the root elements, with a fixed date, and return the empty list of scans."""
     libe57, image = writer.libe57, writer.image
     for prefix, uri in {"": libe57.E57_V1_0_URI, **EXTENSIONS}.items():
         image.extensionsAdd(prefix, uri)

@@ -1,4 +1,4 @@
-"""CAD files: each wall in its plane with grid, heights and dimensions, and the room in space.
+"""CAD files: each wall in its plane, with grid, heights and dimensions, and the room in 3D.
 
 Openings are drawn as rectangles or arches where these fit.
 """
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # Layers with names of the US National CAD Standard: content, AutoCAD colour, and line weight in
 # hundredths of a millimetre, as in ISO 128.
 Layers = Mapping[str, tuple[str, int, int]]
-# Walls are elevations (A-ELEV), the room in space is a model of surfaces (A-WALL).
+# Walls are elevations (A-ELEV); the room in 3D is a surface model (A-WALL).
 LAYERS: Final[Layers] = {
     "A-ELEV-IMAG": ("orthoimages", 7, 13),
     "A-ELEV-OTLN": ("outline of the orthoimage", 8, 13),
@@ -43,13 +43,14 @@ LAYERS: Final[Layers] = {
     "A-ANNO-DIMS": ("dimensions", 2, 18),
     "A-ANNO-TEXT": ("names and notes", 7, 18),
 }
-# 2.5 mm text at 1:50.
+# Text height: 2.5 mm at 1:50.
 _TEXT_M: Final = 0.125
 _LETTER_M: Final = 0.9 * _TEXT_M
 _ROW_M: Final = 1.8 * _TEXT_M
 _METRES: Final = 6
 _VERSION: Final = "R2010"
-# Some programs do not show attributes, so the content is also written as text next to the mark.
+# Attributes are hidden and their content is repeated as text, because some programs do not show
+# attributes.
 _UNSEEN: Final = {"flags": 1}
 _MOST_LINES: Final = 12
 DIMENSION_STYLE: Final = "ORTHOFLOW"
@@ -76,7 +77,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
         image = space.add_image(
             definition, tuple(corners[1]), size, dxfattribs={"layer": "A-ELEV-IMAG"}
         )
-        # The Y axis of a ceiling increases with the rows.
+        # For a ceiling, Y increases with the row number.
         image.dxf.v_pixel = (0.0, -frame.raster_down * frame.gsd_m, 0.0)
     low, high = corners.min(axis=0), corners.max(axis=0)
     is_upright = frame.raster_axes == "wall"
@@ -130,7 +131,7 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
 
 
 def new_document(layers: Layers, text_m: float, version: str = _VERSION) -> Drawing:
-    """Return a new document in metres, with layers and a dimension style of this text height."""
+    """Return a new document in metres, with layers and a dimension style with this text height."""
     from ezdxf.filemanagement import new
 
     document = new(version, setup=True, units=_METRES)
@@ -190,7 +191,7 @@ def _add_blocks(document: Drawing) -> None:
 
 
 def _add_grid(space: Modelspace, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-    """Add lines at round coordinates, each with its number outside the picture."""
+    """Add lines at round coordinates, each labelled outside the picture."""
     longest = float((high - low).max())
     step = nice_step(longest / _MOST_LINES)
     for axis in (0, 1):
@@ -295,7 +296,7 @@ def _add_points(space: Modelspace, names: Iterable[str], places: NDArray[np.floa
 
 
 def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: str) -> None:
-    """Add a text, moved down until it does not overlap others in plan view, with a leader."""
+    """Add a text with a leader, moved down until it overlaps no other text in plan view."""
     added = space.add_text(shown(text), height=_TEXT_M, dxfattribs={"layer": layer})
     placed = space.query("TEXT")[:-1]
     others = [(*one.dxf.insert.vec2, len(one.dxf.text)) for one in placed]
@@ -338,7 +339,7 @@ class RegularOpening:
         kind: `rectangle`, `arch` (a rectangle under a circular segment), or `outline` if neither
             fits.
         outline_m: (n, 2) X and Y, counter-clockwise, not closed; arcs are polygons.
-        deviation_m: maximum distance of the detected outline from this one.
+        deviation_m: maximum distance between the detected outline and this one.
     """
 
     kind: Literal["rectangle", "arch", "outline"]
@@ -351,7 +352,7 @@ def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> Re
 
     Args:
         outline_m: (n, 2) X and Y on an upright wall, counter-clockwise.
-        sigma_m: standard deviation of its sides, None if unknown.
+        sigma_m: standard deviation of the positions of its sides, None if unknown.
 
     A form is accepted if 95 % of the outline is within three sigma (at least 20 mm) of it.
     """
@@ -387,7 +388,7 @@ def _sampled(outline_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 def _sides(
     samples: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
-    """Return left, bottom, right and top, each the median of the samples on that side.
+    """Return the left, bottom, right and top coordinate, each the median of that side's samples.
 
     In a counter-clockwise outline, the left side runs down, the bottom side to the right, and so
     on.
@@ -404,7 +405,7 @@ def _sides(
 def _arches(
     samples: NDArray[np.float64], left: float, bottom: float, right: float
 ) -> list[NDArray[np.float64]]:
-    """Return rectangles under circular segments up to the outline's apex, by springing height."""
+    """Return candidate arches up to the outline's apex, keyed by springing height."""
     apex = float(samples[:, 1].max())
     half = 0.5 * (right - left)
     rises = np.linspace(0.0, min(half, apex - bottom), _SPRINGINGS + 1)[1:]

@@ -56,12 +56,12 @@ def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> 
 
 
 def write_seams_geojson(path: Path, image: Orthoimage) -> None:
-    """Write the areas of a wall by photo, in the coordinates of its GeoTIFF.
+    """Write the area of a wall that each photo covers, in the coordinates of the wall's GeoTIFF.
 
     After editing, the file can be passed to `mosaic.seams` as the input `seams`; it then overrides
     the automatic seams.
     """
-    # On very large walls, corners are accurate only to a few cells.
+    # On very large walls, the corners of areas are accurate only to a few cells.
     step = max(1, math.ceil(math.sqrt(image.source.size / _SEAM_CELLS_MOST)))
     source = np.ascontiguousarray(image.source[::step, ::step])
     features: list[Feature] = []
@@ -108,7 +108,7 @@ def opening_feature(opening: Opening, place: int, *, in_world: bool = False) -> 
 
     Args:
         opening: the opening.
-        place: its index among the openings of its wall, from the left.
+        place: index of the opening among those of its wall, from the left.
         in_world: whether to use scan coordinates x, y, z instead of those of the wall's GeoTIFF.
     """
     sources = [OutlineSource(source).name.lower() for source in opening.side_source.tolist()]
@@ -168,9 +168,9 @@ class ProjectLayer:
 
     Attributes:
         wall: name of the wall.
-        kind: content of the raster: `ortho`, `intensity`, `depth`, `error`.
+        kind: content of the raster: `ortho`, `intensity`, `depth` or `error`.
         raster: its GeoTIFF.
-        about: one line of information, e.g. its accuracy.
+        about: one line of information, e.g. the accuracy of the raster.
         is_shown: whether it is visible when the project is opened.
     """
 
@@ -229,7 +229,7 @@ def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
 
 
 def _write_virtual(path: Path, raster: Path, shift_m: float) -> tuple[float, float, float, float]:
-    """Write a virtual raster that shifts X; return left, bottom, right and top."""
+    """Write a virtual raster with X shifted, and return its left, bottom, right and top edge."""
     from rasterio.shutil import copy
 
     with RasterParts(raster) as parts:

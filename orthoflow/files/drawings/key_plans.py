@@ -28,9 +28,9 @@ from orthoflow.products import CheckPoints, Opening, Planes
 # All pairs and some triples are compared, and a record may contain any number of planes.
 #: planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
 MOST_PLANES: Final = 200
-#: connected parts of them
+#: connected parts of these planes
 MOST_PARTS: Final = 20_000
-# Label of the upwards direction of a plan in a map; in other plans, this is an axis of the scan.
+# Label of the upwards direction of a plan in map coordinates; other plans name an axis of the scan.
 NORTH: Final = "N"
 
 
@@ -39,12 +39,13 @@ class KeyPlan:
     """Lines of a plan, in metres to the right and upwards, relative to a nearby origin.
 
     Attributes:
-        walls: (w, 2, 2) rectangles of upright walls from above.
+        walls: (w, 2, 2) ends of upright walls as seen from above.
         numbers: numbers of these walls, as in files and reports.
         outlines: outlines of the room, (n, 2) each; closed ones end where they begin.
         marked: (n, 2) the marked wall: two ends, or the four corners of a horizontal plane.
         arrow: (2, 2) from the viewer to the wall; None for horizontal planes.
-        up_label: label of the upwards direction of the plan: `N` in a map, else an axis.
+        up_label: label of the upwards direction of the plan: `N` in map coordinates, otherwise an
+            axis of the scan.
         number: number of the marked wall, -1 if none.
     """
 
@@ -58,10 +59,10 @@ class KeyPlan:
 
 
 def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
-    """Return planes with the rectangles of their parts, or their own if they have no parts.
+    """Return planes with the rectangles of their parts; a plane without parts keeps its own.
 
     Raises:
-        InputError: there are more than `MOST_PLANES`, or `MOST_PARTS` of them.
+        InputError: there are more than `MOST_PLANES` planes or `MOST_PARTS` parts.
     """
     _check_counts(planes)
     found = []
@@ -75,10 +76,10 @@ def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
 
 
 def outline_of(planes: Planes) -> RoomOutline:
-    """Return the outline of the room bounded by planes.
+    """Return the outline of the room that the planes bound.
 
     Raises:
-        InputError: there are more than `MOST_PLANES`.
+        InputError: there are more than `MOST_PLANES` planes.
     """
     _check_counts(planes)
     return room_outline(
@@ -124,12 +125,13 @@ def marked_plan(
     *,
     is_map: bool = False,
 ) -> KeyPlan:
-    """Draw planes from above, and mark a line by two ends or a horizontal plane by four corners.
+    """Draw planes from above, and mark a wall by its two ends or a horizontal plane by its corners.
 
     Args:
         planes: planes of the room.
         marked_world: (2 or 4, 3) the marked ends or corners.
-        towards_world: (3,) direction from it to the viewer; None for horizontal planes.
+        towards_world: (3,) direction from the marked wall to the viewer; None for horizontal
+            planes.
         number: number of the marked wall, -1 if none.
         is_map: whether world x and y are easting and northing.
     """
@@ -213,10 +215,10 @@ class DrawnWall:
     Attributes:
         number: number of the wall.
         name: name of the wall.
-        plane_index: index of its plane, None if unknown.
-        frame: frame of its raster.
-        image: file name of its picture next to the drawing; empty if there is none.
-        openings: its openings, from the left.
+        plane_index: index of the wall's plane, None if unknown.
+        frame: frame of the wall's raster.
+        image: file name of the wall's picture, next to the drawing; empty if there is no picture.
+        openings: openings of the wall, from the left.
     """
 
     number: int
@@ -241,7 +243,7 @@ def edges_of(lines: RoomLines, plane_index: int | None) -> Sequence[Edge]:
 
 
 def numbered_openings(openings: Sequence[Opening]) -> Iterator[tuple[int, Opening]]:
-    """Yield openings with their indices among those of their wall, in order."""
+    """Yield each opening in order, with its index among the openings of its wall."""
     counts: dict[int, int] = {}
     for opening in openings:
         counts[opening.wall] = counts.get(opening.wall, -1) + 1

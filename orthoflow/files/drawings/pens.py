@@ -1,4 +1,4 @@
-"""Pages, lines and text on paper, in millimetres from its bottom-left corner.
+"""Pages, lines and text, in millimetres from the bottom-left corner of the paper.
 
 Line widths are those of ISO 128-2, text heights those of ISO 3098, with a minimum of 2.5 mm.
 """
@@ -32,7 +32,7 @@ THIN_MM: Final = 0.25
 MEDIUM_MM: Final = 0.35
 WIDE_MM: Final = 0.5
 FRAME_MM: Final = 0.7
-# ISO 3098.
+# Text heights from ISO 3098.
 TEXT_MM: Final = 2.5
 HEADING_MM: Final = 3.5
 TITLE_MM: Final = 5.0
@@ -40,7 +40,7 @@ BLACK: Final = (0.0, 0.0, 0.0)
 WHITE: Final = (1.0, 1.0, 1.0)
 RED: Final = (0.8, 0.0, 0.0)
 GREY: Final = (0.5, 0.5, 0.5)
-# Contours in front of the plane and behind it, and openings.
+# Colours of contours in front of the plane, of contours behind it, and of openings.
 BEFORE: Final = (0.80, 0.25, 0.05)
 BEHIND: Final = (0.05, 0.30, 0.75)
 OPENING: Final = (0.0, 0.40, 0.45)
@@ -58,7 +58,7 @@ def sheet_canvas(stream: BytesIO, size_mm: tuple[float, float]) -> Iterator[Canv
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
 
-    # Pictures are binary; encoded as text, they would be 25 % larger and slow to write.
+    # Embed pictures as binary data; encoded as text, they would be 25 % larger and slow to write.
     rl_config.useA85 = 0
     register_fonts()
     size = tuple(POINTS_PER_MM * edge for edge in size_mm)
@@ -94,7 +94,7 @@ def line(
 def fill(
     canvas: Canvas, outlines_mm: Sequence[NDArray[np.float64]], colour: Colour = BLACK
 ) -> None:
-    """Fill outlines (n, 2) each; those inside another one are holes."""
+    """Fill the areas within outlines, (n, 2) each; an outline inside another one is a hole."""
     path = canvas.beginPath()
     for outline in outlines_mm:
         for place, (x, y) in enumerate(outline):
@@ -150,7 +150,7 @@ def write_text(  # noqa: PLR0913 - properties of a text
 ) -> None:
     """Write a line of text with capital letters of a given height; untrusted text is escaped.
 
-    It is rotated counter-clockwise about its beginning, or about its centre if centred.
+    The line is rotated counter-clockwise about its beginning, or about its centre if centred.
     """
     canvas.saveState()
     canvas.translate(at_mm[0] * POINTS_PER_MM, at_mm[1] * POINTS_PER_MM)
@@ -189,7 +189,7 @@ def write_on_white(
 
 
 def font_points(high_mm: float) -> float:
-    """Return the font size with capital letters of this height."""
+    """Return the font size at which capital letters have this height."""
     return high_mm * POINTS_PER_MM / _CAPITALS
 
 
@@ -261,7 +261,7 @@ def _runs(text: str, *, is_bold: bool) -> Iterator[tuple[str, str]]:
 
 @lru_cache(maxsize=4096)
 def fallback_font(letter: str) -> str:
-    """Create a font of one letter from an installed font, and return its name.
+    """Create a font with a single letter from an installed font, and return the new font's name.
 
     reportlab only embeds fonts with TrueType outlines, so others are converted.
 
@@ -307,7 +307,7 @@ def fallback_font(letter: str) -> str:
 
 @lru_cache(maxsize=1)
 def _installed_letters() -> dict[str, frozenset[int]]:
-    """Return the code points of each system font by path, in collections only of the first font."""
+    """Return the code points of each system font file; of a collection, only the first font's."""
     from fontTools.ttLib import TTFont, TTLibError
     from matplotlib.font_manager import findSystemFonts
 

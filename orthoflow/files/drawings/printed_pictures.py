@@ -57,7 +57,8 @@ _SHORTEST_CONTOUR_MM: Final = 6.0
 _OVERVIEW_PX: Final = 1000
 # Minimum interval of contours in standard deviations of the noise.
 _CLEAR_OF_NOISE: Final = 4.0
-# Maximum difference of averaged depths in standard deviations, and size of the Gaussian in cells.
+# Maximum difference between averaged depths in standard deviations, and sigma of the Gaussian in
+# cells.
 _SAME_SURFACE: Final = 5.0
 _CALM_CELLS: Final = 4.0
 # Side of the square of cells tested for being level, and the permitted rise relative to the contour
@@ -83,10 +84,9 @@ class Stretch:
 
     @property
     def interval(self) -> float:
-        """Interval of contours: a round number that gives about ten levels over the range.
+        """Contour interval: a round number that gives about ten levels over the range.
 
-        It is at least 1 mm, and large enough that noise does not reach from one contour to the
-        next.
+        The interval is at least 1 mm and four standard deviations of the noise.
         """
         return nice_step(max((self.high - self.low) / 12.0, 1e-3, _CLEAR_OF_NOISE * self.noise))
 
@@ -94,12 +94,12 @@ class Stretch:
 def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = False) -> bytes:
     """Encode a part of a wall's raster as a picture, white in empty cells.
 
-    Cells are unchanged if print resolves them, and otherwise averaged to 400 pixels per inch.
+    Rasters with more than 400 cells per inch of paper are averaged to 400; others are unchanged.
 
     Args:
         raster: GeoTIFF with one band, which is stretched to grey, or three.
         part: part of the raster.
-        scale: n of 1 : n.
+        scale: denominator n of the scale 1 : n.
         is_flipped: whether the rows of the raster go up the paper; `part` refers to the drawing.
 
     Returns:
@@ -127,13 +127,13 @@ def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = Fals
 
 
 def _flipped(part: Part, source: RasterParts) -> Part:
-    """Return the same part, relative to the opposite edge of the raster."""
+    """Return the same part, measured from the opposite edge of the raster."""
     high_m = source.shape[0] * source.gsd_m
     return replace(part, top_m=high_m - part.bottom_m, bottom_m=high_m - part.top_m)
 
 
 def stretch_of(raster: Path) -> Stretch:
-    """Return the values of one band shown black and white: its 2nd and 98th percentiles.
+    """Return the values of a band to show as black and white: its 2nd and 98th percentiles.
 
     The noise is estimated from an overview.
     """
@@ -150,9 +150,9 @@ def stretch_of(raster: Path) -> Stretch:
 
 
 def noise_of(values: NDArray[np.float32]) -> float:
-    """Estimate the standard deviation of noise, which is uncorrelated between cells (rows, cols).
+    """Estimate the standard deviation of noise that is uncorrelated between cells (rows, cols).
 
-    Smooth variation and edges, which affect few cells, do not count as noise.
+    Smooth variation does not count as noise, nor do edges, which affect few cells.
     """
     between = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:]
     away = values[1:-1, 1:-1] - 0.25 * between
@@ -161,7 +161,7 @@ def noise_of(values: NDArray[np.float32]) -> float:
 
 
 def calmed(values: NDArray[np.float32], noise: float) -> NDArray[np.float32]:
-    """Average values with neighbours that differ only by noise, so that edges stay sharp.
+    """Average each value with the neighbours that differ from it only by noise; edges stay sharp.
 
     Args:
         values: (rows, cols), NaN if unknown; NaN is preserved.
@@ -172,14 +172,14 @@ def calmed(values: NDArray[np.float32], noise: float) -> NDArray[np.float32]:
     if noise <= 0.0:
         return values
     known = np.isfinite(values)
-    # Too far from all other values to be averaged with them.
+    # Fill unknown cells with a value too far from all known values to be averaged with them.
     filled = np.where(known, values, np.float32(values[known].max() + 20.0 * noise))
     calm = cv2.bilateralFilter(filled, -1, _SAME_SURFACE * noise, _CALM_CELLS)
     return np.where(known, calm, np.float32(np.nan))
 
 
 def _is_level(values: NDArray[np.float32], least: float) -> NDArray[np.bool_]:
-    """Return where all values around a cell differ by less than a limit."""
+    """Return the cells in whose neighbourhood all values differ by less than a limit."""
     import cv2
 
     around = np.ones((_LEVEL_CELLS, _LEVEL_CELLS), dtype=np.uint8)
@@ -195,9 +195,9 @@ def contours(
     Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster, or of
     the drawing if the rows of the raster go up the paper. The first level is half an interval from
     the plane, because a contour on the plane itself would only show noise. Each depth is averaged
-    over 0.5 mm on paper with those that differ from it only by noise. Contours are omitted where
-    the surface is level within the noise or they would be more than 12 cm apart, since they would
-    wander, and if they are shorter than 6 mm.
+    over 0.5 mm on paper with those that differ from it only by noise. Contours shorter than 6 mm
+    are omitted, and so are contours where the surface is level within the noise or where they would
+    be more than 12 cm apart, since their position would be arbitrary.
     """
     from contourpy import contour_generator
 
@@ -244,7 +244,7 @@ def contours(
 def label_place(
     points_mm: NDArray[np.float64], wide_mm: float, placed_mm: Sequence[NDArray[np.float64]]
 ) -> tuple[tuple[float, float], float] | None:
-    """Return a position for a number on a line (centre on the paper, and degrees), or None.
+    """Return a position for a number on a line (centre and rotation in degrees), or None.
 
     The number is rotated counter-clockwise such that it is not upside down.
 
@@ -253,7 +253,7 @@ def label_place(
         wide_mm: width of the number.
         placed_mm: centres of other numbers, (2,) each.
     """
-    # Complex numbers: right is the real part, up the imaginary part.
+    # As complex numbers: the real part points right, the imaginary part up.
     line = points_mm[:, 0] + 1j * points_mm[:, 1]
     along = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(line)))])
     if along[-1] < _LEAST_WIDTHS * wide_mm:
@@ -314,7 +314,7 @@ def write_cad_picture(raster: Path, path: Path) -> None:
 
     with RasterParts(raster) as source, tempfile.TemporaryDirectory() as folder, writing(path):
         rows, columns = source.shape
-        # GDAL's PNG driver only copies, row by row.
+        # GDAL's PNG driver can only copy an existing file, which it does row by row.
         aside = Path(folder) / "picture.tif"
         profile = {"count": 4, "dtype": "uint8", "transform": rasterio.Affine(2, 0, 0, 0, -2, 0)}
         whole = np.array([0.0, 0.0, columns, rows])
@@ -330,9 +330,9 @@ def write_cad_picture(raster: Path, path: Path) -> None:
             copy(aside, path, driver="PNG", ZLEVEL="4")
 
 
-# An area outlined on a picture: its text, which is written inside if there is room, with parts
-# separated by ", " on lines of their own; and its outline (n, 2) in metres right and down from the
-# top-left corner.
+# An area outlined on a picture: its text, whose parts, separated by ", ", are written inside on
+# separate lines if there is room; and its outline (n, 2) in metres right and down from the top-left
+# corner of the picture.
 Area = tuple[str, NDArray[np.float64]]
 _MIDDLE: Final = [(1.0, 2.0), (13.0, 2.0)]
 _BOX: Final = [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)]
@@ -352,7 +352,7 @@ def wall_picture(
         raster: GeoTIFF.
         is_depth: whether it contains depths, which are drawn with contours.
         is_flipped: whether its rows go up the paper, as for ceilings.
-        areas: openings of the wall.
+        areas: areas to outline, such as openings of the wall.
         language: language of the legend.
     """
 
@@ -432,7 +432,7 @@ def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
             pens.line(canvas, outline, width_mm=pens.MEDIUM_MM, colour=pens.OPENING, is_closed=True)
             low = np.maximum(outline.min(axis=0), (left, bottom))
             high = np.minimum(outline.max(axis=0), (right, top))
-            # The parts of the text on a white background, from the top, if there is room.
+            # Write the parts of the text on a white background, from the top, if there is room.
             rows = shown(text).split(", ")
             wide_mm = max(pens.text_width_mm(row) for row in rows) + 2.0
             high_mm = 1.7 * pens.TEXT_MM * len(rows) + 1.0
@@ -517,13 +517,13 @@ def elevation(
     scale: int,
     language: Language = "en",
 ) -> Drawing:
-    """Return walls side by side, each at its height, with level lines at round heights.
+    """Return a picture of walls side by side, each at its height, with lines at round heights.
 
     Args:
         walls: from left to right.
         up: (3,) unit vector in scan coordinates.
-        text: texts of the sheets.
-        scale: n of 1 : n.
+        text: texts on the sheets.
+        scale: denominator n of the scale 1 : n.
         language: language of labels.
     """
     mm = 1e-3 * scale
@@ -583,12 +583,12 @@ def elevation(
 NOTHING: Final = 0
 _BAND_ROWS: Final = 1024
 _AROUND_ROWS: Final = 8
-# Number of rows above and below the middle from which noise is estimated.
+# Rows above and below the middle of the raster that are used to estimate noise.
 _SAMPLED_ROWS: Final = 128
 _FIGURE_PX: Final = 1600
 # Contours are smoothed as in a drawing at this scale, over 0.5 mm on paper.
 _CONTOUR_SCALE: Final = 20
-# In front of the plane, and behind it.
+# Colours in front of the plane and behind it.
 _CONTOUR_COLOURS: Final = ("#5a0014", "#00204a")
 
 
@@ -597,8 +597,9 @@ class Light:
     """The direction of a distant light in front of a wall.
 
     Attributes:
-        azimuth_deg: its direction on the wall, clockwise from the top; 315 is top left.
-        altitude_deg: angle between its rays and the wall's plane; small ones emphasise relief.
+        azimuth_deg: direction on the wall that the light comes from, clockwise from the top; 315 is
+            top left.
+        altitude_deg: angle between the rays and the wall's plane; small angles emphasise relief.
     """
 
     azimuth_deg: float = 315.0
@@ -632,7 +633,7 @@ def shaded(
 
 
 def _slope(depths: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Return the change per cell: mean of both sides, of one side next to a hole, or zero."""
+    """Return the change per cell: mean of both sides, one side next to a hole, or else zero."""
     steps = np.diff(depths, axis=axis)
     before = np.concatenate([np.full_like(depths.take([0], axis), np.nan), steps], axis=axis)
     behind = np.concatenate([steps, np.full_like(depths.take([0], axis), np.nan)], axis=axis)
@@ -671,7 +672,7 @@ def write_relief(depth: Path, path: Path, light: Light) -> None:
 
 
 def _noise_m(source: RasterParts) -> float:
-    """Return the standard deviation of noise of depths, from the middle rows of the raster."""
+    """Return the standard deviation of the noise of depths in the middle rows of the raster."""
     rows, columns = source.shape
     top, bottom = max(0, rows // 2 - _SAMPLED_ROWS), min(rows, rows // 2 + _SAMPLED_ROWS)
     box = (0.0, float(top), float(columns), float(bottom))
@@ -682,7 +683,7 @@ def _noise_m(source: RasterParts) -> float:
 def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
     """Write contour lines as GeoJSON in X and Y of the raster's GeoTIFF; return their interval.
 
-    Each line has `depth_mm`, positive towards the viewer.
+    Each line has the property `depth_mm`, positive towards the viewer.
     """
     interval_m = stretch_of(depth).interval
     features: list[Feature] = [
@@ -720,7 +721,8 @@ def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) 
         gsd_m = source.gsd_m * factor
     values = np.where(shown, np.asarray(depths, np.float32), np.nan)
     stretch = stretch_of(depth)
-    # The plane is white; equal depths in front of it (red) and behind it (blue) are equally dark.
+    # The plane is white; equal distances in front of it (red) and behind it (blue) are equally
+    # dark.
     norm = CenteredNorm(0.0, halfrange=max(1.0, 1e3 * max(-stretch.low, stretch.high)))
     grey = shaded(values, gsd_m, light, noise_of(values))
     colours = colormaps["RdBu_r"](norm(1e3 * np.nan_to_num(values)))[..., :3]

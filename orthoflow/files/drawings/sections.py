@@ -1,4 +1,4 @@
-"""Plans and sections: the intersection of a plane with a room, and lines beyond it.
+"""Plans and sections: the intersection of a cutting plane with a room, and lines beyond it.
 
 Cut lines are exact intersections of the cutting plane with detected planes; they end where the
 points end or where another plane meets them. Points of the slab that are not near such a line are
@@ -43,22 +43,22 @@ if TYPE_CHECKING:
     from ezdxf.layouts.layout import Modelspace
     from ezdxf.math import Vec2
 
-# Planes that meet the cut at a smaller angle have no sharp line in it.
+# Planes that meet the cutting plane at a smaller angle have no well-defined line of intersection.
 _LEAST_ANGLE_DEG: Final = 20.0
 # Longer stretches without points are drawn as openings; shorter ones are gaps between points.
 _LEAST_OPENING_M: Final = 0.15
-# A line is extended to a corner with another line if its points end this close to it, e.g. behind
-# furniture.
+# A line whose points end within this distance of its corner with another line, e.g. because of
+# furniture, is extended to the corner.
 _REACH_M: Final = 0.3
 _SHORTEST_M: Final = 0.05
-# The two sides of a wall face away from each other and are at most this far apart.
+# Minimum and maximum thickness of a wall, between two sides that face away from each other.
 _THICKNESS_M: Final = (0.04, 1.5)
 _MOST_POINTS: Final = 30_000
-# Points away from lines are drawn if a cell contains this many; fewer are noise.
+# Points away from lines are drawn if a cell of this side has at least this many; fewer are noise.
 _CROWD_M: Final = 0.05
 _CROWD_POINTS: Final = 3
 _BLOCK: Final = 4_000_000
-# Level planes with at least this share of the area of the largest count as floors.
+# Horizontal planes with at least this share of the largest one's area count as floors.
 _FLOOR_SHARE: Final = 0.2
 
 
@@ -81,7 +81,7 @@ class Cut:
     title: str
 
     def place_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return X, Y and distance beyond the cut (n, 3), metres, of world points (n, 3)."""
+        """Return X, Y and the distance beyond the cut (n, 3), in metres, of world points (n, 3)."""
         axes = np.array([self.x_world, self.y_world, self.forward_world])
         return np.asarray((points_world - self.origin_world) @ axes.T)
 
@@ -104,7 +104,7 @@ class CutLine:
 
     @property
     def length_m(self) -> float:
-        """Its length."""
+        """Length of the line in metres."""
         return float(np.linalg.norm(self.ends_m[1] - self.ends_m[0]))
 
 
@@ -119,7 +119,7 @@ class Section:
         beyond_m: (b, 2, 2) edges and outlines of openings beyond the cut.
         points_m: (p, 2) thinned points of the slab that are away from all lines.
         slab_m: thickness of the slab from which points were used; 0 if there is no cloud.
-        n_points: number of points in it.
+        n_points: number of points in the slab.
     """
 
     cut: Cut
@@ -141,7 +141,7 @@ class Section:
 
 
 def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
-    """Return a horizontal cut above the lowest large floor, or at this height if there is none."""
+    """Return a horizontal cut at a height above the lowest large floor, or above 0 without one."""
     e1, e2, up = basis_from_up(planes.up)
     area = _areas_m2(planes)
     level = planes.normal @ up > math.cos(math.radians(_LEAST_ANGLE_DEG))
@@ -159,10 +159,10 @@ def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
 
 
 def section_cut(planes: Planes, through: Sequence[float], language: Language = "en") -> Cut:
-    """Return a vertical cut through two points (x, y, x, y) of a plan, the first on the left.
+    """Return a vertical cut through two points (x, y, x, y) of a plan; the first is on the left.
 
     Raises:
-        ArgumentError: both points are the same.
+        ArgumentError: the two points are identical.
     """
     e1, e2, up = basis_from_up(planes.up)
     first, second = (x * e1 + y * e2 for x, y in np.reshape(through, (2, 2)))
@@ -226,7 +226,7 @@ def _areas_m2(planes: Planes) -> NDArray[np.float64]:
 def _slab(
     cut: Cut, cloud: PointCloud | None, labels: PointLabels | None
 ) -> tuple[float, NDArray[np.float64], NDArray[np.int64]]:
-    """Return the slab's thickness, X and Y of its points, and their planes (-1 if none)."""
+    """Return the slab's thickness, its points' X and Y, and the plane of each point, or -1."""
     if cloud is None or len(cloud) == 0:
         return 0.0, np.empty((0, 2)), np.empty(0, dtype=np.int64)
     slab_m = 0.02
@@ -234,7 +234,8 @@ def _slab(
     while True:
         found = list(_within(cut, cloud, labels, 0.5 * slab_m))
         n_points = sum(len(places) for places, _ in found)
-        # Thick enough for a point every few centimetres along walls, but not thicker than a slice.
+        # Enlarge the slab until there is a point every few centimetres along walls, up to a
+        # maximum.
         if n_points >= 2000 or slab_m >= 0.16:
             break
         slab_m *= 2.0
@@ -322,7 +323,8 @@ def _trace(cut: Cut, planes: Planes, index: int) -> _Trace | None:
     if size < math.sin(math.radians(_LEAST_ANGLE_DEG)):
         return None
     middle = cut.place_m(planes.corners[index].mean(axis=0)[None])[0]
-    # The nearest point to the middle of the plane that satisfies n . p = offset and is in the cut.
+    # The point in both the plane (n . p = offset) and the cut that is nearest to the plane's
+    # middle.
     away = float(normal @ cut.forward_world) * middle[2] / size**2
     point = middle[:2] + away * in_cut
     towards = in_cut / size
@@ -330,7 +332,7 @@ def _trace(cut: Cut, planes: Planes, index: int) -> _Trace | None:
 
 
 def _crossed(cut: Cut, rectangle_world: NDArray[np.float64], trace: _Trace) -> _Span | None:
-    """Return the part of a line in a rectangle (4, 3)."""
+    """Return the part of a line that is inside a rectangle (4, 3)."""
     places = cut.place_m(rectangle_world)
     crossings = []
     for begin, end in zip(places, np.roll(places, -1, axis=0), strict=True):
@@ -424,7 +426,7 @@ def _beyond(cut: Cut, planes: Planes, openings: Sequence[Opening]) -> NDArray[np
 def _unexplained(
     places: NDArray[np.float64], lines: Sequence[CutLine], slab_m: float
 ) -> NDArray[np.float64]:
-    """Return points away from all lines."""
+    """Return the points that are not near any line."""
     free = np.ones(len(places), dtype=bool)
     for line in lines:
         direction = (line.ends_m[1] - line.ends_m[0]) / max(line.length_m, 1e-9)
@@ -455,7 +457,7 @@ LAYERS: Final[Layers] = {
     "A-SECT-SCAN": ("scan points away from the lines", 9, 13),
     "A-ANNO-DIMS": ("dimensions", 7, 18),
 }
-# On paper, millimetres.
+# Text height on paper in millimetres.
 _TEXT_MM: Final = 2.5
 _SOLID_MM: Final = 3.0
 # Margin around the cut lines for hatching and dimensions.
@@ -471,8 +473,8 @@ class SectionDrawing:
 
     Attributes:
         kind: `plan` or `section`.
-        section: its content.
-        scale: n of 1 : n.
+        section: content of the plan or section.
+        scale: denominator n of the scale 1 : n.
         origin: one line about the origin of the data.
         has_dimensions: whether the lengths of cut lines are written next to them.
         language: language of labels.
@@ -486,7 +488,7 @@ class SectionDrawing:
     language: Language = "en"
 
     def mm(self, value: float) -> float:
-        """Return the length in the drawing, metres, of millimetres on paper."""
+        """Return the length in metres in the drawing of a length in millimetres on paper."""
         return 1e-3 * self.scale * value
 
     @property
@@ -517,7 +519,7 @@ def section_sheet(
     """Return the sheet of a plan or section, with the texts of its run.
 
     Args:
-        stem: name of its files without suffix.
+        stem: name of the sheet's files without suffix.
         drawing: the plan or section.
         planes: planes of the room, for the key plan.
         text: texts of the run.
@@ -643,7 +645,7 @@ def _document(drawing: SectionDrawing) -> Document:
 def _add_solid(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None:
     """Hatch behind a line up to the other side of the wall, or a strip if that is unknown.
 
-    A wall whose sides were both detected is hatched from the first of them.
+    If both sides of a wall were detected, it is hatched from the first one only.
     """
     is_known = math.isfinite(cut.thickness_m)
     if is_known and cut.behind @ [0.83, 0.56] < 0.0:
@@ -659,12 +661,12 @@ def _add_solid(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None
 
 def _add_dimension(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None:
     begin, end = cut.ends_m
-    # From left to right or upwards, so that text along it is not upside down.
+    # Orient the dimension rightwards or upwards, so that its text is not upside down.
     if (end[0] - begin[0], end[1] - begin[1]) < (-1e-9 * cut.length_m, 0.0):
         begin, end = end, begin
     direction = (end - begin) / cut.length_m
     left = np.array([-direction[1], direction[0]])
-    # Dimensions are outside, behind the cut lines.
+    # Place the dimension outside the room, behind the cut line.
     side = 1.0 if left @ cut.behind >= 0.0 else -1.0
     space.add_aligned_dim(
         p1=tuple(begin),

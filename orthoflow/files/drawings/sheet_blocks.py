@@ -1,6 +1,6 @@
 """The blocks beside the pictures of a sheet: scale bar, notes, legend, key plan, title block.
 
-reportlab's flowables measure and break text; this module creates the blocks, and packs them into a
+reportlab's flowables measure and wrap text; this module creates the blocks, and packs them into a
 column on the right of the sheet or a strip along its lower edge.
 """
 
@@ -60,7 +60,7 @@ _PLAIN: Final = [
 
 
 class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
-    """A drawing in millimetres from its bottom-left corner, as wide as the available space."""
+    """A flowable as wide as the available space, drawn in mm from its bottom-left corner."""
 
     def __init__(
         self, high_mm: float, draw: Callable[[Canvas, float], None], *, can_grow: bool = False
@@ -69,7 +69,7 @@ class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
         self.high_mm, self.draw_mm, self.can_grow = high_mm, draw, can_grow
 
     def wrap(self, wide: float, _high: float) -> tuple[float, float]:
-        """Return its size in points."""
+        """Return the size of the flowable in points."""
         self.width = wide
         return wide, self.high_mm * pens.POINTS_PER_MM
 
@@ -122,7 +122,7 @@ def furnished(
     for block_mm in [paper.block_mm] if paper.block_mm else sizes:
         if block_mm > most_mm:
             break
-        # The title block is at the bottom of a column, or at the right end of a strip.
+        # The title block goes at the bottom of a column, or at the right end of a strip.
         title_mm = block_mm - 2 * _PADDING_MM if is_column else min(_TITLE_MM, 0.5 * wide)
         title = _title_block(drawing, sheet, title_mm)
         title_high = _high_mm(title, title_mm)
@@ -159,7 +159,7 @@ def _packed(
 ) -> list[tuple[Any, tuple[float, float, float]]] | None:
     """Fill columns from the left, each from the top; None if they do not fit.
 
-    Key plans, which are last, use the remaining height of a column up to their maximum.
+    Key plans come last, and use the remaining height of a column, up to their maximum height.
     """
     placed: list[tuple[Any, tuple[float, float, float]]] = []
     column, used = 0, 0.0
@@ -203,7 +203,7 @@ def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
 
 
 def _scale_bar(drawing: Drawing) -> _Picture:
-    """Return a bar of black and white segments of a round length, with its length at both ends."""
+    """Return a scale bar: black and white segments of round length, with both ends labelled."""
     mm_per_unit = 1e3 * drawing.unit_m / drawing.scale
     length = round_below(_SEGMENT_MM / mm_per_unit)
     segment = length * mm_per_unit
@@ -272,7 +272,7 @@ def _plan(
         [Canvas, Callable[[NDArray[np.float64]], NDArray[np.float64]], float], None
     ],
 ) -> _Picture:
-    """Return a heading with a plan of lines (n, 2) in metres, as large as the space permits."""
+    """Return a heading and, below it, a plan that is drawn as large as the space permits."""
     title = pens.paragraph(heading)
 
     def draw(canvas: Canvas, wide_mm: float) -> None:
@@ -309,7 +309,8 @@ def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64]
         right = wide_mm - 4.0
         pens.arrow(canvas, np.array([[right, 2.0], [right, 10.0]]))
         pens.write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
-        # The marked wall comes first, because not all numbers fit where walls are close together.
+        # The marked wall is numbered first, because not all numbers fit where walls are close
+        # together.
         placed = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
         numbered: list[NDArray[np.float64]] = []
         for number in sorted(placed, key=lambda n: (n != plan.number, -_length(placed[n]))):
@@ -331,7 +332,7 @@ def _length(ends: NDArray[np.float64]) -> float:
 
 
 def _sheet_key(drawing: Drawing, sheet: Sheet) -> tuple[str, NDArray[np.float64], Any]:
-    """Return the division of a wall into sheets, with this sheet filled."""
+    """Return a diagram of how a wall is divided into sheets, with this sheet filled."""
     boxes = {number: np.array(part.corners_m) * [1.0, -1.0] for number, part in sheet.numbered}
 
     def draw(canvas: Canvas, place: Any, _wide_mm: float) -> None:
@@ -410,7 +411,7 @@ def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
 
 
 def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
-    """Yield the named fields, with those of the client in the middle."""
+    """Yield the title block's labelled fields, with the client's own fields in the middle."""
     language, block = drawing.language, drawing.text.block
     number = f"{label('sheet', language)} {sheet.number}"
     last = block.revisions[-1].mark if block.revisions else ""
@@ -442,7 +443,7 @@ def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any]
 def _rows(
     cells: Sequence[tuple[list[Any], bool]], n_columns: int, wide_mm: float
 ) -> Iterator[list[Any]]:
-    """Arrange cells in rows: wide cells take two columns, and the last cell fills its row."""
+    """Arrange cells in rows: wide cells take two columns, the last one the rest of its row."""
     rows: list[list[tuple[list[Any], int]]] = [[]]
     for content, is_wide in cells:
         span = 2 if is_wide else 1

@@ -49,13 +49,13 @@ LONG_MM: Final = {
 #: sheets of a picture of a wall
 MOST_SHEETS: Final = 200
 SCALES: Final = (1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000)
-# Denominators of imperial scales: 12", 6", 3", 1 1/2", 1", 3/4" ... 1/16" to the foot, and
-# engineers' 1" = 20 ft ...
+# Denominators of imperial scales: architects' 12", 6", 3", 1 1/2", 1", 3/4" ... 1/16" to the foot,
+# and engineers' 1" = 20 ft ...
 SCALES_FT: Final = (1, 2, 4, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 240, 480, 1200, 2400, 6000)
 FOOT_M: Final = 0.3048
 _EDGE_MM: Final = (150.0, 5000.0)
 MARGIN_MM: Final = 10.0
-# Margins around a picture for its frame, coordinates and heights.
+# Margins around a picture, for the frame, coordinates and heights.
 LEFT_MM: Final = 11.0
 BELOW_MM: Final = 11.0
 _AROUND_MM: Final = (LEFT_MM + 24.0, BELOW_MM + 11.0)
@@ -89,18 +89,18 @@ class Paper:
 
     @property
     def corner_mm(self) -> tuple[float, float]:
-        """Bottom-left corner of that area on the paper."""
+        """Bottom-left corner, on the paper, of the area for pictures."""
         return MARGIN_MM, MARGIN_MM + (self.block_mm if self.layout == "strip" else 0.0)
 
     @property
     def turned(self) -> Paper:
-        """Return the same paper in the other orientation."""
+        """Return the same paper with width and height exchanged."""
         return replace(self, width_mm=self.height_mm, height_mm=self.width_mm)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """A part of a drawn wall, metres from its top-left corner, to the right and down."""
+    """A part of a drawn wall, in metres right and down from the wall's top-left corner."""
 
     left_m: float
     top_m: float
@@ -114,13 +114,13 @@ class Part:
 
     @property
     def corners_m(self) -> list[tuple[float, float]]:
-        """Its corners, metres to the right and down, from the top-left one clockwise."""
+        """Corners of the part, metres to the right and down, clockwise from the top-left one."""
         xs, ys = (self.left_m, self.right_m), (self.top_m, self.bottom_m)
         return [(xs[0], ys[0]), (xs[1], ys[0]), (xs[1], ys[1]), (xs[0], ys[1])]
 
 
 def whole_of(size_m: tuple[float, float]) -> Part:
-    """Return all of a drawing of this width and height."""
+    """Return the part that covers a whole drawing of this width and height."""
     return Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
 
 
@@ -131,7 +131,7 @@ class View:
     Attributes:
         kind: name of the picture in the drawing.
         part: the part of the wall.
-        corner_mm: its bottom-left corner on the paper.
+        corner_mm: bottom-left corner of the picture on the paper.
     """
 
     kind: str
@@ -165,20 +165,20 @@ def usual_papers() -> list[Paper]:
 
 
 def placed(kinds: Sequence[str], part: Part, paper: Paper, scale: int) -> tuple[View, ...]:
-    """Place pictures of a part of a wall beside or below each other; none if they are too large.
+    """Place pictures of a part of a wall beside or below each other; empty if they do not fit.
 
     Args:
         kinds: the pictures.
         part: the part.
         paper: paper of the sheet.
-        scale: n of 1 : n.
+        scale: denominator n of the scale 1 : n.
     """
     wide, high = (
         1e3 * edge / scale + around for edge, around in zip(part.size_m, _AROUND_MM, strict=True)
     )
     across, up = paper.area_mm
     for columns, rows in ((len(kinds), 1), (1, len(kinds))):
-        # With a tolerance, because 12.0 m at 1:50 are 240.00000000000003 mm.
+        # The tolerance is needed because 12.0 m at 1:50 gives 240.00000000000003 mm.
         if columns * wide > across + 1e-3 or rows * high > up + 1e-3:
             continue
         left = paper.corner_mm[0] + 0.5 * (across - columns * wide) + LEFT_MM
@@ -199,12 +199,12 @@ def cut_up(
     Args:
         size_m: width and height of the drawn wall.
         paper: paper of the sheets.
-        scale: n of 1 : n.
+        scale: denominator n of the scale 1 : n.
         grid_m: step of the grid at which the wall is cut, if the sheets have room; 0 for any
             position.
 
     Raises:
-        ArgumentError: the wall needs more than `MOST_SHEETS`.
+        ArgumentError: the wall needs more than `MOST_SHEETS` sheets.
     """
     limits = [
         1e-3 * scale * max(1.0, limit - around)
@@ -231,7 +231,7 @@ def cut_up(
 
 
 def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list[float]:
-    """Return the cuts of an edge: into equal parts, or at multiples of the grid if these fit."""
+    """Return the cuts that divide an edge equally, or at multiples of the grid if these fit."""
     step_m = size_m / count
     if grid_m > 0.0 and math.ceil(step_m / grid_m - 1e-9) * grid_m <= limit_m + 1e-9:
         step_m = math.ceil(step_m / grid_m - 1e-9) * grid_m
@@ -239,7 +239,7 @@ def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list
 
 
 def round_below(most: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is at most as large.
+    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a value.
 
     >>> round_below(0.3), round_below(2.0), round_below(60.0)
     (0.2, 2.0, 50.0)
@@ -249,7 +249,7 @@ def round_below(most: float) -> float:
 
 
 def nice_step(least: float) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten that is at least as large.
+    """Return the smallest 1, 2 or 5 times a power of ten that is not less than a value.
 
     >>> nice_step(0.3), nice_step(2.0), nice_step(60.0)
     (0.5, 2.0, 100.0)
@@ -260,7 +260,7 @@ def nice_step(least: float) -> float:
 
 #: bytes of the title block of sheets
 MOST_BYTES: Final = 100_000
-#: characters of one of its fields
+#: characters of one field of the title block
 MOST_LETTERS: Final = 300
 _MOST_LOGO_BYTES: Final = 4_000_000
 
@@ -294,7 +294,7 @@ class TitleBlock(_Model):
     """The content of the title block; empty fields are omitted.
 
     Attributes:
-        layout: position of the block; None for the one that wastes less paper.
+        layout: position of the block; None for the position that wastes less paper.
         logo: PNG or JPEG file next to the YAML file.
         project: name of the project.
         title: title of the drawing, instead of the name of the wall.
@@ -360,7 +360,7 @@ class Placed:
     Attributes:
         canvas: the page.
         view: part and position of the picture.
-        scale: n of 1 : n.
+        scale: denominator n of the scale 1 : n.
     """
 
     canvas: Canvas
@@ -388,7 +388,7 @@ class Placed:
     def on_paper(
         self, places_m: Sequence[tuple[float, float]] | NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return positions on the paper (n, 2), mm, of metres right and down from its corner."""
+        """Return paper positions (n, 2), mm, of points in metres right and down on the wall."""
         part = self.view.part
         # The list may be empty, e.g. for a hatch that is too small for a line of its pattern.
         places = np.asarray(places_m, dtype=np.float64).reshape(-1, 2)
@@ -401,8 +401,8 @@ class Picture:
     """A picture of a drawing.
 
     Attributes:
-        draw: draws a part of it.
-        legend: rows of its legend.
+        draw: function that draws a part of the picture.
+        legend: rows of the legend.
     """
 
     draw: Callable[[Placed], None]
@@ -416,7 +416,7 @@ class Axes:
     Attributes:
         across: coordinate at the left edge of the drawing, and its change per metre to the right;
             None if it has no meaning, as for several walls.
-        down: coordinate at its top edge, and its change per metre downwards.
+        down: coordinate at the top edge of the drawing, and its change per metre downwards.
         phrase: meaning of the coordinates, for the notes.
     """
 
@@ -433,8 +433,8 @@ class SheetText:
         name: name of the wall or cut.
         block: the office's title block.
         notes: notes on accuracy, colours and cells.
-        digest: seal of the record.
-        run: run, workflow and program.
+        digest: checksum that seals the record.
+        run: names of run, workflow and program.
     """
 
     name: str
@@ -451,16 +451,16 @@ class Drawing:
     Attributes:
         stem: name of its files without suffix.
         size_m: width and height.
-        pictures: name of the content -> picture; all have this size.
-        axes: coordinates.
-        text: texts.
-        scale: n of 1 : n.
+        pictures: pictures by the name of their content; all have the size `size_m`.
+        axes: coordinates beside the pictures.
+        text: texts on every sheet.
+        scale: denominator n of the scale 1 : n.
         plan: key plan, or None.
         grid: spacing of the grid crosses in `unit`; 0 for no crosses.
         unit: unit of all numbers beside pictures.
         language: language of labels.
-        heights: positions with a height mark, metres down from the top edge.
-        north: (2,) direction `up_label` on the paper, right and up; None if there are heights.
+        heights: positions of height marks, in metres down from the top edge.
+        north: (2,) direction of `up_label` on the paper (right, up); None if there are heights.
         up_label: label of the upwards direction of the key plan.
     """
 
@@ -480,7 +480,7 @@ class Drawing:
 
     @property
     def unit_m(self) -> float:
-        """Length of its unit in metres."""
+        """Length of `unit` in metres."""
         return FOOT_M if self.unit == "ft" else 1.0
 
 
@@ -489,11 +489,11 @@ class Sheet:
     """A sheet of a drawing.
 
     Attributes:
-        paper: its paper.
-        views: pictures on it.
+        paper: paper of the sheet.
+        views: pictures on the sheet.
         number: 1 for the first.
         count: number of sheets.
-        numbered: numbers and parts of all sheets, if there are several.
+        numbered: number and part of each sheet of the drawing, if there are several.
     """
 
     paper: Paper
@@ -504,7 +504,7 @@ class Sheet:
 
 
 def axes_of(frame: WallFrame) -> Axes:
-    """Return the coordinates of a raster in its GeoTIFF; Y goes up the paper, also for ceilings."""
+    """Return the GeoTIFF coordinates of a raster; Y points up the paper, also for ceilings."""
     left_m, top_m = frame.raster_corner_m
     if frame.raster_down > 0.0:
         top_m += frame.height * frame.gsd_m
@@ -514,7 +514,7 @@ def axes_of(frame: WallFrame) -> Axes:
 
 
 def up_words(up: NDArray[np.float64]) -> str:
-    """Return the axis of the scan along which heights are measured, with its sign, or a vector."""
+    """Return the signed axis of the scan along which heights are measured, or a vector."""
     if up.shape != (3,):
         return "?"
     if float(np.abs(up).max()) < 1.0 - 1e-9:
@@ -523,7 +523,7 @@ def up_words(up: NDArray[np.float64]) -> str:
 
 
 def north_of(frame: WallFrame) -> tuple[float, float] | None:
-    """Return the upwards direction of the key plan, right and up; None for upright walls."""
+    """Return the paper direction (right, up) of the key plan's top; None for upright walls."""
     if frame.up is None or frame.raster_axes == "wall":
         return None
     north_world = basis_from_up(np.array(frame.up))[1]

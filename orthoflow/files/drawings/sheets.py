@@ -1,4 +1,4 @@
-"""Sheets: drawings to scale on paper, as PDF, divided if they do not fit on one sheet.
+"""Sheets: PDF drawings to scale, divided among several sheets if they do not fit on one.
 
 Pictures are embedded once; everything else is vectors and text. Lengths on the paper are
 millimetres from its bottom-left corner until they are passed to reportlab, in points.
@@ -93,7 +93,7 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
     columns: dict[float, float] = {}
     bottom_m = part.bottom_m
     if drawing.axes.across is None:
-        # The space below the lowest height is for names.
+        # The space below the lowest height mark is for names.
         bottom_m = min(bottom_m, max(drawing.heights, default=bottom_m) + 1e-6)
     else:
         limits = (part.left_m, part.right_m)
@@ -116,7 +116,7 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
     for text, x in _with_room(columns, drawing, (left - 4.0, right + 4.0)):
         at = (x, bottom - _TICK_MM - 1.0 - pens.TEXT_MM)
         pens.write_text(canvas, text, at, is_centred=True)
-    # Beside the picture, without overlapping the coordinates below it.
+    # Write these beside the picture, without overlapping the coordinates below it.
     for text, y in _with_room(rows, drawing, (bottom, top)):
         pens.write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
     for x in columns.values():
@@ -127,14 +127,14 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
 def _with_room(
     places: dict[float, float], drawing: Drawing, limits_mm: tuple[float, float]
 ) -> Iterator[tuple[str, float]]:
-    """Yield coordinates of every 1st, 2nd, 5th ... mark, as densely as the labels permit.
+    """Yield the coordinate of every 1st, 2nd, 5th ... mark, as densely as the labels permit.
 
     Args:
-        places: coordinate -> its position along the edge.
+        places: positions along the edge by coordinate.
         drawing: the drawing.
         limits_mm: limits of the text; a coordinate at an end is moved inside them.
     """
-    # A quarter of a metre needs two digits.
+    # A grid of a quarter of a metre, for example, needs two decimals.
     digits = len(f"{drawing.grid:.4f}".rstrip("0").partition(".")[2])
     values = sorted(places)
     step = values[1] - values[0] if len(values) > 1 else 1.0
@@ -178,7 +178,7 @@ def _draw_heights(placed: Placed, drawing: Drawing) -> None:
     )
     room = max(1, int((top - bottom) / _MARK_ROW_MM))
     if len(levels) > room + 1:
-        # If there are too many, keep the lowest, the highest and every nth in between.
+        # If there are too many marks, keep the lowest, the highest and every nth in between.
         every = math.ceil((len(levels) - 2) / max(1, room - 1))
         levels = [levels[0], *levels[1:-1][::every], levels[-1]]
     places: list[float] = []
@@ -199,14 +199,14 @@ def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
     for number, part in sheet.numbered:
         other = np.array(part.corners_m)[[0, 2]]
         edge = np.array([np.maximum(own[0], other[0]), np.minimum(own[1], other[1])])
-        # Adjacent parts share an edge, which has a length but no width.
+        # The intersection of adjacent parts is an edge, which has a length but no width.
         along = int(np.argmax(edge[1] - edge[0]))
         if edge[1, along] <= edge[0, along] or edge[1, 1 - along] != edge[0, 1 - along]:
             continue
         (left, bottom), (right, top) = np.sort(placed.on_paper(edge), axis=0).tolist()
         middle = (0.5 * (left + right), 0.5 * (bottom + top))
         is_before = bool(other[0, 1 - along] < own[0, 1 - along])
-        # To the left and below, the number is outside the coordinates.
+        # On the left and lower edges, the number is placed outside the coordinates.
         if along == 1:
             ends, turned_deg = [(left, bottom - 5.0), (left, top + 5.0)], 90.0
             at = (left + (-6.8 if is_before else 6.0), middle[1])
@@ -227,11 +227,11 @@ LaidOut: TypeAlias = tuple[Sheet, Furniture]
 def fitting_scale(
     drawn: Callable[[int], Sequence[Drawing]], scales: Sequence[int], papers: Sequence[Paper]
 ) -> int:
-    """Return n of the largest scale 1 : n at which each wall fits on one sheet.
+    """Return the denominator n of the largest scale 1 : n at which each wall fits on one sheet.
 
     Args:
-        drawn: returns the drawings at a scale.
-        scales: largest first.
+        drawn: function that returns the drawings at a scale.
+        scales: denominators of the permitted scales, largest scale first.
         papers: available papers.
     """
     for scale in scales:
@@ -245,7 +245,7 @@ def lay_out(drawing: Drawing, given: Sequence[Paper] = ()) -> tuple[LaidOut, ...
 
     Args:
         drawing: the drawing.
-        given: permitted papers; if empty, the smallest usual one that fits the wall.
+        given: permitted papers; if empty, the smallest usual paper on which the wall fits is used.
 
     Raises:
         ArgumentError: the title block does not fit on the paper, or the wall needs too many sheets.
@@ -276,7 +276,7 @@ def _ways(drawing: Drawing, papers: Sequence[Paper]) -> Iterator[Paper]:
 
 
 def _on_one(drawing: Drawing, papers: Sequence[Paper], *, is_brief: bool = False) -> LaidOut | None:
-    """Return all pictures of a wall on one sheet, of the first paper on which they fit."""
+    """Return one sheet with all pictures of a wall, on the first paper on which they fit."""
     content = (tuple(drawing.pictures), whole_of(drawing.size_m))
     for paper in _ways(drawing, papers):
         if views := placed(*content, paper, drawing.scale):
@@ -290,7 +290,7 @@ def _on_one(drawing: Drawing, papers: Sequence[Paper], *, is_brief: bool = False
 def _cut(drawing: Drawing, paper: Paper, *, is_brief: bool) -> tuple[LaidOut, ...]:
     """Return the sheets of a divided wall; none if the paper is too small."""
     kinds, whole = tuple(drawing.pictures), whole_of(drawing.size_m)
-    # The blocks of this sheet are the largest: it has a key of several sheets.
+    # The blocks of this sheet need the most space, because it has a key to several sheets.
     view = View(kind=max(kinds, key=len), part=whole, corner_mm=(0.0, 0.0))
     longest = Sheet(paper=paper, views=(view,), count=99, numbered=((1, whole), (2, whole)))
     first = furnished(paper, drawing, longest, is_brief=is_brief)

@@ -1,8 +1,8 @@
 """E57 files, read with libE57: several scans with poses, in Cartesian or spherical coordinates.
 
 The XML section is checked before libE57 parses it. libE57 compares each child of a structure with
-all previous ones, so 60,000 children take over 50 s; and whether it reads the files that XML
-entities refer to depends on its version. The standard (ASTM E2807) needs neither.
+all previous ones, so 60,000 children take over 50 s; and some versions read files that XML entities
+refer to. The standard (ASTM E2807) requires neither.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ MOST_XML_BYTES: Final = 1 << 25
 MOST_XML_ELEMENTS: Final = 200_000
 #: nesting levels of the XML of an E57 file
 DEEPEST_XML: Final = 64
-# The fields of a structure have different names, so their number is limited, too.
+# The fields of a structure have different names, so this also limits their number.
 #: different element names in the XML of an E57 file
 MOST_XML_NAMES: Final = 500
 # E57 3.3: the file has pages of 1024 bytes, of which the last four are a checksum.
@@ -67,7 +67,7 @@ _PAYLOAD: Final = 1020
 _HEADER: Final = struct.Struct("<8sIIQQQQ")
 _TAG: Final = re.compile(rb"<(/?)([A-Za-z_][\w:.-]*)[^<>]*?(/?)>")
 
-# Index in the file, number of points, field name by meaning, and pose.
+# Index in the file, number of points, field names by meaning, and pose.
 _Part = tuple[int, int, dict[str, str], tuple[NDArray[np.float64], NDArray[np.float64]] | None]
 
 
@@ -96,7 +96,7 @@ def open_e57(path: Path, *, intensity_field: str | None = None) -> ScanFile:
 
 
 def _unit(root: Any) -> StatedUnit:
-    """Return metres, as in the standard, unless the coordinate metadata declare another unit."""
+    """Return the unit: metres by the standard, unless the coordinate metadata declare another."""
     text = str(root["coordinateMetadata"].value()) if root.isDefined("coordinateMetadata") else ""
     found = unit_of_crs(text, "coordinate metadata")
     found = found or unit_of_comments([text], "coordinate metadata")
@@ -153,7 +153,7 @@ def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     rotation, translation = np.eye(3), np.zeros(3)
     pose = node["pose"] if node.isDefined("pose") else None
     if pose is not None and pose.isDefined("rotation"):
-        # By name, since the file may store the four numbers in any order.
+        # Read the four numbers by name, since the file may store them in any order.
         quaternion = [number_of(pose["rotation"][name]) for name in "wxyz"]
         length = math.hypot(*quaternion)
         if math.isfinite(length) and length > 0.0:
@@ -192,9 +192,9 @@ def _blocks(path: Path, pye57: Any, parts: list[_Part]) -> Iterator[PointBlock]:
                 arrays: Values = {}
                 buffers = libe57.VectorSourceDestBuffer()
                 for meaning, name in used.items():
-                    # No integer buffers: pye57 treats numpy's 64-bit integers as 32-bit ones and
-                    # returns garbage, and the 16 bits of its own readers are too few for rows and
-                    # columns.
+                    # Integer buffers are not used, because pye57 treats numpy's 64-bit integers as
+                    # 32-bit ones and returns garbage, and the 16 bits in its own readers are too
+                    # few for rows and columns.
                     kind = np.float64 if meaning in ("x", "y", "z", "row", "column") else np.float32
                     arrays[meaning] = np.zeros(capacity, dtype=kind)
                     buffers.append(
@@ -233,7 +233,7 @@ def _block(
 ) -> PointBlock:
     axes = np.stack([values[axis] for axis in "xyz"])
     if is_spherical:
-        # E57 8.4.4: azimuth from x towards y, elevation from the xy plane towards z, in radians.
+        # E57 8.4.4: azimuth from x towards y and elevation from the xy plane towards z, in radians.
         distance, azimuth, elevation = axes
         level = distance * np.cos(elevation)
         axes = np.stack(
@@ -253,8 +253,8 @@ def check_xml(path: Path) -> None:
     """Check the XML of an E57 file before libE57 parses it.
 
     Raises:
-        InputError: the XML is too large or too deep, declares a document type or entities, or has
-            more element names than any scanner software writes.
+        InputError: the XML is too large or nested too deeply, declares a document type or entities,
+            or has more element names than any scanner software writes.
     """
     xml = _xml_of(path)
     if b"<!DOCTYPE" in xml or b"<!ENTITY" in xml:

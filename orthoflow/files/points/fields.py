@@ -1,4 +1,4 @@
-"""Meaning of the fields of a point: one table of field names for all formats."""
+"""Meaning of a point's fields: one table of field names for all formats."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _MEANINGS: Final = {
     for alias in text.split()
 }
 _PLACES: Final = {alias: place for place, alias in enumerate(_MEANINGS)}
-# Fields that can replace a missing intensity, best first.
+# Fields that can replace a missing intensity, most suitable first.
 _STAND_INS: Final = (
     *("reflectance", "reflectivity", "scalarreflectance", "amplitude", "scalaramplitude"),
     *("remission", "scalarremission", "intensity16", "returnintensity", "signalstrength"),
@@ -66,8 +66,8 @@ class Columns:
 
     Attributes:
         names: meaning of each column, `_` for an unused one.
-        labels: column names in the file; empty if it has none.
-        unit: unit of the coordinates, if the column names include it (`X [ft]`).
+        labels: column names in the file; empty if the file does not name its columns.
+        unit: unit of the coordinates, if the column names include a unit (`X [ft]`).
     """
 
     names: tuple[str, ...]
@@ -76,7 +76,7 @@ class Columns:
 
     @property
     def places(self) -> dict[str, int]:
-        """Indices of the columns that are read, by meaning, coordinates first."""
+        """Indices of the columns to read, by meaning, coordinates first."""
         found = {name: self.names.index(name) for name in _READ if name in self.names}
         has_rgb, has_grid = set(_COLOURS) <= set(found), {"row", "column"} <= set(found)
         idle = {"rgb"} if has_rgb else set(_COLOURS)
@@ -126,7 +126,7 @@ def _certainty(label: str) -> int:
 
 
 def may_be_intensity(name: str) -> bool:
-    """Whether a field name suggests a measure of the returned light."""
+    """Return whether a field name suggests a measure of the strength of the returned signal."""
     return _INTENSITY_PARTS.search(plain_name(name)) is not None
 
 
@@ -200,13 +200,13 @@ def columns_of_user(text: str | Sequence[str]) -> Columns:
 def columns_of_values(
     file_name: str, samples: NDArray[np.float64], first_line: str, *, is_pts: bool
 ) -> Columns:
-    """Infer the meaning of columns without a header from their values, if it is unambiguous.
+    """Infer the meaning of columns without a header from their values, if unambiguous.
 
     Args:
         file_name: name of the file, for messages.
-        samples: (n, columns) numbers of the first lines.
+        samples: (n, columns) numbers in the first lines.
         first_line: the first line, for messages.
-        is_pts: the file is a PTS file, in which the intensity precedes the colours.
+        is_pts: whether the file is a PTS file, in which the intensity precedes the colours.
 
     Raises:
         InputError: the meaning is ambiguous.
@@ -239,7 +239,7 @@ def columns_of_values(
 
 
 def _fits(name: str, values: NDArray[np.float64]) -> bool:
-    """Whether three columns can be colours (name `r`) or normals (name `nx`)."""
+    """Return whether three columns can be colours (name `r`) or normals (name `nx`)."""
     finite = values[np.isfinite(values).all(axis=1)]
     if not len(finite):
         return False
@@ -252,7 +252,7 @@ def _fits(name: str, values: NDArray[np.float64]) -> bool:
     if finite.min() < 0.0 or largest.max() > 65535.0:
         return False
     if (largest > 255.0).any() and not (largest > 255.0).all():
-        # The ranges of the columns differ, so one of them is an intensity.
+        # The ranges of the columns differ too much for colours: one of them is an intensity.
         return False
     if largest.max() <= 1.0:
         return not are_normals

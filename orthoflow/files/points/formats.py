@@ -13,16 +13,16 @@ from orthoflow.files.points.fields import Columns
 from orthoflow.files.points.scan_file import PointQuery, ScanFile
 
 # The densest encodings need a byte for eight points; a file that declares more points for its size
-# is refused before memory is allocated for them.
+# is refused before memory is allocated for the points.
 #: points declared by a file, per byte of its size
 MOST_POINTS_PER_BYTE: Final = 8
 
 
 class Format(NamedTuple):
-    """One family of point files.
+    """A family of point files.
 
     Attributes:
-        name: common name of the format.
+        name: usual name of the format.
         suffixes: file suffixes in lower case, with the dot.
         reader: module and function that open the files.
         signature: pattern of the first bytes of a file; None for plain text.
@@ -37,7 +37,7 @@ class Format(NamedTuple):
 
 
 _PLY_START: Final = re.compile(rb"ply[\n\r ]", re.IGNORECASE)
-# Some programs write their own first line, or no comment line at all.
+# Some programs write another first line than the standard's, or no comment line at all.
 _PCD_START: Final = re.compile(
     rb"# \.PCD|(?:.*\n)*?[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]", re.IGNORECASE
 )
@@ -55,7 +55,7 @@ _SNIFFED_BYTES: Final = 4096
 
 
 def find_format(path: Path) -> Format:
-    """Return the format of a point file, from its content if that is conclusive, else its suffix.
+    """Return a point file's format, from its content if conclusive, else from its suffix.
 
     Raises:
         InputError: the file is missing or empty, does not match its suffix, or has an unknown
@@ -102,7 +102,7 @@ def open_scan(
     Args:
         path: the file.
         columns: meaning of the columns of a text file, if given by the user.
-        classes: classes of points to read from a LAS or LAZ file; all if empty.
+        classes: classes of points to read from a LAS or LAZ file; empty for all classes.
         query: requested points; a COPC file is read only where it has such points, other files
             are read completely.
         intensity_field: name of the field to use as intensity; None for the usual one.

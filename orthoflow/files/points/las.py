@@ -1,13 +1,13 @@
 """LAS, LAZ and COPC files, read with laspy block by block.
 
-Header and chunk table are checked before the libraries use them: a damaged point count keeps laspy
-busy for hours, and a damaged chunk table can make the decompressor allocate so much memory that the
-process ends without an exception.
+Header and chunk table are checked before the libraries use them: a damaged point count can make
+laspy run for hours, and a damaged chunk table can make the decompressor allocate so much memory
+that the process ends without an exception.
 
-Point formats 6 and up compress each field separately, so only the fields of a cloud are decoded. A
-COPC file is a LAZ file whose chunks are the nodes of an octree (copc.io, 1.0): the root contains a
-sparse sample of the whole cloud, and each child node adds points in between at twice the density.
-Only nodes with requested points are decoded.
+Point formats 6 and up compress each field separately, so only the fields that a cloud needs are
+decoded. A COPC file is a LAZ file whose chunks are the nodes of an octree (copc.io, 1.0): the root
+contains a sparse sample of the whole cloud, and each child node adds points in between at twice the
+density. Only nodes with requested points are decoded.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ _VLR_BYTES: Final = 54
 _EVLR_BYTES: Final = 60
 _OFFSET_BYTES: Final = 8
 _CHUNKED: Final = (2, 3)
-# Contents of the LASzip record: the compressor, the position of its list of items, and the number
-# of layers of each item type (point, colours, colours with infrared, wave packets).
+# In the LASzip record: the number of the layered compressor, the position of the item list, and the
+# number of layers by item type (point, colours, colours with infrared, wave packets).
 _LAYERED: Final = 3
 _ITEMS_AT: Final = 32
 _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
@@ -71,7 +71,7 @@ _COPC_RECORD: Final = struct.Struct("<H16sHH32s")
 _COPC_INFO: Final = struct.Struct("<5d2Q")
 _COPC_ENTRY: Final = struct.Struct("<4iQii")
 _PAGE: Final = -1
-# Deeper nodes would be smaller than the point spacing of any scanner.
+# Nodes at deeper levels would be smaller than the point spacing of any scanner.
 _LEVELS_MOST: Final = 32
 
 
@@ -94,14 +94,15 @@ def open_las(
 
     Args:
         path: the file.
-        classes: classes of points to read; all if empty.
-        query: requested points; only nodes of a COPC file with such points are read.
+        classes: classes of points to read; empty for all classes.
+        query: requested points; of a COPC file, only nodes with such points are read.
         intensity_field: name of the field to use as intensity; None for the usual one.
     """
     laspy = load_library("laspy", path)
     _check_header(path)
     notes: list[str] = []
-    # Records after the points may declare any size; only the coordinate system is read from them.
+    # Records after the points may declare any size; only the coordinate system is read from these
+    # records.
     with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
         header = reader.header
         n_points = _count_points(path, header, notes)
@@ -145,7 +146,7 @@ def open_las(
 
 
 def _count_points(path: Path, header: Any, notes: list[str]) -> int:
-    """Return the number of points; for uncompressed files, the actual one if it is larger."""
+    """Return the declared number of points, or an uncompressed file's actual one if larger."""
     stated = int(header.point_count)
     if header.are_points_compressed:
         return stated
@@ -261,7 +262,7 @@ def _count_outside(path: Path, header: Any, block: PointBlock) -> int:
     """Count points outside the bounding box in the header.
 
     Compressed points have no checksum, so the bounding box is the only way to detect a changed
-    byte: if some points are far outside, the file is damaged. If the box is somewhere else, it is
+    byte: if some points are far outside, the file is damaged. If the box is in another place, it is
     out of date (points were moved or appended); this is only reported.
 
     Raises:
@@ -320,7 +321,7 @@ def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
 
     Args:
         path: the file.
-        header: its header, as read by laspy.
+        header: header of the file, as read by laspy.
 
     Returns:
         The chunks; empty if the file is not compressed in chunks.
@@ -342,7 +343,7 @@ def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
     with path.open("rb") as file:
         at = _offset_at(path, file, start)
         if at <= 0:
-            # Programs that could not seek back wrote the offset at the end of the file.
+            # Programs that cannot seek write the offset of the chunk table at the end of the file.
             at = _offset_at(path, file, n_file - _OFFSET_BYTES)
         if not start + _OFFSET_BYTES <= at <= n_file - _OFFSET_BYTES:
             raise _damaged(path, "its chunk table is outside the file, which is truncated")
@@ -385,7 +386,7 @@ def _check_chunks(
 
 
 def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> None:
-    """Compare the sizes of a chunk's layers with its own: the decompressor allocates them first.
+    """Check a chunk's layer sizes against its own, since the decompressor allocates all layers.
 
     A chunk of point formats 6 and up consists of its first point, its number of points, the size
     of each layer, and the layers.
@@ -419,10 +420,10 @@ def _records(
     intensity: str,
     nodes: Sequence[_Chunk] | None,
 ) -> Iterator[Any]:
-    """Yield laspy's records of up to `BLOCK_POINTS` points each, in file order.
+    """Yield laspy records with up to `BLOCK_POINTS` points each, in file order.
 
     Raises:
-        BaseException: any error of the library about a damaged file.
+        BaseException: any error that the library raises for a damaged file.
     """
 
     def record(points: NDArray[Any]) -> Any:
@@ -432,7 +433,7 @@ def _records(
 
     row = header.point_format.dtype()
     if not header.are_points_compressed:
-        # Mapped to memory, so that all points are read even if the header declares too few.
+        # Map the file to memory, so that all points are read even if the header declares too few.
         start = int(header.offset_to_point_data)
         n_present = min(n_points, (path.stat().st_size - start) // row.itemsize)
         mapped = np.memmap(path, dtype=row, mode="r", offset=start, shape=(n_present,))
@@ -472,8 +473,8 @@ def _records(
 def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> list[_Chunk] | None:
     """Return the nodes of a COPC file that contain requested points, in file order.
 
-    The deepest level read is the first whose point spacing is not larger than requested. If no
-    node intersects the box, the root is returned, which shows where the cloud is.
+    The deepest level read is the first at which the point spacing is not larger than requested. If
+    no node intersects the box, the root is returned, which shows where the cloud is.
 
     Returns:
         The nodes, or None for a file without an octree.
@@ -499,7 +500,8 @@ def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> li
         raise _bad_octree(path, "it references chunks that the file does not contain")
     last = _LEVELS_MOST
     if query.spacing is not None:
-        # Separate logarithms: a damaged file's spacing may be so large that the quotient overflows.
+        # The logarithms are separate because a damaged file's spacing may be so large that the
+        # quotient overflows.
         levels = math.log2(spacing) - math.log2(query.spacing)
         last = max(0, math.ceil(levels - 1e-9))
     # Coordinates are rounded to the resolution of the file.

@@ -1,4 +1,4 @@
-"""PTX files (Leica): several scans on grids, each with the scanner's pose; 0 0 0 is no return.
+"""PTX files (Leica): several scans on grids, each with the scanner's pose; 0 0 0 means no return.
 
 Some files have scans with fewer lines than rows times columns, or blank lines between scans.
 Therefore, scans are found by two consecutive lines with one number each, which only headers have.
@@ -48,7 +48,7 @@ _HEADER: Final = re.compile(rb"^[ \t]*\d{1,9}[ \t]*\r?\n[ \t]*\d{1,9}[ \t]*\r?\n
 _BLANK: Final = re.compile(rb"^[ \t]*\r?\n", re.MULTILINE)
 _SAMPLE_LINES: Final = 200
 _SEARCH_BYTES: Final = 1 << 24
-# Two numbers and their line ends.
+# Maximum length of two numbers with their line ends.
 _MOST_HEADER_BYTES: Final = 100
 _MOST_SCANS: Final = 1 << 16
 
@@ -59,12 +59,12 @@ class _Part:
 
     Attributes:
         start: offset of the first line of points in bytes.
-        end: offset behind the last line of points in bytes.
+        end: offset of the end of the last line of points in bytes.
         n_points: number of lines with points.
         n_rows: number of rows of the grid; points are stored column by column.
         n_places: rows times columns.
-        pose: rotation and translation, world from scan.
-        layout: how the numbers of a line are separated.
+        pose: rotation and translation from scan to world.
+        layout: widths and separators of the numbers in a line.
     """
 
     start: int
@@ -77,12 +77,12 @@ class _Part:
 
     @property
     def is_whole(self) -> bool:
-        """Whether there is a line for each position of the grid."""
+        """Return whether there is a line for each position of the grid."""
         return self.n_points == self.n_places
 
     @property
     def columns(self) -> Columns:
-        """Meaning of the columns, from their number."""
+        """Meaning of the columns, derived from the number of columns."""
         return Columns(names=tuple(_COLUMNS[self.layout.n_columns].split()))
 
     def scan(self) -> Scan:
@@ -90,7 +90,7 @@ class _Part:
         scan = self.columns.scan(station=self.pose[1])
         if self.is_whole:
             scan.fields |= {"grid"}
-        # The standard ranges of the format; data outside them are scaled by their own range.
+        # These are the standard ranges of the format; data outside are scaled by their own range.
         scan.intensity_limits = (0.0, 1.0) if "intensity" in scan.fields else None
         scan.rgb_limit = 255.0 if "rgb" in scan.fields else None
         return scan
@@ -136,7 +136,7 @@ def _blocks(path: Path, parts: list[_Part]) -> Iterator[PointBlock]:
 
 
 def _find_headers(path: Path) -> list[tuple[int, int]]:
-    """Return the offset of each header and of the end, and the filled lines before it."""
+    """Return the offset of each header and of the end, and the filled lines before each offset."""
     found: list[tuple[int, int]] = []
     offset, n_filled, kept = 0, 0, b""
     with path.open("rb") as file:
@@ -145,8 +145,8 @@ def _find_headers(path: Path) -> list[tuple[int, int]]:
             block = file.read(_SEARCH_BYTES)
             is_last = len(block) < _SEARCH_BYTES
             text = kept + block
-            # Only whole lines; a header may begin at the end of the text, so keep that for the next
-            # block.
+            # Search only whole lines. A header may begin at the end of the text, so keep the end
+            # for the next block.
             cut = len(text)
             if not is_last:
                 cut = text.rfind(b"\n", 0, len(text) - _MOST_HEADER_BYTES) + 1
@@ -198,7 +198,7 @@ def _read_header(
             continue
         first = first or text
         found = find_layout(text)
-        # Lines of points without a return may be shorter than others.
+        # Lines of points without a return may be shorter than other lines.
         if found and found.n_columns in _COLUMNS:
             layout = max(layout or found, found, key=lambda item: item.n_columns)
         elif found is None and re.fullmatch(r"\d+", text):

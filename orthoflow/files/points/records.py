@@ -1,9 +1,9 @@
 """PLY and PCD files: a header that names the fields, then binary records or lines of text.
 
 Records of constant size are read a block at a time. If the vertices of a PLY file contain lists, or
-a binary file has lists before its vertices, plyfile reads the whole file at once: such records
-differ in size, but such files are small. Compressed PCD files are stored field by field, not point
-by point.
+a binary file has lists before its vertices, plyfile reads the whole file at once: such records vary
+in size, but the files are small. Compressed PCD files are stored field by field, not point by
+point.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from orthoflow.files.points.text import Layout, read_tables, take_lines, values_
 from orthoflow.files.points.units import unit_of_comments
 
 _HEADER_BYTES: Final = 1 << 20
-# Counts known and unknown fields.
+# The limit includes unknown fields.
 #: fields of a point in PLY and PCD files
 MOST_FIELDS: Final = 1000
 _PLY_TYPES: Final = {
@@ -97,7 +97,7 @@ def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     columns = replace(columns, labels=tuple(names))
     before, what = elements[:position], "vertex element"
     if _LIST in kinds or (order and any(_LIST in types for *_, types in before)):
-        # A value has at least one byte, and plyfile allocates the declared number of values.
+        # Each value needs at least one byte, and plyfile allocates the declared number of values.
         n_stated = sum(count * len(types) for _, count, _, types in elements)
         n_present = path.stat().st_size - offset
         if n_stated > n_present:
@@ -229,7 +229,7 @@ def _open_pcd(
     scan = columns.scan(
         rgb_limit=255.0 if "rgb" in columns.places else None,
         unit=unit_of_comments(comments),
-        # The default value, 0 0 0 without rotation, means that the position is unknown.
+        # The default viewpoint, 0 0 0 without rotation, means that the position is unknown.
         station=np.array(pose[:3]) if any(pose[:3]) else None,
     )
     scan.fields = scan.fields - {"grid"} | ({"grid"} if height > 1 else frozenset())
@@ -242,7 +242,7 @@ def _open_pcd(
     )
 
 
-# Any: a partial function that yields values by meaning.
+# Any: `read` is a partial function that yields values by meaning.
 def _blocks(read: Any, width: int = 0) -> Iterator[PointBlock]:
     """Yield blocks of points; `width` is the grid width of an organised cloud, else 0."""
     start = 0
@@ -264,7 +264,7 @@ def _used(rows: NDArray[Any], columns: Columns) -> Iterator[Values]:
 def _by_plyfile(path: Path, position: int, columns: Columns) -> Iterator[Values]:
     plyfile = load_library("plyfile", path)
     with reading(path, "PLY"), warnings.catch_warnings():
-        # numpy warns of each empty list of an ASCII file.
+        # numpy warns about each empty list in an ASCII file.
         warnings.simplefilter("ignore", UserWarning)
         rows = plyfile.PlyData.read(str(path)).elements[position].data
     yield from _used(rows, columns)
@@ -322,7 +322,7 @@ def _compressed(
         packed = np.frombuffer(file.read(n_packed), np.uint8)
     if len(packed) != n_packed:
         raise cut_off(path, "compressed data", f"{len(packed)} bytes", str(n_packed))
-    # LZF expands 3 bytes to at most 264, so a larger size is wrong and is not allocated.
+    # LZF expands 3 bytes to at most 264, so memory is not allocated for a larger declared size.
     is_possible = n_stated == n_plain and n_plain <= 264 * n_packed
     plain = np.zeros(n_plain if is_possible else 0, dtype=np.uint8)
     if not is_possible or decompress_lzf(packed, plain) != n_plain:

@@ -1,8 +1,8 @@
 """Common result of all point file readers: scans with metadata, then blocks of points.
 
 A reader opens a file, reads its header, describes its scans and yields blocks of points.
-`point_block` builds a block from the columns of any format, so that points without return, flagged
-points and poses are handled in the same way for all formats.
+`point_block` builds a block from the columns of any format, so that points without a return,
+flagged points and poses are handled in the same way for all formats.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, OrthoflowError, PluginError
 from orthoflow.files.points.units import StatedUnit
 
-# 12 MB of float64 coordinates: fast to process, and small enough to keep several copies.
+# A block has 12 MB of float64 coordinates: fast to process, and small enough for several copies.
 BLOCK_POINTS: Final = 500_000
-# Half of the programs that read our products use 32-bit point indices.
+# Many programs that read our products use 32-bit point indices.
 #: points of a scan file (at most one less can be read)
 MOST_POINTS: Final = 2**32
 
 PointField = Literal["intensity", "rgb", "grid"]
-# Any: arrays of any type.
+# Any: the arrays may have any type.
 Values = dict[str, NDArray[Any]]
 
 
@@ -38,14 +38,14 @@ class Scan:
 
     Attributes:
         name: name of the scan in the file, or empty.
-        fields: attributes of its points besides coordinates.
+        fields: attributes of the points besides coordinates.
         fields_used: names of the file's fields that are read.
         fields_not_used: names of the file's other fields.
         intensity_limits: smallest and largest intensity according to the file, or None.
         rgb_limit: colour value of full brightness according to the file, or None.
         unit: unit of the coordinates, or None if the file does not declare one.
         station: (3,) position of the scanner, in the file's unit, or None.
-        station_is_posed: the file contains a pose other than the identity.
+        station_is_posed: whether the file contains a pose other than the identity.
     """
 
     name: str = ""
@@ -66,14 +66,14 @@ class PointBlock:
     Attributes:
         points: (n, 3) float64 in the file's unit; may contain NaN and infinities.
         scan: index of the scan in its file.
-        n_read: number of points of the file that this block accounts for, including omitted ones.
+        n_read: number of points read from the file for this block, including omitted ones.
         left_out: number of omitted points by cause: `invalid`, `no_return`, `withheld`,
             `synthetic`, `other_class`.
         intensity: (n,) float32 in the file's own scale, NaN if invalid, or None.
         rgb: (n, 3) in the file's own scale and type, or None.
         has_rgb: (n,) points with a valid colour; None if all have one.
-        row: (n,) int64 row in the scan's grid, or None.
-        column: (n,) int64 column in the scan's grid, or None.
+        row: (n,) int64 row of each point in the scan's grid, or None.
+        column: (n,) int64 column of each point in the scan's grid, or None.
     """
 
     points: NDArray[np.float64]
@@ -88,7 +88,7 @@ class PointBlock:
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
-        """Smallest and largest coordinates (2, 3), NaN included; infinities without points."""
+        """Lowest and highest coordinates (2, 3), NaN included; infinities without points."""
         if not len(self.points):
             return np.array([[np.inf] * 3, [-np.inf] * 3])
         return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
@@ -103,9 +103,9 @@ class ScanFile:
         format_name: name of the format, e.g. `E57`.
         n_most: maximum number of points.
         scans: the scans, in the order of their blocks.
-        read: yields the points; can be called once.
-        notes: remarks of the reader as sentences for the user; complete after reading.
-        is_chosen: only the requested parts of the file are read.
+        read: function that yields the points; it can be called only once.
+        notes: the reader's remarks, as sentences for the user; complete once all points are read.
+        is_chosen: whether only the requested parts of the file are read.
     """
 
     name: str
@@ -130,7 +130,7 @@ class ScanFile:
 
     @property
     def fields(self) -> frozenset[PointField]:
-        """Attributes besides coordinates that the points of at least one scan have."""
+        """Attributes, besides coordinates, of the points of at least one scan."""
         return frozenset().union(*(scan.fields for scan in self.scans))
 
 
@@ -139,8 +139,8 @@ class PointQuery:
     """The points requested from a file; a reader may return more.
 
     Attributes:
-        box: (2, 3) lowest and highest coordinates in the file's unit, or None for all.
-        spacing: minimum spacing of points, in the file's unit; None for all.
+        box: (2, 3) lowest and highest coordinates in the file's unit; None for no limits.
+        spacing: sufficient point spacing, in the file's unit; None for all points.
     """
 
     box: NDArray[np.float64] | None = None
@@ -164,7 +164,7 @@ def point_block(
         axes: (3, n) x, y, z; a point with all three exactly zero has no return.
         values: (n,) by name: `intensity`, `r`, `g`, `b` or packed `rgb`, `has_rgb`, `row`,
             `column`; in the file's own types.
-        causes: (n,) True for points to omit, by cause; a point counts for its first cause.
+        causes: (n,) True for points to omit, by cause; a point is counted under its first cause.
         scan: index of the scan.
         pose: (3, 3) rotation and (3,) translation to the file's world; None for the identity.
     """
@@ -209,7 +209,7 @@ def point_block(
 
 
 def axes_of(values: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Return (3, n) coordinates; each axis is contiguous because later passes run along axes."""
+    """Return (3, n) coordinates; each axis is contiguous, since later code processes whole axes."""
     return np.stack([values[axis].astype(np.float64, copy=False) for axis in "xyz"])
 
 
@@ -232,7 +232,7 @@ def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
 
 @contextmanager
 def reading(path: Path, format_name: str) -> Iterator[None]:
-    """Convert any error of a library that reads a file into one sentence about the file.
+    """Convert any error that a library raises while reading a file into a sentence about it.
 
     Raises:
         InputError: the library failed.
@@ -242,7 +242,7 @@ def reading(path: Path, format_name: str) -> Iterator[None]:
     except (OrthoflowError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except BaseException as error:
-        # BaseException: a panic in a Rust library is not an Exception.
+        # BaseException is caught because a panic in a Rust library is not an Exception.
         raise InputError(
             f"{path.name} cannot be read as {format_name}: {_first_line(error)}; the file is "
             "damaged or truncated; copy or export it again"
@@ -251,7 +251,7 @@ def reading(path: Path, format_name: str) -> Iterator[None]:
 
 # Any: the libraries have no types.
 def load_library(name: str, path: Path) -> Any:
-    """Import a library for reading, not before a file needs it.
+    """Import a library for reading, only when a file needs it.
 
     Raises:
         PluginError: the library is not installed, or its import fails.

@@ -1,4 +1,4 @@
-"""Text scans with one point per line, and fast reading of lines of numbers in blocks."""
+"""Text scans with one point per line, and fast block-by-block reading of lines of numbers."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from orthoflow.files.points.scan_file import (
 )
 from orthoflow.files.points.units import unit_of_comments, unit_of_name, unit_of_word
 
-# Far longer than the lines of any text scan or header.
+# The limit is far longer than the lines of any text scan or header.
 #: bytes of a line of a text scan
 MOST_LINE_BYTES: Final = 10_000
 _HEADER_LINES: Final = 200
 _SAMPLE_LINES: Final = 1000
-# About 300,000 points.
+# A block has about 300,000 points.
 _BLOCK_BYTES: Final = 1 << 24
 # Maximum number of digits of a point count; a longer number is not a count.
 _MOST_DIGITS: Final = 20
@@ -49,15 +49,15 @@ _NUMBER: Final = re.compile(
     r"|[-+]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)|n/a|na|null|#(num!|n/a|value!|div/0!|ref!)",
     re.IGNORECASE,
 )
-# How C libraries print NaN and infinity (`nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`), and
-# how spreadsheets do.
+# NaN and infinity as printed by C libraries (`nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`)
+# and by spreadsheets.
 _NOT_A_NUMBER: Final = re.compile(
     rb"(?:[-+]?(?:nan(?:\(\w*\))?|1[.,]#(?:ind|[qs]?nan|inf)\d*)|(?<![^\s,;])(?:n/a|na|null))"
     rb"(?![\w(])|#(?:num!|n/a|value!|div/0!|ref!)",
     re.IGNORECASE,
 )
 _COMMENT: Final = "#/ \t;!%"
-# Column names such as `Points:0` or `P_x`, which do not occur in sentences.
+# Pattern of column names such as `Points:0` or `P_x`, which do not occur in sentences.
 _NO_WORD: Final = re.compile(
     r"[A-Za-z]+(?:[:_.\[(]?[0-2]|[:_.\[(][xyzXYZ])[\])]?|//?X|[PL][xyz]|[A-Za-z]+Time"
 )
@@ -69,13 +69,13 @@ Table = Sequence[NDArray[np.float64]]
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How the numbers of a line are separated.
+    """Separators and number of the fields in a line.
 
     Attributes:
-        separator: one character; a space represents any white space.
-        decimal: `.` or `,`.
+        separator: character between fields; a space represents any white space.
+        decimal: decimal separator, `.` or `,`.
         n_columns: number of fields in the first line.
-        is_quoted: fields may be in quotes and contain separators.
+        is_quoted: whether fields may be in quotes and then contain separators.
     """
 
     separator: str = " "
@@ -84,7 +84,7 @@ class Layout:
     is_quoted: bool = False
 
     def fields(self, line: str) -> list[str]:
-        """Split a line; remove quotes and the empty field after a final separator."""
+        """Split a line into fields; remove quotes and an empty field after a final separator."""
         if self.separator == " ":
             return [_unquoted(item) for item in line.split()]
         fields = line.split(self.separator)
@@ -220,7 +220,7 @@ def _columns_of_header(
 
 
 def _labels(header: str) -> list[str]:
-    # A semicolon starts a comment, unless it separates columns of which the first has no name.
+    # A semicolon starts a comment, unless it separates columns and the first column has no name.
     stripped = header.lstrip(_COMMENT if header.count(";") == 1 else _COMMENT.replace(";", ""))
     return _fields_of(stripped)[0]
 
@@ -255,7 +255,7 @@ def _first_lines(path: Path) -> list[str]:
 
 
 def line_at(path: Path, place: int | None = None) -> int:
-    """Return the number, from 1, of the line that begins at an offset; None is the file's end."""
+    """Return the number (1 for the first) of the line at an offset; None is the file's end."""
     n_lines, n_left, is_within = 1, path.stat().st_size if place is None else place, False
     with path.open("rb") as file:
         while block := file.read(min(_BLOCK_BYTES, n_left)):
@@ -266,7 +266,7 @@ def line_at(path: Path, place: int | None = None) -> int:
 
 
 def _count_ends(block: bytes) -> int:
-    # Five times as fast as `bytes.count` for short lines.
+    # For short lines, this is five times as fast as `bytes.count`.
     return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8) == ord("\n")))
 
 
@@ -280,19 +280,19 @@ def values_of(table: Table, columns: Columns, packed: Any = np.int64) -> Values:
 
 
 def is_comment(line: bytes) -> bool:
-    """Whether a line is a comment: it begins with `#` or `//`, but not with e.g. `#NUM!`."""
+    """Return whether a line is a comment: begins with `#` or `//`, but not e.g. with `#NUM!`."""
     start = line.lstrip()
     return start.startswith((b"#", b"//")) and not _NOT_A_NUMBER.match(start)
 
 
 def find_layout(line: str, sample: Sequence[str] = ()) -> Layout | None:
-    """Return the layout of a line with at least three numbers and more numbers than texts, or None.
+    """Return the layout of a line; None if it has fewer than three numbers or mostly texts.
 
     Numbers may be quoted, as in CSV files.
 
     Args:
         line: the first line of numbers.
-        sample: the following lines; they show decimal commas if the first has only integers.
+        sample: the following lines, used to detect decimal commas if the first has only integers.
     """
     fields, separator = _fields_of(line)
     if not _are_mostly_numbers(fields):
@@ -314,7 +314,7 @@ def _are_mostly_numbers(fields: Sequence[str]) -> bool:
 
 def _fields_of(line: str) -> tuple[list[str], str]:
     """Return the fields of a line and its separator: semicolon, tab, comma or white space."""
-    # Separators in quotes do not count.
+    # Ignore separators in quotes.
     bare = re.sub('"[^"]*"', '""', line)
     words = bare.split()
     separator = " "
@@ -361,7 +361,7 @@ def take_lines(file: BinaryIO, n_lines: int) -> list[bytes]:
 
 
 def long_line(path: Path, place: int) -> InputError:
-    """Return the error for a line too long for a point list; `place` is an offset within it."""
+    """Return the error for a line that is too long; `place` is an offset within this line."""
     return InputError(
         f"{path.name}, line {line_at(path, place) - 1}: the line has more than {MOST_LINE_BYTES} "
         "bytes, so this is not a list of points; export the file again"
@@ -380,13 +380,13 @@ def read_tables(
 
     Args:
         file: file, positioned at the start of a line.
-        layout: how numbers are separated.
+        layout: separators of the numbers.
         columns: indices of the requested columns, from 0.
-        n_rows: maximum number of rows; None for all. No line after them is read.
+        n_rows: maximum number of rows, after which no line is read; None for all rows.
         end: offset in the file where the last line ends; None for the end of the file.
 
     Yields:
-        The columns, without blank lines and comments; NaN where a line is too short.
+        The columns of a block, without blank lines and comments; NaN where a line is too short.
 
     Raises:
         InputError: a line contains something other than numbers.
@@ -426,7 +426,7 @@ def _take_block(file: BinaryIO, n_lines: int | None, end: int | None) -> bytes:
 
 
 def _table(block: bytes, layout: Layout, wanted: list[int]) -> Table:
-    """Parse lines; if that fails, remove comments and other spellings of NaN and parse again."""
+    """Parse lines; if this fails, remove comments and other spellings of NaN, and parse again."""
     try:
         table = _parse(block, layout, wanted, layout.separator)
         # If single spaces are the separator, a line of spaces would become a row.
@@ -454,7 +454,8 @@ def _parse(block: bytes, layout: Layout, columns: list[int], separator: str) -> 
                 sep=separator,
                 decimal=layout.decimal,
                 header=None,
-                # All columns, requested or not: otherwise pandas misses lines with too many fields.
+                # Pass all columns, requested or not; otherwise, pandas does not detect lines with
+                # too many fields.
                 names=list(range(layout.n_columns)),
                 index_col=False,
                 engine="c",

@@ -32,7 +32,8 @@ _WORDS: Final[dict[str, str]] = {
 }
 _UNIT: Final = "|".join(f"(?P<u{k}>{word})" for k, word in enumerate(_WORDS))
 _ANY: Final = re.compile(rf"(?:{_UNIT})\b", re.IGNORECASE)
-# A unit counts only if the comment mentions units; `in` only directly after the word `unit`.
+# A unit is accepted only if the comment mentions units, and `in` only directly after the word
+# `unit`.
 _CONTEXT: Final = re.compile(
     r"\b(?:(?:length|linear|coordinate|xyz|measurement)?[\s_-]*units?(?:[\s_-]*of[\s_-]*\w+)?"
     r"|(?:coordinates?|coords?|xyz|lengths?|distances?|positions?)(?:\s+(?:are|is|given))?\s+in\b)"
@@ -57,7 +58,7 @@ _GEO_UNITS: Final = {
     1025: 0.001,
     1033: 0.01,
 }
-# A longer text is not a coordinate system, and would keep pyproj busy.
+# A longer text is not a coordinate system, and pyproj would take long to parse it.
 _LONGEST_CRS: Final = 100_000
 
 
@@ -67,9 +68,9 @@ class StatedUnit:
 
     Attributes:
         name: a key of `UNITS_M`, or `deg` for geographic coordinates; in a pair such as `us-ft/m`,
-            the second is for heights.
-        metres: length of the unit along x, y and z in metres.
-        source: where the file declares it.
+            the second unit is for heights.
+        metres: length of the unit in metres, along x, y and z.
+        source: part of the file that declares the unit.
     """
 
     name: str
@@ -84,13 +85,13 @@ def unit_of_name(name: str, source: str) -> StatedUnit:
 
 
 def unit_of_word(text: str) -> str | None:
-    """Return the name of the unit if a text is one, e.g. `[ft]`; None otherwise."""
+    """Return the unit's name if a text, such as `[ft]`, is a unit; None otherwise."""
     found = _ANY.fullmatch(text.strip(" []()._-"))
     return None if found is None else _name(found)
 
 
 def unit_of_comments(comments: Iterable[str], what: str = "comment") -> StatedUnit | None:
-    """Find the unit in header comments: a coordinate system, or a phrase about a unit."""
+    """Return the unit from header comments: from a coordinate system, or from a phrase on units."""
     for comment in comments:
         if len(comment) > _LONGEST_CRS:
             continue
@@ -142,7 +143,8 @@ def unit_of_geo_keys(keys: Mapping[int, int]) -> StatedUnit | None:
     names, is_degrees = [], keys.get(_MODEL_TYPE) == _GEOGRAPHIC
     level = _PROJECTED if _PROJECTED in keys else _GEOGRAPHIC_TYPE
     for part, key in (("level", level), ("height", _VERTICAL)):
-        # Other numbers are not codes of EPSG, for which PROJ searches all databases.
+        # Numbers outside this range are not EPSG codes, and PROJ would search all databases for
+        # them.
         if not 1024 < (code := keys.get(key, 0)) < 32767:
             continue
         try:
@@ -182,10 +184,10 @@ def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
 
 
 def _unit_of_factors(level_m: float, height_m: float, source: str) -> StatedUnit | None:
-    """Build a unit from its factors to metres; None if they are not lengths."""
+    """Build a unit from its factors to metres; None if the factors are not those of lengths."""
     if not (level_m > 0.0 and height_m > 0.0):
         return None
-    # International and US survey feet differ in the sixth digit.
+    # The tolerance is tight because international and US survey feet differ in the sixth digit.
     names = [
         next((n for n, unit_m in UNITS_M.items() if abs(m / unit_m - 1.0) < 1e-7), f"{m:.10g} m")
         for m in (level_m, height_m)

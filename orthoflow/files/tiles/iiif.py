@@ -1,7 +1,8 @@
-"""IIIF: a Presentation 3 manifest with physical scale, and level 0 image services.
+"""Export to IIIF: a Presentation 3 manifest with physical scale, and level 0 image services.
 
-Each wall is a canvas; its pictures (orthoimage, intensity, depth, relief) are layers of a choice.
-An image service is a folder with static tiles and an `info.json`, for any web server.
+Each wall is a canvas; its pictures (orthoimage, intensity, depth, relief) are alternatives that the
+viewer offers. An image service is a folder with static tiles and an `info.json`, for any web
+server.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ class Layer:
 
     Attributes:
         label: description of the picture.
-        raster: its GeoTIFF, with three colour bands or one band that is stretched to grey.
-        stem: name of its folder.
+        raster: GeoTIFF of the picture, with three colour bands or one band that is stretched to
+            grey.
+        stem: name of the folder with the tiles.
     """
 
     label: str
@@ -48,8 +50,8 @@ class Canvas:
 
     Attributes:
         label: name of the wall.
-        summary: one line, e.g. on its accuracy.
-        layers: pictures with the same cells; the first one is shown first.
+        summary: one line, e.g. on the accuracy of the orthoimage.
+        layers: pictures with the same cells; the first one is shown initially.
     """
 
     label: str
@@ -151,7 +153,7 @@ def _body(layer: Layer, shape: tuple[int, int], base: str) -> dict[str, JsonValu
 
 
 def _write_service(folder: Path, layer: Layer, base: str) -> tuple[tuple[int, int], float, int]:
-    """Write `info.json` and tiles; return the picture's shape, its cell size, the tile count."""
+    """Write `info.json` and tiles; return the picture's shape, its cell size and the tile count."""
     service = folder / layer.stem
     with RasterParts(layer.raster) as source:
         rows, columns = source.shape
@@ -170,7 +172,8 @@ def _write_service(folder: Path, layer: Layer, base: str) -> tuple[tuple[int, in
                     place = service / f"{left},{top},{wide},{high}" / f"{shape[1]},{shape[0]}"
                     _write_jpeg(place / "0" / "default.jpg", tile)
                     count += 1
-        # The overview that viewers load first, and the whole picture if it fits into one tile.
+        # Write the overview that viewers load first; it is the whole picture if that fits into one
+        # tile.
         small = factors[-1]
         sizes = [(-(-rows // factor), -(-columns // factor)) for factor in (small, *factors[:1])]
         for shape in dict.fromkeys(sizes):

@@ -1,9 +1,9 @@
 """A tile pyramid of an orthoimage, in the Deep Zoom format.
 
 `NAME.dzi` contains the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles. The last level has
-full resolution, each level before it half of that, and level 0 is one pixel. Tiles are transparent
-where the orthoimage is empty. The page next to them pans, zooms and measures; it is a single file
-without server or external resources.
+full resolution, each lower level half the resolution of the next, and level 0 is one pixel. Tiles
+are transparent where the orthoimage is empty. The page next to the tiles can be panned and zoomed,
+and measures distances; it is a single file that needs neither a server nor external resources.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _image(name: str, ortho: OrthoFile) -> JsonValue:
         "origin": numbers(frame.origin_world),
         "u": numbers(frame.u_world),
         "v": numbers(frame.v_world),
-        # X and Y as in the GeoTIFF.
+        # X and Y of the corner, as in the GeoTIFF.
         "corner": list(frame.raster_corner_m),
         "down": frame.raster_down,
         "axes": "E, N" if frame.map_crs else "X, H" if frame.raster_axes == "wall" else "X, Y",
