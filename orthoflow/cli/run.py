@@ -294,7 +294,7 @@ def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
     from orthoflow.workflow.expand import variants_text
 
     if baseline := variants_text(baseline_of(run)):
-        echo(f"baseline: {baseline}, with which all others are compared")
+        echo(f"baseline: {baseline}; all other combinations are compared with it")
     echo(f"products: {run.products_folder}")
     echo(f"report: {run.folder / REPORT_FILE}")
     echo(f"record: {run.path}")

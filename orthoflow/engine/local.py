@@ -476,7 +476,7 @@ class LocalExecutor:
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        """Stop the largest step if the machine is running out of memory."""
+        """Stop the step that uses the most memory if the machine is running out of memory."""
         floor, steps = memory_shortage(), _all_running.copy()
         # One at a time, because a killed process does not release its memory immediately.
         if not floor or any(step.is_victim for step in steps.values()):

@@ -338,7 +338,7 @@ def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
         )
     if min(lens.width, lens.height) < 1 or lens.width * lens.height > MOST_PIXELS:
         size = f"{_cut(lens.width)} x {_cut(lens.height)}"
-        raise damaged(path, f"the photo {whose} is {size} pixels, expected 1 to {MOST_PIXELS}")
+        raise damaged(path, f"the photo {whose} has {size} pixels, expected 1 to {MOST_PIXELS}")
     return lens
 
 

@@ -521,7 +521,7 @@ _OVER: Final = (
 
 
 def over_table(over: Sequence[MetricOverDatasets]) -> Table:
-    """Return a table with a row per metric and combination of the statistics over all datasets.
+    """Return the statistics over all datasets, with a row per metric and combination.
 
     Unknown values, such as p for two datasets, are empty.
     """

@@ -316,7 +316,10 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
     """Return why a metric pattern matches nothing; empty if it may match a metric."""
     step, _, metric = pattern.partition(".")
     if not _has_wildcard(step) and step not in step_names:
-        return f"there is no step {step}, which {pattern} refers to{did_you_mean(step, step_names)}"
+        return (
+            f"{pattern} refers to a step {step}, which does not "
+            f"exist{did_you_mean(step, step_names)}"
+        )
     chosen = [one for one in steps if fnmatchcase(one.name, step)]
     calls = [(one, call) for one in chosen for call in one.calls]
     methods = [(one, call.method) for one, call in calls if call.method is not None]

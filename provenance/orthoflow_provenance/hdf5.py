@@ -83,7 +83,9 @@ def reading(place: str) -> Iterator[None]:
         raise
     except HDF5_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise RecordFormatError(f"{place} cannot be read, the file is damaged: {reason}") from error
+        raise RecordFormatError(
+            f"{place} cannot be read because the file is damaged: {reason}"
+        ) from error
 
 
 def fixed_text(text: str) -> NDArray[np.bytes_]:

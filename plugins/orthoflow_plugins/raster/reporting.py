@@ -144,7 +144,9 @@ def warn(
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
             measured = np.count_nonzero(wall.count) / wall.count.size
-            larger = f"set {{step}}.gsd_m={_least_gsd_m(step_m):g} or more for fewer such cells"
+            larger = (
+                f"set {{step}}.gsd_m to {_least_gsd_m(step_m):g} or more to interpolate fewer cells"
+            )
             ctx.report(
                 CLOSE_CELLS,
                 subject=wall.name,

@@ -135,7 +135,7 @@ class SimulateRoom(Method):
             2.0, ge=0.0, le=50.0, description="Colour noise of the points (one standard deviation)."
         )
         outlier_share: float = Field(
-            0.004, ge=0.0, le=0.5, description="Share of points at a random range."
+            0.004, ge=0.0, le=0.5, description="Share of points with a random range (outliers)."
         )
         beam_m: float = Field(
             0.003,
