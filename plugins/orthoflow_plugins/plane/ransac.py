@@ -203,7 +203,7 @@ class ConsensusProposer(Proposer):
     def _count_near(self, hypotheses: NDArray[np.float64], search: Search) -> NDArray[np.int64]:
         """Return the number (h,) of free test points near each hypothesis."""
         asked = self._shuffled[:_SECOND_POINTS]
-        free_m = self._points_m[asked[search.claims[asked] < 0]]
+        free_m = self._points_m.take(asked[search.claims[asked] < 0], axis=0)
         apart_m = np.abs(free_m @ hypotheses[:, :3].T - hypotheses[:, 3])
         return np.asarray(np.sum(apart_m <= search.cloud.tolerance_m, axis=0, dtype=np.int64))
 
@@ -255,14 +255,16 @@ class ConsensusProposer(Proposer):
         if len(free) < 3:
             return
         count = _HYPOTHESES // 2 if len(earlier) else _HYPOTHESES
-        drawn = draw_hypotheses(self._points_m[free], count, params.model, up, self._rng)
+        drawn = draw_hypotheses(
+            self._points_m.take(free, axis=0), count, params.model, up, self._rng
+        )
         hypotheses = np.vstack([drawn, earlier])
         limit_deg = params.max_tilt_deg + _LEAN_CAUTION_DEG
         chosen = leans_as_asked(hypotheses[:, :3], up, params.constraint, limit_deg)
         chosen &= ~are_near(hypotheses, self._rejected, search.cloud.tolerance_m).any(axis=1)
         hypotheses = hypotheses[chosen]
         asked = self._shuffled[claims[self._shuffled] < 0][:_SECOND_POINTS]
-        self._asked_m = self._points_m[asked]
+        self._asked_m = self._points_m.take(asked, axis=0)
         first = self._scored(hypotheses, self._asked_m[:_FIRST_POINTS], search)
         ranked = hypotheses[np.argsort(-first.value, kind="stable")]
         hypotheses = ranked[_distinct(ranked, search.cloud.tolerance_m)]

@@ -316,10 +316,30 @@ _Rectangle = tuple[int, int, int, int]
 def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangle]:
     """Divide a rectangle into the two smallest that cover its cells; return it if no cut helps."""
     top, bottom, left, right = rectangle
-    pairs = [((top, k, left, right), (k, bottom, left, right)) for k in range(top + 1, bottom)]
-    pairs += [((top, bottom, left, k), (top, bottom, k, right)) for k in range(left + 1, right)]
+    part = cells[top:bottom, left:right]
+    row, column = (
+        int(np.argmin(_heads(lines)[:-1] + _heads(lines[::-1])[-2::-1])) + 1
+        if len(lines) > 1
+        else 0
+        for lines in (part, part.T)
+    )
+    pairs = [
+        ((top, top + row, left, right), (top + row, bottom, left, right)),
+        ((top, bottom, left, left + column), (top, bottom, left + column, right)),
+    ]
     halves = [[_tight(cells, first), _tight(cells, second)] for first, second in pairs]
     return min([[rectangle], *halves], key=_area)
+
+
+def _heads(lines: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the area (n,) of the smallest rectangle around the cells of the first 1 to n lines."""
+    held, places = lines.any(axis=1), np.arange(1, len(lines) + 1)
+    low = np.where(held, lines.argmax(axis=1), lines.shape[1])
+    high = np.where(held, lines.shape[1] - lines[:, ::-1].argmax(axis=1), 0)
+    ends = np.maximum.accumulate(np.where(held, places, 0))
+    starts = np.minimum.accumulate(np.where(held, places - 1, len(lines)))
+    across = np.maximum.accumulate(high) - np.minimum.accumulate(low)
+    return np.asarray((ends - starts) * across)
 
 
 def _tight(cells: NDArray[np.bool_], rectangle: _Rectangle) -> _Rectangle:
