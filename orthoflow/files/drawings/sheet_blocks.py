@@ -119,13 +119,18 @@ def furnished(
     wide, high = paper.width_mm - 2 * MARGIN_MM, paper.height_mm - 2 * MARGIN_MM
     most_mm = _MOST_SHARE * (wide if is_column else high)
     sizes = _COLUMNS_MM if is_column else np.arange(_LOWEST_MM, most_mm, _STRIP_STEP_MM).tolist()
+    notes: list[Any] = []
     for block_mm in [paper.block_mm] if paper.block_mm else sizes:
         if block_mm > most_mm:
             break
         # The title block goes at the bottom of a column, or at the right end of a strip.
         title_mm = block_mm - 2 * _PADDING_MM if is_column else min(_TITLE_MM, 0.5 * wide)
-        title = _title_block(drawing, sheet, title_mm)
-        title_high = _high_mm(title, title_mm)
+        if is_column or not notes:  # a strip has blocks of the same width, whatever its height
+            title = _title_block(drawing, sheet, title_mm)
+            title_high = _high_mm(title, title_mm)
+            notes = _notes(drawing, sheet, is_brief=is_brief)
+        if not is_column and title_high > block_mm:
+            continue
         if is_column:
             lefts, column_mm = [MARGIN_MM + wide - block_mm + _PADDING_MM], title_mm
             corner, room = (lefts[0], MARGIN_MM + _PADDING_MM), high - title_high - _GAP_MM
@@ -136,9 +141,8 @@ def furnished(
             column_mm = pitch_mm - 2 * _PADDING_MM
             corner, room = (MARGIN_MM + wide - title_mm, MARGIN_MM), block_mm
         top = MARGIN_MM + (high if is_column else block_mm)
-        notes = _notes(drawing, sheet, is_brief=is_brief)
         packed = _packed(notes, column_mm, lefts, top, room - 2 * _PADDING_MM)
-        if packed is not None and (is_column or title_high <= block_mm):
+        if packed is not None:
             return Furniture(
                 paper=replace(paper, block_mm=block_mm),
                 placed=(*packed, (title, (*corner, title_mm))),
