@@ -2,7 +2,8 @@
 
     python tests/forked_commands.py [libraries]
 
-Loading takes most of the time of many a command. Reads orders from stdin, a JSON object per line:
+Loading takes most of the time of many a command; with `libraries`, all that the built-in methods
+need is loaded as well. Reads orders from stdin, a JSON object per line:
 `arguments`, `folder`, `environment`, `streams`, two files for what is written to stdout and stderr,
 `forgone`, numbers of rights of root that it gives up, and `draws`; answers each with the exit code.
 A command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
@@ -114,7 +115,15 @@ def _serve() -> None:
     from orthoflow.report.rendering import environment
 
     if sys.argv[1:]:
+        import pkgutil
+        from importlib import import_module
+
+        import orthoflow_plugins
+
         import orthoflow.engine.preload
+
+        for module in pkgutil.walk_packages(orthoflow_plugins.__path__, "orthoflow_plugins."):
+            import_module(module.name)
 
     cpu_name()
     git_commit()
