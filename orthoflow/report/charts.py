@@ -1,4 +1,4 @@
-"""Matplotlib charts in one style, as wide as a journal column, for pages and files."""
+"""Matplotlib charts in a uniform style, as wide as a journal column, for pages and files."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ChartFormat: TypeAlias = Literal["svg", "pdf", "png"]
-# Plan view, in metres: name, number and corners (4, 2) of a wall; name, position (2,) and viewing
-# direction (2,) of a photo.
+# In plan view, in metres: name, number and corners (4, 2) of a wall; name, position (2,) and
+# viewing direction (2,) of a photo.
 PlanWall: TypeAlias = tuple[str, int, NDArray[np.float64]]
 PlanPhoto: TypeAlias = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 
-# Distinguishable with colour vision deficiency (Okabe and Ito 2008), and by line style in greyscale
-# prints.
+# These colours can be distinguished with colour vision deficiency (Okabe and Ito 2008); in
+# greyscale prints, line styles can.
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#000000")
 _STROKES: Final = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _LOGARITHMIC_RATIO: Final = 20.0
-# An axis whose values begin near 0 starts at 0; a truncated axis exaggerates differences.
+# An axis whose values begin near 0 starts at 0, because a truncated axis exaggerates differences.
 _NEAR_ZERO: Final = 0.6
-# Length of a viewing direction as a share of the plan, and maximum number of photos with names.
+# Length of the arrow for a viewing direction as a share of the plan, and maximum number of photos
+# with names.
 _ARROW_SHARE: Final = 0.06
 _NAMED_PHOTOS: Final = 60
 _STYLE: Final = {"font.size": 8.0, "axes.grid": True}
@@ -45,8 +46,8 @@ class ChartPoint:
     Attributes:
         x: value on the horizontal axis.
         y: value on the vertical axis.
-        spread: half the length of its error bar; NaN if it has none.
-        is_filled: whether it is highlighted, as the baseline is.
+        spread: half the length of the error bar; NaN if there is no error bar.
+        is_filled: whether the marker is filled, as for the baseline.
     """
 
     x: float
@@ -66,8 +67,8 @@ def line_chart(
     """Draw lines with error bars.
 
     Args:
-        lines: name -> points in the order of x; `COLOURS` limits the number of distinguishable
-            lines.
+        lines: points in the order of x, by line name; at most `len(COLOURS)` lines can be
+            distinguished.
         below: label of the horizontal axis.
         beside: label of the vertical axis, with its unit.
         bounds: limits of possible y values, e.g. 0 and 1 for shares.
@@ -131,11 +132,12 @@ def plan_chart(
     labels: Sequence[str],
     suffix: ChartFormat = "svg",
 ) -> bytes:
-    """Draw a plan of walls and photos, to scale.
+    """Draw a plan of walls and photos, with equal scales along both axes.
 
     Args:
-        walls: drawn as lines with their names, in the colours of their planes.
-        photos: drawn as dots with an arrow in the viewing direction; with names if there are few.
+        walls: walls, drawn as lines with their names, in the colours of their planes.
+        photos: photos, drawn as dots with an arrow in the viewing direction, and with names if
+            there are few.
         labels: labels of both axes.
         suffix: file format.
     """
@@ -183,7 +185,7 @@ def _name(axes: Axes, name: str, place: NDArray[np.float64], *, colour: Any, abo
 
 
 def saved(figure: Figure, suffix: ChartFormat) -> bytes:
-    """Return the file of a figure without a date, so that the same figure gives the same bytes."""
+    """Return the file of a figure, without a date, so that equal figures give equal bytes."""
     stream = io.BytesIO()
     undated: dict[str, dict[str, Any]] = {
         "svg": {"Date": None},
@@ -195,5 +197,5 @@ def saved(figure: Figure, suffix: ChartFormat) -> bytes:
 
 
 def as_image(svg: bytes) -> str:
-    """Return an SVG file as a data URI for an image on a page."""
+    """Return an SVG file as a data URI, for use as an image on a page."""
     return f"data:image/svg+xml;base64,{base64.b64encode(svg).decode('ascii')}"

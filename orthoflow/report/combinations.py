@@ -22,7 +22,7 @@ from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
-# Planes whose normals differ by more are different walls.
+# Planes whose normals differ by more than this angle are different walls.
 _TURNED_DEG: Final = 10.0
 _LARGER: Final = 1.5
 _ROOMS_MOST: Final = 3
@@ -34,12 +34,13 @@ class Measured:
     """A metric of one combination.
 
     Attributes:
-        value: mean over the repeats; if these are errors of both signs, the mean absolute value.
-        spread: standard deviation over the repeats, NaN if there are none.
-        n_repeats: number of values.
-        n_all: number of repeats of the step that finished, with or without a value.
+        value: mean over the repeats; the mean of the absolute values if they are errors of both
+            signs.
+        spread: standard deviation over the repeats, NaN for a single value.
+        n_repeats: number of repeats with a value.
+        n_all: number of finished repeats of the step, with or without a value.
         unit: `1` for counts and shares.
-        environment: id of the environment in which it was computed.
+        environment: id of the environment in which the metric was computed.
         is_of_sizes: whether `value` is a mean of absolute values.
     """
 
@@ -57,10 +58,10 @@ class Combination:
     """One choice of a variant for each step with variants.
 
     Attributes:
-        run: run to which it belongs.
-        assignment: step -> variant; empty if the workflow has no variants.
-        cells: its cells in the order of the graph, each followed by its repeats.
-        is_baseline: whether it is the workflow's baseline.
+        run: run to which the combination belongs.
+        assignment: variant by step; empty if the workflow has no variants.
+        cells: cells of the combination, in the order of the graph, each followed by its repeats.
+        is_baseline: whether the combination is the workflow's baseline.
     """
 
     run: Run
@@ -107,7 +108,7 @@ class Combination:
         if not found:
             return None
         values = np.array([row.value for row, _ in found])
-        # Errors of both signs would cancel in the mean, however far the repeats are from the truth.
+        # Errors of both signs would cancel in the mean, even if each of them is large.
         is_of_sizes = bool(values.min() < 0.0 < values.max()) and found[0][0].better == "lower"
         if is_of_sizes:
             values = np.abs(values)
@@ -123,19 +124,20 @@ class Combination:
         )
 
     def n_items(self, step: str, counted_by: str) -> float:
-        """Return the number of items a metric sums over (mean over repeats), NaN if not counted."""
+        """Return how many items a metric sums over (mean over repeats); NaN if not counted."""
         count = self.measured(step, counted_by) if counted_by else None
         return math.nan if count is None else count.value
 
 
 def unequal_walls(combinations: Iterable[Combination]) -> str:
-    """Return in which datasets the first walls of the combinations differ; empty if in none.
+    """Return a text listing the datasets in which the combinations' first walls differ, or "".
 
-    The detected planes decide which wall is the first, so its metrics may refer to different walls.
+    Which wall is the first depends on the detected planes, so metrics of the first wall may refer
+    to different walls.
     """
     by_room: dict[tuple[Path, str], list[tuple[Combination, tuple[float, ...]]]] = {}
     for one in combinations:
-        # The last step that outputs walls.
+        # Use the last step that outputs walls.
         steps = [cell.step for cell in one.cells if gives(cell, Walls.type_name)][-1:]
         found = [one.measured(step, name) for step in steps for name in _FIRST_WALL]
         wall = tuple(value.value for value in found if value is not None)
@@ -144,7 +146,7 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
             by_room.setdefault(room, []).append((one, wall))
     groups = []
     for shown in by_room.values():
-        # The walls of the majority; the other combinations are reported.
+        # The wall of most combinations is the reference; the other combinations are reported.
         walls = [wall for _, wall in shown]
         usual = max(walls, key=lambda wall: sum(_may_be_one_wall(wall, other) for other in walls))
         odd = [
@@ -168,7 +170,7 @@ _FIRST_WALL: Final = ("omega_deg", "phi_deg", "area_m2")
 
 
 def _may_be_one_wall(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    """Return whether omega, phi and area may belong to the same wall with slightly other edges."""
+    """Return whether omega, phi and area may be of one wall with slightly different edges."""
     is_turned = angle_between_deg(_normal(*one[:2]), _normal(*other[:2])) >= _TURNED_DEG
     return not is_turned and max(one[2], other[2]) <= _LARGER * min(one[2], other[2])
 
@@ -190,13 +192,13 @@ def gives(cell: RecordedCell, *type_names: str) -> bool:
 
 
 def is_check(cell: RecordedCell) -> bool:
-    """Return whether a cell only checks the results of other steps: all outputs are inspections."""
+    """Return whether a cell only checks results of other steps (all outputs are inspections)."""
     types = {product.type_name for product in cell.outputs.values()}
     return types == {Inspection.type_name}
 
 
 def is_missing(cell: RecordedCell) -> bool:
-    """Return whether the run was interrupted before this cell."""
+    """Return whether the run was interrupted before this cell was reached."""
     return cell.error_type == NOT_YET
 
 
@@ -247,7 +249,7 @@ def baseline_cells(run: Run) -> tuple[RecordedCell, ...]:
 
 
 def baseline_addresses(run: Run) -> tuple[str, ...]:
-    """Return the cells whose figures are next to the page: baseline and cells without variants."""
+    """Return the cells with figures next to the page: baseline cells and cells without variants."""
     baseline = {cell.address for cell in baseline_cells(run)}
     return tuple(
         address
@@ -257,12 +259,13 @@ def baseline_addresses(run: Run) -> tuple[str, ...]:
 
 
 class Way(NamedTuple):
-    """The cells that the page shows for one combination, a row of the comparison.
+    """The cells that the page shows for one combination, i.e. for a row of the comparison.
 
     Attributes:
-        anchor: anchor on the page.
+        anchor: HTML anchor on the page.
         name: the variants as text.
-        cells: addresses of its cells that are not shown by a row above or by a section of the page.
+        cells: addresses of those cells of the combination that no row above and no section of the
+            page shows.
     """
 
     anchor: str
@@ -271,7 +274,7 @@ class Way(NamedTuple):
 
 
 def ways(run: Run, prefix: str) -> tuple[Way, ...]:
-    """Return the combinations of a run; a cell belongs to the first combination that has it.
+    """Return the combinations of a run, each cell with the first combination that contains it.
 
     Args:
         run: the run.
@@ -287,7 +290,7 @@ def ways(run: Run, prefix: str) -> tuple[Way, ...]:
 
 
 def improved_on(run: Run, addresses: Collection[str]) -> frozenset[str]:
-    """Return cells whose result a later step of the same kind refines, e.g. first orientations."""
+    """Return cells whose result is refined by a later step of the same kind (e.g. orientation)."""
     return frozenset(
         before.address
         for address in addresses
@@ -314,7 +317,7 @@ def _comparison(run: Run) -> Mapping[str, object]:
 
 
 def _is_baseline(assignment: Mapping[str, str], baseline: Mapping[str, str]) -> bool:
-    # The dataset is not part of the baseline: each dataset has its own baseline.
+    # The dataset is ignored, because each dataset has its own baseline.
     return bool(baseline) and all(
         baseline.get(step, variant) == variant for step, variant in assignment.items()
     )
@@ -325,9 +328,9 @@ class EnvironmentGroups:
     """Groups of equivalent environments.
 
     Attributes:
-        first: id -> id of the first equivalent environment.
-        words: id of the first environment of each group -> description, with its differences from
-            the first group.
+        first: id of the first equivalent environment, by environment id.
+        words: description of each group, with its differences from the first group, by the id of
+            the group's first environment.
     """
 
     first: Mapping[str, str]
@@ -339,11 +342,11 @@ class EnvironmentGroups:
 
 
 def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
-    """Group the environments that are the same in all packages that the methods use.
+    """Group the environments in which all packages that the methods use are identical.
 
     Only packages required by the distributions of the methods, or by orthoflow, are compared; if
-    one of these distributions is not installed, all packages are. A package found in only one
-    environment, such as a plugin installed between two runs, is ignored.
+    one of these distributions is not installed, all packages are compared. A package found in only
+    one environment, such as a plugin installed between two runs, is ignored.
     """
     runs = tuple(runs)
     environments = {one.id: one for run in runs for one in run.record.environments}
@@ -355,7 +358,8 @@ def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
     known: dict[str, dict[str, str]] = {}
     for key, environment in environments.items():
         facts = _facts(environment, used)
-        # Compare with all members: two of them may differ in a package that the first lacks.
+        # Compare with all members of a group: two of them may differ in a package that the first
+        # lacks.
         like = next((name for name, seen in known.items() if _agree(seen, facts)), key)
         first[key] = like
         known[like] = facts | known.get(like, {})
@@ -378,11 +382,11 @@ def distinct_words(
     """Return descriptions of environments, with the packages in which each differs from the first.
 
     Args:
-        environments: in the order of the descriptions.
+        environments: environments in the order of the descriptions.
         used: packages to compare; None for all.
 
     Returns:
-        Environment id -> description.
+        Descriptions by environment id.
     """
     return {
         one.id: environment_words(one)
@@ -393,7 +397,7 @@ def distinct_words(
 
 
 def _other_packages(own: Mapping[str, str], others: Mapping[str, str]) -> str:
-    """Return the packages in which an environment differs from another; empty if in none."""
+    """Return the packages in which an environment differs from another; empty if there are none."""
     texts = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
     texts += [f"no {name}" for name in others if name not in own]
     return f"; differs from the first in {first_few(texts)}" if texts else ""

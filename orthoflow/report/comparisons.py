@@ -39,7 +39,7 @@ from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
 _NOTHING: Final = "-"
-# Run times of short steps vary by this much even on an idle machine.
+# Run times of short steps vary by this amount even on an idle machine.
 _TIMED_S: Final = 0.1
 _MAX_DESCRIBED: Final = 12  # metrics shown if no quality metric differs
 _MAX_NAMED: Final = 3  # metrics listed in which a combination is best
@@ -59,14 +59,15 @@ class Row:
     """A row of the table: one combination.
 
     Attributes:
-        run: label of its run: workflow and id.
-        variants: variant of each varied step; a dash if the combination does not include the step.
+        run: label of the combination's run: workflow and id.
+        variants: variant of each step with variants; a dash if the combination does not include the
+            step.
         name: the variants as text, with the run if there are several.
-        is_baseline: whether it is the workflow's baseline.
+        is_baseline: whether the combination is the workflow's baseline.
         failure: which cell failed and why; empty if none failed.
         missing: addresses of cells not reached before the run was interrupted.
         values: one value per column.
-        remark: number of failed repeats, as text.
+        remark: text on failed repeats.
     """
 
     run: str
@@ -80,12 +81,12 @@ class Row:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Distinct letters of the environments and data of its values."""
+        """Distinct letters for the environments and data of the row's values."""
         return tuple(dict.fromkeys(value.group for value in self.values if value.group))
 
     @property
     def shortfall(self) -> str:
-        """Why it has no time and memory, in a word or two; empty if it is complete."""
+        """Short reason why time and memory are missing; empty if the row is complete."""
         return "failed" if self.failure else "not computed" if self.missing else ""
 
     def count(self, mark: Mark) -> int:
@@ -99,10 +100,10 @@ class ComparisonTable:
 
     Attributes:
         steps: steps with variants.
-        columns: metrics; processor time and memory last.
-        rows: in the order of the runs and their graphs.
+        columns: metrics, with processor time and memory last.
+        rows: rows in the order of the runs and their graphs.
         shows_runs: whether the rows come from more than one run.
-        groups: letter -> environment and data; empty if these are the same for all values.
+        groups: environment and data by letter; empty if they are the same for all values.
     """
 
     steps: tuple[str, ...]
@@ -119,7 +120,7 @@ class ComparisonTable:
 
     @property
     def glance(self) -> tuple[Row, ...]:
-        """The rows, sorted by how often they are best, then by how often they are near the best."""
+        """The rows, sorted by number of best values, then by number of values near the best."""
 
         def place(row: Row) -> tuple[bool, int, int]:
             return bool(row.shortfall), -row.count(Mark.BEST), -row.count(Mark.NEAR)
@@ -127,7 +128,7 @@ class ComparisonTable:
         return tuple(sorted(self.rows, key=place))
 
     def best_in(self, row: Row) -> str:
-        """Return the metrics in which a row is clearly best, at most three; may be empty."""
+        """Return up to three metrics in which a row is clearly best."""
         found = [
             ": ".join(filter(None, (column.step, column.titled)))
             for column, value in zip(self.columns, row.values, strict=True)
@@ -182,7 +183,7 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
 
 
 def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, ...]:
-    """Return the metrics that the workflows select, or else the quality metrics, without costs.
+    """Return the metrics that the workflows select, by default the quality metrics; no costs.
 
     If no quality metric differs, other metrics that differ are appended; they are not ranked.
     """
@@ -225,7 +226,7 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
     found: dict[tuple[str, str], None] = {}
     for pattern in patterns:
         for step, metric in known:
-            # `*.wall_s` selects the time of every step; the table has a column for its sum.
+            # `*.wall_s` selects the time of every step; the table has a column for the sum.
             is_summed = pattern.startswith("*.") and metric in COSTS
             if not is_summed and fnmatchcase(f"{step}.{metric}", pattern):
                 found[step, metric] = None
@@ -233,7 +234,7 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
 
 
 def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
-    """Return processor time and memory of the cells that depend on variants, if none is missing."""
+    """Return processor time and memory of the cells that depend on variants, if all are known."""
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
     if one.failure or one.missing or not varied:
         return Value(), Value()
@@ -268,7 +269,8 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
     measured = one.measured(column.step, column.metric)
     if measured is None:
         return Value()
-    # A repeat that missed the wall has no error, which makes the remaining ones look good.
+    # A repeat that missed the wall has no error, so the remaining repeats look better than they
+    # are.
     of_all = (
         f" ({measured.n_repeats} of {measured.n_all} repeats)"
         if measured.n_repeats < measured.n_all
@@ -286,21 +288,21 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
     )
 
 
-# Id of the first equivalent environment, and digests of data.
+# Id of the first equivalent environment, and digests of the data.
 _Origin: TypeAlias = tuple[str, tuple[str, ...]]
-# Record, run id and dataset.
+# Path of the record, run id and dataset.
 _Place: TypeAlias = tuple[Path, str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Origins:
-    """Letters for the environments and data from which values of combinations originate.
+    """Letters for the environments and data with which values of combinations were computed.
 
     Attributes:
         environments: groups of equivalent environments.
-        data: record, run and dataset -> digests of the input data.
-        letters: environment and data -> letter; empty if all values have the same origin.
-        legend: letter -> description.
+        data: digests of the input data, by record, run and dataset.
+        letters: letters by environment and data; empty if all values have the same origin.
+        legend: descriptions by letter.
     """
 
     environments: EnvironmentGroups
@@ -370,7 +372,8 @@ def _letter(index: int) -> str:
 
 
 _MOST_COLUMNS: Final = 6
-# Pixels in all pictures together; with many datasets, the pictures become too small to be useful.
+# Number of pixels in all pictures together; with many datasets, the pictures become too small to be
+# useful.
 _PICTURES_PX: Final = 2_000_000
 _LARGEST_PX: Final = 220
 _SMALLEST_PX: Final = 64
@@ -382,8 +385,8 @@ class DatasetRow:
 
     Attributes:
         name: name of the dataset.
-        page: path of its own page, relative to this one; empty if it has none.
-        picture: data URI of its first orthoimage; empty if there is none.
+        page: path of the dataset's own page, relative to this one; empty if there is no such page.
+        picture: data URI of the dataset's first orthoimage; empty if there is no orthoimage.
         failed: failed cells and the reasons, without the cells skipped as a consequence.
         missing: cells not reached before the run was interrupted.
         values: one value per column.
@@ -404,8 +407,8 @@ class DatasetTable:
     """The datasets of a run.
 
     Attributes:
-        columns: step, and metric with its unit.
-        rows: in the order of the run.
+        columns: step and metric of each column, with the metric's unit.
+        rows: rows in the order of the run.
         baseline: variants to which the values belong; empty if there are no variants.
     """
 
@@ -418,8 +421,8 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     """Return the table of the datasets of a run.
 
     Args:
-        parts: dataset -> its part of the run.
-        pages: dataset -> its own page, relative to the page being written.
+        parts: part of the run by dataset.
+        pages: each dataset's own page, relative to the page being written.
     """
     own = {
         name: {cell.address for cell in part.record.cells if DATA in cell.assignment}
@@ -427,7 +430,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     }
     measured = {name: _measured(part, own[name]) for name, part in parts.items()}
     units = {key: row for values in measured.values() for key, row in values.items()}
-    # The columns of the comparison, which the workflow may have selected.
+    # Use the columns of the comparison, which the workflow may have selected.
     columns = comparison_columns([one for part in parts.values() for one in combinations_of(part)])
     wanted = [(column.step, column.metric) for column in columns]
     chosen = [key for key in wanted if key in units][:_MOST_COLUMNS]
@@ -457,7 +460,7 @@ _Measured = Mapping[tuple[str, str], MetricRow]
 
 
 def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
-    """Return the metrics of the baseline on this dataset: (step, metric) -> value."""
+    """Return the baseline's metrics on this dataset, by step and metric."""
     return {
         (row.step, row.metric): row
         for cell in baseline_cells(part)

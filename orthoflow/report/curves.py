@@ -25,7 +25,8 @@ from orthoflow.workflow.model import DATA
 _MOST_CURVES: Final = 12
 _LONGEST_NAME: Final = 120
 _MOST_LINES: Final = 6
-# Records are untrusted and may contain any number; differences of larger ones are meaningless.
+# Records are untrusted and may contain any number; differences between numbers larger than this are
+# meaningless.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
 
@@ -35,12 +36,12 @@ class Curve:
     """One metric plotted against one parameter.
 
     Attributes:
-        name: file name: metric and parameter with their steps.
-        title: title: metric, step and parameter.
+        name: file name, composed of metric and parameter with their steps.
+        title: title with metric, step and parameter.
         caption: explanation of the points and error bars.
-        lines: name -> points.
-        below: label of the parameter's axis.
-        beside: label of the metric's axis, with its unit.
+        lines: points by line name.
+        below: label of the parameter axis.
+        beside: label of the metric axis, with the unit.
         bounds: limits of possible values of the metric.
     """
 
@@ -65,7 +66,7 @@ class Curve:
 
 
 def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
-    """Return the curves of a run, over all its datasets, as files by name."""
+    """Return the curves of a run, over all datasets, as files by name."""
     parts = parts_of(run)
     drawn = curves([*parts.values()] if len(parts) > 1 else [run])
     # Names of steps and metrics in a record may be invalid as file names.
@@ -79,11 +80,12 @@ def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
 def curves(parts: Sequence[Run]) -> tuple[Curve, ...]:
     """Return curves of the compared metrics for every parameter that is swept.
 
-    Sweeps are found from the cells, not from the workflow text: variants of a step that call the
-    same method and differ in one number.
+    A sweep is found from the cells, not from the workflow text: it consists of variants of a step
+    that call the same method and differ in one number.
 
     Args:
-        parts: the run, or the parts of its datasets, over which medians and spreads are computed.
+        parts: the whole run, or one part per dataset; medians and spreads are computed over the
+            parts.
     """
     return tuple(islice(_curves(parts), _MOST_CURVES))
 
@@ -96,8 +98,8 @@ class Sweep:
         step: name of the step.
         method: method of the variants, e.g. `plane.ransac`.
         parameter: name of the parameter.
-        values: variant -> value.
-        others: variant -> other parameters that differ, as text.
+        values: value of the parameter by variant.
+        others: other parameters that differ, as text by variant.
     """
 
     step: str
@@ -115,7 +117,8 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
         if variant is not None and cell.repeat == 0 and cell.status != "skipped":
             by_method.setdefault((cell.step, cell.method), {}).setdefault(variant, cell)
     for (step, method), variants in by_method.items():
-        # Only parameters that were set: defaults may depend on other parameters.
+        # Only parameters that were set are compared, because defaults may depend on other
+        # parameters.
         names = sorted({name for cell in variants.values() for name in cell.params_set})
         differ = [
             name
@@ -146,7 +149,7 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
 
 
 class _Value(NamedTuple):
-    """Value of one combination, and its spread over repeats."""
+    """Value of one combination, and the spread over its repeats."""
 
     value: float
     spread: float
@@ -154,7 +157,7 @@ class _Value(NamedTuple):
     dataset: str
 
 
-# Value of the parameter -> values of the combinations.
+# Values of the combinations by parameter value.
 _Line = dict[float, list[_Value]]
 
 
@@ -185,10 +188,10 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
 def _lines(
     combinations: Sequence[Combination], sweep: Sweep, column: MetricRow
 ) -> dict[str, _Line]:
-    """Return a line per combination of the other variants, over datasets that all its points have.
+    """Return a line per combination of other variants, over the datasets common to its points.
 
-    Parameter values that fail on difficult datasets would look better if only they omitted these
-    datasets.
+    Otherwise, parameter values that fail on difficult datasets would look better, because these
+    datasets would be missing only there.
     """
     lines: dict[str, _Line] = {}
     for one in combinations:
@@ -216,7 +219,7 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
         for name, line in lines.items()
     }
     every = [point for points in drawn.values() for point in points]
-    # Absolute errors are not negative; metrics between 0 and 1 where higher is better are shares.
+    # Absolute errors are never negative; metrics from 0 to 1 for which higher is better are shares.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
     notes = [_points_text(lines, column, n_datasets)]
@@ -240,7 +243,7 @@ def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: boo
     if column.better == "lower":
         # Errors of both signs would cancel, and the most negative one would look best.
         numbers = np.abs(numbers)
-    # Over datasets, the bar is the spread between datasets, not between repeats.
+    # With several datasets, the error bar shows the spread between datasets, not between repeats.
     spread = spread_of(numbers, column.unit) if is_over else found[0].spread
     return ChartPoint(
         x=x,
@@ -251,7 +254,7 @@ def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: boo
 
 
 def _points_text(lines: Mapping[str, _Line], column: MetricRow, n_datasets: int) -> str:
-    """Return sentences on the points and bars, with the number of datasets without failures."""
+    """Return sentences on points and error bars, with the number of datasets without failures."""
     found = [values for line in lines.values() for values in line.values()]
     if n_datasets < 2:
         if any(math.isfinite(one.spread) for values in found for one in values):
@@ -271,9 +274,9 @@ class Varied:
     """Steps and parameters that vary in a run.
 
     Attributes:
-        steps: steps with variants; `data` for datasets.
-        methods: step -> variant -> method, for steps with swept parameters.
-        swept: (step, parameter) -> variant -> value, for swept parameters.
+        steps: names of the steps with variants; `data` for datasets.
+        methods: method by step and variant, for steps with swept parameters.
+        swept: value by variant, for each swept parameter (step, parameter).
     """
 
     steps: tuple[str, ...]
@@ -282,7 +285,7 @@ class Varied:
 
     @classmethod
     def of(cls, run: Run) -> Varied:
-        """Determine what varies from the cells of a run."""
+        """Determine from the cells of a run which steps and parameters vary."""
         swept: dict[tuple[str, str], dict[str, float]] = {}
         for sweep in sweeps(run.record.cells):
             swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
@@ -295,7 +298,7 @@ class Varied:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns; those of steps are as in tables of several runs."""
+        """Names of the columns; names for steps are the same as in tables of several runs."""
         return (
             *("dataset" if step == DATA else f"variant.{step}" for step in self.steps),
             *(f"{step}.use" for step in self.methods),

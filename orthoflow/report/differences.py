@@ -39,10 +39,10 @@ class DifferenceTable:
 
     Attributes:
         title: name of the kind.
-        n_compared: number of values that both runs have.
-        n_different: number of those that differ.
-        rows: values that differ, and values that only one run has; equal rows are grouped.
-        n_alone: number of values that only one run has.
+        n_compared: number of values that are present in both runs.
+        n_different: number of compared values that differ.
+        rows: values that differ or are present in only one run; equal rows are grouped.
+        n_alone: number of values that are present in only one run.
         n_rounded: number of values that differ only by rounding; they have no row.
         whose: steps to which the table is restricted; empty for all.
     """
@@ -67,7 +67,7 @@ def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
         _table("Steps", comparison.cells, str, step_of),
         _table("Parameters", parameters, _parameter_text, step_of, whose=of_shared),
         _table("Environment", comparison.environment, str),
-        # Time and memory always differ, and are in the comparison table.
+        # Time and memory are omitted, because they always differ and are in the comparison table.
         _table(
             "Metrics, without time and memory",
             comparison.measured,
@@ -94,11 +94,11 @@ def _table(
 
     Args:
         title: name of the kind.
-        pairs: all values.
-        text: formats the value of one run.
-        step_of: step of each cell.
-        different: pairs that have a row, in this order; None for all that differ.
-        change: formats the change between the runs.
+        pairs: all values of both runs.
+        text: function that formats the value of one run.
+        step_of: name of the step of each cell.
+        different: pairs to list, in this order; None for all pairs that differ.
+        change: function that formats the change between the runs.
         whose: steps to which the table is restricted; empty for all.
     """
     steps = step_of or {}
@@ -148,15 +148,15 @@ class RowGroup(Generic[Side]):
     """Equal rows.
 
     Attributes:
-        pair: the first of them.
-        n: number of rows.
+        pair: values of the first row.
+        n: number of equal rows.
     """
 
     pair: Pair[Side]
     n: int
 
     def label(self, step_of: Mapping[str, str]) -> str:
-        """Return the label: the address of one cell, or a step and the number of its cells.
+        """Return the label: the address of a single cell, or a step and the number of cells.
 
         >>> steps = {"wall@a": "wall", "wall@b": "wall"}
         >>> rows = [Pair(cell=cell, name="cell_m", left=1, right=2) for cell in steps]
@@ -168,7 +168,7 @@ class RowGroup(Generic[Side]):
         if self.n == 1:
             return ".".join(part for part in (cell, name) if part)
         step = step_of.get(cell, cell)
-        # A row about the step itself has no other name.
+        # A row about the step itself has no further name.
         what = ".".join(dict.fromkeys(part for part in (step, name) if part))
         return f"{what}, {self.n} steps"
 
@@ -176,7 +176,7 @@ class RowGroup(Generic[Side]):
 def grouped_rows(
     pairs: Iterable[Pair[Side]], text: Callable[[Side], str], step_of: Mapping[str, str]
 ) -> list[RowGroup[Side]]:
-    """Group pairs of a step with equal texts, in the order of their first occurrence."""
+    """Group the pairs of each step that have equal texts, in the order of first occurrence."""
     found: dict[Hashable, list[Pair[Side]]] = {}
     for pair in pairs:
         sides = (None if side is None else text(side) for side in (pair.left, pair.right))
@@ -188,7 +188,7 @@ def grouped_rows(
 def moved_first(
     pairs: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
 ) -> list[Pair[ComparedMetric]]:
-    """Sort headline metrics first, then other ranked metrics, then unranked ones, then rounding.
+    """Sort by kind: headline metrics, other ranked metrics, unranked metrics, rounding.
 
     Within each group, the largest relative change comes first.
     """
@@ -197,7 +197,8 @@ def moved_first(
     def key(pair: Pair[ComparedMetric]) -> tuple[bool, int, float, int]:
         facts = pair.right or pair.left
         group = 2 if facts is None else 0 if facts.headline else 1 if facts.better else 2
-        # A later step refines the results of an earlier one, as with orientations.
+        # Later steps come first, because they refine the results of earlier ones, e.g. of
+        # orientations.
         later = -places.get(step_of.get(pair.cell, pair.cell), 0)
         return pair.is_rounded, group, -_relative_change(pair), later
 
@@ -205,7 +206,7 @@ def moved_first(
 
 
 def _relative_change(pair: Pair[ComparedMetric]) -> float:
-    """Return the change relative to the larger value; 0 if only one run has it."""
+    """Return the change relative to the larger value; 0 if only one run has the value."""
     left, right = pair.left, pair.right
     if left is None or right is None or left.value == right.value:
         return 0.0

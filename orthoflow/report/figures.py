@@ -1,4 +1,4 @@
-"""Figures of the methods, on the page and as files, and the graph of a run."""
+"""Figures from the methods, on the page and as files, and the graph of a run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _MAX_ABREAST: Final = 5  # boxes in a row
 _MAX_LETTERS: Final = 26
-# Distinguishable without colour by line width and dashes.
+# Line width and dashes make the states distinguishable without colour.
 _FRAMES: Final[dict[str, dict[str, Any]]] = {
     "ok": {"edgecolor": "#5b6570", "facecolor": "#f3f5f7"},
     "cached": {"edgecolor": "#1c6b35", "facecolor": "#eaf5ec"},
@@ -36,10 +36,10 @@ _FRAMES: Final[dict[str, dict[str, Any]]] = {
 
 
 def run_graph(run: Run) -> nx.DiGraph[str]:
-    """Return the graph of the steps of a run; edges are products.
+    """Return the graph of the steps of a run, whose edges are products.
 
-    Nodes have `state`, `about` (methods and time) and `row`. A step is below all steps on which it
-    depends; wide levels are split into several rows, and skipped steps without connections are
+    Nodes have `state`, `about` (methods and time) and `row`. Each step is below all steps on which
+    it depends; wide levels are split into several rows, and skipped steps without connections come
     last.
     """
     import networkx as nx  # noqa: PLC0415 - takes 0.2 seconds
@@ -94,7 +94,7 @@ def graph_file(run: Run) -> bytes:
             (x0, y0), (x1, y1) = (
                 (nodes[node]["column"], nodes[node]["row"]) for node in (before, after)
             )
-            # Arrows past other rows are curved, so that they do not run behind boxes.
+            # Arrows that cross other rows are curved, so that they do not run behind boxes.
             bulge = 0.25 if y1 - y0 > 1 else 0.0
             axes.annotate(
                 "",
@@ -165,14 +165,15 @@ class FigureGroup:
 def figure_groups(
     run: Run, *, share: float = 1.0, with_files: bool = False
 ) -> tuple[FigureGroup, ...]:
-    """Return the figures of all cells except repeats; identical figures only once.
+    """Return the figures of all cells except repeats; identical figures are returned once.
 
-    If they exceed the limit of a page, large figures are scaled down.
+    If the figures together exceed the size limit of a page, large ones are scaled down.
 
     Args:
         run: the run.
         share: share of the size limit of a page that the figures may use.
-        with_files: whether the figures of `baseline_addresses` are also files in `FIGURES_FOLDER`.
+        with_files: whether the figures of `baseline_addresses` are also written to
+            `FIGURES_FOLDER`.
     """
     named = figure_files(run, baseline_addresses(run)) if with_files else {}
     files = {id(figure): path for path, figure in named.items()}
@@ -217,8 +218,8 @@ def write_figures(
         run: the run.
         folder: output folder, created if missing.
         addresses: addresses of the cells.
-        inside: subfolder in which to write instead; it must not be a link.
-        as_pdf: write each picture as a PDF page with 300 dpi.
+        inside: subfolder of `folder` in which to write instead; it must not be a link.
+        as_pdf: whether to write each picture as a PDF page at 300 dpi.
 
     Returns:
         The number of figures written.
@@ -244,7 +245,7 @@ def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
     try:
         if as_pdf:
             return encode_pdf(decode_image(figure.data, figure.name), dpi=_DPI)
-        # PNG is accepted by publishers and word processors.
+        # Convert WebP to PNG, which publishers and word processors accept.
         if figure.media_type == "image/webp":
             return encode_png(decode_image(figure.data, figure.name))
     except InputError:
@@ -253,7 +254,7 @@ def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
 
 
 def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:
-    """Return the figures, scaled down if they have too many bytes together."""
+    """Return the figures, scaled down if they have too many bytes in total."""
     n_bytes = sum(len(figure.data) for figure in figures)
     if n_bytes <= bytes_most:
         return figures

@@ -1,4 +1,4 @@
-"""Finished runs in Python and notebooks: tables, pictures and arrays."""
+"""Access to finished runs from Python and notebooks: tables, pictures and arrays."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ class OpenedRun(Run):
         """Return a table with a row for every metric of every cell.
 
         Returns:
-            Columns `cell`, `step`, `method`, `dataset` (if there are several), `variant.<step>` for
-            each step with variants (missing if it does not apply to the cell), the method of each
-            step with swept parameters (`plane.use`), each swept parameter (`plane.tolerance_m`, a
-            number), `repeat`, `metric`, `value`, `unit`.
+            Table with the columns `cell`, `step`, `method`, `dataset` (if there are several),
+            `variant.<step>` for each step with variants (missing if it does not apply to the cell),
+            the method of each step with swept parameters (`plane.use`), each swept parameter
+            (`plane.tolerance_m`, a number), `repeat`, `metric`, `value`, `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second and is rarely needed
 
@@ -79,11 +79,12 @@ class OpenedRun(Run):
         return pd.DataFrame(rows, columns=columns)
 
     def statistics(self) -> pd.DataFrame:
-        """Return the table of the report over all datasets; empty for a single dataset.
+        """Return the report's table of statistics over all datasets; empty for a single dataset.
 
         Returns:
             One row per metric and combination of variants, with median, difference from
-            `reference`, its confidence interval, p, p after Holm's correction, and effect.
+            `reference`, confidence interval of the difference, p, p after Holm's correction, and
+            effect.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second and is rarely needed
 
@@ -92,7 +93,7 @@ class OpenedRun(Run):
 
     @cached_property
     def figures(self) -> Figures:
-        """Return all figures of the methods, by `step/name`; notebooks display them."""
+        """Return all figures from the methods, by `step/name`; notebooks display them."""
         return Figures(
             {
                 f"{cell.address}/{figure.name}": ShownFigure(**vars(figure))
@@ -113,12 +114,12 @@ class OpenedRun(Run):
         """Return an output as an object of its product class.
 
         Args:
-            address: address of the cell; with `variants`, the name of the step suffices.
+            address: address of the cell; if `variants` are given, the name of the step suffices.
             port: name of the output.
             store: folder of stored results, for products that the record references but does not
                 contain.
             repeat: number of the repeat, from 0.
-            variants: name of a step with variants, or `data` -> variant or dataset.
+            variants: variant by name of a step; for the key `data`, the dataset.
 
         Raises:
             ArgumentError: the run does not have this cell, or the cell does not have this output.
@@ -154,12 +155,13 @@ class OpenedRun(Run):
 
         Args:
             number: number of the wall, as in the names of its files; None for the first one.
-            cell: address of the cell that made it. None for the cell of the baseline, or, with a
-                warning, of another combination if the baseline has no orthoimage.
+            cell: address of the cell that made the orthoimage. None for the cell of the baseline
+                or, with a warning, of another combination if the baseline has no orthoimage.
             data: name of the dataset, if the run has several; None for the first one.
 
         Raises:
-            ArgumentError: the run does not have this orthoimage; the message lists those it has.
+            ArgumentError: the run does not have this orthoimage; the message lists the available
+                ones.
         """
         part = self if data is None else self._part(data)
         places = dict(embedded_products(part, "orthoimages"))
@@ -194,7 +196,7 @@ class OpenedRun(Run):
     def compare(
         self, other: str | Path | Run, *, store: str | Path = ".orthoflow"
     ) -> ShownComparison:
-        """Compare this run with another one, see `RunComparison`.
+        """Compare this run with another one; see `RunComparison`.
 
         Args:
             other: the other run, its folder or its record.
@@ -211,7 +213,7 @@ class OpenedRun(Run):
         return ShownComparison(**vars(compare_runs(self, opened, stores=stores_at(store))))
 
     def _way_to_logs(self) -> str:
-        """Return how to read the logs of failed steps; empty if none failed."""
+        """Return a hint on how to read the logs of failed steps; empty if no step failed."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed or not failed[0].log:
             return ""
@@ -250,7 +252,7 @@ def open_run(path: str | Path) -> OpenedRun:
 
 
 def open_runs(paths: Sequence[str | Path]) -> RunSet:
-    """Open several runs as one table, see `RunSet.metrics`.
+    """Open several runs, whose metrics form one table; see `RunSet.metrics`.
 
     Args:
         paths: run folders, or the `run.h5` in them.
@@ -264,7 +266,7 @@ def open_runs(paths: Sequence[str | Path]) -> RunSet:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ShownComparison(RunComparison):
-    """A comparison of two runs that notebooks display."""
+    """A comparison of two runs, which notebooks can display."""
 
     def _repr_html_(self) -> str:
         parameters = [
@@ -312,7 +314,7 @@ class Figures(dict[str, "ShownFigure"]):
 
 @dataclass(frozen=True, kw_only=True)
 class ShownFigure(RecordedFigure):
-    """A figure that notebooks display."""
+    """A figure that notebooks can display."""
 
     def save(self, path: str | Path) -> None:
         """Write the figure to a file."""
@@ -324,12 +326,12 @@ class ShownFigure(RecordedFigure):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class WallImage:
-    """An orthoimage as an array: `numpy.asarray` of it returns `rgb`.
+    """An orthoimage that can be used as an array: `numpy.asarray` returns its `rgb`.
 
     Attributes:
-        image: the product with colours, mask, sources and frame.
-        cell: address of the cell that made it.
-        file: its GeoTIFF; None if the files of the run are not next to the record.
+        image: product with colours, mask, sources and frame.
+        cell: address of the cell that made the orthoimage.
+        file: path of the GeoTIFF; None if the files of the run are not next to the record.
     """
 
     image: Orthoimage
@@ -338,17 +340,17 @@ class WallImage:
 
     @property
     def rgb(self) -> Colours:
-        """(rows, columns, 3) uint8, or uint16 from 16-bit photos; 0 in cells without a colour."""
+        """Colours (rows, columns, 3), uint8, or uint16 from 16-bit photos; 0 in empty cells."""
         return self.image.rgb
 
     @property
     def is_shown(self) -> NDArray[np.bool_]:
-        """(rows, columns), whether a cell has a colour, including filled cells."""
+        """Mask (rows, columns), True for cells with a colour, including filled cells."""
         return is_shown(self.image.mask)
 
     @property
     def frame(self) -> WallFrame:
-        """Position of the cells; `frame.world_from_wall` returns metres."""
+        """Frame that defines the cells' positions; `frame.world_from_wall` returns metres."""
         return self.image.frame
 
     def __array__(
@@ -373,7 +375,7 @@ class WallImage:
         return _html("picture", data_uri(picture, "image/webp"), repr(self))
 
 
-# Any: as the macro requires.
+# Any: the macro determines the types.
 def _html(macro: str, *values: Any) -> str:
     """Render a macro of the notebook template, which escapes the text of a record."""
     return str(getattr(environment().get_template("notebook.html.j2").module, macro)(*values))

@@ -1,4 +1,4 @@
-"""Drawings of ties with residuals, and of displacements, on pictures of the walls."""
+"""Drawings of ties with residuals and of displacements, on pictures of the walls."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ from orthoflow.report.pictures import (
 )
 
 _MAX_MARKS: Final = 600  # per drawing
-# Drawn lengths of a vector of RMS length and of the reference, as shares of the longer side.
+# Drawn lengths of a vector with the RMS length and of the reference vector, as shares of the longer
+# side.
 _RMS_SHARE: Final = 0.025
 _REFERENCE_SHARE: Final = 0.08
 _STEP_M: Final = 1e-3  # for derivatives; changes a position in a photo by about one pixel
-# Kind -> marker and colour, visible on light and dark pictures.
+# Marker and colour by kind, visible on light and dark pictures.
 _MARKERS: Final = {
     "control": ("o", "#3ee066"),
     "check": ("s", "#ffe11f"),
     "rejected": ("x", "#ff3b30"),
 }
 _OTHERS: Final = ("o", "#4db8ff")
-# World points (n, 3), lengths (n, 2) in metres along u and v, and kinds (n,).
+# World points (n, 3), vectors (n, 2) in metres along u and v, and kinds (n,).
 _Vectors: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.str_]]
 
 
@@ -45,11 +46,11 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
 
     Args:
         run: the run.
-        walls: pictures of its walls, used as backgrounds.
+        walls: pictures of the run's walls, used as backgrounds.
         share: share of the size limit of a page that the drawings may use.
     """
     cameras, inspections = (embedded_products(run, name) for name in ("cameras", "inspection"))
-    # Digest of a walls product -> first picture of each of its walls.
+    # First picture of each wall of a walls product, by the product's digest.
     known: dict[str, dict[int, Picture]] = {}
     for picture in walls:
         for product in run.cells[picture.cell].outputs.values():
@@ -81,7 +82,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
 def _walls_before(
     run: Run, address: str, known: Mapping[str, Mapping[int, Picture]]
 ) -> Mapping[int, Picture]:
-    """Return the pictures of the nearest walls upstream of a cell."""
+    """Return the pictures of walls from the nearest upstream step of a cell."""
     for cell in run.upstream(address):
         for given in cell.inputs.values():
             if given.digest in known:
@@ -122,7 +123,7 @@ def residuals_on_wall(
     residual_px: NDArray[np.float64],
     frame: WallFrame,
 ) -> NDArray[np.float64]:
-    """Convert residuals from a photo to a wall.
+    """Convert residuals in a photo to displacements on a wall.
 
     Args:
         camera: an oriented photo.
@@ -202,15 +203,15 @@ def _drawn(
     reference: tuple[str, float],
     side: int,
 ) -> bytes:
-    """Draw marks and vectors on the picture of a wall, as WebP.
+    """Draw marks and vectors on the picture of a wall, and encode it as WebP.
 
     Args:
         ground: background picture.
-        groups: kind -> indices of its positions.
+        groups: indices of positions by kind.
         feet: (n, 2) positions in cells.
-        vectors: (n, 2) in cells.
-        reference: text of the reference vector, and its length in cells.
-        side: longer side of the drawing, pixels.
+        vectors: (n, 2) vectors in cells.
+        reference: label of the reference vector, and length of this vector in cells.
+        side: longer side of the drawing in pixels.
     """
     frame = frame_of(ground)
     content = base64.b64decode(ground.uri.partition(",")[2])
@@ -223,7 +224,8 @@ def _drawn(
             marker, colour = _MARKERS.get(kind, _OTHERS)
             u, v = feet[members].T
             axes.scatter(u, v, s=1.2, marker=marker, color=colour, linewidths=0.5, label=kind)
-            # Rejected ties may be off by metres, so they have a mark but no vector.
+            # Residuals of rejected ties may be metres long, so these ties have a mark but no
+            # vector.
             if kind != "rejected":
                 ends = np.stack([feet[members], feet[members] + vectors[members]])
                 axes.plot(*ends.T.swapaxes(1, 2), color=colour, linewidth=0.6)

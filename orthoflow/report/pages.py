@@ -1,4 +1,4 @@
-"""Writing of the report page from templates and records."""
+"""Generation of the report page from templates and records."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from orthoflow.report.tables import plane_tables
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
 
-# Columns of the table over all datasets.
+# Columns of the table of statistics over all datasets.
 _OVER_SHOWN: Final = (
     *("combination", "datasets", "failed", "absent", "partly", "median", "spread"),
     *(
@@ -74,7 +74,7 @@ _NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
 def _part(every: Mapping[str, Sequence[Any]], addresses: Collection[str]) -> SimpleNamespace:
-    """Return the pictures, tables and cells (by kind) that belong to the given cells."""
+    """Return those items (pictures, tables and cells by kind) that belong to the given cells."""
     return SimpleNamespace(
         **{
             kind: [one for one in ones if (getattr(one, "cell", "") or one.address) in addresses]
@@ -94,22 +94,22 @@ def write_page(
     """Write the report of one run, and its figures as PNG and SVG files in `figures/` next to it.
 
     If the run has variants, only the figures of the baseline are written; `write_figures` writes
-    those of any cell. If it has several datasets, each has its own page in `pages/`, with links
-    from the main page.
+    those of any cell. If the run has several datasets, each dataset has its own page in `pages/`,
+    to which the main page links.
 
     Args:
         run: the run.
         path: output file.
         go_on: command that resumes the run, if it was interrupted.
         broken_seals: record -> why its seal is broken.
-        note: called with the name of each part.
+        note: function that is called with the name of each part of the report.
 
     Raises:
         StoreError: a file cannot be written.
         RecordError: the record is damaged, or the name of a figure is not valid for a file.
     """
     addresses = baseline_addresses(run)
-    # Checked first, so that no page is written for a record with invalid names.
+    # Check the names first, so that no page is written for a record with invalid names.
     figure_files(run, addresses)
     pages = pages_of(run)
     with run.held_open() as opened:
@@ -141,8 +141,9 @@ def write_report(
     """Write a self-contained HTML file about one or more runs.
 
     Args:
-        runs: opened with `orthoflow.open_run`; for two runs, the page also lists the differences.
-        path: output file; replaced atomically.
+        runs: runs opened with `orthoflow.open_run`; for two runs, the page also lists the
+            differences.
+        path: output file, which is replaced atomically.
         go_on: command that resumes the run, if it was interrupted.
         broken_seals: record -> why its seal is broken.
         stores: stores with products that the records of two runs reference but do not contain.
@@ -192,7 +193,7 @@ def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> 
         run: the run.
         prefix: prefix of the anchors.
         folder: folder of the page.
-        pages: dataset -> its own page; empty if there are none.
+        pages: page of each dataset; empty if datasets have no pages.
     """
     parts = parts_of(run)
     over = over_datasets(parts)
@@ -231,7 +232,7 @@ def _section(
         with_files: whether files of the figures are written next to the page.
     """
     from_page = Path(os.path.relpath(run.folder, folder))
-    # Pictures of the baseline come first, because the metrics next to them belong to it.
+    # Pictures of the baseline come first, because the metrics next to them belong to the baseline.
     baseline = {cell.address for cell in baseline_cells(run)}
     orthoimages, walls = (
         sorted(pictures(run, share=share), key=lambda picture: picture.cell not in baseline)
@@ -293,7 +294,7 @@ def _section(
 
 
 def _files(run: Run, from_page: Path) -> Mapping[str, Mapping[str, str]]:
-    """Return the published files of cells: address -> name -> path relative to the page."""
+    """Return the paths of published files, relative to the page, by cell address and name."""
     published = {file.path for file in run.record.published}
     found: dict[str, dict[str, str]] = defaultdict(dict)
     for address, paths in run.files.items():

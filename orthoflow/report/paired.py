@@ -35,15 +35,15 @@ from orthoflow.untrusted_text import Value, first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
-# With four datasets p is at least 0.125, so no difference can be significant.
+# With four datasets, p is at least 0.125, so no difference can be significant.
 _MIN_TESTED: Final = 5
 # Minimum number of methods for mean ranks; for two, the signed-rank test is more powerful.
 _MIN_RANKED: Final = 3
-# If all differences agree, p is 0.031 for six datasets and 0.0625 for five.
+# If all differences have the same sign, p is 0.031 for six datasets and 0.0625 for five.
 _MIN_SHOWN: Final = 6
 _SHOWN_P: Final = 0.05
 _MAX_NAMED: Final = 6
-# Step and variant of each step on which a step depends.
+# Name and variant of each step with variants on which a step depends.
 _Variants: TypeAlias = tuple[tuple[str, str], ...]
 _Bases: TypeAlias = dict[_Variants, _Variants]
 _TEST: Final = f"p below {_SHOWN_P:g} after Holm's correction"
@@ -53,21 +53,23 @@ _TEST: Final = f"p below {_SHOWN_P:g} after Holm's correction"
 class Paired:
     """Comparison of a method with the reference on the datasets on which both have a value.
 
-    Differences due to rounding (`is_rounding`) count as zero: neither better nor worse.
+    Differences due to rounding (`is_rounding`) count as zero, i.e. as neither better nor worse.
 
     Attributes:
-        n: number of datasets with both values.
+        n: number of datasets on which both have a value.
         wins: number of datasets on which the method is better.
-        losses: number of datasets on which it is worse.
+        losses: number of datasets on which the method is worse.
         median: median difference in the metric's unit; negative if the method has smaller values.
             Signed errors are compared by absolute value, and metrics for which 1 is best by the
-            logarithm of their ratio to 1. For yes/no metrics, the difference of the shares.
-        p: of Wilcoxon's two-sided signed-rank test; NaN for fewer than five differences.
+            logarithm of their ratio to 1. For yes/no metrics, this is the difference between the
+            shares.
+        p: p-value of Wilcoxon's two-sided signed-rank test; NaN for fewer than five differences.
         effect: matched-pairs rank-biserial correlation, from -1 (worse on every dataset) to 1
-            (better on every dataset); NaN if p is.
-        interval: distribution-free interval of the median difference from order statistics, with a
-            confidence of at least 95 %; NaN for fewer than six datasets and for shares.
-        p_holm: p corrected by Holm's method for all comparisons of the run; NaN if p is.
+            (better on every dataset); NaN if p is NaN.
+        interval: distribution-free confidence interval for the median difference, from order
+            statistics, with a confidence level of at least 95 %; NaN for fewer than six datasets
+            and for shares.
+        p_holm: p corrected by Holm's method for all comparisons in the run; NaN if p is NaN.
     """
 
     n: int
@@ -85,21 +87,21 @@ class MethodOverDatasets:
     """Results of the variants on which a step depends, on all datasets.
 
     Attributes:
-        variants: step -> variant; empty if there are no variants.
-        compared_with: name of the variants with which it is compared: those of the baseline, or
+        variants: variant by step; empty if there are no variants.
+        compared_with: name of the variants with which these are compared: those of the baseline, or
             of the baseline's methods with the same values of swept parameters; empty for the
             baseline itself, the reference.
         n: number of datasets with a value.
-        n_failed: number of datasets on which the step or one before it failed; they are not used.
-        n_absent: number of datasets that have no value, although no step failed.
+        n_failed: number of datasets that are not used because the step or an earlier one failed.
+        n_absent: number of datasets without a value, although no step failed.
         n_partly: number of datasets on which only some repeats have a value.
         n_apart: number of datasets that cannot be paired because the environments or the numbers of
             photos differ from those of the reference.
-        median: median over the datasets, of absolute values for signed errors; for yes/no metrics,
-            the share of "yes"; NaN if there are no values.
+        median: median over the datasets, computed from absolute values for signed errors; for
+            yes/no metrics, the share of "yes"; NaN if there are no values.
         spread: 1.4826 times the median absolute deviation; NaN if there are no values, and for
             shares.
-        repeat_spread: standard deviation over repeats, median over the datasets; NaN without
+        repeat_spread: median over the datasets of the standard deviation over repeats; NaN without
             repeats.
         paired: comparison with `compared_with`; None for the reference and for unranked metrics.
     """
@@ -128,10 +130,10 @@ class MeanRanks:
 
     Attributes:
         n: number of datasets.
-        ranks: method -> mean rank, best (1) first.
-        p: of Friedman's test that all methods are equal.
-        critical_difference: by Nemenyi's test at 0.05; methods whose mean ranks differ by less are
-            not significantly different.
+        ranks: mean rank by method, best (1) first.
+        p: p-value of Friedman's test of the hypothesis that all methods are equal.
+        critical_difference: critical difference of mean ranks by Nemenyi's test at the 0.05 level;
+            methods whose mean ranks differ by less are not significantly different.
     """
 
     n: int
@@ -141,7 +143,7 @@ class MeanRanks:
 
     @property
     def leading(self) -> tuple[str, ...]:
-        """The best and those not significantly different from it; all if p is 0.05 or more."""
+        """Best method and those not significantly different from it; all methods if p >= 0.05."""
         best = min(self.ranks.values())
         reach = self.critical_difference if self.p < _SHOWN_P else math.inf
         return tuple(name for name, rank in self.ranks.items() if rank - best < reach)
@@ -163,14 +165,14 @@ class MetricOverDatasets:
 
     @property
     def reference(self) -> MethodOverDatasets:
-        """Results of the reference."""
+        """Results of the reference variants."""
         return next(one for one in self.methods if not one.compared_with)
 
     @property
     def lead(self) -> str:
-        """The best value and the next best, and whether they differ significantly; may be empty."""
+        """Text on the best and next best value and the significance of their difference, or ""."""
         better, unit = self.column.better, self.column.unit
-        # Medians of fewer datasets may be better because the difficult ones are missing.
+        # Medians over fewer datasets may be better only because the difficult datasets are missing.
         most = max(one.n for one in self.methods)
         known = [one for one in self.methods if one.n == most and math.isfinite(one.median)]
         if better not in BETTER or len(known) < 2:
@@ -192,7 +194,7 @@ class MetricOverDatasets:
 
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
-    """Compare the variants of a run over its datasets, for every metric.
+    """Compare the variants of a run over its datasets for every metric.
 
     Values from different environments, or over different numbers of photos, are never paired.
 
@@ -204,7 +206,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     if len(parts) < 2 or not every:
         return ()
     environments = group_environments(parts.values())
-    # Step -> variants on which it depends -> dataset -> combination.
+    # Combinations by step, by variants on which the step depends, and by dataset.
     ways: dict[str, dict[_Variants, dict[str, Combination]]] = {}
     for name, part in parts.items():
         baseline = baseline_of(part)
@@ -222,10 +224,10 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
 
 
 def _bases(ways: Sequence[_Variants], varied: Varied, reference: _Variants) -> _Bases:
-    """Return the variants with which those of each way are compared.
+    """Return the variants with which each set of variants is compared.
 
     These are the variants of the reference's methods with the same values of swept parameters, so
-    that methods are compared at equal settings; without any, the reference.
+    that methods are compared at equal settings; if there are none, the reference.
     """
     used, values = {}, {}
     for own in ways:
@@ -274,11 +276,11 @@ def _over(
     bases = _bases([*ways], varied, reference)
 
     def comparable(own: _Variants, base: _Variants) -> dict[str, tuple[Measured, Measured]]:
-        """Return, by dataset, its value and that of another, if they are comparable."""
+        """Return pairs of comparable values of two sets of variants, by dataset."""
         found = {}
         for name in measured[own].keys() & measured[base].keys():
             both = measured[own][name], measured[base][name]
-            # A larger error over more photos is not a worse result.
+            # A larger error is not a worse result if it covers more photos.
             ours, theirs = (ways[key][name].n_items(step, column.counted_by) for key in (own, base))
             is_like = environments.are_comparable(*(one.environment for one in both))
             if is_like and not abs(ours - theirs) > 0.0:
@@ -345,7 +347,7 @@ def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDataset
 
 
 def holm(values: Sequence[float]) -> dict[float, float]:
-    """Return p -> corrected p for the p-values of several tests, by Holm's step-down method.
+    """Return the corrected p for each p of several tests, by Holm's step-down method.
 
     >>> holm([0.01, 0.04, 0.03])
     {0.01: 0.03, 0.03: 0.06, 0.04: 0.06}
@@ -361,7 +363,7 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
 
     Args:
         names: names of the methods, at least three.
-        badness_of: (datasets, methods), smaller is better.
+        badness_of: (datasets, methods) values, of which smaller ones are better.
     """
     from scipy.stats import (  # noqa: PLC0415 - takes half a second
         friedmanchisquare,
@@ -427,7 +429,7 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     else:
         sentences.append(f"No difference is significant in any of {len(judged)} metrics ({_TEST})")
         n, n_tests = max(pair.wins + pair.losses for pair in tested), len(tested)
-        # If all differences agree, p is 2 / 2^n.
+        # If all n differences have the same sign, p is 2 / 2^n.
         if (least := n_tests * 2.0 ** (1 - n)) >= _SHOWN_P:
             enough = 2 + math.floor(math.log2(n_tests / _SHOWN_P))
             sentences.append(
@@ -452,7 +454,7 @@ def _paired(pairs: Iterable[tuple[Measured, Measured]], column: MetricRow) -> Pa
     worse = []
     for both in pairs:
         own, other = (badness(one.value, column.better) for one in both)
-        # Otherwise a rank test could treat rounding differences in six datasets as significant.
+        # Without this, a rank test could treat rounding differences in six datasets as significant.
         if math.isfinite(own - other):
             worse.append(0.0 if is_rounding(own, other) else own - other)
     return paired_differences(np.array(worse), column.better, column.unit) if worse else None
@@ -462,9 +464,9 @@ def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1")
     """Return statistics of paired differences.
 
     Args:
-        worse: (n,) finite, by how much the method is worse than the reference on each dataset; 0 if
-            they are level; n is at least 1.
-        better: better direction of the metric, for the sign of the differences.
+        worse: (n,) finite amounts by which the method is worse than the reference on each dataset;
+            0 if they are level; n is at least 1.
+        better: better direction of the metric, which defines the sign of the differences.
         unit: unit of the metric.
     """
     from scipy.stats import quantile_test, rankdata, wilcoxon  # noqa: PLC0415 - half a second
@@ -478,7 +480,7 @@ def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1")
         p = float(wilcoxon(moved).pvalue)
     low, high = math.nan, math.nan
     if not is_flag(unit):
-        # Any: the stubs of scipy declare another class.
+        # Any: scipy's stubs declare another class.
         tested: Any = quantile_test(sign * worse)
         low, high = tested.confidence_interval(1.0 - _SHOWN_P)
     return Paired(
@@ -556,5 +558,5 @@ def over_table(over: Sequence[MetricOverDatasets]) -> Table:
 
 
 def _known(value: float) -> float | None:
-    # Adding 0.0 turns -0.0, from metrics where higher is better, into 0.0.
+    # Adding 0.0 turns -0.0, which occurs for metrics where higher is better, into 0.0.
     return None if math.isnan(value) else value + 0.0

@@ -1,4 +1,4 @@
-"""Tables and citations of a run for publications: CSV, LaTeX, Markdown and BibTeX."""
+"""Tables and citations from a run for publications: CSV, LaTeX, Markdown and BibTeX."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthoflow.report.tables import Column, Table, escaped_latex
 from orthoflow.untrusted_text import shown
 from orthoflow.workflow.model import DATA
 
-# If there are more, combinations are rows instead of columns.
+# With more combinations, they are rows instead of columns.
 _FEW_COMBINATIONS: Final = 4
 # `Hoehle and Hoehle 2009, title, doi:10.1016/...`; only authors and year are required.
 _CITATION: Final = re.compile(
@@ -27,7 +27,7 @@ _URL: Final = re.compile(r",?\s*(https?://\S+)")
 
 
 def paper_files(run: Run) -> dict[str, str]:
-    """Return the files of a run for a publication, by name.
+    """Return the files from a run for a publication, by name.
 
     `results` has a row per combination and dataset with the metrics that the comparison selects, or
     else the headline metrics; `datasets` has the statistics over all datasets, if there are
@@ -47,7 +47,7 @@ def paper_files(run: Run) -> dict[str, str]:
 
 
 def _values(run: Run) -> Table:
-    """Return a table with a row per combination and metric, with unit and better direction."""
+    """Return a table with a row per combination and metric, including unit and better direction."""
     columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     names = (
@@ -128,10 +128,10 @@ def _factors(combinations: Iterable[Combination]) -> tuple[str, ...]:
 
 
 def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
-    """Return citations as BibTeX entries, each with a note on the methods that cite it.
+    """Return citations as BibTeX entries, each with a note on the methods that use the source.
 
     Args:
-        cited: citation -> methods, with what each of them uses from it.
+        cited: by citation, the methods and what each of them uses from the source.
 
     >>> print(bibtex({"Gruen 1985, Adaptive matching, doi:10.1/x": ["inspect.surf"]}), end="")
     @misc{gruen1985,
@@ -160,7 +160,7 @@ def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
 
 
 def _once(cited: Mapping[str, Sequence[str]]) -> list[dict[str, str]]:
-    """Return the fields of each entry; citations with the same DOI are merged, longest title."""
+    """Return the fields of each entry; for the same DOI, the citation with the longest title."""
     found: dict[str, dict[str, str]] = {}
     for text, methods in cited.items():
         fields = {**_fields(" ".join(shown(text).split())), "note": "; ".join(methods)}

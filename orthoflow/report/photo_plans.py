@@ -27,7 +27,7 @@ class PhotoPlan:
     Attributes:
         walls: walls in plan view.
         photos: oriented photos in plan view.
-        caption: description, including the photos that are missing.
+        caption: description, which names the photos that are missing.
         cell: address of the orientation.
         table: quality of the orientation of each photo.
         axes: labels of the scan's axes to the right and upwards.
@@ -152,7 +152,7 @@ def _drawn(
     oriented: Sequence[Camera],
     walls: Mapping[int, tuple[str, WallFrame]],
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
-    """Return walls (by number) and photos in plan view."""
+    """Return walls, by number, and photos in plan view."""
     axes = basis_from_up(up)[:2].T
     viewing = {camera.photo: camera.viewing() for camera in oriented}
     return (

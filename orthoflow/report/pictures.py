@@ -35,18 +35,18 @@ T = TypeVar("T", bound=Product)
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320
 # Number of pictures that a page can contain at full size; if there are more, each becomes smaller.
-# A picture of 1000 px takes about 90 kB.
+# A picture with a longer side of 1000 px takes about 90 kB.
 _FULL_PICTURES: Final = 24
 # The baseline's orthoimages are for close inspection, so they have as many cells as a page allows,
 # at about 0.15 bytes per cell.
 _CLOSE_CELLS: Final = 12_000_000
 
-# Number of positions on a wall with depths in millimetres, about 40 kB on a page.
+# Maximum number of positions with depths per wall; they take about 40 kB on a page.
 _PLACES_MOST: Final = 8_000
 # Maximum length of the scale bar as a share of the picture's width.
 _BAR_SHARE: Final = 0.3
-# From blue (behind the plane) through white (on it) to red (in front): readable in greyscale and
-# with red-green colour blindness. Colours of ColorBrewer's RdBu (Brewer 2003).
+# Colours of ColorBrewer's RdBu (Brewer 2003), from blue (behind the plane) through white (on it) to
+# red (in front); readable with red-green colour blindness.
 DIVERGING: Final = np.array(
     [[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]],
     dtype=np.float64,
@@ -55,7 +55,7 @@ _PLACES: Final = np.linspace(-1.0, 1.0, 255)
 _DIVERGING_TABLE: Final = np.rint(
     np.column_stack([np.interp(_PLACES, np.linspace(-1, 1, 5), one) for one in DIVERGING.T])
 ).astype(np.uint8)
-# Planes of one wall from two methods differ by at most some centimetres and a degree.
+# Planes that two methods detect for the same wall differ by at most a few centimetres and a degree.
 _SAME_NORMAL_COSINE: Final = float(np.cos(np.radians(5.0)))
 _SAME_PLACE_SHARE: Final = 0.1  # of the longer side, between centres
 
@@ -66,20 +66,20 @@ class Picture:
 
     Attributes:
         uri: data URI of the image.
-        title: title.
+        title: title of the image.
         caption: size and shares of the cells.
         file: path of the full image relative to the run folder, or empty.
-        cell: address of the cell that made it.
-        wall: index of its wall; -1 if it is not a raster of a wall.
+        cell: address of the cell that made the image.
+        wall: index of the wall; -1 if the image is not a raster of a wall.
         number: number of the wall shown to users: the index of its plane in `planes.json`.
         name: name of the wall.
-        frame: frame of the raster; None if it is not a raster of a wall.
-        id: HTML id; empty if nothing refers to it.
+        frame: frame of the raster; None if the image is not a raster of a wall.
+        id: HTML id; empty if nothing refers to the image.
         depths: for pictures of depth, `columns` and `rows` of a coarse grid, and `mm` row by row,
             None if unknown.
-        depth_limit_m: depth of the last colour of the scale; the first is at the same distance
-            behind the plane.
-        reading: one sentence on how to interpret it and what indicates a problem.
+        depth_limit_m: depth shown in the last colour of the scale; the first colour shows the same
+            distance behind the plane.
+        reading: one sentence on how to interpret the image and what indicates a problem.
     """
 
     uri: str
@@ -98,19 +98,19 @@ class Picture:
 
     @property
     def width_m(self) -> float:
-        """Width on the wall, metres; 0 if it is not a raster of a wall."""
+        """Width on the wall in metres; 0 if the image is not a raster of a wall."""
         return self.frame.width * self.frame.gsd_m if self.frame is not None else 0.0
 
     @property
     def scale(self) -> tuple[str, float]:
-        """Length of the scale bar (1, 2 or 5 times a power of ten), and its percentage of width."""
+        """Length of the scale bar, a round number, and its share of the width in percent."""
         length_m = round_below(_BAR_SHARE * self.width_m)
         words = f"{length_m:g} m" if length_m >= 1.0 else f"{100.0 * length_m:g} cm"
         return words, 100.0 * length_m / self.width_m
 
     @property
     def layer(self) -> str:
-        """Title without the wall, with variants: the same for all walls of a cell."""
+        """Title without the wall but with variants, which is the same for all walls of a cell."""
         text = self.title.removeprefix(self.name).strip(" ,")
         return text if text and not text.startswith("(") else f"orthoimage {text}".strip()
 
@@ -121,13 +121,13 @@ def data_uri(content: bytes, media_type: str) -> str:
 
 
 def side_px(n_pictures: float) -> int:
-    """Return the longest side of each of n pictures in pixels that keeps the page small."""
+    """Return the longer side, in pixels, at which n pictures keep the page small."""
     share = min(1.0, math.sqrt(_FULL_PICTURES / max(1, n_pictures)))
     return max(SHORTEST_SIDE_PX, round(LONGEST_SIDE_PX * share))
 
 
 def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
-    """Yield every orthoimage in the record; identical ones of several cells once.
+    """Yield every orthoimage in the record; those that are identical in several cells once.
 
     Args:
         run: the run.
@@ -144,7 +144,7 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
 
 
 def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> str:
-    """Return a thumbnail of the cells' first orthoimage as a data URI; empty if they have none."""
+    """Return a thumbnail of the cells' first orthoimage as a data URI; empty if there is none."""
     places = [cell for cell, _ in embedded_products(run, "orthoimages") if cell in addresses]
     for address, product in products_of(run, Orthoimages, places[-1:]):
         for image in product.images:
@@ -154,7 +154,7 @@ def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> 
 
 
 def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
-    """Yield intensity and depth of every wall raster in the record; identical ones once.
+    """Yield intensity and depth pictures of every wall raster in the record; identical ones once.
 
     Args:
         run: the run.
@@ -171,14 +171,15 @@ def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
         yield from _drawn(drawings, n_products=n_products / share)
 
 
-# Function that encodes the image with a given longest side in pixels, and its picture with a frame.
+# Function that encodes the image with a given longer side in pixels, and the picture with its
+# frame.
 _Drawing = tuple[Callable[[int], bytes], Picture]
 
 
 def _drawn(
     drawings: Sequence[_Drawing], *, n_products: float, close_cells: float = 0.0
 ) -> Iterator[Picture]:
-    """Encode pictures in parallel; this takes most of the time of a report.
+    """Encode pictures in parallel, because encoding takes most of the time needed for a report.
 
     Args:
         drawings: pictures of one product.
@@ -274,7 +275,7 @@ def _intensity(
 
 
 def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Picture:
-    """Return a picture of `depth` or `intensity` without image data, caption and reading."""
+    """Return a picture of `depth` or `intensity`, without image data, caption and reading."""
     return Picture(
         uri="",
         title=_title(f"{wall.name}, {what}", address),
@@ -291,7 +292,7 @@ def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Pictur
 def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.uint8]:
     """Return colours of depths from blue (-limit) to red (+limit); 0 and NaN are white."""
     place = np.clip(np.asarray(depth_m, dtype=np.float32) / np.float32(limit_m), -1.0, 1.0)
-    # One table look-up per cell is ten times as fast as mixing colours.
+    # One table look-up per cell is ten times as fast as interpolating colours.
     index = np.rint(np.nan_to_num(place) * 127.0 + 127.0).astype(np.int16)
     coloured: NDArray[np.uint8] = _DIVERGING_TABLE[index]
     return coloured
@@ -306,7 +307,7 @@ def frame_words(frame: WallFrame) -> str:
 
 
 def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
-    """Return cells and ports with a product of a type in the record; identical products once.
+    """Return cells and ports whose product in the record has a given type; identical ones once.
 
     Repeats of a random method are omitted: they differ only in their metrics.
     """
@@ -323,7 +324,7 @@ def products_of(
 ) -> Iterator[tuple[str, T]]:
     """Yield the products of a type in the record, each with the address of its cell.
 
-    One product at a time, since those of a large building may exceed the memory together.
+    One product is loaded at a time, since all products of a large building may exceed the memory.
 
     Args:
         run: the run.
@@ -412,9 +413,9 @@ def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, o
         n_orthoimages: number of orthoimages; every group contains at least one.
 
     Returns:
-        For each group of two or more pictures: name of the wall, width over height of the first
-        picture, and of each picture its id, titles, and rectangle in percent of the first one's
-        sides.
+        For each group of two or more pictures: the name of the wall, the aspect ratio (width /
+            height) of the first picture, and each picture's id, titles, and rectangle in percent of
+            the first picture's sides.
     """
     groups: list[list[Picture]] = []
     for index, picture in enumerate(pictures):

@@ -1,4 +1,4 @@
-"""Formatting of numbers, and the best values of a column."""
+"""Formatting of numbers, and ranking of the values in a column."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def number(value: float, *, significant: int = 4) -> str:
 
 
 def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
-    """Format a number with its unit; shares and counts (unit 1) have none.
+    """Format a number with its unit; shares and counts (unit 1) are formatted without a unit.
 
     >>> number_with_unit(2.5, "mm"), number_with_unit(1.0, "yes/no"), number_with_unit(0.4, "1")
     ('2.5 mm', 'yes', '0.4')
@@ -78,9 +78,9 @@ def seconds_in_words(seconds: float) -> str:
     return "{} min {:02d} s".format(*divmod(round(seconds), 60))
 
 
-# Used if there are no repeats of both values, or all repeats are identical, so that the scatter is
-# unknown: smaller differences, relative to the best, count as none. Times and memory scatter more
-# from run to run (docs/performance.md), even if the repeats of one run agree.
+# Differences smaller than this, relative to the best value, are ignored if the scatter is unknown,
+# i.e. if the values have no repeats or only identical ones. Times and memory scatter more from run
+# to run (docs/performance.md), even if the repeats of one run agree.
 _LEVEL_SHARE: Final = 0.01
 _LEVEL_COST_SHARES: Final = {"s": 0.3, "MiB": 0.1}
 FLAG: Final = "yes/no"
@@ -97,16 +97,16 @@ class Mark(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Value:
-    """A field of a comparison table.
+    """A value in a comparison table.
 
     Attributes:
-        text: formatted number; empty if there is none.
-        sort: sort key of the table; NaN if there is none.
-        spread: standard deviation over repeats; NaN if there are none.
+        text: formatted number; empty if the value is missing.
+        sort: number by which the table is sorted; NaN if the value is missing.
+        spread: standard deviation over repeats; NaN without repeats.
         mark: rank among the values of its group.
-        group: letter of its environment and data; empty if all values have the same.
+        group: letter for the environment and data; empty if they are the same for all values.
         note: remark, e.g. the number of repeats.
-        n_items: number of items it sums over; NaN if not counted.
+        n_items: number of items that the metric sums over; NaN if they are not counted.
     """
 
     text: str = ""
@@ -122,16 +122,17 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
     """Mark the best value of each group, unless all values of the group are level.
 
     Groups that contain a value from a single run are not ranked: with another machine or seed,
-    another value may be the best. A value is near the best if its distance from it does not exceed
-    their standard deviations combined in quadrature; or, without repeats or with identical ones,
-    1 % of the best (10 % for memory, 30 % for times), or rounding. If any value is near the best,
-    the best is also marked as near. A value that sums over fewer items than another in its group is
-    not ranked: a method that rejects difficult photos has smaller errors for the
+    another value may be the best. A value is near the best if their difference does not exceed
+    their standard deviations combined in quadrature; without repeats, or with identical ones, the
+    limit is 1 % of the best (10 % for memory, 30 % for times), or rounding. If any value is near
+    the best, the best is also marked as near. A value that sums over fewer items than another in
+    its group is not ranked: a method that rejects difficult photos has smaller errors for the
     remaining ones.
 
     Args:
         values: values of a column.
-        better: better direction, a key of `BETTER`; other metrics are not ranked.
+        better: better direction, a key of `BETTER`; a metric with any other direction is not
+            ranked.
         unit: unit of the values.
     """
     if better not in BETTER:
@@ -155,14 +156,14 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
         if len(leading) == len(members):
             continue
         for index in leading:
-            # If several values share the best rank, none of them is the best.
+            # If several values share the best rank, none of them is marked as the best.
             mark = Mark.NEAR if len(leading) > 1 else Mark.BEST
             marked[index] = replace(values[index], mark=mark)
     return marked
 
 
 def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
-    """Return whether a value is not distinguishable from a better one."""
+    """Return whether a value cannot be distinguished from a better one."""
     if is_rounding(badness(one.sort, better), badness(other.sort, better)):
         return True
     known = [
@@ -177,11 +178,11 @@ def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
 
 
 def cost_share(unit: str) -> float:
-    """Return the relative scatter of values from run to run; 0 except for times and memory."""
+    """Return the relative scatter of times and memory from run to run; 0 for other units."""
     return _LEVEL_COST_SHARES.get(unit, 0.0)
 
 
-# Better direction as declared by a method (`MetricSpec.better`); others are not ranked.
+# Better directions that a method may declare (`MetricSpec.better`); other metrics are not ranked.
 BETTER: Final = {"lower": "lower is better", "higher": "higher is better", "one": "1 is best"}
 
 
@@ -206,10 +207,10 @@ def badness(value: float, better: str) -> float:
 
 
 def middle_of(values: NDArray[np.float64], unit: str) -> float:
-    """Return the central value over several datasets; NaN if there are none.
+    """Return the central value over several datasets; NaN if there are no values.
 
-    This is the median; for yes/no metrics, the mean, which is the share of "yes": the median would
-    be the same for any minority.
+    This is the median, but for yes/no metrics the mean, i.e. the share of "yes", because the median
+    would not depend on the size of a minority.
     """
     if not values.size:
         return math.nan
@@ -217,8 +218,8 @@ def middle_of(values: NDArray[np.float64], unit: str) -> float:
 
 
 def spread_of(values: NDArray[np.float64], unit: str) -> float:
-    """Return the spread of values over several datasets; NaN if there are none.
+    """Return the spread of values over several datasets; NaN if there are no values.
 
-    A share has no spread, since it determines the counts of both values.
+    Yes/no metrics have no spread, since the share of "yes" describes their distribution completely.
     """
     return math.nan if is_flag(unit) or not values.size else median_deviation(values)

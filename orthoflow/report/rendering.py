@@ -41,12 +41,12 @@ def environment() -> jinja2.Environment:
         "number": number,
         "environments": distinct_words,
         "cited": cited,
-        # Allow line breaks after underscores and before variants of long names and addresses.
+        # In long names and addresses, allow line breaks after underscores and before each variant.
         "breakable": lambda name: Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(shown(name))))),
         "urlpath": quote,
         "shell": shlex.quote,
     }
-    # Part of the package and not a template, so braces have no meaning.
+    # These files are part of the package and not templates, so braces have no special meaning.
     folder = files("orthoflow.report") / "templates"
     css, early, script = (
         folder.joinpath(name).read_text(encoding="utf-8")
@@ -69,7 +69,7 @@ def environment() -> jinja2.Environment:
 
 
 def _shown(value: object) -> object:
-    """Escape control characters, such as text direction marks; markup has been escaped before."""
+    """Escape control characters, such as text direction marks; markup is already escaped."""
     is_text = isinstance(value, str) and not isinstance(value, Markup)
     return shown(str(value), keep="\n\t") if is_text else value
 
@@ -81,7 +81,7 @@ def _hash_source(text: str) -> str:
 
 
 def cited(citation: str) -> Markup:
-    """Escape a citation and make its DOI a link, which does not need the network until clicked."""
+    """Escape a citation and make its DOI a link, which uses the network only when clicked."""
     return Markup(
         _DOI.sub(
             lambda found: (

@@ -1,4 +1,4 @@
-"""Numbers and sentences of the page, from the record."""
+"""Numbers and sentences on the page, derived from the record."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A headline metric: label, value, cell and remark."""
+    """A headline metric with label, value, cell and remark."""
 
     what: str
     value: str
@@ -48,12 +48,12 @@ class Limit:
 
 
 def headline_keys(cells: Iterable[RecordedCell]) -> list[tuple[str, str]]:
-    """Return step and metric of the headline metrics, as declared by the methods.
+    """Return step and name of each headline metric that the methods declare.
 
-    Steps that check results come first, then the other steps, the last one first; within a step,
+    Steps that check results come first, then the other steps in reverse order; within a step,
     metrics keep the order in which the method reports them. If several steps report the same
-    metric, only the last step is used, since it refines the results of earlier ones; checks keep
-    their own.
+    metric, only the last step is used, since it refines the results of earlier ones; metrics of
+    checks are all used.
     """
     checks: dict[str, dict[str, None]] = {}
     others: dict[str, dict[str, None]] = {}
@@ -95,7 +95,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
 
 
 def has_measured_lengths(run: Run) -> bool:
-    """Return whether a check of the baseline compared lengths, so that their errors are known."""
+    """Return whether a check in the baseline compared lengths, so that length errors are known."""
     return any(
         metric.unit == "mm"
         for cell in baseline_cells(run)
@@ -119,7 +119,8 @@ def limits(run: Run) -> tuple[Limit, ...]:
     imaged = {
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
-    # A later orientation reports itself which photos are not oriented.
+    # Later orientations report which photos are not oriented, so diagnostics of earlier ones are
+    # omitted.
     oriented = [
         cell.address
         for cell in by_baseline
@@ -147,14 +148,14 @@ def limits(run: Run) -> tuple[Limit, ...]:
 
 
 def _is_of_others_than(numbers: Collection[str], group: DiagnosticGroup) -> bool:
-    """Return whether diagnostics concern only planes that are not among these, if there are any."""
+    """Return whether diagnostics concern planes, but none of `numbers`; False if that is empty."""
     about = (_PLANE.fullmatch(subject) for subject in (group.worst.subject, *group.subjects))
     named = [plane[1] for plane in about if plane]
     return bool(numbers and named) and not any(number in numbers for number in named)
 
 
 def results(run: Run) -> dict[str, tuple[str, ...]]:
-    """Return addresses by result: succeeded, failed, not reached or not selected."""
+    """Return cell addresses by result: succeeded, failed, not reached or not selected."""
     found: dict[str, tuple[str, ...]] = {"ok": (), "failed": (), "skipped": (), "not asked for": ()}
     for cell in run.record.cells:
         which = "not asked for" if cell.error_type == NOT_ASKED_FOR else cell.status
@@ -163,13 +164,13 @@ def results(run: Run) -> dict[str, tuple[str, ...]]:
 
 
 def citations(run: Run) -> dict[str, tuple[str, ...]]:
-    """Return citations of the methods: citation -> methods, with what each uses from it."""
+    """Return, by citation, the methods that cite it and what each uses from the source."""
     found: dict[str, dict[str, None]] = {}
     for cell in run.record.cells:
         if cell.status != "skipped":
             for citation in cell.citations:
-                # `..., doi:... (4.4, Table 2)`: one entry per publication, whichever sections
-                # methods cite.
+                # In `..., doi:... (4.4, Table 2)`, separate the section, so that each publication
+                # has one entry.
                 placed = _PLACE.fullmatch(citation)
                 text, place = placed.groups() if placed else (citation, "")
                 method = f"{cell.method}: {place}" if place else cell.method

@@ -1,4 +1,4 @@
-"""Tables for pages and publications, and the detected planes as tables."""
+"""Tables for pages and publications, and tables of the detected planes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LATEX: Final = {
 
 
 def escaped_latex(text: str) -> str:
-    """Return a text escaped for LaTeX."""
+    """Escape a text for LaTeX."""
     return "".join(_LATEX.get(sign, sign) for sign in shown(text))
 
 
@@ -36,7 +36,7 @@ class Column(NamedTuple):
     Attributes:
         label: heading, with unit and better direction.
         name: heading in CSV.
-        is_numeric: whether it is right-aligned and sorted numerically.
+        is_numeric: whether the column is right-aligned and sorted numerically.
         digits: number of significant digits.
     """
 
@@ -51,8 +51,8 @@ class Table:
     """A table that is shown on pages and written as CSV, LaTeX and Markdown.
 
     Attributes:
-        name: name of its files without suffix.
-        caption: one sentence.
+        name: name of the table's files without suffix.
+        caption: caption of one sentence.
         columns: columns in order.
         rows: rows of values; None if a field is empty.
     """
@@ -69,7 +69,7 @@ class Table:
         return missing if value is None else str(value)
 
     def only(self, *names: str) -> Table:
-        """Return the table with only these columns."""
+        """Return the table with only the given columns."""
         places = [place for place, column in enumerate(self.columns) if column.name in names]
         return replace(
             self,
@@ -119,10 +119,10 @@ class PlaneTables:
 
     Attributes:
         cell: address of the cell.
-        viewpoint: how it was decided from which side each plane is viewed.
-        planes: a row per plane.
-        materials: thickness of the cloud by position and material.
-        before: addresses of all upstream cells.
+        viewpoint: text on how the viewing side of each plane was determined.
+        planes: table with a row per plane.
+        materials: table of the cloud's thickness by position and material.
+        before: addresses of all cells upstream of `cell`.
     """
 
     cell: str
@@ -132,15 +132,15 @@ class PlaneTables:
     before: frozenset[str] = frozenset()
 
     def taken_further(self, tables: Iterable[PlaneTables]) -> bool:
-        """Return whether another table shows planes that a later step derived from these."""
+        """Return whether one of `tables` shows planes that a later step derived from these."""
         return any(self.cell in table.before for table in tables)
 
 
 def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
-    """Return the planes of every cell that detected some; identical products once."""
+    """Return the tables of every cell with detected planes; identical products once."""
     found = []
     for address, planes in products_of(run, Planes):
-        # Number of planes by the source of their side.
+        # Number of planes by the source of their viewing side.
         counts = Counter(planes.side_source(index) for index in range(len(planes)))
         sources = [f"{source} ({count})" for source, count in counts.items()]
         found.append(
@@ -163,7 +163,7 @@ def _plane_table(planes: Planes) -> Table:
         omega, phi = omega_phi_deg(planes.normal[index], planes.up)
         first, second, _, last = planes.corners[index]
         wide_m, high_m = np.linalg.norm(last - first), np.linalg.norm(second - first)
-        # Given planes have no thickness.
+        # Planes that were given as input have no thickness.
         thickness = planes.thickness[index] if planes.thickness else None
         spread = (None, None) if thickness is None else (thickness.sigma_m, thickness.scan_step_m)
         rows.append(
