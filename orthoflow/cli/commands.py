@@ -262,7 +262,7 @@ _workflow_options = _together(
         "only_data",
         multiple=True,
         metavar="NAMES",
-        help="Run only on these datasets; comma-separated names.",
+        help="Run only on these datasets (comma-separated names).",
     ),
 )
 #: options that select steps

@@ -263,7 +263,9 @@ def _points_text(lines: Mapping[str, _Line], column: MetricRow, n_datasets: int)
     counts = sorted({len(values) for values in found})
     counted = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
     if is_flag(column.unit):
-        return f"Points are shares of {counted} of {n_datasets} datasets, and of their repeats"
+        return (
+            f"Points are the share of yes over {counted} of {n_datasets} datasets and their repeats"
+        )
     absolute = ". Absolute values of errors are used" if column.better == "lower" else ""
     bars = ". Bars are 1.4826 times the median absolute deviation" if counts[-1] > 1 else ""
     return f"Points are medians of {counted} of {n_datasets} datasets{absolute}{bars}"

@@ -163,7 +163,7 @@ def test_of_what_is_found_or_not_a_curve_has_the_share_of_rooms(tmp_path: Path) 
     assert points(curve) == [(0.02, pytest.approx(2 / 3)), (0.05, 1.0), (0.1, 0.75)]
     assert curve.bounds == (0.0, 1.0)
     assert bars(curve) == []
-    assert "shares of 3 of 3 datasets" in curve.caption
+    assert "share of yes over 3 of 3 datasets" in curve.caption
 
 
 def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path) -> None:

@@ -327,8 +327,8 @@ def _compressed(
     plain = np.zeros(n_plain if is_possible else 0, dtype=np.uint8)
     if not is_possible or decompress_lzf(packed, plain) != n_plain:
         raise InputError(
-            f"{path.name} cannot be decompressed: {n_points} points need {n_plain} bytes; the "
-            "file is damaged, export it again"
+            f"{path.name} cannot be decompressed: {n_points} points need {n_plain} "
+            "bytes; the file is damaged: export it again"
         )
     kinds = [row[k] for k in range(len(columns.names))]
     parts = np.split(plain, np.cumsum([kind.itemsize for kind in kinds])[:-1] * n_points)

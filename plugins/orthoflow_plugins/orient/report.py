@@ -381,10 +381,10 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
             partial(map_chart, error_mm, label, frame, low=0.0, high=round_scale(1e3 * high_m)),
-            f"Predicted error of a coordinate on {wall.name}, at each position that of the most "
-            f"accurate photo; median {1e3 * median_m:.2g} mm. Grey: no oriented photo shows the "
-            "wall. In bright areas far from ties, the orthoimage may be displaced; more ties there "
-            "would help.",
+            f"Predicted error of a coordinate on {wall.name}, at each position for the "
+            f"most accurate photo; median {1e3 * median_m:.2g} mm. Grey: no oriented "
+            "photo shows the wall. In bright areas far from ties, the orthoimage may "
+            "be displaced; more ties there would help.",
         )
 
 

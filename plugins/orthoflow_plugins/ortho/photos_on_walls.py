@@ -229,8 +229,9 @@ def pixels_of(photo: Photo, camera: Camera, level: Level) -> Colours:
     viewing = camera.viewing()
     if pixels.shape[:2] != (viewing.height, viewing.width):
         raise MethodError(
-            f"{photo.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels, but its camera "
-            f"{viewing.width} x {viewing.height}: connect the photos that were oriented"
+            f"{photo.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels, but its "
+            f"camera has {viewing.width} x {viewing.height}: connect the photos that "
+            "were oriented"
         )
     return in_levels(pixels, level)
 
