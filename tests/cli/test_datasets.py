@@ -102,7 +102,7 @@ def test_a_replay_takes_the_files_of_a_dataset_from_elsewhere(
         assert done.exit_code == 0, done.stderr
     else:
         assert "input number@hall" not in done.stderr
-        assert "give it with --input number@stairs=PATH" in done.stderr
+        assert "pass --input number@stairs=PATH" in done.stderr
 
 
 def test_later_rows_compute_nothing_again(folder: Path) -> None:
