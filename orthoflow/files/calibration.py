@@ -123,7 +123,7 @@ def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
     """Return the first pattern that equals the photo's name, or matches it as a shell pattern.
 
     Matching is case-sensitive. A name with brackets matches itself, and a name with folders is also
-    matched without them.
+    matched without the folders.
     """
     names = (photo_name, photo_name.rpartition("/")[2])
     for pattern in patterns:
@@ -165,7 +165,7 @@ def lens_for(
 
 
 class _Lens(BaseModel):
-    """An entry of the file; each validator uses the fields above its own."""
+    """An entry in the file; each validator uses fields that are declared before its own."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 

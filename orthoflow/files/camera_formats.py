@@ -271,9 +271,10 @@ def _is_realitycapture(path: Path) -> bool:
 def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
     """Read RealityCapture's "internal/external camera parameters" (CSV).
 
-    The focal length is the equivalent for a 36 mm film along the photo's longer side. The principal
-    point is relative to the centre, as a fraction of that side. Heading is clockwise from north
-    (y); pitch 0 looks straight down. Missing parameters are zero; comment lines may be anywhere.
+    The focal length refers to a frame whose longer side is 36 mm. The principal
+    point is relative to the centre, as a fraction of the longer side. Heading is clockwise from
+    north (y); pitch 0 looks straight down. Missing parameters are zero; comment lines may be
+    anywhere.
 
     Raises:
         InputError: the file is damaged.

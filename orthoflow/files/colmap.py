@@ -142,7 +142,7 @@ def _pycolmap(purpose: str) -> Any:
 
 
 def _kept_ties(ties: Ties | None, photo: str) -> NDArray[np.float64]:
-    """Return a photo's ties kept by the orientation (n, 6): pixel, position, residual length."""
+    """Return a photo's ties that the orientation kept (n, 6): pixel, position, residual length."""
     if ties is None or photo not in ties.photo_names:
         return np.empty((0, 6))
     mine = (ties.photo == ties.photo_names.index(photo)) & (ties.role != TieRole.REJECTED)
@@ -284,7 +284,7 @@ def _given(
 
 
 def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | WideLens | str, str]:
-    """Return a camera's lens and a note on omitted terms, or the reason why it has no lens."""
+    """Return a camera's lens and a note on omitted terms, or the reason why it is unusable."""
     if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
         raise damaged(path, f"a camera has {camera.width} x {camera.height} pixels")
     if camera.is_spherical():

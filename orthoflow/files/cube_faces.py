@@ -4,7 +4,7 @@ The fisheye model is OpenCV's (`cv2.fisheye`; Kannala and Brandt 2006): the imag
 angle theta from the axis is theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal
 lengths from the principal point. Metashape's model also has tangential terms and skew. In a
 panorama, columns are azimuths, clockwise as seen from above, and rows are elevations, from top to
-bottom, as in ASTM E2807; its camera looks at the centre of the image.
+bottom, as in ASTM E2807; the camera looks at the centre of the image.
 """
 
 from __future__ import annotations
@@ -212,10 +212,10 @@ def _growth(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np
 
 @cache
 def _fold_rad(radial: tuple[float, ...]) -> float:
-    """Return the angle from the axis where the lens model stops increasing; pi if it never does."""
+    """Return the angle at which the distorted angle stops increasing; pi if it never does."""
     angles = np.linspace(0.0, math.pi, _ANGLES_TRIED)
     with np.errstate(all="ignore"):
-        # Negated, so that NaN counts as not increasing.
+        # The comparison is negated so that NaN counts as not increasing.
         stops = ~(_growth(radial, angles) > 0.0)
     return float(angles[max(int(np.argmax(stops)) - 1, 0)]) if stops.any() else math.pi
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # Each of the two columns of a journal page is 85 mm wide.
 COLUMN_INCHES: Final = 85.0 / 25.4
 DPI: Final = 300
-# A higher picture would not leave room for its caption on a page.
+# A taller picture would not leave room for its caption on a page.
 _MAX_HEIGHT_INCHES: Final = 6.0
 # A column cannot show more pixels than this along a picture's longer side.
 _MAX_SIDE_PX: Final = 1000

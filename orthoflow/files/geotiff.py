@@ -321,8 +321,8 @@ def world_file_text(place: GridPlace, *, rows: float = 1.0, columns: float = 1.0
 
     Args:
         place: position of the raster.
-        rows: rows of cells per pixel; more than one for a preview.
-        columns: columns of cells per pixel.
+        rows: number of raster rows per pixel of the image; more than 1 for a preview.
+        columns: number of raster columns per pixel of the image.
     """
     across_m, down_m = columns * place.gsd_m, place.down * rows * place.gsd_m
     first = (place.corner_m[0] + 0.5 * across_m, place.corner_m[1] + 0.5 * down_m)
@@ -379,7 +379,7 @@ class RasterParts:
 
     Attributes:
         shape: rows and columns.
-        place: position of the raster; its coordinate system is not included.
+        place: position of the raster, without its coordinate system.
         bands: number of bands.
         dtype: numpy name of the stored type.
     """

@@ -232,7 +232,7 @@ def _fisheye(
 def nearest_lens(
     start: Intrinsics, rays: NDArray[np.float64], pixels: NDArray[np.float64]
 ) -> tuple[Intrinsics | FisheyeLens, float]:
-    """Return the lens in our models closest to another program's, and its deviation in pixels.
+    """Return the lens in our models that is closest to another program's, and its deviation.
 
     Args:
         start: focal length, principal point and size of the other lens.

@@ -50,7 +50,7 @@ def write_room(
         path: output file, `.glb`.
         orthos: the orthoimages, at least one.
         up: (3,) unit vector of the world's up direction.
-        depths: GeoTIFF of depths by wall number, for walls in relief; walls without one are flat.
+        depths: GeoTIFF of depths by wall number, for walls in relief; other walls are flat.
 
     Raises:
         StoreError: the file cannot be written.
@@ -83,7 +83,7 @@ def write_room(
 def write_page(path: Path, model: Path) -> None:
     """Write a page that shows a model without a server; a small model is embedded.
 
-    For a large or unreadable model, the page asks for the file.
+    If the model is large or cannot be read, the page asks the user for the file.
 
     Args:
         path: output file, `.html`.
@@ -148,7 +148,7 @@ class _Document:
                 },
             }
         )
-        # The root is node 0.
+        # The number is the index plus one, because node 0 is the root.
         return len(self.nodes)
 
     def finished(self, root: dict[str, JsonValue]) -> bytes:

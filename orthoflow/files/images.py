@@ -207,7 +207,7 @@ def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
 def cells_webp(
     shape: tuple[int, ...], cells: Cells, *, longest_side_px: int, least_px: int = 0
 ) -> bytes:
-    """Return the picture of `cells_png` as lossy WebP, with a given maximum length of its sides.
+    """Return the picture of `cells_png` as lossy WebP, with a given maximum side length.
 
     If the longer side has fewer than `least_px` cells, each cell becomes a square of pixels.
     """
@@ -217,7 +217,7 @@ def cells_webp(
 
 
 def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
-    """Return an encoded image as WebP, reduced to a maximum length of its sides.
+    """Return an encoded image as WebP, reduced to a maximum side length.
 
     Raises:
         InputError: the bytes are not an image.

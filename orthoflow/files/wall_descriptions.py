@@ -36,7 +36,7 @@ class WallDescription(BaseModel):
             a point measured in it; None if the image was not checked.
         expected_mm_p95: 95th percentile of the expected error over the image.
         n_withheld_ties: number of withheld tie points on this wall; 0 if there is no image.
-        errors: errors of the run because of which the orthoimage should not be delivered.
+        errors: errors in the run because of which the orthoimage should not be delivered.
         orthoimage: path of the GeoTIFF, relative to the file with this description.
     """
 

@@ -40,7 +40,7 @@ _LONGEST_KEY: Final = 1024
 _TAG: Final = "tag:yaml.org,2002:"
 
 Scalar: TypeAlias = bool | int | float | str | None
-# Keys and indices on the way to a value: `("steps", "wall", "in", "cloud", 0)`.
+# Keys and indices that lead to a value: `("steps", "wall", "in", "cloud", 0)`.
 Location: TypeAlias = tuple[str | int, ...]
 
 

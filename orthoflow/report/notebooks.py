@@ -255,7 +255,7 @@ def open_runs(paths: Sequence[str | Path]) -> RunSet:
     """Open several runs, whose metrics form one table; see `RunSet.metrics`.
 
     Args:
-        paths: run folders, or the `run.h5` in them.
+        paths: run folders, or their `run.h5` files.
 
     Raises:
         ArgumentError: a path does not exist, or no paths are given.

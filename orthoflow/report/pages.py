@@ -101,7 +101,7 @@ def write_page(
         run: the run.
         path: output file.
         go_on: command that resumes the run, if it was interrupted.
-        broken_seals: record -> why its seal is broken.
+        broken_seals: reason why the seal is broken, by record.
         note: function that is called with the name of each part of the report.
 
     Raises:
@@ -145,7 +145,7 @@ def write_report(
             differences.
         path: output file, which is replaced atomically.
         go_on: command that resumes the run, if it was interrupted.
-        broken_seals: record -> why its seal is broken.
+        broken_seals: reason why the seal is broken, by record.
         stores: stores with products that the records of two runs reference but do not contain.
 
     Raises:
@@ -227,7 +227,7 @@ def _section(
         run: the run.
         prefix: prefix of the anchors.
         folder: folder of the page; paths of files are relative to it.
-        broken_seals: record -> why its seal is broken.
+        broken_seals: reason why the seal is broken, by record.
         share: share of the size limit of a page that pictures may use.
         with_files: whether files of the figures are written next to the page.
     """

@@ -199,7 +199,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     Values from different environments, or over different numbers of photos, are never paired.
 
     Args:
-        parts: dataset -> its part of the run.
+        parts: part of the run by dataset.
     """
     every = [one for part in parts.values() for one in combinations_of(part)]
     every = [one for one in every if DATA in one.assignment]

@@ -59,7 +59,7 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
 
     Args:
         run: the run.
-        walls: pictures of its walls.
+        walls: pictures of the run's walls.
     """
     baseline = {cell.address for cell in baseline_cells(run)}
     every = [cell for cell, _ in embedded_products(run, "cameras")]

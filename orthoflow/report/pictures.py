@@ -67,7 +67,7 @@ class Picture:
     Attributes:
         uri: data URI of the image.
         title: title of the image.
-        caption: size and shares of the cells.
+        caption: size of the image and shares of the cell states.
         file: path of the full image relative to the run folder, or empty.
         cell: address of the cell that made the image.
         wall: index of the wall; -1 if the image is not a raster of a wall.

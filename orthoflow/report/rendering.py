@@ -1,4 +1,4 @@
-"""Template environment of pages and drawings."""
+"""Template environment for pages and drawings."""
 
 from __future__ import annotations
 

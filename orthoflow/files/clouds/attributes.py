@@ -1,6 +1,6 @@
 """Points prepared for writing in blocks: selected, coloured, with plane and normal.
 
-`cloud.json`, next to the points, describes them and the meaning of their colours and fields.
+`cloud.json`, next to the file of points, describes the points, their colours and their fields.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class AttributedCloud:
         labels: plane labels of the points; None if `planes` is None.
         photo_colours: colours for the colouring `photos`.
         photo_names: names of these photos, by number.
-        wall: if given, only points over this raster and within its buffer are written, and
-            deviations are measured from its plane.
-        wall_plane: number of the plane of that wall.
+        wall: wall to whose raster and buffer the points are restricted, and from whose plane
+            deviations are measured; None for all points.
+        wall_plane: number of the plane of `wall`.
         box_world: (2, 3) lowest and highest corner of a box; points outside are omitted. None for
             all points.
         is_cleaned: whether isolated points are omitted.
@@ -99,7 +99,7 @@ class AttributedCloud:
 
     @cached_property
     def scans(self) -> tuple[int, ...]:
-        """Return the numbers of the scans with points, before cropping."""
+        """Return the numbers of the scans that have points before cropping."""
         found: set[int] = set()
         if self.cloud.scan is None:
             return (0,)
@@ -108,7 +108,7 @@ class AttributedCloud:
         return tuple(sorted(found))
 
     def station(self, scan: int) -> NDArray[np.float64] | None:
-        """Return the station of a scan (3,); None unless the files give one for each scan."""
+        """Return the station of a scan (3,); None unless the files contain one for every scan."""
         cloud = self.cloud
         if cloud.stations is None or cloud.stations_source != "file":
             return None

@@ -1,9 +1,9 @@
 """A cloud as COPC 1.0: a LAZ file whose chunks are octree nodes, in order of increasing density.
 
 A node contains one point per cell of its grid, and its child nodes add points in between; a node
-with few points keeps them all. Points are buffered in files next to the output, so memory does not
-grow with their number. They are sorted into groups along a Morton curve; a cell of the root's grid
-is never split between groups.
+whose volume has few points contains all of them. Points are buffered in files next to the output,
+so memory does not grow with their number. They are sorted into groups along a Morton curve; a cell
+of the root's grid is never split between groups.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ def _colour(
 def _extent(
     cloud: PointCloud,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Return the extent of a cloud without outliers, in metres from its origin, and its spacing.
+    """Return a cloud's extent without outliers, in metres from its origin, and its point spacing.
 
     Returns:
         (3,) lowest and (3,) highest coordinates, the side of the cubes used for the estimate, and

@@ -23,7 +23,7 @@ from orthoflow.files.points.scan_file import load_library
 from orthoflow.products import PointCloud
 from orthoflow.version import __version__
 
-# LAS 1.4 with colours.
+# Point format of LAS 1.4 with colours.
 _POINT_FORMAT: Final = 7
 _VERSION: Final = "1.4"
 _SCALE_M: Final = 1e-4

@@ -206,7 +206,7 @@ def _add_grid(space: Modelspace, low: NDArray[np.float64], high: NDArray[np.floa
 
 
 def _add_level(space: Modelspace, x: float, height_m: float) -> None:
-    """Add a height mark right of the picture."""
+    """Add a height mark to the right of the picture."""
     mark = space.add_blockref(
         _LEVEL_BLOCK, (x + 2 * _TEXT_M, height_m), dxfattribs={"layer": "A-ANNO-LEVL"}
     )
@@ -246,7 +246,7 @@ def _add_dimension(
 
 
 def _add_placed_wall(document: Drawing, space: Modelspace, wall: DrawnWall) -> None:
-    """Add a wall's coordinate system, and its picture at its position."""
+    """Add a wall's coordinate system, and the wall's picture at its position in the room."""
     frame = wall.frame
     axes = {"origin": frame.origin_world, "xaxis": frame.u_world, "yaxis": -frame.v_world}
     document.ucs.add(

@@ -1,9 +1,10 @@
 """Plans and sections: the intersection of a cutting plane with a room, and lines beyond it.
 
 Cut lines are exact intersections of the cutting plane with detected planes; they end where the
-points end or where another plane meets them. Points of the slab that are not near such a line are
-kept as points. X and Y of the drawing are metres: for a plan, (e1, e2) of the right-handed frame
-(e1, e2, up); for a section, the distance from its first point and the height.
+points end or where another plane meets them. Points in a thin slab around the cutting plane that
+are not near such a line are kept as points. X and Y of the drawing are metres: for a plan, (e1, e2)
+of the right-handed frame (e1, e2, up); for a section, the distance from its first point and the
+height.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class Section:
     Attributes:
         cut: the cutting plane.
         lines: the cut lines.
-        gaps_m: (g, 2, 2) stretches of cut planes without points: doors, windows, shadows.
+        gaps_m: (g, 2, 2) stretches of cut planes without points: doors, windows, occlusions.
         beyond_m: (b, 2, 2) edges and outlines of openings beyond the cut.
         points_m: (p, 2) thinned points of the slab that are away from all lines.
         slab_m: thickness of the slab from which points were used; 0 if there is no cloud.
@@ -316,7 +317,7 @@ _Span = tuple[float, float]
 
 
 def _trace(cut: Cut, planes: Planes, index: int) -> _Trace | None:
-    """Return a point on the line where a plane is cut, its direction, and the side of the solid."""
+    """Return a point on a plane's cut line, the line's direction, and the side of the solid."""
     normal = planes.normal[index]
     in_cut = np.array([normal @ cut.x_world, normal @ cut.y_world])
     size = float(np.linalg.norm(in_cut))

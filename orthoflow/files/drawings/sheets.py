@@ -167,7 +167,7 @@ def _marks(
 
 
 def _draw_heights(placed: Placed, drawing: Drawing) -> None:
-    """Draw height marks right of the picture, moved apart if they would overlap."""
+    """Draw height marks to the right of the picture, moved apart if they would overlap."""
     canvas, part = placed.canvas, placed.view.part
     _, bottom, right, top = placed.edges_mm
     start, slope = drawing.axes.down

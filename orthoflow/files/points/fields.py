@@ -83,7 +83,7 @@ class Columns:
         idle |= set() if has_grid else {"row", "column"}
         return {name: place for name, place in found.items() if name not in idle}
 
-    # Any: values of other attributes of `Scan`.
+    # Any: `more` contains other attributes of `Scan`.
     def scan(self, **more: Any) -> Scan:
         """Return a scan with these fields."""
         places = self.places

@@ -46,7 +46,7 @@ def decompress_lzf(packed: NDArray[np.uint8], plain: NDArray[np.uint8]) -> int:
         count += 2
         if source < 0 or written + count > plain.size:
             return -1
-        # Byte by byte: source and target overlap if a pattern repeats.
+        # Copy byte by byte, because source and target overlap if a pattern repeats.
         for _ in range(count):
             plain[written] = plain[source]
             written += 1

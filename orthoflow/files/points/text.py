@@ -473,7 +473,7 @@ def _parse(block: bytes, layout: Layout, columns: list[int], separator: str) -> 
 def _unread_line(
     path: Path, start: int, block: bytes, layout: Layout, wanted: list[int]
 ) -> InputError:
-    """Return the error for the first line of a block that is not data; `start` is its offset."""
+    """Return the error for the first line without data in the block at the offset `start`."""
     first_line = line_at(path, start)
     where, got = f"from line {first_line}", " per line"
     for number, line in enumerate(block.split(b"\n"), start=first_line):
