@@ -40,8 +40,7 @@ def in_cells_of_points(wall: Wall) -> Wall:
 
     Returns:
         The same wall if it has no intensity or its cells are not much finer than its point spacing;
-        otherwise a wall with depths, spreads, counts and intensity of joined cells, without
-        colours.
+        otherwise a wall of joined cells with depths, spreads, counts and intensity, but no colours.
     """
     gsd_m = wall.frame.gsd_m
     factor = math.floor(scan_step_m(wall.count, gsd_m=gsd_m) / gsd_m)
@@ -77,7 +76,7 @@ def _join(
     places: NDArray[np.float32],
     which: tuple[slice, float],
 ) -> None:
-    """Fill some rows of a joined wall with values and centroids of its measured cells.
+    """Fill some rows of a joined wall with values and centroids computed from measured cells.
 
     Args:
         wall: the wall.
@@ -159,13 +158,14 @@ _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
-# The depths around a cell form a relief step if they differ by more than this many cells and by
-# more than this many point spreads. The nine depths around a cell of a smooth surface differ by
+# The depths around a cell form a relief step if they differ by more than this many cell sizes and
+# by more than this many point spreads. The nine depths around a cell of a smooth surface differ by
 # about three spreads, and rarely by five.
 _STEP_CELLS: Final = 1.0
 _STEP_SPREADS: Final = 6.0
-# A surface consists mainly of relief if more than this share of the cells in a window of this width
-# is next to steps. The share is 0.06 to 0.11 in rooms with mouldings and 0.21 on a carved fountain.
+# A surface consists mainly of relief if, in a window of this many cells along each side, more than
+# this share of the known cells is next to steps. The share is 0.06 to 0.11 in rooms with mouldings
+# and 0.21 on a carved fountain.
 _RELIEF_CELLS: Final = 121
 _RELIEF_SHARE: Final = 0.16
 # Minimum distance between textured positions; these are taken in turn from the cells of a grid.
@@ -213,7 +213,7 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
 
 
 def grey_channels(grey: NDArray[np.float32]) -> Channels:
-    """Return grey values minus their local mean, normalised; for similar spectral bands."""
+    """Return normalised grey values minus their local mean, for similar spectral bands."""
     return colour_channels(grey[:, :, None])
 
 
@@ -284,7 +284,7 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
         # Deviation from the line between the two neighbours; NaN next to void cells.
         off_m = np.abs(depth_m[:-2] - 2.0 * depth_m[1:-1] + depth_m[2:])
         found[1:-1] |= off_m > 0.5 * step_m
-    # Where there is no depth nearby, both are infinite.
+    # Where there is no depth nearby, the highest and lowest depths are infinite.
     with np.errstate(over="ignore"):
         beside = known & bent & (high - low > step_m)
     n_beside, n_known = (
@@ -388,7 +388,7 @@ def _evened(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[
 def _broadly(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Blur with a wide Gaussian, at a quarter of the resolution.
 
-    This takes a tenth of the time, and the result differs by less than 1 %.
+    This takes a tenth of the time needed at full resolution; the result differs by less than 1 %.
     """
     import cv2
 

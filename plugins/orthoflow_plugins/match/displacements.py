@@ -73,7 +73,7 @@ def search_shifts(
 
 @kernel_part
 def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
-    """Fill in the shift with the highest score (of side^2), this score, and its lead."""
+    """Fill in the shift with the highest of the side^2 scores, this score, and its lead."""
     side = round(math.sqrt(scores.shape[0]))
     top = 0
     for k in range(side * side):
@@ -183,7 +183,7 @@ def match_patches(
         window: (p, p) float64 weights of a patch's cells.
         patch: scratch arrays (p, p), (p + 3, p, c) and (p, p, c), float64.
         found: (n, 4) float64: the shift (across, down), refined in place; the standard deviation of
-            a coordinate for independent cells (inf if undetermined), and the correlation.
+            a coordinate, assuming independent cells (inf if undetermined); and the correlation.
     """
     weight, lines, moved = patch
     least = 0.0
@@ -267,7 +267,7 @@ def _sample(
 
 @kernel_part
 def _cubic(t: float) -> tuple[float, float, float, float]:
-    """Return weights of four neighbours at fraction t (cubic convolution, Keys 1981, a = -1/2)."""
+    """Return weights for four neighbours at fraction t (cubic convolution, Keys 1981, a = -1/2)."""
     return (
         ((-0.5 * t + 1.0) * t - 0.5) * t,
         (1.5 * t - 2.5) * t * t + 1.0,
@@ -371,9 +371,8 @@ def measure(
         second: the second picture.
         places: (column, row) cells of the first picture.
         radius_cells: search radius.
-        min_score: minimum correlation. The default of 0.35 is half the correlation at correct
-            positions; it can be lower if there are many patches, which are checked against their
-            neighbours.
+        min_score: minimum correlation. The default of 0.35 is half the usual correlation at correct
+            positions; it can be lower if many patches are checked against their neighbours.
         min_distinct: minimum difference between the best correlation and the next peak.
         threads: number of threads.
     """
@@ -416,7 +415,7 @@ def _mixed_and_refined(
 def _cut_out(
     picture: Channels, centres: NDArray[np.intp], reach: int, gains: NDArray[np.float32]
 ) -> Channels:
-    """Cut out patches around centres (n, 2), combined to one channel by their gains (n, c)."""
+    """Cut out patches around centres (n, 2), combined into one channel by their gains (n, c)."""
     side = 2 * reach + 1
     rows, columns = picture.known.shape
     values, known = (np.zeros((len(centres), side, side), dtype=np.float32) for _ in range(2))
@@ -459,7 +458,8 @@ def _refined(
 ) -> Displacements:
     begun = found[:, :2]
     forth, sigma_forth, score = _matched(first, second, places, begun, threads)
-    # Use half the difference of both directions, so that effects of interpolation cancel out.
+    # Use half the difference between the forward and backward shifts, so that effects of
+    # interpolation cancel out.
     middle = np.rint(forth).astype(np.intp)
     back, sigma_back, _ = _matched(second, first, places + middle, -forth, threads)
     shifts = 0.5 * (forth - back)

@@ -1,4 +1,4 @@
-"""Matching of photos and walls by key points, with mirrored photos and mixtures of colours."""
+"""Matching of photos with walls by key points, including mirrored photos and colour mixtures."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ _MAX_RATIO: Final = 0.85
 # Several matches within a square of this side length count as one.
 _PLACE_PX: Final = 2.0
 
-# Descriptors are invariant to the strength of contrast, but not to its sign. If materials have
-# different brightness in laser and photo, half of the edges may be inverted; a combination of the
+# Descriptors are invariant to the strength of contrast, but not to its sign. If the brightness of
+# materials differs between laser and photo, half of the edges may be inverted; a combination of the
 # photo's colours may restore most of the signs. The combination with the most matches is used.
 MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
     "green less red": (-1.0, 1.0, 0.0),
@@ -92,7 +92,7 @@ class PairingParams(MethodParams):
 
     @property
     def max_ratio(self) -> float:
-        """Maximum ratio of a match; 1 accepts any."""
+        """Limit of the ratio test; 1 accepts all matches."""
         return _MAX_RATIO if self.ratio is None else self.ratio
 
 
@@ -124,7 +124,7 @@ class PhotoPairs:
         features: key points of the photo, in pixels of the full image.
         scale: factor by which the photo was reduced.
         pairs: one per wall with matches.
-        radius_px: radius of the guided matching; matches with a wrong homography are evenly
+        radius_px: radius of the guided matching; if the homography is wrong, matches are evenly
             distributed within it.
         is_mirrored: whether the mirrored photo matches better; if so, no wall counts as shown.
         n_recognised: number of inliers before the guided matching.
@@ -166,7 +166,7 @@ def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> 
 def pair_photo(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Recognise the walls in a photo from coarse to fine, then match them at their resolution.
+    """Recognise walls in a photo from coarse to fine, then match it at their resolution.
 
     If a photo is much finer than the raster, its key points have no counterpart there and lead to
     many false matches. At one cell per pixel, both show the same detail, which gives 2 to 5 times
@@ -213,7 +213,7 @@ def pair_in_colours(
         params: parameters of the matching.
 
     Returns:
-        The matches of the picture with the most inliers, which is grey unless a mixture has more.
+        The matches in grey or, if it has more inliers, in a mixture.
     """
     best = pair_photo(photo_grey(photo), walls, params)
     if best.n_recognised >= CLEARLY:
@@ -250,7 +250,7 @@ def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
 def side_matches(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> NDArray[np.intp]:
-    """Count a photo's inliers with walls as seen from the front and from behind.
+    """Count a photo's inliers on walls seen from the front and from behind.
 
     A wall whose normal points away from the viewer is a mirror image of the photo.
 
@@ -266,7 +266,7 @@ def side_matches(
     counts = np.zeros((len(walls), 2), dtype=np.intp)
     scale = min(seeker.finest, _FIRST_SIDE_PX / max(grey.shape))
     while True:
-        # Use all key points, since a coarsely rastered wall contains few of the strongest ones.
+        # Use all key points, since a coarse raster contains few of the strongest ones.
         features = seeker.key_points(scale)
         for side, seen in enumerate((features, features.mirrored(grey.shape[1]))):
             for pair in seeker.pairs(seen, scale, walls).pairs:
@@ -297,7 +297,8 @@ def rematched(
         expected: (m, 2) expected photo pixels of the wall's key points.
         agreeing: (n,) bool, inliers among the matches so far.
         radius_px: search radius.
-        ratio: maximum ratio of the distances of the best and the second best match in the radius.
+        ratio: maximum ratio between the distances of the best and the second-best descriptor within
+            the radius.
     """
     photo, wall = sets
     good = matches.take(agreeing)
@@ -348,7 +349,7 @@ class _Seeker:
         """Recognise walls at increasing scales, first by the strongest key points, then by all.
 
         Returns:
-            The best matches, and all key points at their scale.
+            The best matches, and all key points at the scale of these matches.
         """
         scale = min(self.finest, _FIRST_SIDE_PX / max(self.grey.shape))
         found: tuple[PhotoPairs, Features] | None = None

@@ -18,7 +18,7 @@ CLIP_LIMIT: Final = 3.0
 """Limit of local contrast equalisation (CLAHE)."""
 _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
-# The depths around a point form a relief edge if they differ by more than this many cells.
+# The depths around a point form a relief edge if they differ by more than this many cell sizes.
 _SMOOTH_CELLS: Final = 1.0
 # Maximum and minimum number of smooth cells from which the typical point spread is estimated.
 _MAX_SPREADS: Final = 100_000
@@ -84,7 +84,7 @@ def wall_picture(
 
 
 def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Interpolate NaN values, more coarsely the farther from known values (push-pull)."""
+    """Interpolate NaN values, more coarsely the farther they are from known ones (push-pull)."""
     import cv2
 
     known = np.isfinite(values)

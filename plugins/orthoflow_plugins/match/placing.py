@@ -1,13 +1,13 @@
 """Coarse poses of photos from structure, if key points do not match the photos with a wall.
 
-A correlation of structure in nine parts does not prove a position, since a repeating motif also
-correlates elsewhere. Therefore, overlapping patches are matched independently at the most likely
-positions; a position is probably correct if most of the patches fit one pose.
+A high correlation of the structure in nine parts of a photo does not prove its position, since a
+repeating motif also correlates elsewhere. Therefore, overlapping patches are matched independently
+at the most likely positions; a position is probably correct if most of the patches fit one pose.
 
 A repeating motif, or another wall with the same tiles, may still fit best. Photos share many more
 key points with each other than with the laser intensity. Therefore, a position is accepted if
 another photo, at its own position, shows the same key points at the same positions on the wall,
-because wrong positions would have to be wrong in the same way.
+because two wrong positions would both have to be wrong in the same way.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ _MIN_SCORE: Final = 0.3
 _MIN_DISTINCT: Final = 0.03
 # Minimum number of tie points in a round to determine a pose.
 _MIN_FIT: Final = 8
-# A position is dropped if it has fewer tie points or a smaller share of patches that agree.
+# A position is dropped if it has fewer tie points, or a smaller share of agreeing patches, than
+# this.
 _TIES_FEW: Final = 20
 _SHARE_FEW: Final = 0.05
 # In simulated rooms, wrong positions had leads of up to 6.1 with 15 % of the patches agreeing.
@@ -310,7 +311,7 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
 
 
 def _is_same(first: Placed, second: Placed) -> bool:
-    """Return whether two poses project the tie points of one to the same positions."""
+    """Return whether two poses project the tie points of one of them to the same pixels."""
     if first.piece.wall != second.piece.wall:
         return False
     camera, pixels = second.camera, first.piece.pixels_photo

@@ -68,11 +68,12 @@ class FaceByPhotos(Method):
     """Turn planes whose side was guessed towards the side that the photos show.
 
     A wall seen from behind is a mirror image of its photos. If no scanner station determines the
-    side of a plane, the cloud is rastered coarsely on the plane, and the photos are matched both
-    with this picture and with its mirror image. If grey decides no plane, mixtures of the photos'
-    colours are used. The side with clearly more inliers is used. If the photos do not decide the
-    side of a plane, it is turned if it is between two planes with known sides that both face the
-    other way. Planes with a known side, floors and ceilings remain unchanged.
+    side of a plane, the cloud is projected onto a coarse raster in the plane, and the photos are
+    matched both with this picture and with its mirror image. If grey values decide the side of no
+    plane, mixtures of the photos' colours are used. The side with clearly more inliers is used. If
+    the photos do not decide the side of a plane, it is turned if it is between two planes with
+    known sides that both face the other way. Planes with a known side, floors and ceilings remain
+    unchanged.
     """
 
     id: ClassVar[str] = "face.photos"
@@ -214,7 +215,7 @@ def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepCon
 
 
 def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Features | None:
-    """Find key points of the cloud rastered on a plane; None if there are none."""
+    """Find key points in a raster of the cloud on a plane; None if there are none."""
     corners = planes.corners[index]
     area_m2 = float(
         np.linalg.norm(corners[3] - corners[0]) * np.linalg.norm(corners[1] - corners[0])

@@ -101,7 +101,7 @@ class MatchSift(Method):
         )
 
     class In(Ports):
-        """The photos, the rastered walls, and ties measured by hand."""
+        """The photos, the wall rasters, and ties measured by hand."""
 
         photos: Photos
         walls: Walls
@@ -145,7 +145,7 @@ def _matched(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> tuple[list[TiePiece], dict[str, JsonValue], list[float]]:
-    """Match photos with the walls by key points, or by structure if these are unclear.
+    """Match photos with the walls by key points or, if the result is unclear, by structure.
 
     Returns:
         Ties, details of each photo, and the search radius of each photo.

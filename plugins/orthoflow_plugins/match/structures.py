@@ -1,12 +1,11 @@
 """Structure of photos and walls: position and direction of edges, regardless of their sign.
 
-A laser measures at another wavelength than a camera, so contrast may be weaker, missing or
-inverted, depending on the material. Edges keep their position and orientation (modulo 180 degrees);
-relief steps are also edges of the wall. A photo is compared with the wall at many scales. Nine
-overlapping parts of the photo are correlated with the whole wall, and may shift slightly relative
-to each other because of perspective. The scale with the largest lead is chosen; the lead is the
-difference between the best sum of correlations and the sums at all other positions, relative to
-their spread.
+Laser and camera use different wavelengths, so contrast may be weaker, missing or inverted,
+depending on the material. Edges keep their position and orientation (modulo 180 degrees); relief
+steps are also edges of the wall. A photo is compared with the wall at many scales. Nine overlapping
+parts of the photo are correlated with the whole wall, and may shift slightly relative to each other
+because of perspective. The scale with the largest lead is chosen; the lead is the difference
+between the best sum of correlations and the sums at all other positions, relative to their spread.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
 # Number of cells along the shorter side of a wall, unless its raster is coarser.
 _CELLS: Final = 200.0
-# Range of scales. On the wall, the longer side of the photo is at least the first value times the
-# shorter side of the wall, and its shorter side at most the second value times it.
+# Range of scales, as multiples of the shorter side of the wall: the minimum length of the longer
+# side of the photo on the wall, and the maximum length of the photo's shorter side.
 _SIZES: Final = (0.2, 1.6)
 _STEP: Final = 1.1
 _MAX_PART_CELLS: Final = 250
@@ -42,10 +41,10 @@ _EVEN_SIGMA_CELLS: Final = 12.0
 _POOL_SIGMA_CELLS: Final = 1.5
 _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
-# Prevents high scores of parts that hardly overlap the wall.
+# This prevents high scores for parts that hardly overlap the wall.
 _MIN_ENERGY: Final = 0.25
-# Two positions are distinct if they differ by this distance, relative to the photo's width, or by
-# this logarithm of scales.
+# Two positions are distinct if they differ by at least this distance, relative to the photo's
+# width, or if the logarithms of their scales differ by at least this.
 _ELSEWHERE: Final = (0.25, 0.25)
 # Maximum number of cells along a photo's longer side; larger photos are compared in cells that are
 # two or four times as wide.
@@ -64,7 +63,7 @@ class WallStructure:
     Attributes:
         wall: the wall in coarse cells.
         channels: its structure.
-        levels: spectra of the structure in cells of this size, twice and four times the size.
+        levels: spectra of the structure in cells of one, two and four times the size.
         usual_spread_m: as returned by the function `usual_spread_m`.
     """
 
@@ -239,7 +238,7 @@ def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -
     """Return possible positions of a photo on a wall, the most likely first.
 
     Args:
-        rgb: (height, width, 3) colours of the photo, upright to about 9 degrees.
+        rgb: (height, width, 3) colours of the photo, upright to within about 9 degrees.
         wall: the wall.
         n_most: maximum number of positions.
     """
@@ -343,7 +342,7 @@ def _part_map(
 
 
 def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[np.complex64]:
-    """Transform layers (c, rows, cols) with padding; the transform along rows skips padded ones."""
+    """Transform layers (c, rows, cols) with padding; padding rows are skipped along the columns."""
     from scipy import fft
 
     along = fft.rfft(layers, padded[1], axis=2)

@@ -1,8 +1,8 @@
 """Ties between photos and walls: from key points or measured by hand, without duplicates.
 
 `preset: paper` matches as in markiewicz2015 (3.5, 3.6, 4.3): with OpenCV's default SIFT, and with
-the best match as in its reference [36], openMVG. This match of a key point of the wall is the
-nearest descriptor in the photo, provided that the ratio of the distances to the nearest and the
+matches chosen as in openMVG, reference [36] of the paper. The match of a key point of the wall is
+the nearest descriptor in the photo, provided that the ratio of the distances to the nearest and the
 second nearest is below a limit (0.8 in openMVG's documentation). Without poses, all key points of a
 wall are matched; with poses, those in the part that the photo shows.
 """
@@ -146,8 +146,8 @@ def paper_ties(
         walls: the walls.
         cameras: cameras by photo name; photos without a pose and key points outside the photo are
             not matched. None matches all photos and key points.
-        ratio: maximum ratio of the distances of the best and the second best match; None for that
-            of openMVG.
+        ratio: maximum ratio between the distances of the best and the second-best match; None for
+            that of openMVG.
         ctx: context for progress.
 
     Returns:
@@ -290,13 +290,13 @@ def ties_by_hand_alone(
 
 
 def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepContext) -> Ties:
-    """Append ties measured by hand to those of matching.
+    """Append ties measured by hand to those from matching.
 
     Args:
         ties: ties of all photos, with their walls.
         hand: ties measured by hand in photos with the same names, or None.
         walls: the walls of `ties`.
-        ctx: context for the metric of their number.
+        ctx: context in which their number is reported.
     """
     if hand is None or not len(hand.photo):
         return ties
@@ -305,7 +305,7 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
     kept = np.flatnonzero(known[hand.photo] >= 0)
     ctx.metric("n_by_hand", len(kept), "1")
     own_walls = walls.nearest(hand.points_world[kept])
-    # The type is Any, since the arrays of the product are collected by name.
+    # Any, since the product's arrays of various types are collected by name.
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(ties, name), getattr(hand, name)[kept]])
         for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m", "role")

@@ -64,7 +64,7 @@ _OCCUPIED_CELLS: Final = 5.0
 _FIRST_RADIUS_CELLS: Final = 8
 _MIN_RADIUS: Final = 2
 _MAX_ROUNDS: Final = 4
-# A pose is final if it moves the photo by less than this on the walls.
+# A pose is final if its last change moves the photo by less than this on the walls.
 _SETTLED_CELLS: Final = 0.3
 # Relative decrease of the held-out error required for another round.
 _MIN_GAIN: Final = 0.03
@@ -269,7 +269,7 @@ def _traced(
 
 
 def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) -> float:
-    """Return the RMS displacement of the ties on the walls that another pose causes."""
+    """Return the RMS displacement on the walls that another pose causes at the ties."""
     squares = []
     for piece in pieces:
         projection = view.projections[piece.wall]
@@ -524,7 +524,7 @@ def _view(trace: Trace, photos: Photos, setup: Setup) -> View:
 
 
 def painted_walls(views: Sequence[View], walls: Sequence[Wall]) -> list[_Painted]:
-    """Project oriented photos onto the walls; each cell takes the photo of highest resolution."""
+    """Project oriented photos onto the walls; each cell uses the photo of highest resolution."""
     painted = []
     for index, wall in enumerate(walls):
         grey = np.full(wall.frame.shape, np.nan, dtype=np.float32)
@@ -571,7 +571,7 @@ def recovered_pose(
 
 
 def lens_of(photo: Photo, oriented: Mapping[str, Camera], photos: Photos) -> Intrinsics | None:
-    """Return a photo's lens: calibrated, or estimated for a photo of the same camera.
+    """Return a photo's lens: calibrated, or estimated for another photo by the same camera.
 
     The estimate is preferred to EXIF values, which may be wrong for all photos of a lens.
 

@@ -58,7 +58,7 @@ class Projection:
         return np.array([self.part[1].start, self.part[0].start], dtype=np.intp)
 
     def pixels_at(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pixels (n, 2) of fractional cells (n, 2) = (column, row); NaN next to void."""
+        """Return pixels (n, 2) at fractional cells (n, 2) = (column, row); NaN next to void cells."""
         return np.column_stack([between(self.u, at), between(self.v, at)])
 
     def hide(self, mask: NDArray[np.bool_]) -> None:
@@ -87,8 +87,8 @@ class View:
     Attributes:
         index: index of the photo.
         grey: (height, width) grey values of the photo.
-        colours: function that returns its colours (height, width, 3), which are needed for few
-            photos.
+        colours: function that returns the colours (height, width, 3) of the photo, which only few
+            photos need.
         camera: the pose.
         projections: projection of each wall, None if the photo does not show it.
         hidden: cells of each wall that are hidden by points in front of it; empty if unknown.
@@ -291,7 +291,7 @@ def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[sli
 def _project_cells(
     near: ViewingCamera, wall: Wall, part: tuple[slice, slice], step: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return u, v and distance of every step-th cell; `near` has its origin at that of the wall."""
+    """Return u, v and distance of every step-th cell; `near` has the origin of the wall."""
     frame = wall.frame
     rows = np.arange(part[0].start, part[0].stop, step)
     columns = np.arange(part[1].start, part[1].stop, step)
@@ -311,7 +311,7 @@ def _project_cells(
 
 
 def between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Interpolate (n,) at fractional cells (n, 2) = (column, row); NaN next to unknown values."""
+    """Interpolate values (n,) at fractional cells (n, 2) = (column, row); NaN near unknown ones."""
     height, width = raster.shape
     inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
     left = np.where(inside, at[:, 0], 0.0).astype(np.intp)

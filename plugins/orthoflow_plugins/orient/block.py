@@ -123,7 +123,7 @@ class Block:
 
     @property
     def lens_starts(self) -> NDArray[np.intp]:
-        """First column of each lens in the normal matrix, after the poses, and the end."""
+        """First column of each lens in the normal matrix, and the total number of columns."""
         sizes = [lens.freedom.sigmas.size for lens in self.lenses]
         return POSE_PARAMETERS * len(self.cameras) + np.cumsum([0, *sizes], dtype=np.intp)
 
@@ -219,7 +219,7 @@ def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float6
 
     Args:
         block: the block.
-        alone: include the uncertainty of all points.
+        alone: whether to include the uncertainty of points seen more than once, too.
     """
     seen = block.seen
     covariances = (seen.sigma_px**2)[:, None, None] * np.eye(2)
@@ -292,7 +292,7 @@ def lenses_json(
 
 
 def lens_statistics(block: Block) -> JsonValue:
-    """Return mean and SD of the free parameters, per image size and set of free parameters."""
+    """Return mean and SD of the free parameters for each image size and set of free parameters."""
     kinds: dict[tuple[int, int, tuple[str, ...]], list[NDArray[np.float64]]] = {}
     for index, lens in enumerate(block.lenses):
         camera, names = block.cameras[block.lens_of.index(index)], lens.freedom.names
@@ -318,7 +318,7 @@ def lens_statistics(block: Block) -> JsonValue:
 def correlation_notes(
     block: Block, photos: Sequence[Photo], cofactors: NDArray[np.float64]
 ) -> list[tuple[str, Note]]:
-    """Return a note on each lens parameter correlated with poses, with the lens's first photo."""
+    """Return notes on lens parameters correlated with poses, with the first photo of each lens."""
     notes: list[tuple[str, Note]] = []
     # Each lens is only determined by its own photos, even if the same camera took all photos.
     shared = ", or set intrinsics: shared if one camera took all photos at the same zoom"

@@ -91,9 +91,8 @@ _SAME_PLACE_M: Final = 1e-6
 # Photos without EXIF may or may not share a lens. A series is usually taken with one lens, and many
 # photos determine a lens far better than a single one does. However, the photographer may have
 # zoomed, and a photo may have been rotated or cropped. Therefore, the focal length from each
-# photo's own ties is compared with the shared one. Zooming changes it by more than this share,
-# correlated scan errors by less (up to 0.7 % with photogrammetric clouds with 10 to 30 mm of
-# noise).
+# photo's own ties is compared with the shared one. Zooming changes it by more than this share, but
+# correlated scan errors by less (up to 0.7 % for photogrammetric clouds with 10 to 30 mm of noise).
 _MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
 # The photo with the largest contradiction distorts the shared lens, so that other photos contradict
@@ -113,8 +112,8 @@ class OrientColmapBundle(Method):
     Each photo is first oriented separately; photos whose ties agree with their pose no better than
     by chance are excluded. Key points are then matched between overlapping photos. COLMAP's cost
     functions and the Ceres solver adjust poses, lenses and points together. Ties to walls are
-    weighted by the standard deviations from the matching step, ties between photos by that of their
-    residuals. Uncalibrated lenses start from EXIF and are refined. Photos with the same focal
+    weighted by the standard deviations from the matching step, and ties between photos by that of
+    their residuals. Uncalibrated lenses start from EXIF and are refined. Photos with the same focal
     length in EXIF share a lens; so do photos without EXIF unless their ties contradict this. The
     gates and withheld ties are those of `orient.pnp`.
     """
@@ -287,7 +286,7 @@ class Adjusted:
         estimates: one per photo, in world coordinates.
         tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
             (reduced) picture in which the key point was found.
-        ties_px: (m,) lengths of the residuals of these ties, photo pixels.
+        ties_px: (m,) lengths of the residuals of these ties, in photo pixels.
         n_tie_points: number of points that are not in the scan.
     """
 
@@ -502,7 +501,7 @@ def _weighed(
 def _weigh_between(
     ties: PhotoTies, lengths: NDArray[np.float64], weights: _Weights, rejection_sigma: float
 ) -> None:
-    """Reject outliers among the ties between photos and estimate the inliers' deviation.
+    """Reject outliers among ties between photos; estimate the inliers' standard deviation.
 
     Args:
         ties: ties between photos.

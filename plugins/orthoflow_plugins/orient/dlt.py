@@ -62,7 +62,8 @@ _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
 _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
 # Relief smaller than this many standard deviations of the points is mostly noise.
 _RELIEF_SIGMAS: Final = 10.0
-# With flatter control points, the eleven parameters depend on rounding errors of coordinates.
+# If control points are closer to a plane, rounding errors of coordinates affect the eleven
+# parameters.
 _MAX_CONDITION: Final = 5000.0
 # The lens model is insufficient if the standard deviation of unit weight exceeds this.
 _MAX_SIGMA0: Final = 1.5
@@ -369,7 +370,7 @@ def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArra
 
 
 def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.float64]:
-    """Return points (n, 3) on a grid over the photo, each at the range of the nearest control."""
+    """Return points (n, 3) on a grid over the photo, at the range of the nearest control point."""
     across, down = ((np.arange(_FRAME) + 0.5) / _FRAME for _ in range(2))
     pixels = np.stack(np.meshgrid(across * camera.width, down * camera.height), axis=-1)
     pixels = pixels.reshape(-1, 2)

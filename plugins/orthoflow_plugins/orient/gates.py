@@ -133,7 +133,7 @@ def sigmas_on_wall(
 
 
 def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
-    """Return variances (4,) at the image corners, each the largest of the walls shown there."""
+    """Return variances (4,) at the image corners, each the largest on any wall shown there."""
     camera, worst = resection.camera, np.full(4, np.nan)
     # Centres of the pixels in the corners.
     corners_px = np.array(
@@ -308,7 +308,7 @@ class Candidate:
 
     @property
     def chance(self) -> float:
-        """Probability that as many check points would agree with a wrong pose (binomial)."""
+        """Binomial probability that at least as many check points agree with a wrong pose."""
         from scipy.special import bdtrc  # importing scipy.stats would take seconds
 
         fit, limit = self.estimate.fit, self.estimate.limit
@@ -430,10 +430,11 @@ class Gate:
 
     Attributes:
         name: name in the record.
-        value: computes the value to test; None passes.
+        value: function that computes the value to test; None passes.
         limit: the smallest value that passes, or the name of a parameter that contains it.
         is_upper: whether the limit is the largest value that passes instead.
-        reason: returns the reason for a refusal from the candidate, its value and the limit.
+        reason: function that returns the reason for a refusal, given the candidate, its value and
+            the limit.
     """
 
     name: str

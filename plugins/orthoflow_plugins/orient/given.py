@@ -41,8 +41,8 @@ class OrientGiven(Method):
     """Use poses from other programs unchanged.
 
     The poses are not verified, so their status is `ok`, the source of their lens is `given`, and
-    their error on the wall is only known if the files contain it. If the ties of the run that
-    estimated them are given, they show which walls support the poses. A photo with at least six
+    their error on the wall is known only if the files contain it. If the ties of the run that
+    estimated the poses are given, they show which walls support these. A photo with at least six
     ties measured by hand is oriented from these, with the given lens, and must pass the gates for
     such ties; fewer ties are used only to check the given pose. If no photo shows a wall with its
     given pose, the poses are refused, since they are not in the coordinate system of the scan.
@@ -148,7 +148,7 @@ def _disagreement(
 
 
 def _joined(hand: Ties, earlier: Ties, kept: NDArray[np.bool_]) -> Ties:
-    """Append the kept (n,) ties of an earlier run to ties measured by hand."""
+    """Append those ties of an earlier run that `kept` (n,) selects to ties measured by hand."""
     names = tuple(dict.fromkeys((*hand.photo_names, *earlier.photo_names)))
     place = np.array([names.index(name) for name in earlier.photo_names], dtype=np.int32)
     # Any, since the arrays of the product are collected by name.

@@ -259,7 +259,7 @@ class Trusted:
         tied: the photo with its ties.
         estimate: its separate orientation.
         by_hand: its orientation only from ties measured by hand, or None.
-        kept: (n,) bool, the ties of that orientation.
+        kept: (n,) bool, the ties used in `by_hand`.
     """
 
     tied: TiedPhoto
@@ -268,7 +268,7 @@ class Trusted:
     kept: NDArray[np.bool_]
 
     def judged(self, ties: Ties, params: OrientParams, estimate: Estimate) -> Oriented:
-        """Test an orientation; return that from ties by hand if it fails or contradicts these."""
+        """Test an orientation; if it fails or contradicts ties by hand, return that from the ties."""
         found = judged(self.tied, candidate_of(self.tied, ties, params, estimate))
         is_with_hand = not (self.kept & (found.role == TieRole.REJECTED)).any()
         if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
@@ -304,7 +304,7 @@ def require(ties: Ties, photos: Photos) -> None:
 def tied_photo(
     photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
 ) -> TiedPhoto:
-    """Choose the ties of a photo and split them into control and check."""
+    """Choose the ties of a photo and split them into control and check points."""
     # Draw once per photo, so that its samples do not depend on the ties of other photos.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
     chosen = ties_of_photo(ties, photo.name)
@@ -369,7 +369,8 @@ def with_believable_priors(
             key = (photo.camera, photo.width, photo.height, photo.exif_focal_px)
             lenses.setdefault(key, []).append(at)
     for members in lenses.values():
-        # A separate random generator, so that orientations do not depend on the presence of EXIF.
+        # Use a separate random generator, so that orientations do not depend on the presence of
+        # EXIF.
         rng = np.random.default_rng(0)
         tied = [tied_photo(photos[at], ties, params, rng) for at in members]
         tied.sort(key=lambda each: -len(each.seen))

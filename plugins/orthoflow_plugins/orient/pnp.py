@@ -38,8 +38,8 @@ class OrientPnp(Method):
     """Orient each photo separately: a robust pose, then a weighted adjustment with the full lens.
 
     Some ties are withheld to check the pose. A photo is `ok` only if it has enough ties, they are
-    well distributed, more withheld ties agree than by chance, the camera is in front of the wall,
-    and the predicted error on the wall is small; otherwise its status is the reason for its
+    well distributed, more withheld ties agree than would by chance, the camera is in front of the
+    wall, and the predicted error on the wall is small; otherwise its status is the reason for its
     rejection.
     """
 
@@ -114,7 +114,7 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
         raise GeometryError(f"solvePnP does not support skew, and the lens has {lens.skew:.1f} px")
     # Large survey coordinates would reduce the precision.
     middle = seen.points_world.mean(axis=0)
-    # The type is Any, because OpenCV's type stubs do not accept these arrays.
+    # Any, because OpenCV's type stubs do not accept these arrays.
     call: Any = cv2.solvePnP
     try:
         found, turn, shift = call(

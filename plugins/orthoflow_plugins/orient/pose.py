@@ -33,7 +33,7 @@ from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
 from orthoflow.sdk import DiagnosticSpec, MethodParams, MetricSpec, Ports
 
-# Declaration and values of a diagnostic of a photo.
+# Declaration and values of a diagnostic about a photo.
 Note: TypeAlias = tuple[DiagnosticSpec, Mapping[str, Any]]
 NOT_ORIENTED: Final = DiagnosticSpec(
     code="photo-not-oriented",
@@ -427,7 +427,7 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
 def adjusted(
     tied: TiedPhoto, start: Start, params: OrientParams, solve: Solver | None = None
 ) -> Estimate:
-    """Adjust and reject alternately until the set of control points no longer changes.
+    """Alternate adjustment and rejection until the set of control points no longer changes.
 
     Args:
         tied: the photo.
@@ -446,7 +446,7 @@ def adjusted(
         used = agreeing & ~is_check
         lens = start.lens.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
         control, soft_limit = seen.take(used), math.inf if solve else SOFT_LIMIT * unit
-        # If the lens is not adjusted, use that of the prior.
+        # If the lens is not adjusted, use the lens of the prior.
         begin = camera if lens.sigmas.size else posed(prior, camera)
         if solve:
             camera = solve(control, begin)
@@ -505,7 +505,7 @@ def unit_deviation(normalised: NDArray[np.float64]) -> float:
 
 
 def expected_px(seen: SeenPoints) -> float:
-    """Return the a priori deviation of a tie, with the scale from the spread of the ties."""
+    """Return the a priori standard deviation of a tie, at a scale estimated from all ties."""
     spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
     lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
     per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)

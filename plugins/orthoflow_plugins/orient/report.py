@@ -34,7 +34,8 @@ from orthoflow_plugins.orient.pose import NOT_ORIENTED, Note, ties_of_photo
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# 4.55 % of a normal distribution are beyond this limit, and at most a quarter of any (Chebyshev).
+# 4.55 % of a normal distribution is beyond this limit, and at most a quarter of any distribution
+# (Chebyshev).
 _BEYOND: Final = 2.0
 _SIDE_PX: Final = 900
 # Colours as in markiewicz2015, Figure 17: control green, rejected red, check yellow.
@@ -237,7 +238,7 @@ def hand_over(
 
 
 def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
-    """Report the expected errors on the wall of cameras for which they are known."""
+    """Report the expected errors on the wall, for cameras for which they are known."""
     sigmas = [camera.sigma_wall_m for camera in cameras if camera.sigma_wall_m is not None]
     _sum_up(ctx, "sigma_wall_mm", [1000.0 * sigma for sigma in sigmas], "mm")
 
@@ -373,7 +374,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         shown = np.isfinite(best)
         if not shown.any():
             continue
-        # Use percentiles, so that a hardly covered corner does not dominate the scale.
+        # Use percentiles, so that a sparsely covered corner does not dominate the scale.
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         error_mm = np.where(shown, 1e3 * best, np.nan)
         label = "predicted error of a coordinate [mm]"
