@@ -65,7 +65,7 @@ class DenseSgm(Method):
     )
 
     class Params(MethodParams):
-        """Distance of the surface and density of its points."""
+        """Range of distances to the surface, and density of its points."""
 
         nearest_m: float = Field(1.0, gt=0.0, description="Distance of the nearest surface.")
         farthest_m: float = Field(

@@ -33,11 +33,11 @@ from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_sh
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
 
-# Neighbouring cells whose true depths differ by more form a depth step; errors there are reported
-# separately.
+# Neighbouring cells whose true depths differ by more than this form a depth step; errors there are
+# reported separately.
 _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
-# A multiple of the patch size (32 cells), large enough that little is lost at the borders.
+# Side of a block: a multiple of the patch size (32 cells), so large that little is lost at borders.
 BLOCK_CELLS: Final = 96
 # Maximum number of cells, on all walls together, for which colours are compared.
 _COLOUR_CELLS: Final = 250_000
@@ -130,12 +130,13 @@ class WallSamples:
         depth_m: (n,) measured minus true depth, away from true depth steps.
         sigma_m: (n,) predicted standard deviation of each depth; NaN if unknown.
         step_depth_m: (m,) the same error within 2 cells of a true depth step.
-        colour: (c,) mean square error of a painted cell over the three channels, away from steps.
+        colour: (c,) mean square error of each coloured cell over the three channels, away from
+            depth steps.
         shift_m: (p, 2) displacement of patches along u and v, measured minus true position.
         shift_cells: (p, 2) the same in cells.
         n_seen: number of tested cells whose true surface is visible from a station.
-        n_seen_painted: number of painted cells among these.
-        n_seen_shown: number of painted or filled cells among these.
+        n_seen_painted: number of coloured cells among these.
+        n_seen_shown: number of coloured or filled cells among these.
     """
 
     depth_m: NDArray[np.float64]
@@ -223,7 +224,8 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return a mask of cells within 2 cells of a true depth step or the border of the surface."""
     import cv2
 
-    # Replace missing depths by a very large one, so that the border of the surface is a step, too.
+    # Replace missing depths with a very large one, so that the border of the surface is a step,
+    # too.
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(1e3))
     edge = np.zeros(depth.shape, dtype=np.uint8)
     down = np.abs(np.diff(depth, axis=0)) > _STEP_M

@@ -92,10 +92,10 @@ class InspectCheckpoints(Method):
     surroundings, rendered from the true scene, are found. Without orthoimages, the points are
     searched for in the intensity of the walls. RMS and standard deviation are those of the lengths
     of the residuals. A point is an outlier if its residual exceeds twice the RMS of all points
-    (`once`, the rule to compare) or of the remaining points (`iterated`, which removes at most a
-    quarter of the points; `iterated_capped` if it reaches that limit). Metrics of a class of points
-    (flat, vertical ...) have the class as a prefix. `x` points right along u, `y` down along v;
-    residuals are the shown minus the surveyed position. `length_error_..._share` are relative
+    (`once`, the rule for comparisons) or of the remaining points (`iterated`, which removes at most
+    a quarter of the points; `iterated_capped` if it reaches that limit). Metrics of a class of
+    points (flat, vertical ...) have the class as a prefix. `x` points right along u, `y` down along
+    v; residuals are the shown minus the surveyed position. `length_error_..._share` are relative
     errors of distances between points of a wall. Targets are also compared in 3D (`3d`), with their
     positions on the plane through the depths around them.
     """

@@ -39,7 +39,7 @@ _ARROW_COLOURS: Final = ("#1a8a1a", "#d09000", "#d01c1c")
 
 
 def depth_error_map(depth_m: NDArray[np.float64], frame: WallFrame) -> bytes:
-    """Draw a map of depth errors: blue behind the truth, red in front of it."""
+    """Draw a map of depth errors: blue behind the true surface, red in front of it."""
     label = "measured minus true depth [mm]"
     high = DEPTH_SPAN_MM
     return map_chart(1e3 * depth_m, label, frame, low=-high, high=high, cmap="RdBu_r")
@@ -64,7 +64,7 @@ def vector_map(
     shift_cells: NDArray[np.float64],
     names: Sequence[str] = (),
 ) -> bytes:
-    """Draw an orthoimage in pale grey, and arrows from true to shown positions.
+    """Draw an orthoimage in pale grey, with arrows from true to shown positions.
 
     Arrows are green up to the median length, yellow up to twice the median, and red beyond; a
     reference arrow is drawn below the image. If there are many pairs, every nth is drawn.

@@ -30,7 +30,7 @@ lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "hig
 _AXES: Final = ("x", "y")
 # Largest share of the points that the iterated rule may remove.
 _OUTLIERS_MOST: Final = 0.25
-# Maximum share of points that the iterated rule would remove without the cap.
+# Larger cap, to find out whether the iterated rule would remove more points than the cap allows.
 _MOST_WITHOUT_CAP: Final = 0.5
 # Minimum length of a distance between check points, as a share of the longest one. Shorter
 # distances depend more on single points than on the scale.
@@ -130,7 +130,7 @@ def displacement_findings(
 def check_findings(
     shift_m: NDArray[np.float64], gsd_m: float, *, prefix: str = ""
 ) -> list[Finding]:
-    """Compute statistics of displacements (n, 2) of check points, including Table 1.
+    """Compute statistics of displacements (n, 2) of check points, including those of Table 1.
 
     `rms_mm` and `sd_mm` are those of the lengths; `mean_shift_share` is the length of the mean
     displacement divided by the RMS.
@@ -169,8 +169,8 @@ def length_findings(
 ) -> list[Finding]:
     """Compute relative errors of distances between check points (markiewicz2015, 5: 0.2 %).
 
-    A distance is compared if both points are on the same wall and it is at least a quarter of the
-    longest distance; the result is empty if there is none.
+    A distance is compared if both points are on the same wall and the distance is at least a
+    quarter of the longest one; the result is empty if there is no such distance.
 
     Args:
         surveyed_m: (n, 2) metres along u and v, surveyed positions.
@@ -201,7 +201,7 @@ def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
 
     At most a quarter of the lengths are removed. If there are two kinds of points, such as points
     at edges and points on flat parts, the iteration would continue until it has removed the worse
-    kind; `cap_binds` detects this. The rule that is applied once is therefore the one to compare.
+    kind; `cap_binds` detects this. Comparisons should therefore use the rule that is applied once.
     """
     return _iterated(length_m, _OUTLIERS_MOST)
 
@@ -268,7 +268,7 @@ def rms(values: ArrayLike) -> float:
 def report(
     findings: Sequence[Finding], main: int, numbers: Mapping[int, int], ctx: StepContext
 ) -> None:
-    """Report findings as metrics: those of the main wall under their own names.
+    """Report findings as metrics: those of the main wall without a prefix.
 
     Findings of all walls together get the prefix `all_`. Displacements and completeness of the
     other walls get a prefix such as `wall_1_`, with the position of the plane in `planes.json`.

@@ -75,7 +75,7 @@ class OrthoimageGrey(GreyCells):
 
 
 def n_shown(image: Orthoimage) -> int:
-    """Return the number of cells that are painted or filled."""
+    """Return the number of cells that are coloured or filled."""
     return sum(count_cells(image.mask, state) for state in SHOWN_STATES)
 
 

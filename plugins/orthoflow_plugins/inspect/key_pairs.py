@@ -252,7 +252,7 @@ def _descriptor_distances(
 def _clear_winners(
     owner: NDArray[np.int64], apart: NDArray[np.float64], n_owners: int
 ) -> NDArray[np.bool_]:
-    """Return a mask of the pairs that are the nearest of their point and pass the ratio test."""
+    """Return a mask of the pairs that are the best for their point and pass the ratio test."""
     order = np.lexsort((apart, owner))
     starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
     nearest = np.full(n_owners, np.inf)

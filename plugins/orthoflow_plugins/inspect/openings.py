@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 _MAX_SAMPLES: Final = 1 << 24
 # Maximum depth of a recess in the scene.
 _BEHIND_MOST_M: Final = 2.0
-# A recess belongs to a wall if at least this share of the cells around it (within this number of
-# cells) is the face of the wall.
+# A recess belongs to a wall if at least the second value, as a share of the cells around it within
+# the first value, is on the face of the wall.
 _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
 # An outline matches an opening if their intersection over union (IoU) is at least this.
@@ -37,7 +37,7 @@ _SAME_IOU: Final = 0.5
 _REACH_CELLS: Final = 10.0
 # Sampling interval of this search.
 _STEP_CELLS: Final = 1.0 / 16.0
-# Number of lines across a side along which the border is searched for.
+# Number of lines, perpendicular to a side, along which the border is searched for.
 _LINES: Final = 33
 # Share of a side at either end that is ignored, because corners influence it.
 _ENDS_SHARE: Final = 0.1

@@ -1,7 +1,7 @@
 """True errors of estimated cameras and their ties, which residuals cannot show.
 
-Cameras are compared by position, angle and projection onto the wall, ties by the true targets of
-their pixels.
+Cameras are compared with the true ones by position, angle and projection onto the wall; ties are
+compared with the scene points that their pixels actually show.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
 
 
 def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
-    """Return distances (n,) of ties from the true targets of their pixels, in cells of the wall.
+    """Return distances (n,) of ties from the scene points that their pixels show, in wall cells.
 
     Distances are measured in the plane of the wall with the linearised true camera; they are
     infinite if the true camera does not look towards the point.
@@ -255,7 +255,7 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
 def _error_on_walls(
     found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
-    """Compare positions of a grid of pixels that both cameras project onto the true surfaces."""
+    """Compare the positions to which both cameras project a grid of pixels on true surfaces."""
     columns, rows = ((np.arange(n) + 0.5) / n for n in _GRID)
     grid = np.stack(np.meshgrid(columns * true.width, rows * true.height), axis=-1).reshape(-1, 2)
     seen = views.trace(true, grid)

@@ -98,8 +98,8 @@ class IntensityGrey(GreyCells):
 
     Attributes:
         intensity: (rows, cols) float32 from 0 to 1, NaN where unknown.
-        of_roots: use square roots, since laser intensities span several orders of magnitude, and
-            their roots are more similar to grey values of a photo.
+        of_roots: whether to use square roots, since laser intensities span several orders of
+            magnitude, and their roots are more similar to grey values of a photo.
     """
 
     intensity: NDArray[np.float32]
@@ -239,8 +239,8 @@ def refine_shifts(
 def _smoothed(image: GreyImage) -> GreyImage:
     """Smooth with a Gaussian of one cell, using only valid cells.
 
-    Cells at the border of the region become invalid, since their neighbours are only on one side
-    and the mean would be shifted. Scattered holes do not matter.
+    Cells at the border of the region become invalid, since their neighbours are only on one side,
+    so the mean would be biased. Scattered holes do not matter.
     """
     inside = _gauss(image.region) > _LEAST_REGION
     weight = _gauss(image.valid)

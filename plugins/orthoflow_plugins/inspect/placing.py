@@ -23,7 +23,7 @@ _SAME_DIRECTION_DEG: Final = 2.0
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
     """Return orthoimages whose `wall` is an index of these walls.
 
-    Orthoimages from other programs, and those of walls rastered in another step, only refer to a
+    Orthoimages from other programs, and those of walls rasterised in another step, refer only to a
     plane.
 
     Raises:

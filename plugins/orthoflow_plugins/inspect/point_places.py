@@ -1,4 +1,4 @@
-"""Find where images show check points: measured, recognised as targets, or by the truth."""
+"""Find check points in images: by measurements, as targets, or by means of the true scene."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ShownPoint:
         how: how the point was found, or why it was not found.
         wall: index of the wall in `Walls`; -1 if the point is on no wall.
         expected: (2,) column and row of the surveyed position; NaN if the point is on no wall.
-        place: (2,) column and row where the image shows it; NaN if not found.
+        place: (2,) column and row where the image shows the point; NaN if not found.
         point_world: (3,) metres, the point of the surface at `place`; NaN if unknown.
     """
 
@@ -84,7 +84,7 @@ class PointFinder:
         walls: walls of the images.
         truth: truth of a simulated room, or None to search for targets.
         search_m: search radius.
-        target_radius_m: radius of the targets, or of the part to use.
+        target_radius_m: radius of the targets, or of their inner part if only this is used.
     """
 
     pictures: Sequence[Picture]
@@ -174,7 +174,7 @@ def find_by_truth(
 
     Args:
         picture: the image to inspect.
-        frame: its grid.
+        frame: grid of the image.
         expected: (2,) column and row of the surveyed position.
         truth: the simulated scene.
         buffers_m: depths in front of and behind the plane that belong to the wall.

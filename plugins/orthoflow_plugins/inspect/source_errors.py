@@ -1,4 +1,7 @@
-"""True errors of painted cells, from the true target of the pixel that coloured them."""
+"""True errors of cells coloured from photos.
+
+Each cell is compared with the scene point that its source pixel actually shows.
+"""
 
 from __future__ import annotations
 
@@ -18,24 +21,25 @@ from orthoflow_plugins.inspect.orientation_errors import true_camera
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
-# A cell is wrong if its colour comes from a point farther away than this.
+# A cell is wrong if its colour comes from a scene point farther away than this.
 _FAR_CELLS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceErrors:
-    """The true origin of the colours of a wall's painted cells.
+    """The true origin of the colours of a wall's cells.
 
     Attributes:
         frame: grid of the cells.
-        displacement_m: (rows, cols, 2) position of the cell minus the true target of its pixel,
-            along u and v; NaN if no oriented photo coloured the cell or the pixel has no target.
+        displacement_m: (rows, cols, 2) position of the cell minus that of the scene point that its
+            source pixel shows, along u and v; NaN if no oriented photo coloured the cell or the
+            pixel shows no surface.
         traced: (rows, cols) bool, cells coloured by an oriented photo.
         expected_m: (rows, cols) predicted error of the orthoimage; None if it has no prediction.
-        ghosts: (rows, cols) bool, cells whose pixel shows a free-standing object.
+        ghosts: (rows, cols) bool, cells whose source pixel shows a free-standing object.
         n_seen_by_both: number of tested cells whose true surface is visible from a station and in a
             photo.
-        n_seen_painted: number of painted cells among these.
+        n_seen_painted: number of coloured cells among these.
     """
 
     frame: WallFrame
@@ -84,8 +88,9 @@ class SourceSamples:
             from true depth steps.
         step_m: (m, 2) the same within 2 cells of a true depth step.
         n_traced: cells coloured by an oriented photo.
-        n_far: number of traced cells whose pixel has a target more than 3 cells away, or no target.
-        n_ghosts: number of traced cells whose pixel shows a free-standing object.
+        n_far: number of traced cells whose source pixel shows a point more than 3 cells away, or no
+            surface.
+        n_ghosts: number of traced cells whose source pixel shows a free-standing object.
         n_stated: number of coordinates away from steps with a predicted error.
         n_within_1_sigma: number of coordinates whose error is at most the predicted one.
         n_within_2_sigma: number of coordinates whose error is at most twice the predicted one.
@@ -114,7 +119,7 @@ def trace_sources(
     truth: Truth,
     views: SceneCameras,
 ) -> SourceErrors:
-    """Trace every cell that was coloured by a photo back to the true target of its pixel.
+    """Trace every cell that was coloured by a photo to the scene point that its pixel shows.
 
     The cell's point on the measured surface is projected with the estimated camera, as when the
     orthoimage was made; the ray of that pixel through the true camera meets the true scene, and the

@@ -176,7 +176,7 @@ class InspectTruth(Method):
     buffer, seen perpendicular to the wall. Depths and colours are compared away from true depth
     steps; a band of 2 cells along the steps is reported separately. Displacements come from patches
     of 32 x 32 covered cells, matched to the truth by least squares. Metrics without a prefix
-    describe the first wall, those with `all_` all walls together. On large walls, colours and
+    describe the first wall, and those with `all_` all walls together. On large walls, colours and
     patches are compared in evenly spread blocks of 96 x 96 cells, and visibility is tested on a
     regular lattice of cells; depths and displacements that follow from cameras are compared in
     every cell. If there are more than eight million errors, statistics are computed from an evenly
@@ -187,10 +187,10 @@ class InspectTruth(Method):
     surface is projected with the estimated camera, and the ray of that pixel through the true
     camera meets the true scene at the point whose colour the cell shows. Displacements of patches
     then have the prefix `patch_`. The ties stored with the cameras are compared, too. A tie is
-    wrong if it is more than 1.5 cells of the wall from the true target of its pixel.
-    `match_wrong_share` is the share of wrong ties among all ties, `tie_wrong_share` the share among
-    those that the orientation kept, and `match_wrong_share_own_wall` the share among those on the
-    wall that covers most of their photo.
+    wrong if it is more than 1.5 cells of the wall from the scene point that its pixel shows.
+    `match_wrong_share` is the share of wrong ties among all ties, `tie_wrong_share` is the share
+    among those that the orientation kept, and `match_wrong_share_own_wall` is the share among those
+    on the wall that covers most of their photo.
 
     Without orthoimages, only planes and labels are compared, which is sufficient for plane
     detectors.

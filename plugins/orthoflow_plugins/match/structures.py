@@ -342,7 +342,7 @@ def _part_map(
 
 
 def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[np.complex64]:
-    """Transform layers (c, rows, cols) with padding; padding rows are skipped along the columns."""
+    """Transform layers (c, rows, cols) with padding; transforms along rows skip padding rows."""
     from scipy import fft
 
     along = fft.rfft(layers, padded[1], axis=2)

@@ -58,7 +58,7 @@ class Projection:
         return np.array([self.part[1].start, self.part[0].start], dtype=np.intp)
 
     def pixels_at(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pixels (n, 2) at fractional cells (n, 2) = (column, row); NaN next to void cells."""
+        """Return pixels (n, 2) at fractional cells (n, 2) = (column, row); NaN near void cells."""
         return np.column_stack([between(self.u, at), between(self.v, at)])
 
     def hide(self, mask: NDArray[np.bool_]) -> None:

@@ -50,7 +50,8 @@ def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overl
 
     Args:
         layers: photos of one wall.
-        of_all_pairs: compare all pairs of layers of a patch instead of only the best two.
+        of_all_pairs: whether to compare all pairs of layers that show a patch, not only the best
+            two.
     """
     import cv2
 
@@ -110,7 +111,7 @@ def _grey(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 def seam_steps(
     source: NDArray[np.int16], layers: Sequence[Layer], balance: Balance | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compare the two sources in cells to the left of or above seams, if both show them.
+    """Compare the two sources of a seam, in cells to the left of or above it that both show.
 
     Args:
         source: (rows, cols) index of the layer of each cell, -1 if none.

@@ -5,7 +5,8 @@ comes from one photo, and there are no double contours even if some parallax rem
 
 The model consists of an exposure per photo, the vignetting of its lens, and a smooth field per
 photo. All of these are logarithms, so that factors become sums. Where two photos show the same
-blocks of a wall, the difference of their corrections must equal their observed difference.
+blocks of a wall, the difference between their corrections must equal the observed difference in
+brightness.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ _LEAST_BLOCKS: Final = 4
 _BLOCKS_MOST: Final = 200
 # An overlap counts as at most this many independent blocks.
 _INDEPENDENT: Final = 50.0
-# Smallest standard deviation of the difference of two photos in a block.
+# Smallest standard deviation of the difference between two photos in a block.
 _SPREAD_LEAST: Final = 0.01
 # Prior standard deviations of exposures, lens terms and nodes of fields, in logarithms.
 _EXPOSURE_PRIOR: Final = 1.0
@@ -121,7 +122,7 @@ def _between(
     """Return the first of the two blocks around each cell (n,), and the weight of the second."""
     n_blocks = part.stop - part.start
     middles = 0.5 * (edges[part] + edges[part.start + 1 : part.stop + 1])
-    # Look up rows or columns once instead of all cells.
+    # Interpolate once for each row or column, not for each cell.
     at = np.interp(np.arange(edges[-1]) + 0.5, middles, np.arange(n_blocks))
     first = np.minimum(at.astype(np.int64), max(0, n_blocks - 2))
     return first[cells], (at - first).astype(np.float32)[cells][:, None]
@@ -135,7 +136,7 @@ def balance_of(
     """Find corrections that equalise the layers of a wall; None if the layers already agree.
 
     Args:
-        layers: layers with painted cells, at least one.
+        layers: layers with coloured cells, at least one.
         wall: the wall, or None.
         cameras: camera of each layer, or None if unknown.
     """
@@ -165,7 +166,7 @@ def _radii(
     blocks: Blocks,
     lights: Sequence[BlockLight],
 ) -> list[Radii | None]:
-    """Return the distance of the blocks of each layer from the centre of its photo."""
+    """Return the distances of the blocks of each layer from the centre of its photo."""
     lenses: dict[tuple[int, int, int], int] = {}
     found: list[Radii | None] = []
     down, right = blocks.centres()
@@ -183,7 +184,7 @@ def _radii(
         pixels = camera.viewing().project(frame.world_from_wall(middles, depths_m))[:, :2]
         half = np.array([0.5 * lens.width, 0.5 * lens.height])
         radii = np.linalg.norm(pixels - half, axis=1) / np.linalg.norm(half)
-        # Painted cells are inside the photo; all others, and NaN, get the radius of the corner.
+        # Coloured cells are inside the photo; all others, and NaN, get the radius of the corner.
         radii = np.fmin(radii, 1.0).astype(np.float32)
         values = radii.reshape(len(rows), len(columns))
         found.append(Radii(values=values, lens=lenses.setdefault(key, len(lenses))))
@@ -197,7 +198,7 @@ def _depths_at(wall: Wall, middles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -> Balance:
-    """Add corrections that blend the remaining differences of layers near their seams.
+    """Add corrections that blend the remaining differences between layers near their seams.
 
     Towards a seam, each layer changes to the mean of the layers on both sides, weighted by their
     shares of the neighbourhood. Blocks with depth edges, and blocks where two layers show different
@@ -237,7 +238,7 @@ def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -
 def _apart(
     balance: Balance, pair: tuple[int, int], shared: Box, around: Box, says: NDArray[np.float32]
 ) -> NDArray[np.float32] | None:
-    """Return the smooth difference (rows, cols, 3), second minus first, of two balanced layers.
+    """Return the smooth difference (rows, cols, 3) between two balanced layers (second - first).
 
     Args:
         balance: the colour balance of all layers.
@@ -444,7 +445,7 @@ def _corner(part: Box) -> NDArray[np.int64]:
 
 
 def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
-    """Return the columns of the exposures: 1 for the first layer, -1 for the second."""
+    """Return the design matrix's exposure columns: 1 for the first layer, -1 for the second."""
     from scipy.sparse import csr_array
 
     layers = np.repeat(
@@ -459,7 +460,7 @@ def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
 def _lens_columns(
     overlaps: Sequence[_Overlap], radii: Sequence[Radii | None], n_lenses: int
 ) -> csr_array:
-    """Return the columns of the lenses, two per lens."""
+    """Return the design matrix's lens columns, two per lens."""
     from scipy.sparse import csr_array
 
     columns = np.zeros((sum(len(item.apart) for item in overlaps), 2 * n_lenses))
@@ -476,7 +477,7 @@ def _lens_columns(
 
 
 def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -> csr_array:
-    """Return the columns of the fields, one per node and layer."""
+    """Return the design matrix's columns of the fields, one per node and layer."""
     from scipy.sparse import csr_array
 
     n_nodes = _NODES**2

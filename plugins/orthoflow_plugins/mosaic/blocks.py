@@ -17,7 +17,7 @@ from orthoflow.products import Layer, LayerMask
 # Levels outside this range are almost black or clipped.
 _DARKEST: Final = 10.0 / 255.0
 _BRIGHTEST: Final = 245.0 / 255.0
-# Minimum share of pixels within this range in blocks where exposure is measured.
+# Minimum share of pixels within this range of levels, in blocks whose brightness is measured.
 _SAYING_LEAST: Final = 0.95
 # Minimum height of depth edges, at which photos differ because of parallax.
 _DEPTH_EDGE_M: Final = 0.03
@@ -175,7 +175,7 @@ def common(one: Box, other: Box) -> Box | None:
 
 
 def inside(part: Box, box: Box) -> Box:
-    """Return the slices of a part within the arrays of its box."""
+    """Return the slices of a part of a box in arrays over that box."""
     rows, columns = (
         slice(inner.start - outer.start, inner.stop - outer.start)
         for inner, outer in zip(part, box, strict=True)

@@ -31,10 +31,11 @@ if TYPE_CHECKING:
 _BLOCK_M: Final = 0.025
 _BLOCK_CELLS: Final = (4, 32)
 _LEAST_PAINTED: Final = 0.5
-# Added to brightness, so that noise in almost black cells does not count as a difference.
+# This is added to brightness, so that noise in almost black cells is not taken for a difference.
 _DARK: Final = 0.02
 # Two observations contradict each other if the logarithms of their brightness differ by at least
-# this much and, up to twice this, by this many standard deviations of all blocks.
+# the first value and, up to twice this value, by at least the second value times the standard
+# deviation over all blocks.
 _APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
 # In the core of a region of contradiction, the difference must exceed the limit by this factor.
@@ -132,7 +133,7 @@ def _contradicted(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.float64]:
-    """Return the difference of a photo from better confirmed ones in each block; 0 if none."""
+    """Return each block's difference between a photo and better-confirmed ones; 0 if none."""
     worst = np.zeros(blocks.shape)
     for other in range(len(supports)):
         ratio = apart.get((min(photo, other), max(photo, other)))
@@ -245,7 +246,7 @@ def _known(witness: _Witness, blocks: Blocks) -> NDArray[np.bool_]:
 def _difference(
     one: _Witness, other: _Witness, box: Box
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the difference of two observations, in grey if one is grey, and where both exist."""
+    """Return the difference between two observations (grey if one is) and a mask of both."""
     difference = one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
     if one.is_grey or other.is_grey:
         difference = np.repeat(difference.mean(axis=2, keepdims=True), 3, axis=2)
@@ -253,7 +254,7 @@ def _difference(
 
 
 def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the smooth part (r, c, 3) of the difference of two observations; NaN if unknown."""
+    """Return the smooth part (r, c, 3) of a difference of observations; NaN if unknown."""
     known = np.asarray(np.isfinite(difference).all(axis=2), dtype=np.bool_)
     if not known.any():
         return np.zeros(difference.shape)
@@ -266,9 +267,10 @@ def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
-    """Return the difference of two observations in each block, in units of the threshold.
+    """Return the difference between two observations in each block, in units of the threshold.
 
-    It is NaN where one of them is missing; the result is None if they have no block in common.
+    The difference is NaN where an observation is missing; None is returned if the observations have no
+    block in common.
     """
     box = common(one.box, other.box)
     if box is None:

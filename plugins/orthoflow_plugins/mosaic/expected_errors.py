@@ -2,7 +2,7 @@
 
 Three independent causes displace the content of a cell along the wall: errors of the pose of the
 photo (its covariance, propagated to the wall), errors of the depth of the cell (times the tangent
-of the angle of view), and displacements between overlapping photos that neither of them explains.
+of the viewing angle), and displacements between overlapping photos that neither of them explains.
 Overlaps separate the last two, because a depth error displaces photos taken from different sides in
 different directions.
 """
@@ -44,8 +44,8 @@ _PATCH_M: Final = 0.05
 # (neighbouring and distant cells differ by 0.98 and 1.3 mm in the simulated room, 1.2 and 2.4 mm in
 # a stuccoed hall, 1.7 and 5.2 mm in a stereo cloud of a fountain).
 _PATCHY_TIMES: Final = 1.5
-# Overlaps reveal depth errors if the tangents of the views differ by at least this much in at least
-# this many patches.
+# Overlaps reveal depth errors if the tangents of the viewing angles differ by at least the first
+# value in at least the second number of patches.
 _LEAST_TANGENTS: Final = 0.3
 _LEAST_SLANTED: Final = 20
 # Displacements of more than this many standard deviations are false matches.
@@ -210,7 +210,7 @@ def _depth_variances(
     centre: NDArray[np.float64],
     noises_m: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return variances (n,) of a coordinate due to the depths of cells viewed from a centre (3,).
+    """Return variances (n,) of a coordinate due to depth errors, viewed from a centre (3,).
 
     The first noise is that of single cells, the second is shared by neighbouring cells.
     """
@@ -233,10 +233,10 @@ def _excess_of_overlaps(
 ) -> tuple[float, float | None] | None:
     """Separate errors of poses and depths by means of displacements; None if these are too few.
 
-    A squared displacement is the sum of the variances of both poses, twice the additional variance
-    of a pose, and the variance of the depth times the squared difference of the tangents of both
-    views. The two unknown variances are estimated by weighted least squares, without outliers and
-    with the constraint that they are not negative.
+    The expected squared displacement is the sum of the variances of both poses, twice the
+    additional variance of a pose, and the depth variance times the squared difference between the
+    tangents of the two viewing angles. The two unknown variances are estimated by weighted least
+    squares, without outliers and with the constraint that they are not negative.
 
     Returns:
         The additional standard deviation of a coordinate in one photo, and the standard deviation
@@ -287,7 +287,7 @@ def _excess_of_overlaps(
 def _views_of(
     wall: Wall, camera: Camera, centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return, at positions, variances (n,) due to a pose and tangents (n, 2) of the views."""
+    """Return variances (n,) due to a pose, and tangents (n, 2) of viewing angles, at positions."""
     frame = wall.frame
     depths_m = np.nan_to_num(
         wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)

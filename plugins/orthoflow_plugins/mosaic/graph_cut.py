@@ -69,8 +69,8 @@ def cut_labels(
     """Assign a layer to each cell by a graph cut; -1 if no layer shows the cell.
 
     Boykov, Veksler and Zabih 2001: each layer in turn takes over cells of the others if this lowers
-    the sum of view costs and seam costs (colour differences between both layers on both sides,
-    Kwatra et al. 2003, plus depth edges). The cut is computed at a reduced scale.
+    the sum of view costs and seam costs (colour differences between the two layers on both sides of
+    a seam, Kwatra et al. 2003, plus depth edges). The cut is computed at a reduced scale.
 
     Args:
         layers: layers of one wall.

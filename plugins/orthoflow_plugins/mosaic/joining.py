@@ -54,7 +54,7 @@ def preferences(
     wall: Wall | None = None,
     balance: Balance | None = None,
 ) -> list[Preference]:
-    """Return functions that compute each layer's preference by a rule; the largest wins.
+    """Return functions that compute each layer's preference by a rule; the highest is used.
 
     `best-view` is the quality of the layers: angle of incidence, resolution and distance from the
     border of the photo. `voronoi` prefers the layer whose area ends farthest away, so that seams
@@ -235,7 +235,7 @@ def coloured(
 def best_views(
     layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """Assign each cell to the layer with the highest preference; if equal, to the first.
+    """Assign each cell to the layer with the highest preference, or to the first of several.
 
     Returns:
         (rows, cols) rank of the state of each cell, and its layer, `NOBODY` if it has none.

@@ -64,7 +64,7 @@ _NAMED_MOST: Final = 24
 _LONG_NAME: Final = 16
 # Weight of the source colours over the grey image.
 _TINT: Final = 0.45
-# Minimum shares of empty cells, of contradicted cells and of a cause for which they are reported.
+# Minimum shares of empty cells, of contradicted cells and of cells with one cause for a report.
 _EMPTY_WORTH_WORDS: Final = 0.1
 _CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01
@@ -286,7 +286,7 @@ def _join(
     wall = walls[index] if index < len(walls) else None
     cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
     require_one_raster(group, name)
-    # A layer without painted cells is not a source, but shows which cells are hidden.
+    # A layer without coloured cells is not a source, but shows which cells are hidden.
     painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in group if all(layer is not painter for painter in painters)]
     n_outvoted, contradicted = 0, None
@@ -369,7 +369,7 @@ def _show(ctx: StepContext, image: Orthoimage) -> None:
 
 
 def _report_empty(ctx: StepContext, image: Orthoimage) -> None:
-    """Report the causes of empty cells, unless they only lack a surface."""
+    """Report the causes of empty cells, unless all of them lack a surface."""
     words = {
         OrthoMask.NONE: "are in no oriented photo (check why photos were refused, or take another)",
         OrthoMask.OCCLUDED: "are hidden in all photos, or seen too obliquely (take a "

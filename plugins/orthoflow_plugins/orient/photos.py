@@ -268,7 +268,7 @@ class Trusted:
     kept: NDArray[np.bool_]
 
     def judged(self, ties: Ties, params: OrientParams, estimate: Estimate) -> Oriented:
-        """Test an orientation; if it fails or contradicts ties by hand, return that from the ties."""
+        """Test a pose; if it fails or contradicts ties by hand, return the pose from these ties."""
         found = judged(self.tied, candidate_of(self.tied, ties, params, estimate))
         is_with_hand = not (self.kept & (found.role == TieRole.REJECTED)).any()
         if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
