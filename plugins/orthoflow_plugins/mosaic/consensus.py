@@ -269,8 +269,8 @@ def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
 def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
     """Return the difference between two observations in each block, in units of the threshold.
 
-    The difference is NaN where an observation is missing; None is returned if the observations have no
-    block in common.
+    The difference is NaN where an observation is missing; None is returned if the observations
+    have no block in common.
     """
     box = common(one.box, other.box)
     if box is None:

@@ -1,4 +1,4 @@
-"""Gaps between painted cells: which to fill (skarlatos2012, section 3), and their colours."""
+"""Gaps between coloured cells: which to fill (skarlatos2012, section 3), and their colours."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 _WINDOWS: Final = (3, 5, 7)
-# Painted cells within this distance of a gap need the position of their point.
+# Coloured cells within this distance of a gap need the position of their point.
 _BESIDE_CELLS: Final = 2
 # OpenCV propagates colours through successive gaps, but beyond this distance, the effect is less
-# than one level of 8 bits.
+# than one 8-bit level.
 _FRONT_CELLS: Final = 64
 
 
@@ -72,14 +72,14 @@ def inpainted(
     method: Inpainting,
     radius_px: float,
 ) -> NDArray[np.uint8]:
-    """Inpaint the fillable cells with OpenCV, from the colours of painted cells only.
+    """Inpaint the fillable cells with OpenCV, using only colours of cells that are not void.
 
     Args:
         rgb: (rows, cols, 3); values of void cells have no influence.
         is_void: (rows, cols) cells without a colour.
         is_fillable: (rows, cols) void cells to fill.
         method: method of `cv2.inpaint`.
-        radius_px: radius from which a cell takes its colour.
+        radius_px: radius within which cells influence the colour of a filled cell.
 
     Returns:
         (rows, cols, 3) colours, 0 in void cells that are not filled.
@@ -90,7 +90,8 @@ def inpainted(
     if is_void.all() or not is_fillable.any():
         return painted
     # cv2.inpaint treats every cell outside its mask as known, so the black of large voids would
-    # bleed into adjacent gaps. Give all void cells the colour of the nearest painted cell first.
+    # bleed into adjacent gaps. Therefore, first give all void cells the colour of the nearest cell
+    # that is not void.
     _, labels = cv2.distanceTransformWithLabels(
         is_void.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -113,14 +114,14 @@ def painted_between(
     reach_cells: float,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Fill gaps in place by interpolation between the painted cells around them.
+    """Fill gaps in place by interpolation between the coloured cells around them.
 
     Args:
         gaps: (n,) flat indices of the cells to fill.
         rgb: (rows, cols, 3) 8-bit or 16-bit colours; the gaps are overwritten.
-        around: the painted cells.
+        around: the coloured cells.
         depth_m: (cells,) depth of the surface; NaN if unknown.
-        reach_cells: gaps without a painted cell within this distance are unchanged.
+        reach_cells: gaps without a coloured cell within this distance are unchanged.
         threads: number of threads.
 
     Returns:

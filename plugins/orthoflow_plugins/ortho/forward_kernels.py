@@ -35,7 +35,7 @@ class Catch(NamedTuple):
 def throw_pixels(
     view: WallView, relief: Relief, buffer: DepthBuffer, rays: NDArray[np.float64], catch: Catch
 ) -> int:
-    """Trace the ray of each pixel to its first intersection, and offer the pixel to that cell.
+    """Trace the ray of each pixel to the first cell that it hits; keep one pixel for each cell.
 
     A cell takes the pixel that hits it closest to its centre, or the first of several. A ray that
     hits the side of a depth step is ignored, since no cell shows that side.

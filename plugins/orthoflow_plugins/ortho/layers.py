@@ -93,7 +93,7 @@ class LayerStack:
 
 
 def count_shown(walls: Walls, layers: Layers) -> tuple[int, int, int]:
-    """Count cells of all walls: with a depth, painted, and hidden but not painted."""
+    """Count cells of all walls: with a depth, coloured, and hidden but not coloured."""
     n_surface = n_painted = n_hidden = 0
     for place, wall in enumerate(walls.walls):
         masks = [layer.mask for layer in layers.layers if layer.wall == place]

@@ -30,8 +30,8 @@ from orthoflow_plugins.ortho.visibility_kernels import (
 Tile = tuple[slice, slice]
 
 TILE_CELLS: Final = 512
-# The part of a photo that covers a tile stays below 27 MB, and its sides below 32767, as cv2.remap
-# requires.
+# Maximum side of the part of a photo that covers a tile. This part is then smaller than 27 MB, and
+# its sides are shorter than 32767 pixels, as cv2.remap requires.
 _CROP_MOST_PX: Final = 3_000
 # Margin of that part; Lanczos needs 4 pixels, so the result does not depend on the cropping.
 _REACH_PX: Final = 5
@@ -53,7 +53,7 @@ class CellFootprint:
         pixels_down: length of a cell along v in photo pixels.
         photo_gsd_m: size of a photo pixel perpendicular to the ray.
         obliquity_deg: angle between the ray and the normal of the wall.
-        n_cells: number of painted cells.
+        n_cells: number of coloured cells.
     """
 
     pixels_across: float
@@ -65,13 +65,13 @@ class CellFootprint:
 
 @dataclass(kw_only=True)
 class Painting:
-    """The result of painting a photo on a wall.
+    """The result of projecting a photo onto a wall.
 
     Attributes:
         mask: (rows, cols) uint8 `LayerMask`.
-        rgb: (rows, cols, 3) with the bit depth of the photo; None if no cell is painted.
-        quality: (rows, cols) float32; None if no cell is painted.
-        footprints: footprint of each painted tile, by its first row and column.
+        rgb: (rows, cols, 3) with the bit depth of the photo; None if no cell is coloured.
+        quality: (rows, cols) float32; None if no cell is coloured.
+        footprints: footprint of each tile with coloured cells, by first row and column of the tile.
     """
 
     mask: NDArray[np.uint8]
@@ -99,7 +99,7 @@ def paint(
         buffer: depth buffer of objects in front of the wall.
         params: choice of cells, and sampling of colours.
         allocate: allocates zeroed arrays of the layer; those of colours and quality only if a cell
-            is painted.
+            is coloured.
         threads: number of tiles processed at once; it does not change the result.
     """
     import cv2
@@ -212,12 +212,12 @@ def footprint_of(
     tile: Tile,
     inner: Tile,
 ) -> CellFootprint:
-    """Measure the footprint at the middle of the painted cells of a tile.
+    """Measure the footprint at the middle of the coloured cells of a tile.
 
     Args:
         view: the camera in the axes of the wall.
         surface: the wall.
-        is_painted: (rows, cols) painted cells of the tile with its margin, at least one.
+        is_painted: (rows, cols) coloured cells of the tile with its margin, at least one.
         tile: rows and columns of the tile on the wall.
         inner: rows and columns of the tile within `is_painted`.
     """
@@ -243,7 +243,7 @@ def footprint_of(
     )
     aside = view.gsd_m * math.hypot(view.column - column, view.row - row)
     return CellFootprint(
-        # A neighbour of a painted cell may be outside the lens model, so its position may be NaN.
+        # A neighbour of a coloured cell may be outside the lens model, so its position may be NaN.
         pixels_across=across if math.isfinite(across) else 1.0,
         pixels_down=down if math.isfinite(down) else 1.0,
         photo_gsd_m=centre[2] / math.sqrt(view.camera[12] * view.camera[13]),
@@ -262,7 +262,7 @@ def sample(
     *,
     into: Colours,
 ) -> None:
-    """Sample the colours of a tile; cells that are not painted become black.
+    """Sample the colours of a tile; cells that are not visible become black.
 
     Args:
         photo: (height, width, 3), 8 or 16 bits.
@@ -321,7 +321,7 @@ def sample_bilinear(
     inner: Tile,
     colours: Colours,
 ) -> None:
-    """Sample colours bilinearly; cells that are not painted become black.
+    """Sample colours bilinearly; cells that are not visible become black.
 
     The border of the photo is replicated. `cv2.remap` would round positions to 1/32 pixel and take
     twice as long.

@@ -222,7 +222,7 @@ def pixels_of(photo: Photo, camera: Camera, level: Level) -> Colours:
     """Decode a photo (height, width, 3) to 8 or 16 bits.
 
     Raises:
-        MethodError: the camera has another image size.
+        MethodError: the image size of the camera differs from that of the photo.
     """
     deep = level is np.uint16
     pixels = (decode_levels if deep else decode_image)(photo.encoded, photo.name)

@@ -145,9 +145,9 @@ def colours_of(
 def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> NDArray[np.float64]:
     """Find factors on the brightness of scans that remove colour casts, as logarithms (scans, 3).
 
-    Where two scans overlap, they show the same surface, so differences of their mean colours are
-    due to exposure and white balance, except at edges of texture and objects; the L1 norm is robust
-    to these. In a group of overlapping scans, the median scan keeps its colours.
+    Where two scans overlap, they show the same surface, so differences between their mean colours
+    are due to exposure and white balance, except at edges of texture and objects; the L1 norm is
+    robust to these. In a group of overlapping scans, the median scan keeps its colours.
 
     Args:
         painters: coloured points with scan numbers.

@@ -105,7 +105,7 @@ class PointcloudDirect(Method):
     Params = DirectParams
 
     class In(Ports):
-        """The walls, of which frames and buffers are used, and the coloured cloud."""
+        """The walls, of which only frames and buffers are used, and the coloured cloud."""
 
         walls: Walls
         cloud: PointCloud
@@ -299,7 +299,7 @@ def _fill(
 
 
 def _report(ctx: StepContext, layers: list[Layer], names: Sequence[str], n_filled: int) -> None:
-    """Report the shares of painted, filled and void cells, and ways to fill more cells."""
+    """Report the shares of coloured, filled and void cells, and ways to fill more cells."""
     n_cells = sum(layer.mask.size for layer in layers)
     n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
     ctx.metric("painted_share", (sum(n_shown) - n_filled) / n_cells, "1")

@@ -26,8 +26,9 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     look_at_cells,
 )
 
-# A surface hides a cell if it is above the ray by more than this number of standard deviations of
-# depth plus this number of cells, which allows for detail finer than the raster.
+# A surface hides a cell if it is above the cell's ray by more than the first number of standard
+# deviations of depth plus the second number of cells, which allows for detail finer than the
+# raster.
 _TOLERANCE_SIGMAS: Final = 3.0
 _TOLERANCE_CELLS: Final = 0.5
 # Quality decreases to 0 at the border of a photo over this share of its shorter side.

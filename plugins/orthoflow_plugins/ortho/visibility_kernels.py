@@ -81,11 +81,11 @@ class TileVisibility(NamedTuple):
     """Visibility of a tile of cells in a photo, filled by `look_at_cells`.
 
     Attributes:
-        u: (rows, cols) float32 photo column, first pixel centre at 0.5; 0 where not painted.
+        u: (rows, cols) float32 photo column, first pixel centre at 0.5; 0 where not visible.
         v: (rows, cols) float32 photo row likewise.
         mask: (rows, cols) uint8 state of the cell.
         quality: (rows, cols) float32 photo pixels per cell, reduced at the border; 0 where not
-            painted.
+            visible.
     """
 
     u: NDArray[np.float32]
@@ -266,7 +266,7 @@ def _set_states(
 def _keep_painted(
     mask: NDArray[np.uint8], values: NDArray[np.float32], kept: NDArray[np.float32]
 ) -> None:
-    """Copy the values of painted cells; set the others to 0."""
+    """Copy the values of visible cells; set the others to 0."""
     painted, zero = np.uint8(PAINTED), np.float32(0.0)
     for j in range(mask.size):
         kept[j] = values[j] if mask[j] == painted else zero
@@ -282,7 +282,7 @@ def _hide_low_cells(
     depths: NDArray[np.float32],
     mask: NDArray[np.uint8],
 ) -> None:
-    """Trace the rays from painted cells of a row towards the camera, up to a height.
+    """Trace the rays from cells of a row not yet hidden towards the camera, up to a height.
 
     A ray advances by one row or one column at a time, along the axis on which it is longer.
 

@@ -53,7 +53,7 @@ class _Trend:
 
 
 def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
-    """Return the cloud with the intensities it would have if all scans had the same conditions.
+    """Return the cloud with the intensities of scans made under identical conditions.
 
     Only points on walls are corrected. If scans do not overlap, the cloud is unchanged and a
     warning is reported.
@@ -119,7 +119,7 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
 
 
 def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
-    """Return differences between two scans in the same square, as rows.
+    """Return differences between pairs of scans in the same square, as rows.
 
     Returns:
         (n, 5): scan, other scan, and the differences (first minus second) of the means of log

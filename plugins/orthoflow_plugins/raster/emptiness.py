@@ -92,7 +92,7 @@ def emptiness_of(
         wall: the wall.
         slab: its raster and buffer.
         sight: the scanned points.
-        free_m: objects farther in front of the wall belong to the opposite surface.
+        free_m: objects farther than this in front of the wall belong to the opposite surface.
         threads: number of threads.
     """
     points = sight.points
@@ -202,7 +202,7 @@ def _blocked(
 
 @dataclass(frozen=True, kw_only=True)
 class _Room:
-    """The voxels that contain points; positions are offsets of the cloud."""
+    """The voxels that contain points; positions are relative to the cloud's origin."""
 
     low_m: NDArray[np.float64]
     side_m: float

@@ -1,11 +1,11 @@
 """The extent of a wall, up to adjoining surfaces and including its relief.
 
-In markiewicz2015 (section 6), points in a range in front of and behind each plane are rastered.
-Here, both this range and the rectangle are determined from the points connected to the wall. For
-this, a sample of the cloud is divided into voxels, and a region grows along the wall and in depth
-from the voxels on the plane. If a detected plane adjoins the wall, the rectangle ends at its
-nearest point, because a larger rectangle would show the adjoining plane. Otherwise, it ends where
-the points end.
+In markiewicz2015 (section 6), points within a range in front of and behind each plane are
+rasterised. Here, both this range and the rectangle are determined from the points connected to the
+wall. For this, a sample of the cloud is divided into voxels, and a region grows along the wall and
+in depth from the voxels on the plane. If a detected plane adjoins the wall, the rectangle ends at
+the nearest point of that plane, because a larger rectangle would show the adjoining plane.
+Otherwise, it ends where the points end.
 """
 
 from __future__ import annotations
@@ -58,9 +58,10 @@ _BEYOND_MOST_M: Final = 0.1
 _FAR_FRONT_MOST_M: Final = 3.0
 # Such an object belongs to the wall only if it alone covers more than this share of the wall.
 _FAR_SHARE_LEAST: Final = 0.03
-# The distance is at most halfway to a surface that faces the wall, or to a scanner.
+# The depth of such an object is at most this share of the distance from the wall to a surface that
+# faces it, or to a scanner.
 _HALFWAY: Final = 0.5
-# A surface faces the wall if the cosine between the normals is smaller.
+# A surface faces the wall if the cosine of the angle between the normals is smaller than this.
 _FACING_COSINE: Final = -0.7
 # Opposite walls of a room have similar areas; objects in front of a wall cover a few per cent of
 # it.
@@ -73,7 +74,7 @@ _GROUND_M: Final = 0.15
 _RELIEF_LEAST: Final = 5e-4
 _BEYOND_RELIEF_M: Final = 0.02
 _RELIEF_USUAL_M: Final = 0.15
-# Maximum cosine between the normals of a wall and an adjoining plane.
+# Maximum cosine of the angle between the normals of a wall and an adjoining plane.
 _ADJOINING_COSINE: Final = 0.7
 _BESIDE_SINE: Final = 0.9
 # Along at least this share of the wall's side, points of an adjoining plane must be in this range

@@ -107,7 +107,7 @@ def mapped(
         ctx: receives warnings.
 
     Raises:
-        MethodError: the system does not exist, or z is not up.
+        MethodError: the system does not exist, or z does not point up.
     """
     from orthoflow.files.geotiff import require_map_crs
 

@@ -52,7 +52,7 @@ ExtentOf = Callable[[int], Extent]
 
 # Points of `near` farther from the wall than this are probably wrong.
 _FAR_M: Final = 1.0
-# A wider missing strip would be noticed in a drawing.
+# A missing strip wider than this would be noticed in a drawing.
 _CUT_WORTH_WORDS_M: Final = 0.05
 OBLIQUE: Final = DiagnosticSpec(
     code="wall-beside-an-oblique-surface",
@@ -78,7 +78,7 @@ CROP_OF_SEVERAL: Final = DiagnosticSpec(
 
 
 class RasterGrid(Method):
-    """Raster the cloud on each wall: depth, spread, count, intensity and colour.
+    """Rasterise the cloud on each wall: depth, spread, count, intensity and colour.
 
     Narrow gaps are interpolated between neighbouring points of a scan if its rows and columns are
     known, otherwise between the measured cells around the gap, from the positions of their points.
@@ -92,7 +92,7 @@ class RasterGrid(Method):
     result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
-        # Identifies the first wall.
+        # This identifies the first wall.
         MetricSpec("omega_deg", label="direction of the first normal (omega)"),
         MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
         MetricSpec("area_m2", label="area of the first wall's raster"),
@@ -104,7 +104,7 @@ class RasterGrid(Method):
         MetricSpec(
             "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
         ),
-        # Also reported by cause.
+        # This is also reported by cause.
         MetricSpec("empty_share", label="cells without a depth"),
         MetricSpec("empty_*_share", label="cells without a depth, by cause"),
         MetricSpec("measured_share", label="cells with a measured depth"),
@@ -135,7 +135,7 @@ class RasterGrid(Method):
         walls: Walls
 
     def run(self, inputs: In, params: RasterParams, ctx: StepContext) -> Out:
-        """Raster the selected planes, with one or a few passes over the cloud for each."""
+        """Rasterise the selected planes, with one or a few passes over the cloud for each."""
         from orthoflow.geometry.cloud_quality import scan_step_m
 
         cloud, planes = inputs.cloud, inputs.planes

@@ -115,7 +115,7 @@ def sort_into_cells(
     owners: int,
     owner: int,
 ) -> None:
-    """Append depths to those of their cells.
+    """Append the depths of points to those of their cells.
 
     Args:
         entries: one chunk.
@@ -253,7 +253,7 @@ def add_places(
         entries: one chunk.
         offsets: points of the whole cloud.
         wall_from_offset: (3, 4) as in `Target`.
-        few: added to.
+        few: the sums, updated.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells are visited.
     """
@@ -294,7 +294,7 @@ class Reach(NamedTuple):
     Attributes:
         step: number of rows and columns of the scan between the points.
         side_cells: maximum distance on the wall along u and along v, in cells.
-        step_m: maximum difference of their depths.
+        step_m: maximum difference between their depths.
     """
 
     step: int
@@ -337,7 +337,7 @@ def recover_between(
         rgb: colours of the cloud, or empty.
         reach: limits for neighbours.
         is_void: (rows, cols) True for void cells of the wall.
-        sums: added to.
+        sums: updated.
     """
     rows, columns = grid.points.shape
     step = reach.step

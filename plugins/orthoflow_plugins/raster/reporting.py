@@ -1,4 +1,4 @@
-"""Metrics and diagnostics of rastered walls."""
+"""Metrics and diagnostics of wall rasters."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 def warn(
     ctx: StepContext, walls: Sequence[Wall], steps_m: Sequence[float], intensity_source: str
 ) -> None:
-    """Report limitations of walls: missing data of the cloud, and cells finer than its points."""
+    """Report limitations of walls: data missing in the cloud, and cells finer than its point spacing."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
@@ -195,7 +195,7 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:
-    """Report planes that are not rastered because a larger wall shows them.
+    """Report planes that are not rasterised because a larger wall shows them.
 
     Args:
         ctx: context of the step.

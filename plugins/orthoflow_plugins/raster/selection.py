@@ -28,7 +28,7 @@ BufferOf = Callable[[int], tuple[float, float]]
 
 
 def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> list[int]:
-    """Return the indices of the planes to raster, those with the most points first.
+    """Return the indices of the planes to rasterise, those with the most points first.
 
     Raises:
         MethodError: there are no planes, or none has the requested orientation or rank.
@@ -105,14 +105,15 @@ def covered_planes(
 
 
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
-    """Return the plane nearest to a point (3,); if several are, the one with the most points."""
+    """Return the plane nearest to a point (3,); if tied, the one with the most points."""
     return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))
 
 
 def distance_m(planes: Planes, index: int, place: NDArray[np.float64]) -> float:
     """Return the distance of a point (3,) from the measured surface of a plane.
 
-    This is the nearest of its connected parts, or its rectangle if there are no parts.
+    The measured surface consists of the plane's connected parts, or of its rectangle if there are
+    none.
     """
     rectangles = planes.corners[index][None]
     if planes.part_corners is not None and planes.part_plane is not None:

@@ -33,9 +33,9 @@ from orthoflow_plugins.raster import kernels
 from orthoflow_plugins.raster.nets import interpolate_net
 from orthoflow_plugins.raster.parameters import RasterParams
 
-# Rules for which a cell has the values of a single point, not the mean of several.
+# Rules by which a cell gets the values of a single point instead of the mean of several.
 ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
-# Minimum difference of depth between layers in a cell.
+# Minimum depth difference between layers in a cell.
 LAYER_M: Final = 0.02
 # Radius of the filter of the surface `denoised`; the sigma of its Gaussian weight is half of it.
 DENOISE_CELLS: Final = 4
@@ -43,12 +43,12 @@ DENOISE_CELLS: Final = 4
 CELLS_AT_ONCE: Final = 1 << 20
 # Maximum distance of neighbours in the scan, in radii of a narrow gap.
 SPAN_GAPS: Final = 4
-# If a scan has more rows times columns, these numbers do not form a grid (2 GB of indices).
+# If the product of a scan's rows and columns exceeds this, they are not used (2 GB of indices).
 _GRID_CELLS_MOST: Final = 1 << 28
 # Number of depths sorted at once (256 MB).
 _POINTS_AT_ONCE: Final = 1 << 26
 
-# Maximum distance of neighbours in rows and columns.
+# Maximum distance between neighbours, in rows and in columns.
 _NEAR_CELLS: Final = 2
 # Minimum number of known neighbours for a decision.
 _KNOWN_LEAST: Final = 6
@@ -62,9 +62,9 @@ _SPARSE_LEAST: Final = 3
 _SLOPE: Final = 0.5
 # A cell is sparse if the number of known neighbours is below this fraction of the maximum nearby.
 _SPARSE_SHARE: Final = 0.35
-# The shadow of an edge is narrower than twice this reach, in cells.
+# Half the maximum width of the scan shadow of an edge, in cells.
 _AROUND_CELLS: Final = 16
-# Maximum difference of cells on one surface due to noise, in standard deviations.
+# Maximum depth difference between cells on one surface due to noise, in standard deviations.
 _CLOSE_SIGMAS: Final = 4.0
 # Maximum differences in the two passes, in standard deviations of the noise of a cell. The first
 # pass removes most of the noise, so the second one can be stricter at steps.
@@ -127,7 +127,7 @@ def carried_to_centres(
 ) -> CellSurface:
     """Extrapolate intensity and colour of cells with few points to the centres of the cells.
 
-    Rules that use a single point keep its values unchanged.
+    If the rule uses a single point per cell, the values of this point remain unchanged.
     """
     if params.surface in ONE_POINT or (surface.intensity is None and surface.rgb is None):
         return surface
@@ -424,7 +424,7 @@ def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def denoised(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     """Average depths over neighbours on the same surface (bilateral filter, Tomasi 1998).
 
-    The maximum difference of depth depends on the noise of the raster, so that steps of more than
+    The maximum depth difference depends on the noise of the raster, so that steps of more than
     about six standard deviations are preserved exactly.
 
     Args:
@@ -471,7 +471,7 @@ def _find_specks(
     Args:
         depth_m: (rows, cols) metres, NaN where void.
         is_sparse: (rows, cols) True for sparse cells of an otherwise dense surface.
-        agree_m: maximum difference of depths that agree; the same for sparse cells; and the
+        agree_m: maximum difference between depths that agree; the same for sparse cells; and the
             increase of the latter per row or column of distance, due to a slope.
         is_speck: (rows, cols) set for known cells if fewer than two of at least six known cells in
             the 5 x 5 neighbourhood agree, and for sparse cells if fewer than three, or fewer than
@@ -530,7 +530,7 @@ def close_gaps(
     *,
     threads: int,
 ) -> NDArray[np.uint8]:
-    """Interpolate the narrow gaps of a surface in place; their spread is NaN and their count 0.
+    """Interpolate narrow gaps of a surface in place; filled cells get spread NaN and count 0.
 
     Gaps are interpolated between neighbouring points of a scan if its rows and columns are known,
     otherwise between the measured cells around them.
@@ -572,8 +572,8 @@ def _recover_between_neighbours(
 
     A point that the scanner missed is between its neighbours in the scan, however far apart these
     are on the raster. A gap between points that are close neighbours on one surface is therefore
-    interpolated. A gap through which the scanner looked is not, because it has no neighbours on
-    both sides. Clouds without rows and columns have no neighbours.
+    interpolated. A gap through which the laser passed is not, because there are no neighbours on
+    both sides of it. Clouds without rows and columns have no neighbours.
 
     Returns:
         (cells,) True for filled cells; their spread is NaN and their count 0.

@@ -31,7 +31,7 @@ _REACH_OF_OUTLIERS: Final = 32
 
 
 def bytes_needed(shapes: Sequence[tuple[int, int]], *, is_tin: bool = False) -> int:
-    """Estimate the memory needed to raster walls with these numbers of rows and columns."""
+    """Estimate the memory needed to rasterise walls with these numbers of rows and columns."""
     sizes = [rows * columns for rows, columns in shapes]
     # Finished large walls are kept in files, and need the memory of one band while they are
     # processed.
@@ -70,7 +70,7 @@ def rastered_wall(
     allocate: Allocate,
     threads: int,
 ) -> Wall:
-    """Raster the wall of a plane; large walls are processed in bands of rows.
+    """Rasterise the wall of a plane; large walls are processed in bands of rows.
 
     Args:
         cloud: the points.
@@ -85,7 +85,7 @@ def rastered_wall(
 
     frame, width = slab.frame, slab.frame.width
     cells_most = _BAND_CELLS + (slab.n_cells if params.surface == "tin" else 0)
-    # The filter for noise is applied twice. The interpolation of gaps needs the distance of
+    # The filter for noise is applied twice. The interpolation of gaps needs the distance between
     # neighbours across a gap, a disc on each side, and a margin.
     reach_rows = _REACH_OF_OUTLIERS + 2 * DENOISE_CELLS
     reach_rows += (SPAN_GAPS + 2) * params.recover_gap_cells + 2
