@@ -130,7 +130,7 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 def warn(
     ctx: StepContext, walls: Sequence[Wall], steps_m: Sequence[float], intensity_source: str
 ) -> None:
-    """Report limitations of walls: data missing in the cloud, and cells finer than its point spacing."""
+    """Report limitations of walls: missing data, and cells finer than the point spacing."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
