@@ -91,7 +91,7 @@ class RecordCommand(Command):
     """
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run the command; if it fails, report errors of its records."""
+        """Run the command; if it fails because of a damaged record, report the damage."""
         try:
             return super().invoke(ctx)
         except (GeometryError, ProductError) as error:

@@ -72,7 +72,7 @@ class _Waiting:
 
 @dataclass(frozen=True, kw_only=True)
 class _Nodes:
-    """Runs of points of one node each, coarse nodes first; a node has one run per group.
+    """Runs of points, each from a single node, coarse nodes first; a node has one run per group.
 
     Attributes:
         key: (r,) uint64 level of the node, followed by 42 bits of its position along the curve.
