@@ -32,14 +32,15 @@ SAMPLE_POINTS: Final = 200_000
 _BOX_POINTS: Final = 20_000
 _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
-# Margin of the robust box on each side, as a share of its size and in addition.
+# Margin of the robust box on each side, as a share of its size, and the additional margin.
 _MARGIN_SHARE: Final = 0.02
 MARGIN_M: Final = 2.5
 # Share of the points allowed outside the box on each side, far below the minimum share of a plane.
 # Otherwise ghosts in mirrors and stray points (0.4 % in simulated rooms) would make the box several
 # times as large.
 _OUTSIDE_SHARE: Final = 0.00125
-# Maximum number of threads, so that their own plans and rasters are small relative to the cloud.
+# Maximum number of threads, so that the threads' own plans and rasters are small relative to the
+# cloud.
 _PARTS_MOST: Final = 8
 # A cloud thinner than this in two directions is a line or a point.
 _THINNEST_M: Final = 1e-4
@@ -200,7 +201,7 @@ def prepare(
 
 
 def draw_sample(cloud: PointCloud) -> Sample:
-    """Draw one point from each of `SAMPLE_POINTS` equal parts of the cloud; all of a small cloud.
+    """Draw one point from each of `SAMPLE_POINTS` equal parts of a cloud, or all of a small cloud.
 
     The position within a part follows the golden ratio: a fixed stride would coincide with the
     columns of a scan, and random positions would need a seed.

@@ -19,7 +19,7 @@ from orthoflow_plugins.plane.proposing import Candidate, DetectorParams, Propose
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
 
-# Minimum number of points of a candidate as a share of the minimum of a plane.
+# Minimum number of points of a candidate, as a share of the minimum number for a plane.
 PART_SHARE: Final = 0.2
 # Number of neighbours for normals and region growing.
 _NEIGHBOURS: Final = 30
@@ -62,7 +62,7 @@ def load_open3d(purpose: str) -> Any:
 
 
 class _Open3dMethod(Detector):
-    """Base class of the methods of open3d."""
+    """Base class of the methods that use open3d."""
 
     determinism = "loose"
 
@@ -135,7 +135,7 @@ class SegmentProposer(Proposer):
 
 
 class Open3dPatches(_Open3dMethod):
-    """Find planes with open3d's `detect_planar_patches`, a region growing.
+    """Find planes by region growing with open3d's `detect_planar_patches`.
 
     For comparison: it uses the same sample of the cloud as the other detectors, with normals from
     nearest neighbours in it. `refit: false` returns the planes of open3d, which pass through the

@@ -50,7 +50,7 @@ def draw_deviations(
     """Draw the distances of points from the first planes, with the normal distribution."""
     count = min(_PANELS_MOST, len(planes))
     figure = column_figure(0.3 + 1.15 * count)
-    # The same scale for all planes, so that they can be compared.
+    # Use the same scale for all planes, so that they can be compared.
     panels = figure.subplots(count, 2, squeeze=False, sharex="col", sharey="col")
     tolerance_mm = 1000.0 * deviations.tolerance_m
     edges_mm = np.linspace(-tolerance_mm, tolerance_mm, HISTOGRAM_BINS + 1)
@@ -126,7 +126,7 @@ def draw_planes(
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.04 * (high - low)
     n_named = min(_NAMED_MOST, len(planes))
-    # No constrained layout, since it would draw all points twice.
+    # Do not use the constrained layout, since it would draw all points twice.
     panel_in = COLUMN_INCHES * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.0))
     legend_in = 0.08 + 0.14 * -(-n_named // _NAMES_ABREAST)
     figure = column_figure(2.0 * panel_in + legend_in)
@@ -138,7 +138,7 @@ def draw_planes(
     above.plot(*flat[on_none].T, ".", markersize=1.0, markeredgewidth=0.0, color=_GREY)
     below.plot(*flat.T, ",", color="#e4e4e4")
     from_the_front = planes.normal @ np.cross(*view) > 0.0
-    # The smallest planes last, so that the floor does not hide objects on it.
+    # Draw the smallest planes last, so that the floor does not hide objects on it.
     for k in range(len(planes)):
         colour = plane_ink(k)
         if from_the_front[k]:
@@ -289,7 +289,7 @@ def draw_accumulator(
         ctx: receives the figure.
         points_m: (s, 2) sample in the plan, e1 and e2 from the centre; NaN for points left out.
         votes: (angles, bins) votes for lines before any plane was removed.
-        centre_m: (2,) centre of the plan, whose distance is the middle edge of the bins.
+        centre_m: (2,) centre of the plan; its distance is at the middle edge of the bins.
         bin_m: width of a bin, and minimum side of a pixel of the plan.
         planes: the planes, in world coordinates.
         cloud: the cloud.
@@ -341,7 +341,7 @@ def draw_accumulator(
     above.set_ylabel("e2 [m]")
     below.set_xlabel("direction of the normal [deg]")
     below.set_ylabel("distance from the centre [m]")
-    # Below the panels, because the plan of a single long wall is too narrow for a legend.
+    # Below the panels, there is space for it; the plan of a single long wall is too narrow.
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     ctx.figure(
         "accumulator",
@@ -395,7 +395,7 @@ def draw_space(
     )
     figure = column_figure(5.0)
     panels = figure.subplots(3, 2, sharex="col", sharey=True)
-    # The same scale for all sections, so that they can be compared.
+    # Use the same scale for all sections, so that they can be compared.
     most = max(float(votes.max()) for votes in (*over_omega.values(), *over_phi.values()))
     for (left, right), phi_deg, omega_deg in zip(panels, over_omega, over_phi, strict=True):
         shown = _show_votes(left, over_omega[phi_deg], (*omegas, -reach_m, reach_m), most)
@@ -417,7 +417,7 @@ def draw_space(
 
 
 def _around(first_deg: float, end_deg: float, count: int) -> tuple[float, float]:
-    """Return the limits of an axis whose pixels are centred on angles from the first, evenly."""
+    """Return the limits of an axis whose pixels are centred on evenly spaced angles."""
     half_deg = 0.5 * (end_deg - first_deg) / count
     return first_deg - half_deg, end_deg - half_deg
 
@@ -449,7 +449,7 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     points_m = np.column_stack([cloud.x[::every], cloud.y[::every], cloud.z[::every]])
     basis = basis_from_up(planes.up)
     framed = points_m.astype(np.float64) @ basis.T
-    # Not the extent of all points, some of which are far outside, behind mirrors and windows.
+    # Do not use the extent of all points, since some are far outside, behind mirrors and windows.
     corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ basis.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     cell_m = max(cell_m, float((high - low).max()) / _SECTION_CELLS_MOST)
@@ -491,7 +491,7 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
 def draw_normals(
     ctx: StepContext, voxels: SurfaceVoxels, n_regions: int, planes: Planes, cloud: PointCloud
 ) -> None:
-    """Report the scatter of normals about that of the first plane; draw histogram and map.
+    """Report the scatter of normals about the first plane's normal; draw histogram and map.
 
     Args:
         ctx: receives metrics and figure.

@@ -117,14 +117,14 @@ def refine_plane(
         only.
     """
     basis = np.eye(3) if freedom == "any" else basis_from_up(up)
-    # Always the same memory layout, so that only one version of the kernel is compiled.
+    # Always use the same memory layout, so that only one version of the kernel is compiled.
     packed = np.ascontiguousarray(points if freedom == "any" else points @ basis.T)
     row = np.append(basis @ start.normal, start.offset_m)
     for tolerance_m in tolerances_m:
         if not refine_robustly(packed, row, tolerance_m, _FREEDOMS[freedom][0]):
             return None
     normal = row[:3] @ basis
-    # Normalised twice, because Plane accepts only rounding errors in the length.
+    # Normalise twice, because Plane accepts only rounding errors in the length.
     normal /= np.linalg.norm(normal)
     return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(row[3]))
 
@@ -156,7 +156,7 @@ class CellFit:
         return np.asarray(self.heights_m - self.design @ self.solution)
 
     def faded(self) -> NDArray[np.float64]:
-        """Return (n,) how far residuals are between full weight (0) and no weight (1)."""
+        """Return how far (n,) residuals are between full weight (0) and no weight (1)."""
         beyond = (np.abs(self.residuals_m() / self.limit_m) - _FULL_SHARE) / (1.0 - _FULL_SHARE)
         return np.clip(beyond, 0.0, 1.0)
 
@@ -199,7 +199,7 @@ class AdjustedPlane:
         """Return the covariance (4, 4) of (normal, offset) in the cloud's offsets.
 
         Returns:
-            The covariance, and the number of independent cells with the same covariance.
+            The covariance, and the number of independent cells that would give the same covariance.
         """
         covariance, n_independent = stated_covariance(self.fit)
         return self.jacobian @ covariance @ self.jacobian.T, n_independent
@@ -241,7 +241,7 @@ def adjust_plane(
         cells: (rows, columns) bool, True for cells that belong to the plane.
         fit_tolerance_m: tolerance of the sums.
         freedom: orientation that the fit keeps exactly.
-        settled_m: the fit has converged if no cell moves by more.
+        settled_m: the fit has converged if no cell moves by more than this.
 
     Returns:
         The plane, or None if the cells do not determine it.
@@ -275,7 +275,7 @@ def adjust_plane(
     normal = normal / length
     bend_per_m, bend_share = _bend(full, heights_m)
     return AdjustedPlane(
-        # Normalised twice, because Plane accepts only rounding errors in the length.
+        # Normalise twice, because Plane accepts only rounding errors in the length.
         plane=Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m / length),
         moved_m=float(np.abs(full @ change).max()),
         bend_per_m=bend_per_m,
@@ -373,7 +373,7 @@ def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
 def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
     """Return the curvature of cell heights, and the share of their variance that it explains."""
     reach_m = max(float(np.abs(design[:, 1:]).max()), _FLATTEST_M)
-    # In units of the reach, so that the normal equations are well conditioned.
+    # Use units of the reach, so that the normal equations are well conditioned.
     u, v = design[:, 1] / reach_m, design[:, 2] / reach_m
     curved = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
     normal_matrix, right = curved.T @ curved, curved.T @ heights_m
@@ -392,8 +392,8 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
     """Return the covariance of a robust fit, including correlated and one-sided errors.
 
     Returns:
-        The covariance (p, p) of the unknowns, and the number of independent cells with the same
-        one.
+        The covariance (p, p) of the unknowns, and the number of independent cells that would give
+        the same covariance.
     """
     design, weights = fit.design, fit.weights()
     scores, products, used = _scores(fit)
@@ -428,8 +428,8 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
 def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
     """Return the covariance (p, p) of the unknowns for independent cells.
 
-    The sandwich of M-estimates (Huber & Ronchetti 2009, section 7.6); the leverage of single cells
-    is negligible.
+    This is the sandwich estimator for M-estimates (Huber & Ronchetti 2009, section 7.6); the
+    leverage of single cells is negligible.
     """
     scores, products, _ = _scores(fit)
     inverse = np.linalg.inv(products.sum(axis=0))
@@ -466,7 +466,7 @@ def jackknife_covariance(
         for j in range(i, size):
             parts[:, i, j] = parts[:, j, i] = np.bincount(tile, products[:, i, j])[held]
     whole = parts.sum(axis=0)
-    # Damped, in case the other tiles do not determine a plane.
+    # The matrix is damped in case the other tiles do not determine a plane.
     without = whole - parts + _STEADY * np.diag(np.diag(whole))
     moves = np.linalg.solve(without, sums[:, :, None])[:, :, 0]
     return (n_tiles - 1) / n_tiles * (moves.T @ moves)

@@ -2,11 +2,11 @@
 
 The points of the sample are counted in cells, and each cell votes for the planes through it: for
 each direction of the normal, in the bin of its distance. The 2D transform of markiewicz2015 is the
-special case of horizontal normals and of cells without height; floors and ceilings are that of the
-vertical normal.
+special case of horizontal normals and of cells without height; floors and ceilings correspond to
+the special case of the vertical normal.
 
-Votes are linear: after points were removed, only the cells that lost points vote again, with the
-change of their votes.
+Votes are linear: after points have been removed, only the cells that lost points vote again, with
+the change in their votes.
 
 For each direction in the plan, the cells are counted in a vertical image (distance along that
 direction, height). The occupied cells of this image vote for all inclinations; they are far fewer
@@ -115,7 +115,7 @@ class Voters:
         self.smear_bins = max(1, round(0.3 * reach_m * float(self.slopes.max()) / bin_m))
 
     def recount(self, claims: NDArray[np.int16]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Count the free points of the sample, those with negative claims (s,).
+        """Count the points of the sample not yet assigned, which have negative claims (s,).
 
         Returns:
             The positions (3, k) whose votes have changed, and the changes (k,).
@@ -209,7 +209,7 @@ class HoughProposer(Proposer):
         self._voted_for, self._last = -1, (0, 0)
 
     def keep_first(self) -> None:
-        """Keep what is drawn of the votes before any plane was removed."""
+        """Keep the votes that are drawn, as they are before any plane is removed."""
 
     def propose(self, search: Search) -> Candidate | None:
         """Return the plane with the best score."""
@@ -313,7 +313,7 @@ class HoughProposer(Proposer):
 
 
 class PlanProposer(HoughProposer):
-    """Proposes walls at maxima of the votes of plan cells, level planes at those of heights.
+    """Proposes walls at maxima of the votes of plan cells, and level planes at those of heights.
 
     Attributes:
         first: (angles, bins) votes for walls before any plane was removed; None if only level
@@ -486,7 +486,7 @@ def _vote(
     us, vs, heights = places
     a, b, c = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2])
     zero, none, top, d = np.float32(0.0), np.int32(-1), np.float32(votes.size), np.float32(shift)
-    # Without branches, so that the compiler vectorises the loop.
+    # The loop has no branches, so that the compiler vectorises it.
     for i in range(weights.size):
         place = c * heights[i] + a * us[i] + b * vs[i] + d
         within = (place >= zero) & (place < top)
@@ -593,7 +593,7 @@ def best_bins(
         votes: (d, bins).
         rows: (m,) rows to search.
         half: a window has 2 half + 1 bins and is separated from adjacent windows by one bin.
-        is_plain: ignore adjacent windows.
+        is_plain: whether to ignore adjacent windows.
         barred: (d, bins) 1 for bins that must not be the centre of a window.
         scores: (d,) set for these rows.
         places: (d,) set to the middle bin.
@@ -605,7 +605,7 @@ def best_bins(
     windows = np.empty(n_bins + 2 * gap, dtype=np.int64)
     line = np.empty(n_bins, dtype=np.int64)
     before, middle, after = windows[:n_bins], windows[gap:], windows[2 * gap :]
-    # Separate loops, which the compiler vectorises.
+    # These are separate loops, so that the compiler vectorises them.
     for d in rows:
         row, is_barred = votes[d], barred[d]
         total = np.int64(0)

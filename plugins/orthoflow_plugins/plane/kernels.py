@@ -26,8 +26,8 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.slabs import Offsets
 from orthoflow.geometry.threads import even_parts, in_threads
 
-# Small enough that a block is a short piece of one surface, so that its box excludes most planes;
-# large enough that the boxes of 48 million points fit into the cache of the processor.
+# A block is so small that it is a short piece of one surface and its box excludes most planes, but
+# so large that the boxes of 48 million points fit into the processor's cache.
 BLOCK_POINTS: Final = 256
 # Distances are summed in steps of the fit tolerance divided by this: half a micrometre at 15 mm;
 # the squares of 48 million points still fit into 64 bits.
@@ -71,7 +71,7 @@ def piece_of(points: BlockedPoints, piece: slice) -> BlockedPoints:
 
 
 def in_blocks(offsets: Offsets, *, parts: int) -> BlockedPoints:
-    """Return points in blocks; the box of a block with NaN or infinite values has such sides."""
+    """Return points in blocks; NaN and infinite values also appear in the box of their block."""
     boxes = np.empty((-(-len(offsets.x) // BLOCK_POINTS), 6), dtype=np.float32)
     points = BlockedPoints(*offsets, boxes)
 
@@ -136,7 +136,7 @@ def _measure_block(
 ) -> int:
     """Set the distances of a block's points from the plane of a slab; return their number.
 
-    A separate loop, which the compiler vectorises.
+    This is a separate loop, so that the compiler vectorises it.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -193,7 +193,7 @@ def _find_cells(
 ) -> None:
     """Set the table cell of each point of a block that belongs to a slab.
 
-    Without branches, so that the compiler vectorises the loop.
+    The loop has no branches, so that the compiler vectorises it.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -336,7 +336,7 @@ def measure_deviations(
     histogram: NDArray[np.int64],
     extents: NDArray[np.float64],
 ) -> None:
-    """Sum and bin the distances of points to their plane, and find their extent.
+    """Sum and bin the distances of points from their planes, and find the extents of the points.
 
     Args:
         points: (n,) offsets in blocks.
@@ -519,7 +519,7 @@ def bin_distances(
         for start in range(0, points.shape[1], BLOCK_POINTS):
             stop = min(start + BLOCK_POINTS, points.shape[1])
             xs, ys, zs = points[0, start:stop], points[1, start:stop], points[2, start:stop]
-            # A separate loop, which the compiler vectorises.
+            # This is a separate loop, so that the compiler vectorises it.
             for i in range(xs.size):
                 places[i] = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))
             for i in range(xs.size):

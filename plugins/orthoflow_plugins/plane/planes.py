@@ -1,9 +1,9 @@
 """Products from detected planes: deviations, visible sides, order, names, world rectangles.
 
-Deviations of all points are measured in one pass. markiewicz2015 regards a plane as correct if they
-appear normally distributed (Figures 6c to 14c). With a million points, every formal test of
-normality rejects, so measures of the departure are reported: skewness, excess kurtosis, shares
-within one, two and three standard deviations, and a quantile-quantile plot.
+Deviations of all points are measured in one pass. markiewicz2015 regards a plane as correct if its
+deviations appear normally distributed (Figures 6c to 14c). With a million points, every formal test
+rejects normality, so measures of the departure from it are reported: skewness, excess kurtosis,
+shares within one, two and three standard deviations, and a quantile-quantile plot.
 
 The visible side of a plane is determined from the scanner stations, or guessed from the points. A
 wrong side mirrors all images of the wall, so guesses are always reported.
@@ -506,7 +506,7 @@ def side_of_remaining(
     *,
     clear_m: float,
 ) -> int:
-    """Return the side of a plane with more of the other points, assumed to be that of the room.
+    """Return the side of a plane that has more of the other points and so probably faces the room.
 
     At first, points on parallel planes are excluded: behind the front of a pilaster is the whole
     wall, but the room, with its floor, side walls and furniture, is in front of it. Of the
@@ -551,7 +551,7 @@ def _faced(
     corners_m = rectangle_m(plane, raster.axes, extent_m)
     claims = prepared.sample_claims
     members = prepared.sample.index[claims == claim]
-    # Thinned evenly, because the first points of a plane may all be from one scan.
+    # Thin evenly, because the first points of a plane may all be from one scan.
     members = members[:: max(1, len(members) // _MEMBERS_MOST)]
     side = side_of_stations(plane, corners_m.mean(axis=0), cloud, members)
     is_guessed = side == 0

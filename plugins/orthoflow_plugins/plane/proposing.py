@@ -170,7 +170,7 @@ class Proposer:
     # Any: a `search.Search`, whose module imports this one; so are the other types below.
     @abstractmethod
     def propose(self, search: Any) -> Candidate | None:
-        """Return the best candidate among the free points, or None."""
+        """Return the best candidate among the points not yet assigned, or None."""
 
     def reject(self) -> None:
         """Exclude the last candidate from further proposals."""
@@ -179,7 +179,7 @@ class Proposer:
         """Change the claims of the cloud after all points are labelled."""
 
     def draw(self, ctx: StepContext, planes: Planes, cloud: PointCloud) -> None:
-        """Report and draw what only this detector shows."""
+        """Report and draw the results specific to this detector."""
 
 
 def leans_as_asked(
@@ -188,7 +188,7 @@ def leans_as_asked(
     constraint: Constraint,
     max_tilt_deg: float,
 ) -> NDArray[np.bool_]:
-    """Return (n,) whether planes with normals (n, 3) satisfy a constraint within `max_tilt_deg`."""
+    """Return whether (n,) planes with normals (n, 3) satisfy a constraint within `max_tilt_deg`."""
     tilts_deg = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0)))
     if constraint == "any":
         return np.ones(len(normals), dtype=bool)

@@ -63,7 +63,8 @@ _SUPPORT_CAUTION: Final = 0.4
 _POLISHED: Final = 4
 # Maximum number of similar hypotheses that are scored again to find the best of them.
 _SIMILAR_MOST: Final = 5
-# Minimum share of the points within the tolerance that are in its inner part; 0.4 by chance.
+# Minimum share of the points within the tolerance that are in its inner part; 0.4 is expected by
+# chance.
 _CROWDED_SHARE: Final = 0.5
 # Number of new draws after all hypotheses are rejected.
 _REDRAWS: Final = 2
@@ -165,7 +166,8 @@ class ConsensusProposer(Proposer):
         points_m = search.cloud.sample.offsets_m
         self._centre_m = np.median(points_m, axis=0)
         self._points_m = points_m - self._centre_m
-        # Shuffled once, so that any initial part of the free points represents all of them.
+        # The order is random, so that any initial part of the remaining points represents all of
+        # them.
         self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
         drawn = self._shuffled[:_DRAWN_MOST]
         self._order = drawn[curve_order(points_m[drawn])]
@@ -201,7 +203,7 @@ class ConsensusProposer(Proposer):
         self._n_near = np.append(self._n_near, self._count_near(hypothesis[None], search))
 
     def _count_near(self, hypotheses: NDArray[np.float64], search: Search) -> NDArray[np.int64]:
-        """Return the number (h,) of free test points near each hypothesis."""
+        """Return the number (h,) of remaining test points near each hypothesis."""
         asked = self._shuffled[:_SECOND_POINTS]
         free_m = self._points_m.take(asked[search.claims[asked] < 0], axis=0)
         apart_m = np.abs(free_m @ hypotheses[:, :3].T - hypotheses[:, 3])
@@ -247,7 +249,7 @@ class ConsensusProposer(Proposer):
         return None
 
     def _draw(self, search: Search) -> None:
-        """Draw hypotheses; score them and the earlier ones with few points, the best with more."""
+        """Draw hypotheses; score these and earlier ones with few points, and the best with more."""
         claims, up, params = search.claims, search.cloud.up, self._params
         free = self._order[claims[self._order] < 0]
         earlier, self._hypotheses = self._hypotheses, self._hypotheses[:0]
@@ -324,7 +326,7 @@ def plane_of(hypothesis: NDArray[np.float64]) -> Plane:
 def are_near(
     hypotheses: NDArray[np.float64], others: NDArray[np.float64], tolerance_m: float
 ) -> NDArray[np.bool_]:
-    """Return (h, o) whether hypotheses (h, 4) are similar to others (o, 4)."""
+    """Return a mask (h, o): whether hypotheses (h, 4) are similar to others (o, 4)."""
     cosines = hypotheses[:, :3] @ others[:, :3].T
     apart_m = np.abs(hypotheses[:, 3, None] - np.copysign(1.0, cosines) * others[:, 3])
     return (np.abs(cosines) > math.cos(math.radians(_SIMILAR_DEG))) & (apart_m < tolerance_m)

@@ -1,7 +1,8 @@
 """`plane.region`: regions grown over neighbouring points with similar normals on a common plane.
 
 Regions consist of voxels. They are grown over neighbours, or formed by grouping normals alone. The
-region with the most free points is proposed first. Points may also be labelled by their region.
+region with the most unassigned points is proposed first. Points may also be labelled by their
+region.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class Region(Detector):
     paper` sets both and the other values of that paper (10 mm cube, 1 degree, every 10th point,
     stop at 10 % unclassified), each of which can be overridden.
 
-    If the cloud is so sparse that a neighbourhood would have too few points, it is enlarged;
+    If a neighbourhood would have too few points because the cloud is sparse, it is enlarged;
     `neighbourhood_mm` reports the size. `normal_scatter_deg` reports the scatter of the normals of
     the first plane: a smaller `angle_deg` results in fragments.
     """
@@ -218,7 +219,7 @@ class RegionProposer(Proposer):
         return regions[self._voxels.table.voxel_of(blocked(cloud.sample.offsets_m))]
 
     def propose(self, search: Search) -> Candidate | None:
-        """Return the plane of the region with the most free points."""
+        """Return the plane of the region with the most unassigned points."""
         free = self._region_of_sample[(search.claims < 0) & (self._region_of_sample >= 0)]
         counts = np.bincount(free, minlength=len(self.n_points))
         constraint, by_normal = self._params.constraint, self._params.criterion == "normal"
@@ -246,7 +247,7 @@ class RegionProposer(Proposer):
         self._barred.add(self._last)
 
     def relabel(self, found: list[FoundPlane], cloud: PreparedCloud) -> None:
-        """Assign each point to the plane of its region instead of the nearest plane, if asked.
+        """Assign each point to the plane of its region instead of the nearest plane, if requested.
 
         A region belongs to the plane that contains most of its points, if more than half of its
         points are on a plane.

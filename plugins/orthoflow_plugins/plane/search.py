@@ -1,10 +1,11 @@
 """The search common to all detectors: candidates are refined, verified, fitted and labelled.
 
 Detectors therefore differ in how they propose planes, not in how planes are fitted. A candidate is
-refined on the free points of the sample with a decreasing tolerance. It must have enough points in
-cells where they concentrate on the plane, and is fitted to these cells. All planes are then fitted
-to all points in one pass. For clouds above 24 million points, randomly drawn blocks are used:
-errors are common to neighbouring points, so the other blocks would add little information.
+refined, with a decreasing tolerance, on the points of the sample that are not yet assigned to a
+plane (free points). It must have enough points in cells where they concentrate on the plane, and is
+fitted to these cells. All planes are then fitted to all points in one pass. For clouds above 24
+million points, randomly drawn blocks are used: errors are common to neighbouring points, so the
+other blocks would add little information.
 """
 
 from __future__ import annotations
@@ -147,14 +148,14 @@ UNEXPLAINED: Final = DiagnosticSpec(
 
 @dataclass(kw_only=True)
 class Search:
-    """State of a greedy search: the points of the sample that are still free.
+    """State of a greedy search: the points of the sample that are not yet assigned to a plane.
 
     Attributes:
         cloud: the cloud.
         params: criteria for planes and for the end of the search.
         claims: (m,) int16 plane of each point of the sample, -1 if not yet assigned.
         n_taken: number of planes and clutter whose points were assigned.
-        n_points: number of free points of the sample.
+        n_points: number of points of the sample that are not yet assigned.
         refusals: for each rejected candidate, the criterion and the candidate's share of all
             points.
     """
@@ -195,7 +196,7 @@ class Search:
         """Assign points to a plane, except points that are nearer to an earlier plane."""
         points_m, bounds_m = self.cloud.sample.offsets_m, self.cloud.bounds_of(support.bounds_m)
         (x, y, z), (a, b, c) = points_m.T, raster.plane.normal
-        # Faster than a product of matrices.
+        # This is faster than a matrix product.
         away_m = np.abs(a * x + b * y + c * z - raster.plane.offset_m)
         near = np.flatnonzero((away_m <= bounds_m[0]) & (away_m < self._away_m))
         u, v = (points_m[near] @ raster.axes.T).T
@@ -355,7 +356,7 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
     Returns None if they do not, and adds the criterion to `search.refusals`. Clutter near the
     scanner has more points than a distant wall, and its many slightly different candidates would
     hide the wall. Points of candidates rejected for their size or shape are therefore removed from
-    the search. Those of them on a plane are assigned to it when all points are labelled.
+    the search. Those that are on a plane are assigned to it when all points are labelled.
     """
     up, params = search.cloud.up, search.params
     leans = partial(leans_as_asked, up=up, max_tilt_deg=params.max_tilt_deg)
@@ -471,7 +472,7 @@ def _judged(
         search: receives the criterion.
         freedom: orientation that the fit keeps exactly.
         every: number of points of the cloud per summed point; None for free points of the sample.
-        settled_m: the fit has converged if no cell moves by more.
+        settled_m: the fit has converged if no cell moves by more than this.
     """
     if support is None:
         search.refuse("scattered")
@@ -630,7 +631,7 @@ def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
     Args:
         ctx: receives the metrics.
         passed_s: (n, 2) elapsed and processor seconds: one row for the time spent on each plane,
-            then one from the last plane to the labels of all points.
+            then one for the time from the last plane until all points are labelled.
     """
     times_s = {"detection": passed_s.sum(axis=0), "first_plane": passed_s[0]}
     if len(passed_s) > 2:

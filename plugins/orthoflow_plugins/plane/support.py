@@ -99,7 +99,7 @@ class SurfaceRaster:
         )
 
     def covers(self, points: NDArray[np.float64], cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return (m,) whether points project into the given cells (rows, columns)."""
+        """Return whether (m,) points project into the given cells (rows, columns)."""
         placed = np.floor((points @ self.axes.T - self.low_m) / self.cell_m).astype(np.int64)
         row = np.clip(placed[:, 1], 0, self.shape[0] - 1)
         return cells[row, np.clip(placed[:, 0], 0, self.shape[1] - 1)]
@@ -216,8 +216,9 @@ def measure_cells(
 def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
     """Return the cells whose points concentrate on the plane instead of filling the slab.
 
-    A cell needs three points, and significantly more of them in the inner slab than by chance.
-    Three of its eight neighbours must meet the same criteria, which excludes scattered clutter.
+    A cell needs three points, and significantly more of them in the inner slab than expected by
+    chance. Three of its eight neighbours must meet the same criteria, which excludes scattered
+    clutter.
     """
     wanted = _CROWDED_SHARE * sums.n_near + 0.5 * np.sqrt(sums.n_near)
     crowded = (sums.n_near >= 3) & (sums.n_inner >= wanted)

@@ -2,9 +2,9 @@
 
 Thickness is the noise of the scanner on the wall; markiewicz2015 recommends inspecting it first
 (3.1, Figure 3). Relief and bow do not count as thickness, so distances refer to the mean of a small
-tile of the wall. It is measured on the sample. In addition, it is measured along one scan row of
-the whole cloud, where other rows and stations do not contribute, so that only the noise of single
-distances remains, on each material along the row.
+tile of the wall. Thickness is measured on the sample and, in addition, along one scan row of the
+whole cloud. Other rows and stations do not contribute to the latter, so only the noise of single
+distances remains, which is reported for each material along the row.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def measure_thickness(
         members, distance_m = members[near], distance_m[near]
         axes = wall_axes(normal, planes.up)
         placed = np.floor(sample.offsets_m[members] @ axes.T / _TILE_M).astype(np.int64)
-        # One number per tile, because sorting pairs takes many times as long.
+        # Use one number per tile, because sorting pairs takes many times as long.
         keys = placed[:, 0] * 2**31 + placed[:, 1]
         _, tile, count = np.unique(keys, return_inverse=True, return_counts=True)
         crowded, deviation_m, usual = _from_tiles(distance_m, tile, count)
@@ -134,7 +134,7 @@ def measure_thickness(
 def row_points(
     planes: Planes, plane_of_sample: NDArray[np.int64], prepared: PreparedCloud, cloud: PointCloud
 ) -> RowPoints | None:
-    """Return the scan row with the most points of the first plane; None if there are no rows."""
+    """Return the scan row with the most points on the first plane; None if there are no rows."""
     members = prepared.sample.index[plane_of_sample == 0]
     if cloud.row is None or not len(members):
         return None

@@ -161,8 +161,8 @@ class VoxelTable:
             tables[part] = (bricks, numbers, sums, n_used)
 
         each_part(len(cloud.claims), cloud.parts, gather)
-        # Numbered by position, so that numbers depend neither on threads nor on the order of
-        # points.
+        # Number the voxels by position, so that numbers depend neither on threads nor on the order
+        # of points.
         occupied = np.flatnonzero(np.max([table[0] for table in tables], axis=0) >= 0)
         bricks = np.full(n_bricks, -1, dtype=np.int32)
         bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
@@ -344,7 +344,7 @@ def _place_block(
 ) -> int:
     """Set the positions (3, BLOCK_POINTS) of a block's points, in voxels; return their number.
 
-    Separate loops without branches, each writing one array, which the compiler vectorises.
+    The loops have no branches and each writes one array, so that the compiler vectorises them.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -423,7 +423,7 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
         shape: bricks along a, b, c.
         bricks: (a * b * c,) row of each brick in `numbers`, -1 if not yet assigned.
         numbers: (rows, VOXELS) number of each voxel, -1 if not yet assigned.
-        sums: (voxels, N_SUMS) added to.
+        sums: (voxels, N_SUMS) updated.
         n_used: numbers of rows and voxels in use.
 
     Returns:
@@ -581,7 +581,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
     limits: NDArray[np.float64],
     regions: NDArray[np.int32],
 ) -> int:
-    """Grow regions over neighbouring voxels near the region's plane with similar normals.
+    """Grow regions over neighbouring voxels that have similar normals and are near their plane.
 
     The plane is fitted to all points of the region and refitted as the region grows. When no more
     voxels are added, all neighbours of the region are tested again with the last plane.
