@@ -46,7 +46,7 @@ from orthoflow.untrusted_text import text_of_file
 MOST_BYTES: Final = 400_000
 #: entries of a calibration file
 MOST_CAMERAS: Final = 1000
-#: values of a calibration file, aliases expanded
+#: values of a calibration file, with aliases expanded
 MOST_VALUES: Final = 20_000
 _REQUIRED: Final = ("width", "height", "fx", "fy", "cx", "cy")
 
@@ -269,7 +269,7 @@ def _problem(lens: Intrinsics | FisheyeLens) -> str:
 
 
 def _folds(camera: Intrinsics) -> bool:
-    """Whether the lens model is not invertible somewhere in the image."""
+    """Return whether the lens model is not invertible somewhere in the image."""
     sides = (np.linspace(0.0, side, 9) for side in (camera.width, camera.height))
     pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     try:

@@ -47,7 +47,7 @@ _USUAL_NAMES: Final = ("cameras.json", "bundle.out", "cameras.xml", "cameras.csv
 
 
 def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
-    """Read the cameras of one file, or of a folder with files that belong together.
+    """Read the cameras from one file, or from a folder with files that belong together.
 
     Raises:
         InputError: the format is unknown, a file is damaged, or there are too many cameras.
@@ -111,8 +111,8 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
 
     Each line of the list is a photo name, which may contain spaces or be quoted, optionally
     followed by 0 and a focal length in pixels. Only lists with one line per camera are used. A list
-    with the name of the Bundler file has priority, then `list.txt`; otherwise all lists of photos
-    must have the same content.
+    with the name of the Bundler file has priority over `list.txt`; if neither exists, all lists of
+    photos must have the same content.
     """
     n_cameras = bundler_count(path)
     lists = {

@@ -1,4 +1,4 @@
-"""COLMAP models: `cameras.txt`, `images.txt` and `points3D.txt`; `.bin` files can be read, too.
+"""COLMAP models: `cameras.txt`, `images.txt` and `points3D.txt`; `.bin` files can also be read.
 
 COLMAP has the same pixel coordinates as orthoflow (the centre of the first pixel is (0.5, 0.5)) and
 the same camera axes, so nothing is converted. The written points are the ties that the orientation
@@ -36,7 +36,7 @@ from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
 from orthoflow.untrusted_text import open_file, reading
 
-# COLMAP's parameter names -> ours, for models that OpenCV's model includes.
+# Our names for COLMAP's parameters, where they differ, in models that OpenCV's includes.
 _NAMES: Final = {"k": "k1"}
 _BROWN: Final = frozenset(
     {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
@@ -256,7 +256,7 @@ def _whole_names(images: Path) -> dict[int, str]:
             if words and not words[0].startswith("#"):
                 if len(words) == _WORDS_OF_IMAGE and words[0].isdecimal():
                     names[int(words[0])] = words[9].strip()
-                # The next line contains the points of the image, and may be empty.
+                # Skip the next line, which contains the points of the image and may be empty.
                 next(stream, None)
     return names
 

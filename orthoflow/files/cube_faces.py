@@ -79,7 +79,7 @@ class PanoramaLens:
         return np.stack([u, v], axis=-1)
 
     def sees(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels (..., 2) are inside the image: all finite ones."""
+        """Return which pixels (..., 2) are inside the image, i.e. are finite."""
         return np.asarray(np.isfinite(pixels).all(axis=-1))
 
 
@@ -94,9 +94,9 @@ class FisheyeLens:
         fy: focal length along v in pixels.
         cx: principal point along u in pixels.
         cy: principal point along v in pixels.
-        radial: k1, k2, k3, k4.
-        tangential: p1, p2, applied to the undistorted direction.
-        skew: pixels along u per unit along v.
+        radial: coefficients k1, k2, k3, k4.
+        tangential: coefficients p1, p2, applied to the undistorted direction.
+        skew: shift along u, in pixels, per unit along v.
         field_of_view_deg: full angle covered by the lens; photos are not used outside it.
     """
 

@@ -1,4 +1,4 @@
-"""Validation of user documents by pydantic models, with positions and readable messages."""
+"""Validation of user documents by pydantic models, with the positions of errors in messages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LONGEST_PATH: Final = 100
 def read_model(
     text: str, model: type[Model], most_values: int = MOST_VALUES
 ) -> tuple[Model | None, list[tuple[Position, str]]]:
-    """Read a document as a pydantic model, or find its errors and their positions.
+    """Read a document as a pydantic model, or list its errors with their positions.
 
     Args:
         text: the document.
@@ -41,7 +41,7 @@ def read_model(
         most_values: maximum number of values, with aliases expanded.
 
     Returns:
-        The model, or None and at least one problem, in the order of the text.
+        The model and no problems, or None and the problems in the order of the text.
     """
     log = _Collected()
     document = read_yaml(text, log, most_values)
@@ -261,7 +261,8 @@ def _parts_of(annotations: Iterable[object]) -> Iterator[object]:
 
 # Units and decimals ------------------------------------------------------------------------------
 
-# Factors to the first unit of each family; the keys are suffixes of parameter names.
+# Factors by which units are converted to the first of their family; keys are suffixes of
+# parameters.
 _FAMILIES: Final[tuple[Mapping[str, float], ...]] = (
     {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "um": 1e-6, "µm": 1e-6},
     {"deg": 1.0, "rad": 180.0 / math.pi, "°": 1.0, "gon": 0.9},
@@ -320,7 +321,7 @@ def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
 
 
 def _factor(given: str, wanted: str) -> float | None:
-    """Return the conversion factor between two units; None if they are of different families."""
+    """Return the conversion factor between two units; None if they measure different quantities."""
     for family in _FAMILIES:
         if given in family and wanted in family:
             return family[given] / family[wanted]

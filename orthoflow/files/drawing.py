@@ -1,4 +1,4 @@
-"""Charts and pictures in the width of a journal column (85 mm), with text of at least 6 points."""
+"""Charts and pictures as wide as a journal column (85 mm), with text of at least 6 points."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def styled(settings: Mapping[Any, Any]) -> Iterator[None]:
     """Draw in the style of all charts, regardless of the user's matplotlib settings.
 
     Args:
-        settings: matplotlib settings in addition to those of all charts.
+        settings: additional matplotlib settings.
     """
     import matplotlib as mpl
 

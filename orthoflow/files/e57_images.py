@@ -1,4 +1,4 @@
-"""Photos in E57 files (`images2D`), with lenses and poses if the file contains them.
+"""Photos in E57 files (`images2D`), with their lenses and poses if these are in the file.
 
 The camera axes of a pinhole image are x right, y up and z backwards (ASTM E2807); the pose
 transforms them to the file's world. Principal points are relative to the outer corner of the first
@@ -76,7 +76,7 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class E57ImageCount:
-    """Number of images in an E57 file, and number of those with lens and pose."""
+    """Number of images in an E57 file, and number of images with lens and pose."""
 
     n_images: int = 0
     n_posed: int = 0

@@ -1,9 +1,9 @@
 """GeoTIFF files in the plane of a wall: single-band rasters and cloud-optimised orthoimages.
 
 The coordinates are local, in metres, pixel-is-area. For walls, X runs along the wall from its left
-edge and Y is the height; for floors and ceilings, they are x and y of the world. Rasters of
+edge and Y is the height; for floors and ceilings, X and Y are x and y of the world. Rasters of
 horizontal planes can be in map coordinates instead (easting, northing). `WallFrame.raster_axes`
-decides. Identical rasters give identical bytes.
+defines which of these applies. Identical rasters give identical bytes.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class RasterFile:
     """The content of a GeoTIFF.
 
     Attributes:
-        values: (rows, cols) for one band, (rows, cols, bands) for several; stored type.
+        values: (rows, cols) for one band, (rows, cols, bands) for several; of the stored type.
         shown: (rows, cols) dataset mask, True where the file has content.
         place: position of the raster, without its coordinate system.
         tags: tags of the dataset.
@@ -257,7 +257,7 @@ def write_orthoimage(
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
     The file is written a row of tiles at a time, so memory-mapped arrays may be larger than memory;
-    meanwhile, an uncompressed copy exists next to it.
+    meanwhile, an uncompressed copy exists next to the file.
 
     Args:
         path: output file in an existing folder.
@@ -497,7 +497,7 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
 
 
 def _gsd_m(path: Path, transform: Affine) -> float:
-    """Return the size of square cells with X along the rows and Y along the columns."""
+    """Return the cell size; cells must be square, with X along the rows and Y along the columns."""
     side = float(transform.a)
     limit = 1e-6 * abs(side)
     if (
@@ -576,10 +576,11 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Restrict GDAL to the file itself, and hide rasterio's warnings from the user.
+    """Prevent GDAL from using other files, and hide rasterio's warnings from the user.
 
-    Masks are written into the file. Overviews, masks and metadata in separate files are ignored:
-    they are not part of its digest, and may reference any other file, even on the network.
+    Masks are written into the file itself. Overviews, masks and metadata in separate files are
+    ignored, because they are not part of the file's digest and may reference any other file, even
+    on the network.
     """
     import rasterio
 
@@ -594,7 +595,7 @@ def quiet() -> Iterator[None]:
 def let_go_of_untrusted_text() -> None:
     """Suppress tracebacks if rasterio cannot decode a file's bytes in a message from GDAL.
 
-    This happens in a callback, which cannot raise, so Python prints the error through both hooks.
+    The error occurs in a callback, which cannot raise it, so Python prints it through both hooks.
     GDAL's own error about the file is raised afterwards.
     """
     log_unraisable, show_exception = sys.unraisablehook, sys.excepthook
@@ -620,11 +621,11 @@ class RasterPlace:
 
     Attributes:
         shape: rows and columns.
-        transform: six numbers: X per column, X per row, X of the corner, and the same for Y.
+        transform: X per column, X per row and X of the corner, and the same three numbers for Y.
         epsg: EPSG code of the coordinate system, or None.
         wkt: coordinate system, as returned by GDAL.
         wkt2: coordinate system as WKT 2.
-        bounds: smallest X and Y, largest X and Y, in the coordinate system.
+        bounds: lowest X and Y, highest X and Y, in the coordinate system.
         outline_lonlat: closed ring of the corners, counter-clockwise, longitude and latitude in
             degrees; empty if the coordinate system has no position on Earth.
         bands: data type of each band.

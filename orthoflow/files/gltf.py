@@ -41,10 +41,10 @@ def write_room(
 ) -> None:
     """Write the walls; the file and one texture at a time are kept in memory.
 
-    Each wall is a node with a matrix. Its vertices are in metres on the wall; the matrix positions
-    them relative to `extras.offset_world` of the root and makes the world's up direction y, so that
-    large survey coordinates need not fit into 32-bit vertices. Empty cells are transparent; a wall
-    seen from behind is invisible.
+    Each wall is a node with a matrix. The vertices are in metres on the wall; the matrix positions
+    them relative to `extras.offset_world` of the root, with y as the up direction, so that large
+    survey coordinates need not fit into 32-bit vertices. Empty cells are transparent; a wall seen
+    from behind is invisible.
 
     Args:
         path: output file, `.glb`.
@@ -306,7 +306,7 @@ def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
 
 
 def _places(count: int) -> NDArray[np.float32]:
-    """Return positions of nodes along a side, 0 to 1: cell centres, except at both ends."""
+    """Return positions (0 to 1) of nodes along a side: cell centres, and the two ends."""
     places = (np.arange(count) + 0.5) / count
     places[0], places[-1] = 0.0, 1.0
     return places.astype(np.float32)

@@ -51,7 +51,8 @@ STRETCH_PERCENTILES: Final = (1.0, 99.0)
 Shrunk = TypeVar("Shrunk", np.float32, np.uint8)
 Sampled = TypeVar("Sampled", bound=np.generic)
 Part = tuple[slice, slice]
-# Function that returns a part of an image (rows, cols[, 3]), and where it has content.
+# Function that returns a part of an image (rows, cols[, 3]), and its mask, True for cells with
+# content.
 Cells = Callable[[Part], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 
 
@@ -139,7 +140,7 @@ def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
 
     Args:
         image: (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA.
-        quality: 1..100.
+        quality: WebP quality, 1..100.
     """
     import cv2
 
@@ -341,7 +342,7 @@ def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
 
 
 def photo_grey(photo: Photo) -> NDArray[np.uint8]:
-    """Return a photo's grey values (height, width; Rec. 601); raises as `photo_rgb`."""
+    """Return a photo's grey values (height, width; Rec. 601); raise the errors of `photo_rgb`."""
     import cv2
 
     return np.asarray(cv2.cvtColor(photo_rgb(photo), cv2.COLOR_RGB2GRAY), dtype=np.uint8)

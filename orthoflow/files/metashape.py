@@ -3,10 +3,10 @@
 Metashape has orthoflow's axes (x right, y down, z forward) and pixel coordinates (centre of the
 first pixel at (0.5, 0.5)), but measures the principal point from the centre of the photo, and its
 P1 and P2 are p2 and p1 in OpenCV (Metashape Pro manual, appendix on camera models). A camera's
-matrix transforms to the chunk; the chunk's own transform leads to the world. For chunks with a
-geographic or projected coordinate system, the world is geocentric, in metres and in the system's
-datum, and the poses are converted from there. In a rig, only the master camera has a matrix; the
-pose of each other camera relative to the master is stored in its sensor.
+matrix transforms camera to chunk coordinates; the chunk's own transform converts these to the
+world. For chunks with a geographic or projected coordinate system, the world is geocentric, in
+metres and in the system's datum, and the poses are converted from there. In a rig, only the master
+camera has a matrix; the pose of each other camera relative to the master is stored in its sensor.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def _from_geocentric(crs: Any, path: Path) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # reported below instead
         group = pyproj.transformer.TransformerGroup(geocentric, crs, always_xy=True)
-    # A negative accuracy means that heights are not converted.
+    # If the accuracy is negative, heights would not be converted.
     if crs.is_compound and not (group.best_available and group.transformers[0].accuracy >= 0.0):
         grids = [grid.short_name for way in group.unavailable_operations for grid in way.grids]
         missing = f" without its grid {grids[0]} (`projsync --file {grids[0]}`)" if grids else ""

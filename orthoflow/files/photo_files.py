@@ -2,7 +2,7 @@
 
 Pillow reads the containers, GDAL the pages of TIFF files. simplejpeg (libjpeg-turbo) detects damage
 in the scan data of a JPEG, which other decoders fill with grey or noise. EXIF tags are as in CIPA
-DC-008 (Exif 2.32); a damaged EXIF block is read as far as possible and never causes an error.
+DC-008 (Exif 2.32); a damaged EXIF block is read as far as possible, without an error.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _MAGICS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"FOVb", "camera raw (Sigma)"),
     (b"\0MRM", "camera raw (Minolta)"),
 )
-# Brands of ISO base media files, by format.
+# Brands of ISO base media files that identify a format.
 _HEIC_BRANDS: Final = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1"})
 _AVIF_BRANDS: Final = frozenset({b"avif", b"avis"})
 
@@ -141,7 +141,7 @@ def _raw_in_tiff(encoded: bytes) -> str | None:
             return "camera raw (DNG)" if is_raw or _SUB_IFDS_TAG in page else None
         if page.get(_PHOTOMETRIC_TAG) == _COLOUR_FILTER_ARRAY:
             return "camera raw"
-    # NEF, ARW, PEF: the pages contain only previews; the image itself is in a sub-IFD.
+    # In NEF, ARW and PEF files, the pages contain only previews; the image itself is in a sub-IFD.
     is_below = bool(pages) and _SUB_IFDS_TAG in pages[0][1]
     return "camera raw" if is_below and not any(_is_photo(page) for _, page in pages) else None
 
@@ -276,8 +276,8 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
     opaque: NDArray[np.bool_] | None = None
     with _tiff_page(encoded, start) as page:
         is_stated = ColorInterp.alpha in page.colorinterp
-        # Some programs do not declare the meaning of the last of two or four bands. If all its
-        # values are 0 or the maximum, it is alpha; an infrared band is not.
+        # Some programs do not declare the meaning of the last of two or four bands. If all values
+        # of this band are 0 or the maximum, it is an alpha band, not e.g. infrared.
         band = page.colorinterp.index(ColorInterp.alpha) + 1 if is_stated else page.count
         if is_stated or (band in (2, 4) and page.dtypes[0] in ("uint8", "uint16")):
             alpha = page.read(band)
@@ -416,7 +416,8 @@ def damage(encoded: bytes) -> tuple[str, bool]:
                 return "", False
             return text, not _is_padded(encoded, text)
         except KeyError:
-            # simplejpeg does not support all kinds of sub-sampling; Pillow detects truncation.
+            # simplejpeg does not support all kinds of subsampling; for the others, Pillow at least
+            # detects truncation.
             pass
         else:
             return "", False
@@ -568,7 +569,7 @@ class Exif:
 
     @property
     def camera(self) -> str:
-        """Manufacturer and model, without repeating the manufacturer."""
+        """Manufacturer and model of the camera, with the manufacturer named only once."""
         first_word = self.make.partition(" ")[0].lower()
         is_repeated = bool(first_word) and self.model.lower().startswith(first_word)
         return self.model if is_repeated else f"{self.make} {self.model}".strip()
@@ -580,7 +581,7 @@ class FocalLength:
 
     Attributes:
         value_px: focal length in pixels of the stored array, or None if unknown.
-        reason: data from which it was computed, or the reason why it is unknown.
+        reason: data from which the focal length was computed, or the reason why it is unknown.
         doubt: message about an impossible EXIF value, which is ignored; empty otherwise.
     """
 
@@ -657,7 +658,7 @@ def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], b
 def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     """Return the focal length of a photo in pixels of its stored array.
 
-    The pixel pitch of the focal plane has priority, since it is exact if it is correct; it is
+    The pixel pitch in the focal plane has priority, since a correct pitch is exact; it is
     adapted if the image was reduced or rotated since then. It is ignored if it contradicts the 35
     mm equivalent, which does not depend on the image size and refers to the diagonal (see
     `FULL_FRAME_DIAGONAL_MM`). Impossible values are reported and ignored.

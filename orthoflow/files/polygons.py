@@ -1,4 +1,4 @@
-"""GeoJSON files: polygons drawn in other programs, and output of features."""
+"""GeoJSON files: reading polygons drawn in other programs, and writing features."""
 
 from __future__ import annotations
 

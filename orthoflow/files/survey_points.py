@@ -20,16 +20,16 @@ _IN_IMAGE: Final = ("u_px", "v_px")
 _IN_MAP: Final = ("map_x", "map_y")
 _IN_SPACE: Final = ("shown_x", "shown_y", "shown_z")
 _SEPARATORS: Final = (";", "\t", ",")
-#: bytes of a file of check points
+#: bytes of a check point file
 MOST_BYTES: Final = 20_000_000
-#: lines of a file of check points
+#: lines of a check point file
 MOST_POINTS: Final = 100_000
 #: lines of a tie file; runs with many photos write long ones
 MOST_TIES: Final = 1_000_000
 #: bytes of a tie file
 MOST_TIE_BYTES: Final = 200_000_000
 _MAX_PROBLEMS: Final = 20
-#: characters of a line of a file of check points
+#: characters of a line of a check point file
 MOST_LINE: Final = 10_000
 # Columns that the `ties.csv` of a run has in addition to those of measured ties.
 _RESIDUALS: Final = ("residual_u_px", "residual_v_px")
@@ -43,7 +43,7 @@ class SurveyPoint:
     Attributes:
         name: name of the point, unique in its file.
         position: x, y, z as given in the file.
-        class_name: class of the point; empty if none is given.
+        class_name: class of the point; empty if the file does not give it.
         wall: wall in whose orthoimage the point was measured, or None.
         pixel_wall: measured column and row in the wall's orthoimage, or None.
         place_m: measured X and Y in the coordinates of the orthoimage's GeoTIFF, or None.
@@ -65,7 +65,7 @@ class MeasuredTie:
 
     Attributes:
         where: file and line of the tie, for messages.
-        photo: photo name.
+        photo: name of the photo.
         pixel: column and row as given in the file.
         position: x, y, z as given in the file.
         sigma_px: standard deviation of each pixel coordinate, or None.
@@ -220,7 +220,7 @@ class _Table:
             raise InputError("\n".join(self.problems[:_MAX_PROBLEMS] + more))
 
     def rows(self) -> Iterator[tuple[int, dict[str, str]]]:
-        """Yield line number and cells of each row that has a cell for every column."""
+        """Yield the line number and the cells of each row that has a cell for every column."""
         names = ",".join(self.required)
         text = text_of_file(
             self.path,

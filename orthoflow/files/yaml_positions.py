@@ -32,7 +32,7 @@ from orthoflow.products.product import JsonValue
 DEEPEST: Final = 60
 #: digits of an integer in a workflow or calibration file
 MOST_DIGITS: Final = 1000
-#: values of a workflow file, aliases expanded
+#: values of a workflow file, with aliases expanded
 MOST_VALUES: Final = 10_000
 _LONGEST_SHOWN: Final = 100
 # Maximum length of a key in characters; the limit is YAML's own.
@@ -60,9 +60,9 @@ class Document:
     """A document as plain values with positions.
 
     Attributes:
-        value: value of the whole document.
-        places: location -> position of the value; contains at least `()`, the whole document.
-        keys: location -> position of the key.
+        value: content of the whole document.
+        places: position of each value by location; contains at least `()`, the whole document.
+        keys: position of each key by location.
     """
 
     value: JsonValue
@@ -74,7 +74,7 @@ class Document:
         value, stated, found = self.value, list[str | int](), Location()
         is_found = True
         for part in location:
-            # A single value in place of a list has no index.
+            # A single value given instead of a list has no index.
             if is_found and isinstance(part, int) and not isinstance(value, list):
                 continue
             stated.append(part)
@@ -359,7 +359,7 @@ class _Converter:
         return entries
 
     def _joined_items(self, items: list[Node], at: Location) -> list[Node]:
-        """Join numbers split at a decimal comma: `[0,02]` is 0 and 02."""
+        """Join numbers that were split at a decimal comma: `[0,02]` is the list of 0 and 02."""
         joined = items[:1]
         for item in items[1:]:
             if self._is_split(joined[-1], item) and re.fullmatch(r"0\d+", str(item.value)):

@@ -55,7 +55,7 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """One choice of a variant for each step with variants.
+    """A choice of one variant for each step with variants.
 
     Attributes:
         run: run to which the combination belongs.
@@ -87,7 +87,7 @@ class Combination:
 
     @property
     def n_failed_repeats(self) -> int:
-        """Number of repeats that failed, not counting the first."""
+        """Number of failed cells among the repeats, without the first computation."""
         return sum(cell.status == "failed" and cell.repeat > 0 for cell in self.cells)
 
     @property
@@ -222,7 +222,7 @@ def combinations_of(run: Run) -> tuple[Combination, ...]:
 def combination_of(
     run: Run, assignment: Mapping[str, str], baseline: Mapping[str, str]
 ) -> Combination:
-    """Return the combination of all cells that are compatible with the given variants."""
+    """Return the combination of all cells that agree with the given variants."""
     return Combination(
         run=run,
         assignment=assignment,

@@ -62,9 +62,9 @@ class Row:
         run: label of the combination's run: workflow and id.
         variants: variant of each step with variants; a dash if the combination does not include the
             step.
-        name: the variants as text, with the run if there are several.
+        name: variants as text, with the run if there are several.
         is_baseline: whether the combination is the workflow's baseline.
-        failure: which cell failed and why; empty if none failed.
+        failure: first failed cell and reason; empty if no cell failed.
         missing: addresses of cells not reached before the run was interrupted.
         values: one value per column.
         remark: text on failed repeats.
@@ -114,7 +114,7 @@ class ComparisonTable:
 
     @property
     def baseline(self) -> str:
-        """Name of the baseline; empty if there is none or more than one."""
+        """Name of the baseline; empty if there is not exactly one baseline."""
         found = [row.name for row in self.rows if row.is_baseline]
         return found[0] if len(found) == 1 else ""
 
@@ -140,7 +140,7 @@ class ComparisonTable:
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
     """Return the table of combinations of one or more runs; None if there is only one combination.
 
-    Values are ranked only within the same environment and data; if there are several of either,
+    Values are ranked only within the same environment and data; if environments or data differ,
     letters distinguish them.
     """
     combinations = [one for run in runs for one in combinations_of(run)]
@@ -248,7 +248,7 @@ def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
 
 
 def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
-    """Return run labels: workflow, options that differ between runs, run folder and id."""
+    """Return the label of each run: workflow, options that differ between runs, folder and id."""
     shared = frozenset.intersection(*(frozenset(run.record.overrides) for run in runs))
     labels = {}
     for run in runs:
@@ -338,7 +338,7 @@ class Origins:
         return Origins(environments=groups, data=data, letters=letters, legend=legend)
 
     def letter(self, one: Combination, environment: str) -> str:
-        """Return the letter of a value; empty if all values have the same origin."""
+        """Return the letter for a value's origin; empty if all values have the same origin."""
         first = self.environments.first.get(environment, environment)
         return self.letters.get((first, self.data[_place(one)]), "")
 
@@ -366,7 +366,7 @@ def _data_of(record: RunRecord, data: str) -> tuple[str, ...]:
 
 
 def _letter(index: int) -> str:
-    # AA follows Z.
+    # The letter after Z is AA.
     first, last = divmod(index, len(ascii_uppercase))
     return (ascii_uppercase[first - 1] if first else "") + ascii_uppercase[last]
 
@@ -390,7 +390,7 @@ class DatasetRow:
         failed: failed cells and the reasons, without the cells skipped as a consequence.
         missing: cells not reached before the run was interrupted.
         values: one value per column.
-        limit: the most important diagnostic, and how many more there are.
+        limit: most important diagnostic, and number of further ones, as text.
     """
 
     name: str

@@ -92,7 +92,7 @@ def curves(parts: Sequence[Run]) -> tuple[Curve, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Variants of a step that differ in a number, and possibly in other parameters.
+    """Variants of a step that differ in a numeric parameter, and possibly in others.
 
     Attributes:
         step: name of the step.
@@ -110,7 +110,7 @@ class Sweep:
 
 
 def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
-    """Yield the sweeps among cells: groups of variants that differ in only one number."""
+    """Yield the sweeps among cells: variants of which several differ in only one number."""
     by_method: dict[tuple[str, str], dict[str, RecordedCell]] = {}
     for cell in cells:
         variant = cell.assignment.get(cell.step)
@@ -171,7 +171,8 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     columns = comparison_columns(combinations)
     for column in sorted(columns, key=lambda one: not one.headline):
         for (step, parameter), group in swept.items():
-            # The parameter itself may be a metric; plotting it against itself is meaningless.
+            # A method may report the parameter as a metric, and a plot against itself would be
+            # meaningless.
             is_behind = any(cell.step == column.step and step in cell.assignment for cell in cells)
             if (column.step, column.metric) == (step, parameter) or not is_behind:
                 continue

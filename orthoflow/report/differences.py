@@ -90,7 +90,7 @@ def _table(
     change: Callable[[Pair[Side]], str] = lambda _pair: "",
     whose: str = "",
 ) -> DifferenceTable:
-    """Return the differences of one kind, with equal differences of a step grouped.
+    """Return the differences of one kind, with equal differences within a step grouped.
 
     Args:
         title: name of the kind.

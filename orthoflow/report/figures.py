@@ -270,7 +270,7 @@ def _smaller(figure: RecordedFigure, side_px: int) -> RecordedFigure:
     try:
         data = shrunk_webp(figure.data, figure.name, longest_side_px=side_px)
     except InputError:
-        # A picture that cannot be decoded is omitted; the page is still written.
+        # Omit a picture that cannot be decoded, so that the page can still be written.
         return replace(figure, data=b"", caption=f"{figure.caption} (the picture is damaged)")
     is_smaller = len(data) < len(figure.data)
     return replace(figure, media_type="image/webp", data=data) if is_smaller else figure

@@ -127,12 +127,12 @@ def residuals_on_wall(
 
     Args:
         camera: an oriented photo.
-        points_world: (n, 3) metres.
-        residual_px: (n, 2) observed minus computed.
+        points_world: (n, 3) points in metres.
+        residual_px: (n, 2) residuals, observed minus computed.
         frame: frame of the wall.
 
     Returns:
-        (n, 2) metres along u and v; NaN for points outside the photo.
+        (n, 2) displacements along u and v in metres; NaN for points outside the photo.
     """
     viewing = camera.viewing().shifted(frame.origin_world)
     points = points_world - frame.origin_world
@@ -143,7 +143,7 @@ def residuals_on_wall(
     ]
     jacobian = np.stack(along, axis=2)
     found = np.full((len(points), 2), np.nan)
-    # There is no solution for a wall seen edge-on.
+    # If the wall is seen edge-on, there is no solution.
     solvable = np.isfinite(jacobian).all(axis=(1, 2)) & (np.linalg.det(jacobian) != 0.0)
     found[solvable] = np.linalg.solve(jacobian[solvable], residual_px[solvable, :, None])[..., 0]
     return found

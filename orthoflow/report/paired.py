@@ -60,9 +60,9 @@ class Paired:
         wins: number of datasets on which the method is better.
         losses: number of datasets on which the method is worse.
         median: median difference in the metric's unit; negative if the method has smaller values.
-            Signed errors are compared by absolute value, and metrics for which 1 is best by the
-            logarithm of their ratio to 1. For yes/no metrics, this is the difference between the
-            shares.
+            Signed errors are compared by absolute value, and metrics for which 1 is the best value
+            by the logarithm of their ratio to 1. For yes/no metrics, this is the difference between
+            the shares.
         p: p-value of Wilcoxon's two-sided signed-rank test; NaN for fewer than five differences.
         effect: matched-pairs rank-biserial correlation, from -1 (worse on every dataset) to 1
             (better on every dataset); NaN if p is NaN.
@@ -129,7 +129,7 @@ class MeanRanks:
     """Ranks of methods over the datasets on which all of them have a value (Demsar 2006).
 
     Attributes:
-        n: number of datasets.
+        n: number of datasets on which all methods have a value.
         ranks: mean rank by method, best (1) first.
         p: p-value of Friedman's test of the hypothesis that all methods are equal.
         critical_difference: critical difference of mean ranks by Nemenyi's test at the 0.05 level;
@@ -293,7 +293,7 @@ def _over(
     for own, by_data in ways.items():
         values = np.array([value.value for value in measured[own].values()])
         if column.better == "lower":
-            # Errors of both signs would cancel.
+            # Use absolute values, because errors of both signs would cancel.
             values = np.abs(values)
         n_failed = sum(one.failure is not None for one in by_data.values())
         n_both = len(measured[own].keys() & measured[bases[own]].keys())
@@ -461,7 +461,7 @@ def _paired(pairs: Iterable[tuple[Measured, Measured]], column: MetricRow) -> Pa
 
 
 def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1") -> Paired:
-    """Return statistics of paired differences.
+    """Return the statistics of paired differences.
 
     Args:
         worse: (n,) finite amounts by which the method is worse than the reference on each dataset;

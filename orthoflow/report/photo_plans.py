@@ -122,7 +122,7 @@ def _table(orientation: Cameras) -> Table:
 
 
 def _counts(ties: Ties | None, role: TieRole) -> dict[str, int]:
-    """Return the number of ties with a role in each photo."""
+    """Return the number of ties with a given role in each photo."""
     if ties is None:
         return {}
     counts = np.bincount(ties.photo[ties.role == role], minlength=len(ties.photo_names))
@@ -160,7 +160,7 @@ def _drawn(
             (name, number, np.asarray(frame.corners_world(), dtype=np.float64) @ axes)
             for number, (name, frame) in walls.items()
         ),
-        # The third axis of a camera is its viewing direction.
+        # The third axis of a camera is the viewing direction.
         tuple(
             (name, one.centre_world @ axes, one.rotation[2] @ axes) for name, one in viewing.items()
         ),

@@ -1,4 +1,4 @@
-"""Pictures on the page: products as small images, grouped by wall."""
+"""Pictures on the page: small images of products, grouped by wall."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Picture:
         file: path of the full image relative to the run folder, or empty.
         cell: address of the cell that made the image.
         wall: index of the wall; -1 if the image is not a raster of a wall.
-        number: number of the wall shown to users: the index of its plane in `planes.json`.
+        number: number of the wall as shown to users, i.e. the index of its plane in `planes.json`.
         name: name of the wall.
         frame: frame of the raster; None if the image is not a raster of a wall.
         id: HTML id; empty if nothing refers to the image.
@@ -377,7 +377,7 @@ def cursor_places(
 
     Args:
         orthoimages: pictures of orthoimages.
-        walls: pictures of walls, including those of depth.
+        walls: pictures of walls, including pictures of depth.
     """
     places: list[dict[str, object]] = []
     for picture in orthoimages:

@@ -30,7 +30,7 @@ def number(value: float, *, significant: int = 4) -> str:
     if digits >= 10:
         return f"{value:.3g}"
     printed = f"{value:.{digits}f}"
-    # Zeros before the decimal point are significant.
+    # Trailing zeros are removed only after a decimal point.
     return printed.rstrip("0").rstrip(".") if digits else printed
 
 
@@ -47,7 +47,7 @@ def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
 
 
 def number_with_spread(value: float, spread: float) -> str:
-    """Format a mean to the second digit of its standard deviation, unless it is very small.
+    """Format a mean to two digits of its standard deviation, unless this is very small.
 
     >>> number_with_spread(12.3456, 0.0123), number_with_spread(3.0, 0.0)
     ('12.346 ± 0.012', '3')
@@ -103,7 +103,7 @@ class Value:
         text: formatted number; empty if the value is missing.
         sort: number by which the table is sorted; NaN if the value is missing.
         spread: standard deviation over repeats; NaN without repeats.
-        mark: rank among the values of its group.
+        mark: rank among the values of the group.
         group: letter for the environment and data; empty if they are the same for all values.
         note: remark, e.g. the number of repeats.
         n_items: number of items that the metric sums over; NaN if they are not counted.
@@ -187,7 +187,7 @@ BETTER: Final = {"lower": "lower is better", "higher": "higher is better", "one"
 
 
 def is_flag(unit: str) -> bool:
-    """Return whether a unit is that of yes/no metrics (1 or 0)."""
+    """Return whether a unit is the unit of yes/no metrics (1 or 0)."""
     return unit == FLAG
 
 

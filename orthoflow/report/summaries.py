@@ -77,7 +77,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
     keys = [key for key in headline_keys(cells.values()) if key[1] in rows[key[0]]]
     chosen = [rows[step][metric] for step, metric in keys]
     found = []
-    # Yes/no metrics with the undesired value come first; those with the desired value are omitted.
+    # Yes/no metrics come first if they have the undesired value; otherwise, they are omitted.
     for row in sorted(chosen, key=lambda row: not is_flag(row.unit)):
         if is_flag(row.unit) and row.value:
             continue

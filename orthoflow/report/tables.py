@@ -34,8 +34,8 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        label: heading, with unit and better direction.
-        name: heading in CSV.
+        label: heading on pages, with unit and better direction.
+        name: heading in CSV files.
         is_numeric: whether the column is right-aligned and sorted numerically.
         digits: number of significant digits.
     """
@@ -78,7 +78,7 @@ class Table:
         )
 
     def csv(self) -> str:
-        """Return the table as CSV, with all digits of numbers."""
+        """Return the table as CSV, with all digits of its numbers."""
         return csv_text([[column.name for column in self.columns], *self.rows])
 
     def latex(self) -> str:

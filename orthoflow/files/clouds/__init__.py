@@ -1,1 +1,1 @@
-"""Clouds as files for other programs: point attributes and colours, and a writer per format."""
+"""Export of clouds for other programs: point attributes and colours, and a writer per format."""

@@ -1,4 +1,4 @@
-"""Points prepared for writing in blocks: selected, coloured, with plane and normal.
+"""Preparation of points for writing in blocks: selection, colours, planes and normals.
 
 `cloud.json`, next to the file of points, describes the points, their colours and their fields.
 """
@@ -52,7 +52,7 @@ class AttributedCloud:
         planes: planes of the run; None if there are no planes, and thus no deviations.
         labels: plane labels of the points; None if `planes` is None.
         photo_colours: colours for the colouring `photos`.
-        photo_names: names of these photos, by number.
+        photo_names: names of the photos in `photo_colours`, by number.
         wall: wall to whose raster and buffer the points are restricted, and from whose plane
             deviations are measured; None for all points.
         wall_plane: number of the plane of `wall`.
@@ -94,7 +94,7 @@ class AttributedCloud:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no point is selected."""
+        """Return whether no point is selected."""
         return not any(self._chosen(part, None).any() for part in self._parts())
 
     @cached_property
@@ -136,8 +136,9 @@ class AttributedCloud:
         """Return the columns that are available for this cloud.
 
         World coordinates in metres; unit normals towards the viewer, 0 0 0 where there is no
-        surface; colours; intensity 0..1; scan; plane, or -1; deviation from the plane in metres,
-        positive towards the viewer, or NaN; number of the photo that provides the colour, or -1.
+        surface; colours; intensity 0..1; scan number; plane number, or -1; deviation from the plane
+        in metres, positive towards the viewer, or NaN; number of the photo that provides the
+        colour, or -1.
         """
         photos, is_labelled = self.photo_colours, self.labels is not None
         is_known = {
@@ -290,7 +291,7 @@ UNKNOWN: Final = (128, 128, 128)
 _DARKEST: Final = 0.4
 _PIECES: Final = 64
 _PIECE: Final = 4096
-# Colours of deviations.
+# Colours of deviations behind, on and in front of the plane.
 BEHIND: Final = (33, 102, 172)
 ON_PLANE: Final = (247, 247, 247)
 BEFORE: Final = (178, 24, 43)

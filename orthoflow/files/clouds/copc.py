@@ -54,7 +54,7 @@ class _Waiting:
         order: (n,) int64 point indices, group after group.
         counts: number of points in each cell of the root's grid, along the curve.
         low: (3,) int64 lowest corner of the root, in steps of the file's scale.
-        side: side of the root, in the same steps.
+        side: side length of the root, in the same steps as `low`.
     """
 
     records: NDArray[np.void]
@@ -156,8 +156,8 @@ def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path)
         return None
     records = np.memmap(folder / "records", dtype=kind, mode="r")
     n_points = len(records)
-    # With a margin of one step and an odd number of steps, no point is on a node border as computed
-    # by readers from rounded metres.
+    # With a margin of one step and an odd number of steps, no point is on the border between nodes
+    # that readers compute from rounded metres.
     low = np.min(lowest, axis=0) - 1
     span = int((np.max(highest, axis=0) - low).max())
     waiting = _Waiting(
@@ -240,7 +240,7 @@ def _nodes(waiting: _Waiting) -> _Nodes:
 
 
 def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Return the level of the node that keeps each point; points are sorted along the curve."""
+    """Return the level of the node that contains each point; points are sorted along the curve."""
     levels = np.full(len(codes), _DEEPEST, dtype=np.int64)
     left = np.arange(len(codes))
     for level in range(_DEEPEST):

@@ -120,7 +120,7 @@ def _colour(
         # A point is visible unless a surface is nearer by more than the tolerance.
         cells = (pixels / buffer.reduction).astype(np.int64)
         is_seen = depth_m <= buffer.nearest[cells[:, 1], cells[:, 0]] + _TOLERANCE_M
-        # Pixels per metre, squared, decreasing near the photo's border.
+        # Quality: pixels per metre, squared, reduced near the photo's border.
         rim = np.minimum(pixels, size - pixels).min(axis=1) / size.min()
         quality = (camera.fx / depth_m) ** 2 * np.clip(rim / _BORDER_SHARE, 1e-3, 1.0)
         wins = is_seen & (quality.astype(np.float32) > colours.best[index])

@@ -29,7 +29,7 @@ _VERSION: Final = "1.4"
 _SCALE_M: Final = 1e-4
 _NO_DATE: Final = dt.date(1970, 1, 1)
 _LARGEST: Final = 2.0**30
-# Names as in CloudCompare and PDAL.
+# Field names as in CloudCompare and PDAL.
 _LAS_NAMES: Final = {
     **{f"n{axis}": f"Normal{axis.upper()}" for axis in "xyz"},
     "scan": "point_source_id",
@@ -93,11 +93,11 @@ def las_header(laspy: Any, attributed: AttributedCloud) -> Any:
     )
     header.scales = np.full(3, _scale_m(cloud))
     header.offsets = np.floor(cloud.origin)
-    # Required by LAS 1.4 for this point format, even if the coordinate system is unknown.
+    # LAS 1.4 requires this bit for the point format, even if the coordinate system is unknown.
     header.global_encoding.wkt = True
     if attributed.crs_wkt:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(attributed.crs_wkt))
-    # A fixed date, so that the same cloud gives the same bytes.
+    # The date is fixed, so that identical clouds give identical bytes.
     header.creation_date = _NO_DATE
     header.generating_software = "orthoflow"
     return header

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from ezdxf.document import Drawing
     from ezdxf.layouts.layout import Modelspace
 
-# Layers with names of the US National CAD Standard: content, AutoCAD colour, and line weight in
-# hundredths of a millimetre, as in ISO 128.
+# Content, AutoCAD colour and line weight (in 1/100 mm, as in ISO 128) by layer name of the US
+# National CAD Standard.
 Layers = Mapping[str, tuple[str, int, int]]
 # Walls are elevations (A-ELEV); the room in 3D is a surface model (A-WALL).
 LAYERS: Final[Layers] = {
@@ -152,7 +152,8 @@ def _wall_document() -> tuple[Drawing, Modelspace]:
 def _add_dimension_style(document: Drawing, text_m: float) -> None:
     """Define the dimension style: metres with three decimals, text above the line.
 
-    The header contains the same values, because some programs redraw dimensions from it alone.
+    The header contains the same values, because some programs redraw dimensions using only the
+    header.
     """
     style = document.dimstyles.add(DIMENSION_STYLE)
     values = {
@@ -354,7 +355,7 @@ def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> Re
         outline_m: (n, 2) X and Y on an upright wall, counter-clockwise.
         sigma_m: standard deviation of the positions of its sides, None if unknown.
 
-    A form is accepted if 95 % of the outline is within three sigma (at least 20 mm) of it.
+    A form is accepted if 95 % of the outline is within three sigma, or 20 mm if this is more.
     """
     limit_m = max(_TOLERANCE_M, 3.0 * (sigma_m or 0.0))
     samples, directions = _sampled(outline_m)

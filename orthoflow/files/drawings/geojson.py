@@ -169,9 +169,9 @@ class ProjectLayer:
     Attributes:
         wall: name of the wall.
         kind: content of the raster: `ortho`, `intensity`, `depth` or `error`.
-        raster: its GeoTIFF.
+        raster: path of the GeoTIFF.
         about: one line of information, e.g. the accuracy of the raster.
-        is_shown: whether it is visible when the project is opened.
+        is_shown: whether the layer is visible when the project is opened.
     """
 
     wall: str
@@ -195,7 +195,7 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
     for number, layer in enumerate(layers):
         vrt = folder / f"{number:02d}_{layer.raster.stem}.vrt"
         boxes.append(_write_virtual(vrt, layer.raster, places[layer.wall]))
-        # Ids must be unique in the project, and the same for the same run.
+        # Ids must be unique in the project, and reproducible for the same run.
         identity = f"{layer.raster.stem}_{uuid5(NAMESPACE_URL, vrt.name).hex}"
         described.append({**vars(layer), "file": vrt.name, "identity": identity})
     extent = np.array(boxes)

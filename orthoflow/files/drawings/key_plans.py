@@ -1,4 +1,4 @@
-"""The lines of a room, computed once for all formats, and key plans with one wall marked."""
+"""Lines of a room, computed once for all formats, and key plans in which one wall is marked."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class KeyPlan:
         walls: (w, 2, 2) ends of upright walls as seen from above.
         numbers: numbers of these walls, as in files and reports.
         outlines: outlines of the room, (n, 2) each; closed ones end where they begin.
-        marked: (n, 2) the marked wall: two ends, or the four corners of a horizontal plane.
+        marked: (n, 2) two ends of the marked wall, or four corners of a marked horizontal plane.
         arrow: (2, 2) from the viewer to the wall; None for horizontal planes.
         up_label: label of the upwards direction of the plan: `N` in map coordinates, otherwise an
             axis of the scan.
@@ -129,7 +129,7 @@ def marked_plan(
 
     Args:
         planes: planes of the room.
-        marked_world: (2 or 4, 3) the marked ends or corners.
+        marked_world: (2 or 4, 3) ends or corners of what is marked.
         towards_world: (3,) direction from the marked wall to the viewer; None for horizontal
             planes.
         number: number of the marked wall, -1 if none.
@@ -233,7 +233,7 @@ class DrawnWall:
         return self.frame.raster_from_wall(self.frame.wall_from_world(points_world)[:, :2])
 
     def near(self, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which points (n, 3) are on the raster's rectangle or near it."""
+        """Return which points (n, 3) are inside or near the raster's rectangle."""
         return self.frame.distances_m(points_world) <= REACH_M
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 POINTS_PER_MM: Final = 72.0 / 25.4
 FONT: Final = "DejaVuSans"
-# ISO 128-2: the ratio of successive widths is about the square root of two.
+# Line widths of ISO 128-2, in which successive widths differ by about the square root of two.
 FINE_MM: Final = 0.13
 THIN_MM: Final = 0.25
 MEDIUM_MM: Final = 0.35
@@ -44,7 +44,7 @@ GREY: Final = (0.5, 0.5, 0.5)
 BEFORE: Final = (0.80, 0.25, 0.05)
 BEHIND: Final = (0.05, 0.30, 0.75)
 OPENING: Final = (0.0, 0.40, 0.45)
-# ISO 128-2, line 10: a long dash, a gap, a dot, a gap.
+# Line type 10 of ISO 128-2: long dash, gap, dot, gap.
 MATCH_DASHES_MM: Final = (8.0, 1.5, 0.5, 1.5)
 # Height of capital letters of the font relative to its size.
 _CAPITALS: Final = 0.729
@@ -54,7 +54,7 @@ Colour = tuple[float, float, float]
 
 @contextmanager
 def sheet_canvas(stream: BytesIO, size_mm: tuple[float, float]) -> Iterator[Canvas]:
-    """Open a PDF page whose unit is the millimetre."""
+    """Open a PDF page whose coordinates are millimetres."""
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
 

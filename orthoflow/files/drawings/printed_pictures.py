@@ -1,6 +1,6 @@
 """Pictures of walls: rasters for print and CAD, contours, elevations, and relief.
 
-Rasters are read in parts, so that memory is bounded.
+Rasters are read in parts to limit the memory.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 PRINT_DPI: Final = 400.0
 _MM_PER_INCH: Final = 25.4
-# Cells read at a time.
+# Number of cells that are read at a time.
 _BAND_CELLS: Final = 1 << 23
 # Pictures up to this size are lossless; larger ones would make the files too large to send.
 _LOSSLESS_PX: Final = 8_000_000
@@ -61,15 +61,15 @@ _CLEAR_OF_NOISE: Final = 4.0
 # cells.
 _SAME_SURFACE: Final = 5.0
 _CALM_CELLS: Final = 4.0
-# Side of the square of cells tested for being level, and the permitted rise relative to the contour
-# interval.
+# Side of the square of cells in which a surface is tested for being level, and the permitted rise
+# relative to the contour interval.
 _LEVEL_CELLS: Final = 5
 _LEVEL_SHARE: Final = 0.02
 # Minimum length of a contour with a number, in widths of the number.
 _LEAST_WIDTHS: Final = 5.0
 _APART_MM: Final = 12.0
 _TRIED: Final = (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
-# Minimum ratio of chord to length of the line below a number; on curved lines the number would be
+# Minimum ratio of chord to length of the line behind a number; on curved lines, the number would be
 # next to the line.
 _STRAIGHT: Final = 0.9
 
@@ -97,13 +97,13 @@ def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = Fals
     Rasters with more than 400 cells per inch of paper are averaged to 400; others are unchanged.
 
     Args:
-        raster: GeoTIFF with one band, which is stretched to grey, or three.
+        raster: GeoTIFF with three bands, or with one, which is stretched to grey.
         part: part of the raster.
         scale: denominator n of the scale 1 : n.
         is_flipped: whether the rows of the raster go up the paper; `part` refers to the drawing.
 
     Returns:
-        PNG, or JPEG if large.
+        The picture as PNG, or as JPEG if it is large.
     """
     import cv2
 
@@ -113,7 +113,8 @@ def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = Fals
         cells = np.clip(cells, 0.0, [*source.shape[::-1], *source.shape[::-1]])
         shape = _printed_shape(part, cells, scale)
         stretch = stretch_of(raster) if source.bands == 1 else None
-        # In OpenCV's order (blue first): converting an A0 sheet would take another 750 MB.
+        # Channels are in OpenCV's order (blue first), because converting an A0 sheet would take
+        # another 750 MB.
         picture = np.full((*shape, 3), 255, dtype=np.uint8)
         for rows, values, shown in _bands(source, cells, shape):
             colours = _grey(values, stretch) if stretch else eight_bits(cast("Colours", values))
@@ -222,7 +223,7 @@ def contours(
     surface = np.where(known, depths, np.nan).astype(np.float32)
     noise = noise_of(surface)
     surface = calmed(surface, noise)
-    # With noise alone, one averaged cell in ten thousand exceeds this.
+    # With noise alone, one averaged cell in ten thousand exceeds the first limit.
     drawn = known & ~_is_level(surface, max(0.6 * noise, _LEVEL_SHARE * interval_m))
     generator = contour_generator(x, y, np.ma.array(surface.astype(np.float64), mask=~drawn))
     low, high = (
@@ -350,8 +351,8 @@ def wall_picture(
 
     Args:
         raster: GeoTIFF.
-        is_depth: whether it contains depths, which are drawn with contours.
-        is_flipped: whether its rows go up the paper, as for ceilings.
+        is_depth: whether the raster contains depths, which are drawn with contours.
+        is_flipped: whether the rows of the raster go up the paper, as for ceilings.
         areas: areas to outline, such as openings of the wall.
         language: language of the legend.
     """
@@ -427,7 +428,7 @@ def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
     with placed.clipped() as canvas:
         for text, outline_m in areas:
             outline = placed.on_paper(outline_m)
-            # A white line below makes the outline visible on any picture.
+            # A white line under the coloured one makes the outline visible on any picture.
             pens.line(canvas, outline, width_mm=1.0, colour=pens.WHITE, is_closed=True)
             pens.line(canvas, outline, width_mm=pens.MEDIUM_MM, colour=pens.OPENING, is_closed=True)
             low = np.maximum(outline.min(axis=0), (left, bottom))
@@ -448,7 +449,7 @@ def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
 _GAP_MM: Final = 8.0
 # Space for names below the walls.
 _NAMES_MM: Final = 12.0
-# Minimum distance between heights with separate marks.
+# Minimum distance between height marks.
 _LEVELS_MM: Final = 1.5
 # Walls within this angle belong to the same facade.
 _PARALLEL_DEG: Final = 10.0
@@ -456,11 +457,11 @@ _PARALLEL_DEG: Final = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class ElevationWall:
-    """A wall of an elevation.
+    """A wall in an elevation.
 
     Attributes:
         name: name of the wall.
-        frame: frame of its picture.
+        frame: frame of the wall's picture.
         raster: GeoTIFF of the picture.
     """
 
@@ -470,7 +471,7 @@ class ElevationWall:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height."""
+        """Width and height of the wall in metres."""
         return self.frame.width * self.frame.gsd_m, self.frame.height * self.frame.gsd_m
 
 
@@ -520,7 +521,7 @@ def elevation(
     """Return a picture of walls side by side, each at its height, with lines at round heights.
 
     Args:
-        walls: from left to right.
+        walls: walls from left to right.
         up: (3,) unit vector in scan coordinates.
         text: texts on the sheets.
         scale: denominator n of the scale 1 : n.

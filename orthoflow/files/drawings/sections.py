@@ -92,10 +92,10 @@ class CutLine:
     """A cut line.
 
     Attributes:
-        plane: index of its plane in `planes.json`.
-        ends_m: (2, 2) X and Y.
+        plane: index of the line's plane in `planes.json`.
+        ends_m: (2, 2) X and Y of both ends.
         behind: (2,) unit vector away from the room, into the wall.
-        thickness_m: distance to the other side of the wall; NaN if that was not detected.
+        thickness_m: distance to the other side of the wall; NaN if the other side was not detected.
     """
 
     plane: int
@@ -118,7 +118,7 @@ class Section:
         lines: the cut lines.
         gaps_m: (g, 2, 2) stretches of cut planes without points: doors, windows, occlusions.
         beyond_m: (b, 2, 2) edges and outlines of openings beyond the cut.
-        points_m: (p, 2) thinned points of the slab that are away from all lines.
+        points_m: (p, 2) thinned points of the slab that are not near any line.
         slab_m: thickness of the slab from which points were used; 0 if there is no cloud.
         n_points: number of points in the slab.
     """
@@ -195,7 +195,7 @@ def section_of(
     Args:
         cut: the cutting plane.
         planes: planes of the room.
-        openings: openings of its walls.
+        openings: openings of the walls.
         cloud: the points; if None, lines extend as far as the rectangles of the planes.
         labels: the plane of each point.
 
@@ -284,7 +284,7 @@ def _drawn(
         if len(places):
             own = places[plane == index] if (plane >= 0).any() else places
             offset = (own - point) @ behind
-            # Tolerance: the noise of the plane, and its inclination within the slab.
+            # The tolerance covers the noise of the plane and its inclination within the slab.
             near = np.abs(offset) <= 3.0 * float(planes.rms_m[index]) + 0.5 * slab_m
             # Rounding to millimetres leaves few values.
             along = np.unique(np.round((own[near] - point) @ direction, 3)).tolist()
@@ -387,7 +387,7 @@ def _snapped(span: _Span, meets: Sequence[float]) -> _Span:
 
 
 def _with_thickness(lines: Sequence[CutLine]) -> Iterator[CutLine]:
-    """Set the distance of lines to the other side of their wall, if that was detected."""
+    """Set the thickness of walls whose other side was also detected."""
     for line in lines:
         middle = line.ends_m.mean(axis=0)
         found = []
@@ -439,7 +439,7 @@ def _unexplained(
 
 
 def _thinned(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return one point per cell of a grid adapted to their number, without isolated points."""
+    """Return one point per cell of a grid adapted to the number of points; omit isolated points."""
     if len(places) == 0:
         return places
     _, cell, n_in_cell = np.unique(
@@ -477,7 +477,7 @@ class SectionDrawing:
         section: content of the plan or section.
         scale: denominator n of the scale 1 : n.
         origin: one line about the origin of the data.
-        has_dimensions: whether the lengths of cut lines are written next to them.
+        has_dimensions: whether cut lines are labelled with their lengths.
         language: language of labels.
     """
 
@@ -517,7 +517,7 @@ def section_sheet(
     grid: float,
     crs: str | None = None,
 ) -> Drawing:
-    """Return the sheet of a plan or section, with the texts of its run.
+    """Return the sheet of a plan or section, with the texts of the run.
 
     Args:
         stem: name of the sheet's files without suffix.
@@ -644,7 +644,7 @@ def _document(drawing: SectionDrawing) -> Document:
 
 
 def _add_solid(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None:
-    """Hatch behind a line up to the other side of the wall, or a strip if that is unknown.
+    """Hatch the solid behind a line up to the wall's other side, or a strip if it is unknown.
 
     If both sides of a wall were detected, it is hatched from the first one only.
     """
@@ -655,7 +655,7 @@ def _add_solid(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None
     begin, end = cut.ends_m
     outline = [begin, end, end + deep_m * cut.behind, begin + deep_m * cut.behind]
     hatch = space.add_hatch(dxfattribs={"layer": "A-SECT-PATT"})
-    # Lines of the pattern are 3.175 units apart; 1.3 mm on paper.
+    # Lines of the pattern are 3.175 units apart; they shall be 1.3 mm apart on paper.
     hatch.set_pattern_fill("ANSI31", scale=drawing.mm(1.3) / 3.175)
     hatch.paths.add_polyline_path([tuple(place) for place in outline], is_closed=True)
 

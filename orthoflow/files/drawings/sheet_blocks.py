@@ -51,7 +51,7 @@ _SYMBOL_MM: Final = 14.0
 _QR_MM: Final = 28.0
 _SIGNATURE_MM: Final = 14.0
 _LOGO_MM: Final = 16.0
-# Wider title blocks have four columns instead of two.
+# Title blocks wider than this have four columns instead of two.
 _FOUR_COLUMNS_MM: Final = 140.0
 _PLAIN: Final = [
     *((f"{side}PADDING", (0, 0), (-1, -1), 0) for side in ("LEFT", "RIGHT", "TOP", "BOTTOM")),
@@ -83,8 +83,8 @@ class Furniture:
     """The blocks beside the pictures of a sheet.
 
     Attributes:
-        paper: paper with the space reserved for the blocks.
-        placed: flowables, with left and bottom on the paper and width, in mm.
+        paper: paper, including the size of the space for the blocks.
+        placed: flowables, each with left, bottom and width on the paper in mm.
     """
 
     paper: Paper
@@ -252,7 +252,7 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
         )
         rows.append((symbol, label("legend_match", language)))
     for place, (draw, text) in enumerate(rows):
-        # Keep the heading with the first row.
+        # Keep the heading together with the first row.
         heading = (
             [[pens.paragraph(label("legend", language), is_bold=True), ""]] if place == 0 else []
         )
@@ -432,7 +432,7 @@ def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
 
 def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any], bool]]:
     language = drawing.language
-    # Imperial scales: inches on paper per foot.
+    # Architects' imperial scales are given in inches on paper per foot.
     is_ruler = drawing.unit == "ft" and 12 <= drawing.scale <= 192 and drawing.scale in SCALES_FT
     inches = Fraction(12, drawing.scale) if is_ruler else None
     text = f"1:{drawing.scale}" + (f' ({inches}" = 1\'-0")' if inches else "")

@@ -46,7 +46,7 @@ LONG_MM: Final = {
     "A2.0": (1189.0, 420.0),
     "A1.0": (1189.0, 594.0),
 }
-#: sheets of a picture of a wall
+#: sheets into which a wall is divided
 MOST_SHEETS: Final = 200
 SCALES: Final = (1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000)
 # Denominators of imperial scales: architects' 12", 6", 3", 1 1/2", 1", 3/4" ... 1/16" to the foot,
@@ -140,7 +140,7 @@ class View:
 
 
 def paper_of(text: str) -> Paper:
-    """Parse a paper size: `A0` to `A4`, elongated as `A3.1`, or in mm as `700x500`.
+    """Parse a paper size: `A0` to `A4`, an elongated size such as `A3.1`, or mm such as `700x500`.
 
     Raises:
         ArgumentError: the text is not a paper size.
@@ -302,13 +302,13 @@ class TitleBlock(_Model):
         client: name of the client.
         organisation: organisation responsible for the drawing.
         author: author of the drawing.
-        checked_by: person who checked it.
+        checked_by: person who checked the drawing.
         date: date of the drawing.
         drawing: drawing number, to which the numbers of wall and sheet are appended.
-        revision: current revision; by default the mark of the last one in `revisions`.
-        note: any text.
+        revision: current revision; by default the last one in `revisions`.
+        note: additional text.
         fields: further fields required by the client, by name.
-        revisions: oldest first.
+        revisions: rows of the table of revisions, oldest first.
     """
 
     layout: Literal["column", "strip"] | None = None
@@ -415,9 +415,9 @@ class Axes:
 
     Attributes:
         across: coordinate at the left edge of the drawing, and its change per metre to the right;
-            None if it has no meaning, as for several walls.
+            None if the coordinate has no meaning, as for several walls.
         down: coordinate at the top edge of the drawing, and its change per metre downwards.
-        phrase: meaning of the coordinates, for the notes.
+        phrase: description of the coordinates, for the notes.
     """
 
     across: tuple[float, float] | None
@@ -491,7 +491,7 @@ class Sheet:
     Attributes:
         paper: paper of the sheet.
         views: pictures on the sheet.
-        number: 1 for the first.
+        number: number of the sheet, 1 for the first.
         count: number of sheets.
         numbered: number and part of each sheet of the drawing, if there are several.
     """

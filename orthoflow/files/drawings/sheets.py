@@ -1,7 +1,7 @@
 """Sheets: PDF drawings to scale, divided among several sheets if they do not fit on one.
 
-Pictures are embedded once; everything else is vectors and text. Lengths on the paper are
-millimetres from its bottom-left corner until they are passed to reportlab, in points.
+Each picture is embedded once; everything else is vectors and text. Positions on the paper are in
+millimetres from the bottom-left corner, and are converted to points for reportlab.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
         pens.write_text(placed.canvas, text, at, turned_deg=turned_deg, is_centred=True)
 
 
-# Paper of the sheets if a wall does not fit on a single one.
+# Paper of the sheets if a wall does not fit on a single sheet.
 _CUT_PAPER: Final = "A1"
 #: a sheet with its pictures, and the blocks beside them
 LaidOut: TypeAlias = tuple[Sheet, Furniture]
@@ -288,7 +288,7 @@ def _on_one(drawing: Drawing, papers: Sequence[Paper], *, is_brief: bool = False
 
 
 def _cut(drawing: Drawing, paper: Paper, *, is_brief: bool) -> tuple[LaidOut, ...]:
-    """Return the sheets of a divided wall; none if the paper is too small."""
+    """Return the sheets of a divided wall; empty if the paper is too small."""
     kinds, whole = tuple(drawing.pictures), whole_of(drawing.size_m)
     # The blocks of this sheet need the most space, because it has a key to several sheets.
     view = View(kind=max(kinds, key=len), part=whole, corner_mm=(0.0, 0.0))

@@ -37,7 +37,7 @@ def label(key: str, language: Language = "en", **values: object) -> str:
 
 
 def numerals(text: str, language: Language) -> str:
-    """Return a number formatted by Python with the separators of a language, or another text.
+    """Convert a number formatted by Python to a language's separators; keep any other text.
 
     >>> numerals("+13,694.5 m", "de"), numerals("+13,694.5 m", "en"), numerals("1.2, 3", "de")
     ('+13.694,5 m', '+13,694.5 m', '1.2, 3')

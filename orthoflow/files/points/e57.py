@@ -44,7 +44,7 @@ _CARTESIAN: Final = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL: Final = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 _GRID: Final = ("rowIndex", "columnIndex")
-# Fields that are non-zero for invalid values.
+# Fields that are non-zero if the values of a point are invalid.
 _STATES: Final = (
     "cartesianInvalidState",
     "sphericalInvalidState",
@@ -157,8 +157,8 @@ def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         quaternion = [number_of(pose["rotation"][name]) for name in "wxyz"]
         length = math.hypot(*quaternion)
         if math.isfinite(length) and length > 0.0:
-            # Normalise before scipy does: the squares of very large or small numbers over- or
-            # underflow.
+            # Normalise with `hypot` before scipy does, because squares of very large or small
+            # numbers overflow or underflow.
             unit = [item / length for item in quaternion]
             rotation = np.asarray(Rotation.from_quat(unit, scalar_first=True).as_matrix())
     if pose is not None and pose.isDefined("translation"):

@@ -20,7 +20,8 @@ IGNORED: Final = "_"
 _COLOURS: Final = ("r", "g", "b")
 _NORMALS: Final = ("nx", "ny", "nz")
 _READ: Final = ("x", "y", "z", *_COLOURS, "rgb", "intensity", "row", "column")
-# Field name -> meaning, the most reliable names first: in `N X Y Z`, `N` is not the northing.
+# Meaning by field name, the most reliable names first: in `N X Y Z`, for instance, `N` is not the
+# northing.
 _MEANINGS: Final = {
     alias: name
     for name, text in {
@@ -56,7 +57,7 @@ _STAND_INS: Final = (
 _INTENSITY_PARTS: Final = re.compile(
     "intens|reflect|amplitud|remission|signal|echo|power|grey|gray|luminance|bright"
 )
-# Limited because the search for brackets takes quadratic time.
+# The length is limited because the search for brackets takes quadratic time.
 _LONGEST_NAME: Final = 200
 
 
@@ -138,7 +139,7 @@ def columns_of_names(
     Args:
         labels: field names, in order.
         intensity_field: name of the field to use as intensity; None for the usual names or, if
-            there are none, those of reflectance, amplitude and remission.
+            none of them exists, the names of reflectance, amplitude and remission.
 
     Returns:
         The columns, or None if x, y or z is missing.
@@ -216,7 +217,7 @@ def columns_of_values(
     counts = is_whole and n_columns > 3 and len(first) >= 5 and np.all(np.diff(first) == 1.0)
     lead = ("number",) if counts else ()
     rest = samples[:, len(lead) + 3 :]
-    # All orders of intensity, colours and normals that have this number of columns.
+    # Try all orders of intensity, colours and normals that have this number of columns.
     parts = (("intensity",), _COLOURS, _NORMALS)
     orders = [order for count in range(4) for order in permutations(parts, count)]
     readings = [

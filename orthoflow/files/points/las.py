@@ -116,7 +116,7 @@ def open_las(
     columns = columns_of_names(names, intensity_field=intensity_field)
     intensity = "intensity" if columns is None else names[columns.names.index("intensity")]
     if intensity == "intensity" and intensity_field is None and n_points:
-        # If the usual field contains only zeros, use an extra field instead.
+        # If the standard field contains only zeros, use an extra field instead.
         others = columns_of_names(("x", "y", "z", *extra))
         if others is not None and "intensity" in others.names:
             with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
@@ -248,7 +248,7 @@ def _block(chunk: Any, classes: frozenset[int], intensity: str) -> PointBlock:
     if classes:
         causes["other_class"] = ~np.isin(np.asarray(chunk.classification), list(classes))
     axes = np.empty((3, len(chunk)))
-    # Convert in parts that fit into the processor's cache.
+    # Convert the coordinates in parts that fit into the processor's cache.
     for start in range(0, len(chunk), _PART_POINTS):
         part = slice(start, start + _PART_POINTS)
         for place, name in enumerate("XYZ"):
@@ -504,7 +504,7 @@ def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> li
         # quotient overflows.
         levels = math.log2(spacing) - math.log2(query.spacing)
         last = max(0, math.ceil(levels - 1e-9))
-    # Coordinates are rounded to the resolution of the file.
+    # The margin is needed because coordinates are rounded to the resolution of the file.
     slack = 2e-6 * half
 
     def is_wanted(level: int, *place: int) -> bool:

@@ -1,7 +1,8 @@
 """PTX files (Leica): several scans on grids, each with the scanner's pose; 0 0 0 means no return.
 
 Some files have scans with fewer lines than rows times columns, or blank lines between scans.
-Therefore, scans are found by two consecutive lines with one number each, which only headers have.
+Therefore, scans are found by two consecutive lines with one number each, which occur only in
+headers.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class _Part:
         end: offset of the end of the last line of points in bytes.
         n_points: number of lines with points.
         n_rows: number of rows of the grid; points are stored column by column.
-        n_places: rows times columns.
+        n_places: number of grid positions (rows times columns).
         pose: rotation and translation from scan to world.
         layout: widths and separators of the numbers in a line.
     """

@@ -56,7 +56,7 @@ _PLY_TYPES: Final = {
     )
     for name in names
 }
-# The type of a list; plyfile reads elements with lists.
+# Placeholder type for lists; plyfile reads the elements that contain lists.
 _LIST: Final = "O"
 _VERTEX_NAMES: Final = ("vertex", "vertices", "point", "points")
 _BYTE_ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -126,7 +126,7 @@ def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
 
 
 def _ply_header(text: str) -> tuple[str, list[_Element], list[str]]:
-    """Return byte order (empty for ASCII), elements and comments.
+    """Return the byte order (empty for ASCII), the elements and the comments of a PLY header.
 
     plyfile's own parser is stricter: it refuses repeated property names and some line orders.
     """

@@ -1,4 +1,4 @@
-"""Common result of all point file readers: scans with metadata, then blocks of points.
+"""Common result of all readers for point files: scans with metadata, then blocks of points.
 
 A reader opens a file, reads its header, describes its scans and yields blocks of points.
 `point_block` builds a block from the columns of any format, so that points without a return,
@@ -42,7 +42,7 @@ class Scan:
         fields_used: names of the file's fields that are read.
         fields_not_used: names of the file's other fields.
         intensity_limits: smallest and largest intensity according to the file, or None.
-        rgb_limit: colour value of full brightness according to the file, or None.
+        rgb_limit: colour value for full brightness according to the file, or None.
         unit: unit of the coordinates, or None if the file does not declare one.
         station: (3,) position of the scanner, in the file's unit, or None.
         station_is_posed: whether the file contains a pose other than the identity.
@@ -69,9 +69,9 @@ class PointBlock:
         n_read: number of points read from the file for this block, including omitted ones.
         left_out: number of omitted points by cause: `invalid`, `no_return`, `withheld`,
             `synthetic`, `other_class`.
-        intensity: (n,) float32 in the file's own scale, NaN if invalid, or None.
-        rgb: (n, 3) in the file's own scale and type, or None.
-        has_rgb: (n,) points with a valid colour; None if all have one.
+        intensity: (n,) float32 on the file's own scale, NaN if invalid; None if not available.
+        rgb: (n, 3) on the file's own scale and of its type; None if not available.
+        has_rgb: (n,) True for points with a valid colour; None if all colours are valid.
         row: (n,) int64 row of each point in the scan's grid, or None.
         column: (n,) int64 column of each point in the scan's grid, or None.
     """
@@ -161,7 +161,7 @@ def point_block(
     """Build a block of points from the values of a file.
 
     Args:
-        axes: (3, n) x, y, z; a point with all three exactly zero has no return.
+        axes: (3, n) x, y, z; if all three are exactly zero, the point has no return.
         values: (n,) by name: `intensity`, `r`, `g`, `b` or packed `rgb`, `has_rgb`, `row`,
             `column`; in the file's own types.
         causes: (n,) True for points to omit, by cause; a point is counted under its first cause.

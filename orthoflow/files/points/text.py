@@ -63,7 +63,7 @@ _NO_WORD: Final = re.compile(
 )
 
 
-# Columns (n,) of numbers.
+# A table is a sequence of columns (n,) of numbers.
 Table = Sequence[NDArray[np.float64]]
 
 
@@ -409,7 +409,7 @@ def read_tables(
 
 
 def _take_block(file: BinaryIO, n_lines: int | None, end: int | None) -> bytes:
-    """Read the next whole lines of a file, up to a number of lines and an offset."""
+    """Read the next complete lines of a file, up to a number of lines and an offset."""
     size = _BLOCK_BYTES if end is None else min(_BLOCK_BYTES, end - file.tell())
     block = file.read(size)
     if block and not block.endswith(b"\n"):

@@ -79,7 +79,7 @@ class StatedUnit:
 
 
 def unit_of_name(name: str, source: str) -> StatedUnit:
-    """Return the unit with a name of `UNITS_M`, or `deg`."""
+    """Return the unit with a name from `UNITS_M`, or with the name `deg`."""
     metres = UNITS_M.get(name, float("nan"))
     return StatedUnit(name=name, metres=(metres, metres, metres), source=source)
 
@@ -136,7 +136,7 @@ def unit_of_crs(text: str, what: str) -> StatedUnit | None:
 
 
 def unit_of_geo_keys(keys: Mapping[int, int]) -> StatedUnit | None:
-    """Return the unit in GeoTIFF keys; explicit unit keys override those of coded systems."""
+    """Return the unit in GeoTIFF keys; explicit unit keys override the units of coded systems."""
     import pyproj
 
     factors: dict[str, float] = {}

@@ -1,1 +1,1 @@
-"""Orthoimages as tiles, and a page that shows them without a server."""
+"""Export of orthoimages as tiles, and a page that shows them without a server."""

@@ -90,7 +90,7 @@ def write_viewer(folder: Path, images: Mapping[str, OrthoFile]) -> None:
     """
     described = [_image(name, ortho) for name, ortho in images.items()]
     text = json.dumps(described, allow_nan=False)
-    # Escape names, which come from records, so that they cannot end the script.
+    # Escape names, which come from records, so that they cannot end the script element.
     for letter in "<>&":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
     page = files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
