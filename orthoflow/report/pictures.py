@@ -27,7 +27,7 @@ from orthoflow.products import (
     Walls,
     is_shown,
 )
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, published_files
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.untrusted_text import shown
 
@@ -348,7 +348,7 @@ def _title(name: str, address: str) -> str:
 
 
 def _published(run: Run, address: str, name: str) -> str:
-    for path in run.files.get(address, ()):
+    for path in published_files(run.folder, address):
         if path.name == name:
             return path.relative_to(run.folder).as_posix()
     return ""
