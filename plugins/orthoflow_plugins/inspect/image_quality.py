@@ -115,7 +115,7 @@ def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
 
     Args:
         image: grey levels, and valid cells.
-        wall: index in the findings.
+        wall: index of the wall in the findings.
     """
     profiles = _edge_profiles(image)
     if len(profiles) < _EDGES_LEAST:

@@ -39,7 +39,7 @@ _REACH_CELLS: Final = 10.0
 _STEP_CELLS: Final = 1.0 / 16.0
 # Number of lines, perpendicular to a side, along which the border is searched for.
 _LINES: Final = 33
-# Share of a side at either end that is ignored, because corners influence it.
+# Share of a side that is ignored at each end, because corners influence it.
 _ENDS_SHARE: Final = 0.1
 
 

@@ -231,7 +231,7 @@ def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
 
 
 def _distances(found: Planes, true: Planes, index: int) -> list[_PlaneDistance]:
-    """Return the differences of all detected planes from a true plane."""
+    """Return the differences between all detected planes and a true plane."""
     return [_plane_distance(found.plane(k), true, index) for k in range(len(found))]
 
 

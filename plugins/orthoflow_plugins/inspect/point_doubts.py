@@ -65,7 +65,7 @@ def report_doubts(
 
 
 def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
-    """Return the distance of a point from its wall; 0 if it is at most the length of the wall."""
+    """Return a point's distance from its wall; 0 if this is at most the length of the wall."""
     if picture is None:
         return 0.0
     frame = picture.frame

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace
     from orthoflow_plugins.match.warping import Before
 
-# As in `ortho`, points of the cloud with fewer neighbours are outliers and hide nothing.
+# As in `ortho`, points of the cloud with fewer neighbours than this are outliers and hide nothing.
 _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",

@@ -352,7 +352,7 @@ def confirmed(
     on: tuple[Sequence[Wall], Sequence[WallStructure | None]],
     cores: int = 1,
 ) -> dict[int, Placed]:
-    """Choose the positions of photos that confirm each other.
+    """Choose those positions of photos that confirm each other.
 
     Args:
         photos: all photos.

@@ -182,7 +182,7 @@ def trace_photo(
             is_little = found[0].n_ties < _FEW_SHARE * setup.max_ties
             if found[0].content == "grey" and not is_little:
                 continue
-        # The pose from one set of channels is the start for the next.
+        # The pose from one set of channels is the initial pose for the next.
         start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
         tried = _traced(start, setup, content, lens)
         if found is None or _rank(tried[0]) < _rank(found[0]):

@@ -56,7 +56,7 @@ from orthoflow_plugins.mosaic.joining import (
 )
 from orthoflow_plugins.mosaic.parameters import SeamsParams
 
-# Figure of the sources: length of its longer side in pixels.
+# Length of the longer side of the figure of the sources, in pixels.
 _LONGEST_PX: Final = 900
 # Maximum number of sources in the legend.
 _NAMED_MOST: Final = 24

@@ -98,7 +98,7 @@ class DetectorOut(Ports):
 
 
 class Detector(Method):
-    """Base class of the methods that detect planes; they differ in how they propose them."""
+    """Base class of the methods that detect planes, which differ in how they propose planes."""
 
     result_version = 3
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = DETECTOR_METRICS

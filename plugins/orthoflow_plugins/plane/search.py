@@ -571,7 +571,7 @@ def _bounds(found: list[FoundPlane], cloud: PreparedCloud) -> list[NDArray[np.fl
 
 
 def label(found: list[FoundPlane], cloud: PreparedCloud) -> None:
-    """Assign all points to the nearest plane whose rectangles contain them."""
+    """Assign each point to the nearest plane whose rectangles contain it."""
     bounds = _bounds(found, cloud)
     plane_of_slab = np.repeat(np.arange(len(found)), [len(own) for own in bounds])
     slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)[plane_of_slab]

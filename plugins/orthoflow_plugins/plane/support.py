@@ -65,7 +65,7 @@ class SurfaceRaster:
     def over(
         cls, plane: Plane, box_corners: NDArray[np.float64], up: NDArray[np.float64], cell_m: float
     ) -> SurfaceRaster:
-        """Return a raster on a plane that covers a box with corners (8, 3); limits its size."""
+        """Return a raster of limited size on a plane that covers a box with corners (8, 3)."""
         axes = wall_axes(plane.normal, up)
         placed = box_corners @ axes.T
         low, high = placed.min(axis=0), placed.max(axis=0)

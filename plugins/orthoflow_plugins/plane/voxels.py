@@ -47,7 +47,7 @@ _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _BRICKS_MOST: Final = 8_000_000
 # Minimum number of points of a neighbourhood for a reliable normal.
 POINTS_LEAST: Final = 16.0
-# Maximum side of a voxel as a share of the scene.
+# Maximum side of a voxel as a share of the size of the scene.
 _VOXEL_SHARE_MOST: Final = 0.05
 # Initial numbers of rows and voxels of tables.
 _ROWS_FIRST: Final = 2_048

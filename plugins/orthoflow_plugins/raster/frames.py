@@ -133,7 +133,7 @@ def mapped(
             name, tilt_deg = planes.names[index], math.degrees(tilt_rad)
             ctx.report(TILTED, subject=name, tilt_deg=tilt_deg, off_mm=1e3 * off_m)
             continue
-        # Whole cells extend beyond the rectangle; distribute this excess evenly to all sides.
+        # Whole cells extend beyond the rectangle; distribute this excess evenly over all sides.
         middle = frame.wall_from_world(planes.corners[index].mean(axis=0)[None])[0, :2]
         beyond = middle - 0.5 * np.array([frame.width, frame.height])
         origin = frame.world_from_wall(beyond[None])[0]

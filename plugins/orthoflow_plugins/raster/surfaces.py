@@ -41,7 +41,7 @@ LAYER_M: Final = 0.02
 DENOISE_CELLS: Final = 4
 # Maximum number of cells of temporary arrays.
 CELLS_AT_ONCE: Final = 1 << 20
-# Maximum distance of neighbours in the scan, in radii of a narrow gap.
+# Maximum distance between neighbours in the scan, as a multiple of the radius of a narrow gap.
 SPAN_GAPS: Final = 4
 # If the product of a scan's rows and columns exceeds this, they are not used (2 GB of indices).
 _GRID_CELLS_MOST: Final = 1 << 28
