@@ -1,4 +1,4 @@
-"""Tables of points from surveyors or written by hand: a header, then one point per line."""
+"""Tables of points, from surveyors or written by hand: a header, then one point per line."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
     )
 
 
-# Metrics of the first wall.
+# Metrics that identify the first wall.
 _FIRST_WALL: Final = ("omega_deg", "phi_deg", "area_m2")
 
 

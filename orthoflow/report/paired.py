@@ -347,7 +347,7 @@ def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDataset
 
 
 def holm(values: Sequence[float]) -> dict[float, float]:
-    """Return the corrected p for each p of several tests, by Holm's step-down method.
+    """Return the corrected p-value for each p-value of several tests, by Holm's method.
 
     >>> holm([0.01, 0.04, 0.03])
     {0.01: 0.03, 0.03: 0.06, 0.04: 0.06}

@@ -47,7 +47,7 @@ def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
 
 
 def number_with_spread(value: float, spread: float) -> str:
-    """Format a mean to two digits of its standard deviation, unless this is very small.
+    """Format a mean to two digits of its standard deviation, unless that deviation is tiny.
 
     >>> number_with_spread(12.3456, 0.0123), number_with_spread(3.0, 0.0)
     ('12.346 ± 0.012', '3')

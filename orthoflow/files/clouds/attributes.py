@@ -324,7 +324,7 @@ def plane_colours(
 
 
 def deviation_colours(deviation_m: NDArray[np.float32], full_m: float) -> NDArray[np.uint8]:
-    """Return colours (n, 3) of signed distances: blue behind, white on, red in front; NaN grey.
+    """Return colours (n, 3) of signed distances: blue behind, white on, red in front; grey for NaN.
 
     >>> deviation_colours(np.array([-0.01, 0.0, 0.02, np.nan], dtype=np.float32), 0.01).tolist()
     [[33, 102, 172], [247, 247, 247], [178, 24, 43], [128, 128, 128]]

@@ -29,7 +29,7 @@ _PROJECTED_AT_ONCE: Final = 1 << 19
 _SAMPLED_MOST: Final = 200_000
 # Percentage of points at each end of an axis that may be outliers.
 _OUTSIDE_PERCENT: Final = 0.5
-# Number of cubes along the cloud's longest side, for estimating the area of its surfaces.
+# Number of cubes along the cloud's longest side, used to estimate the area of its surfaces.
 _CUBES: Final = 64
 
 

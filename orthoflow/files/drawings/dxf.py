@@ -219,7 +219,7 @@ def _add_level(space: Modelspace, x: float, height_m: float) -> None:
 def _add_opening(
     space: Modelspace, outline_m: NDArray[np.float64], sigma_m: float | None, words: str
 ) -> None:
-    """Add an opening in regular form, with its size and deviation from the detected outline."""
+    """Add an opening as a regular form, with its size and deviation from the detected outline."""
     regular = regular_opening(outline_m, sigma_m)
     _add_polygon(space, regular.outline_m, "A-ELEV-OPNG")
     low, high = regular.outline_m.min(axis=0), regular.outline_m.max(axis=0)
@@ -334,7 +334,7 @@ _ARC_POINTS: Final = 33
 
 @dataclass(frozen=True, kw_only=True)
 class RegularOpening:
-    """An opening of a wall in regular form.
+    """A wall opening, approximated by a regular form.
 
     Attributes:
         kind: `rectangle`, `arch` (a rectangle under a circular segment), or `outline` if neither

@@ -129,7 +129,7 @@ def marked_plan(
 
     Args:
         planes: planes of the room.
-        marked_world: (2 or 4, 3) ends or corners of what is marked.
+        marked_world: (2 or 4, 3) ends of the marked wall, or corners of the marked plane.
         towards_world: (3,) direction from the marked wall to the viewer; None for horizontal
             planes.
         number: number of the marked wall, -1 if none.

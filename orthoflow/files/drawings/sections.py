@@ -489,7 +489,7 @@ class SectionDrawing:
     language: Language = "en"
 
     def mm(self, value: float) -> float:
-        """Return the length in metres in the drawing of a length in millimetres on paper."""
+        """Convert a length in millimetres on paper to metres in the drawing."""
         return 1e-3 * self.scale * value
 
     @property

@@ -137,7 +137,7 @@ def _blocks(path: Path, parts: list[_Part]) -> Iterator[PointBlock]:
 
 
 def _find_headers(path: Path) -> list[tuple[int, int]]:
-    """Return the offset of each header and of the end, and the filled lines before each offset."""
+    """Return the offset of each header and of the end, and how many filled lines precede it."""
     found: list[tuple[int, int]] = []
     offset, n_filled, kept = 0, 0, b""
     with path.open("rb") as file:

@@ -280,7 +280,7 @@ def values_of(table: Table, columns: Columns, packed: Any = np.int64) -> Values:
 
 
 def is_comment(line: bytes) -> bool:
-    """Return whether a line is a comment: begins with `#` or `//`, but not e.g. with `#NUM!`."""
+    """Return whether a line begins with `#` or `//`, and not with an error value like `#NUM!`."""
     start = line.lstrip()
     return start.startswith((b"#", b"//")) and not _NOT_A_NUMBER.match(start)
 
