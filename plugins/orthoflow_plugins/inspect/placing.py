@@ -21,7 +21,7 @@ _SAME_DIRECTION_DEG: Final = 2.0
 
 
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
-    """Return orthoimages whose `wall` is an index of these walls.
+    """Return orthoimages whose `wall` is an index into these walls.
 
     Orthoimages from other programs, and those of walls rasterised in another step, refer only to a
     plane.
@@ -63,7 +63,7 @@ def wall_of(image: Orthoimage, walls: Walls, allocate: Allocate = in_memory) -> 
     Args:
         image: the orthoimage.
         walls: all walls.
-        allocate: allocates the resampled arrays by name.
+        allocate: function that allocates the resampled arrays by name.
 
     Raises:
         MethodError: the image is not on the wall.

@@ -1,4 +1,4 @@
-"""Errors of planes, and scores of their labels, against the truth."""
+"""Errors of planes and scores of their labels, from a comparison with the truth."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ _FEATHER_CELLS: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Balance:
-    """Corrections of the layers of a wall, as logarithms of factors on brightness.
+    """Corrections of the layers of a wall, as logarithms of brightness factors.
 
     Attributes:
         blocks: blocks of the wall.

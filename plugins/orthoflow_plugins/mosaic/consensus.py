@@ -71,7 +71,7 @@ def consensus(
     Args:
         layers: photos of one wall, not modified; each shows some cells.
         wall: the scanned wall; None if unknown.
-        allocate: creates the masks of changed layers, given a name.
+        allocate: function that creates the masks of changed layers, given a name.
 
     Returns:
         The layers, with excluded cells marked as hidden; the number of cells in which an excluded
@@ -254,7 +254,7 @@ def _difference(
 
 
 def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the smooth part (r, c, 3) of a difference of observations; NaN if unknown."""
+    """Return the smooth part (r, c, 3) of a difference between observations; NaN if unknown."""
     known = np.asarray(np.isfinite(difference).all(axis=2), dtype=np.bool_)
     if not known.any():
         return np.zeros(difference.shape)

@@ -90,7 +90,7 @@ def expected_errors_m(
         sources: names of the photos.
         cameras: oriented photos by name; a photo without a covariance has no expected error.
         overlaps: displacements between overlapping photos.
-        allocate: creates the array.
+        allocate: function that creates the array.
 
     Returns:
         (rows, cols), NaN where no photo is used or the error of the photo is unknown.

@@ -166,7 +166,7 @@ def joined(
             them.
         wall: the surface, to keep seams away from its depth edges, or None.
         balance: the colour balance of `painters`, or None.
-        allocate: creates the arrays of the orthoimage, given a name.
+        allocate: function that creates the arrays of the orthoimage, given a name.
 
     Returns:
         (rows, cols) `OrthoMask`, and the index of the layer of each cell, `NOBODY` if it has none.
@@ -214,7 +214,7 @@ def coloured(
         painters: layers of the wall with coloured cells.
         source: (rows, cols) index of the layer of each cell, `NOBODY` if it has none.
         balance: colour balance of the layers; None leaves colours unchanged.
-        allocate: creates the array.
+        allocate: function that creates the array.
     """
     is_deep = any(layer.rgb.dtype == np.uint16 for layer in painters)
     level: Level = np.uint16 if is_deep else np.uint8

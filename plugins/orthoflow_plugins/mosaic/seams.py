@@ -278,7 +278,7 @@ def _join(
         params: parameters of the step.
         polygons: hand-drawn areas of all walls.
         ctx: context of the step.
-        allocate: allocates the arrays of the orthoimage by name.
+        allocate: function that allocates the arrays of the orthoimage by name.
     """
     frame, index = group[0].frame, group[0].wall
     name, number = inputs.layers.name(index), inputs.layers.number(index)

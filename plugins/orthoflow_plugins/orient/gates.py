@@ -334,14 +334,14 @@ class Candidate:
 
     @property
     def check_over_control(self) -> float | None:
-        """Ratio of the shares of inliers among check and control points."""
+        """Ratio of the share of inliers among check points to that among control points."""
         if self.is_check.sum() < _MIN_CHECKS:
             return None
         return float(self.estimate.agreeing[self.is_check].mean()) / self.control_share
 
     @property
     def check_rms_over_control(self) -> float | None:
-        """Ratio of the RMS residuals of check and control points."""
+        """Ratio of the RMS residual of check points to that of control points."""
         if self.withheld.sum() < _MIN_CHECKS:
             return None
         squares = self.estimate.fit.normalised**2

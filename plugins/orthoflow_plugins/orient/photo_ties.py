@@ -36,7 +36,7 @@ class PhotoTies:
         point: (m,) index of the observed point, 0..k-1; each point is observed at least twice.
         pixels: (m, 2) pixels of the photo.
         scale: (m,) photo pixels per pixel of the reduced picture in which the key point was found.
-        points_world: (k, 3) metres, intersected with the given poses.
+        points_world: (k, 3) metres, intersections of rays for the given poses.
     """
 
     photo: NDArray[np.intp]

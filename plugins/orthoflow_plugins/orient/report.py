@@ -92,7 +92,7 @@ class Oriented:
     candidate: Candidate | None = None
 
     def residuals_of(self, kind: TieRole) -> NDArray[np.float64]:
-        """Return the finite residuals (m, 2) of one role."""
+        """Return the finite residuals (m, 2) of ties with one role."""
         values = self.residuals_px[self.role == kind]
         return np.asarray(values[np.isfinite(values).all(axis=1)])
 

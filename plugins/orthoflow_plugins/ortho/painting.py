@@ -98,8 +98,8 @@ def paint(
         surface: the wall.
         buffer: depth buffer of objects in front of the wall.
         params: choice of cells, and sampling of colours.
-        allocate: allocates zeroed arrays of the layer; those of colours and quality only if a cell
-            is coloured.
+        allocate: function that allocates zeroed arrays of the layer; those of colours and quality
+            only if a cell is coloured.
         threads: number of tiles processed at once; it does not change the result.
     """
     import cv2

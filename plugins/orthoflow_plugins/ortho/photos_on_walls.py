@@ -110,7 +110,7 @@ def project_photos(
     Args:
         inputs: walls and oriented photos.
         ctx: context of the step.
-        project: projects a photo onto a wall and adds the layer.
+        project: function that projects a photo onto a wall and adds the layer.
         hides: whether relief and cloud can hide cells.
 
     Returns:

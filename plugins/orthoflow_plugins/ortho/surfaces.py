@@ -127,7 +127,7 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
     Args:
         wall: the wall.
         hides: whether the surface can hide parts of itself.
-        allocate: allocates the occluding surface.
+        allocate: function that allocates the occluding surface.
     """
     depth = np.asarray(wall.depth_m, dtype=np.float32).view(np.ndarray)[:]
     side = FINE_CELLS if hides else BLOCK_CELLS

@@ -106,7 +106,8 @@ class Voters:
         self._position_of_point[inside] = number
         self.positions_m = np.ascontiguousarray(positions_m.T, dtype=np.float32)
         self.votes = np.zeros(len(positions_m), dtype=np.int64)
-        # A single normal is not refined, and normals in the plan only about the vertical axis.
+        # A single normal is not refined; normals in the plan are refined only about the vertical
+        # axis.
         is_turned = (len(angles_rad) > 1, bool(angles_rad[:-1, 1].any()))
         slopes = (step_rad * np.array(_SLOPES if turned else (0.0,)) for turned in is_turned)
         self.slopes = np.stack(np.meshgrid(*slopes), axis=-1).reshape(-1, 2)
@@ -377,7 +378,7 @@ class SpaceProposer(HoughProposer):
 def directions_over(
     n_turns: int, constraint: Constraint, max_tilt_deg: float
 ) -> NDArray[np.float64]:
-    """Return directions evenly distributed over the hemisphere, or the part that is needed.
+    """Return directions evenly distributed over the hemisphere, or over the part needed.
 
     At phi = 90 degrees, every omega describes the same plane, so a regular table would count a
     floor once for every omega. Here the number of directions for each phi is proportional to the

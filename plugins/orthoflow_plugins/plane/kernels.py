@@ -42,7 +42,7 @@ def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> N
     Args:
         n_items: length of the range.
         parts: number of parts; some may be empty.
-        task: called with the index of the part and its slice of the range.
+        task: function called with the index of the part and its slice of the range.
     """
     pieces = even_parts(n_items, parts, multiple=BLOCK_POINTS)
     in_threads([partial(task, part, piece) for part, piece in enumerate(pieces)])

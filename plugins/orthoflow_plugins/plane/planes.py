@@ -56,7 +56,8 @@ _CLEAR_M: Final = 0.05
 _FULL_VOTE_M: Final = 1.0
 # Points may project this far outside the rectangle, because floor and ceiling are at its edges.
 _BESIDE_M: Final = 0.3
-# Minimum majority, as a share of all points with the minimum distance from the plane.
+# Minimum majority of the weighted votes, as a share of the votes if all points were at the minimum
+# distance from the plane.
 _DOUBT: Final = 0.01
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-unknown",

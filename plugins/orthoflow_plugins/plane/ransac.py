@@ -382,7 +382,7 @@ def draw_hypotheses(
 
 
 def curve_order(points_m: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the order of points (m, 3) along a Morton curve, whose neighbours are close."""
+    """Return the order of points (m, 3) along a Morton curve, on which neighbours are close."""
     low, high = np.quantile(points_m, (0.01, 0.99), axis=0)
     scale = (2**_CURVE_BITS - 1) / max(float((high - low).max()), 1e-9)
     cells = np.clip((points_m - low) * scale, 0, 2**_CURVE_BITS - 1).astype(np.uint32)
@@ -402,7 +402,7 @@ def fewest_false_alarms(
     extents_m: NDArray[np.float64],
     n_corners: int,
 ) -> Scores:
-    """Score hypotheses at the tolerance at which their points are least likely by chance.
+    """Score hypotheses at the tolerance at which their points are least likely due to chance.
 
     Args:
         histograms: (h, bins) number of points per distance bin, 0..reach.

@@ -226,7 +226,7 @@ def detect(
         cloud: the cloud.
         params: parameters of the detector.
         ctx: the step's context.
-        proposer_of: creates the proposer at the beginning of a search.
+        proposer_of: function that creates the proposer at the beginning of a search.
         method: id of the detector, for messages.
 
     Raises:
@@ -319,7 +319,7 @@ def find_planes(
     Args:
         search: the search; its claims and those of its cloud are set.
         proposer: the detector.
-        on_found: called after each plane with the number of planes so far.
+        on_found: function called after each plane with the number of planes so far.
     """
     found = fit_to_all(greedy_search(search, proposer, on_found), search)
     label(found, search.cloud)

@@ -83,7 +83,7 @@ def covered_planes(
     Args:
         planes: all planes, those with the most points first.
         params: the criteria.
-        buffer_m: returns the buffers of walls.
+        buffer_m: function that returns the buffers of walls.
         chosen: result of `chosen_planes`.
     """
     if not params.skip_covered or params.ranks or params.near:

@@ -78,7 +78,7 @@ def rastered_wall(
         params: parameters.
         planes: all planes.
         index: index of the wall's plane.
-        allocate: creates the arrays of a large wall.
+        allocate: function that creates the arrays of a large wall.
         threads: number of threads.
     """
     from orthoflow_plugins.raster.surfaces import DENOISE_CELLS, SPAN_GAPS
