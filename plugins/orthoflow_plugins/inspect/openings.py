@@ -304,7 +304,7 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
 def _side_error(
     wall: _TrueWall, begin: NDArray[np.float64], end: NDArray[np.float64], sigma_m: float
 ) -> _SideError | None:
-    """Measure a side; return None if most lines across it meet no true border."""
+    """Measure the error of a side; return None if most lines across it meet no true border."""
     way = end - begin
     length = float(np.linalg.norm(way))
     if length <= 0.0:

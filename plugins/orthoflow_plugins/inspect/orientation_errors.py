@@ -255,7 +255,7 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
 def _error_on_walls(
     found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
-    """Compare the positions to which both cameras project a grid of pixels on true surfaces."""
+    """Compare where the two cameras project a grid of pixels onto the true surfaces."""
     columns, rows = ((np.arange(n) + 0.5) / n for n in _GRID)
     grid = np.stack(np.meshgrid(columns * true.width, rows * true.height), axis=-1).reshape(-1, 2)
     seen = views.trace(true, grid)

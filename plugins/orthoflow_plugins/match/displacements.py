@@ -372,7 +372,8 @@ def measure(
         places: (column, row) cells of the first picture.
         radius_cells: search radius.
         min_score: minimum correlation. The default of 0.35 is half the usual correlation at correct
-            positions; it can be lower if many patches are checked against their neighbours.
+            positions; a lower value is possible if many patches are checked against their
+            neighbours.
         min_distinct: minimum difference between the best correlation and the next peak.
         threads: number of threads.
     """

@@ -2,9 +2,9 @@
 
 Three independent causes displace the content of a cell along the wall: errors of the pose of the
 photo (its covariance, propagated to the wall), errors of the depth of the cell (times the tangent
-of the viewing angle), and displacements between overlapping photos that neither of them explains.
-Overlaps separate the last two, because a depth error displaces photos taken from different sides in
-different directions.
+of the viewing angle), and displacements between overlapping photos that neither of these errors
+explains. Overlaps separate the last two, because a depth error displaces photos taken from
+different sides in different directions.
 """
 
 from __future__ import annotations

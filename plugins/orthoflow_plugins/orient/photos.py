@@ -51,7 +51,7 @@ _MAX_TRIALS: Final = 300
 _CONTRADICTION: Final = 1e-3
 # Limit of residuals, in standard deviations of a coordinate.
 _LIMIT: Final = 3.5
-# Poses that differ by more are distinct; the same pose from two starts differs far less.
+# Poses that differ by more than this are distinct; the same pose from two starts differs far less.
 _ONE_POSE_RAD: Final = math.radians(2.0)
 BY_HAND: Final = DiagnosticSpec(
     code="photo-oriented-by-hand",

@@ -176,7 +176,8 @@ _TIGHTENING: Final = 0.8
 _MAX_TIGHTENED: Final = 7
 # Minimum number of ties for the adjustment of a lens with a prior.
 _LEAST_FOR_LENS: Final = 8
-# A calibration whose focal length deviates by more than both limits belongs to another lens.
+# A calibration belongs to another lens if its focal length deviates from that determined by the
+# ties by more than both limits.
 _MIN_FOCAL_OFF: Final = 0.03
 _FOCAL_OFF_SIGMAS: Final = 5.0
 _LEAST_FOR_FOCAL: Final = 25

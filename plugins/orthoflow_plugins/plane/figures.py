@@ -341,7 +341,7 @@ def draw_accumulator(
     above.set_ylabel("e2 [m]")
     below.set_xlabel("direction of the normal [deg]")
     below.set_ylabel("distance from the centre [m]")
-    # Below the panels, there is space for it; the plan of a single long wall is too narrow.
+    # The legend is below the panels, because the plan of a single long wall is too narrow for it.
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     ctx.figure(
         "accumulator",

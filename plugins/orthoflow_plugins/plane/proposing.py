@@ -165,7 +165,7 @@ class Candidate:
 
 
 class Proposer:
-    """What a detector contributes to the search that all of them share."""
+    """What a detector contributes to the search, which all detectors share."""
 
     # Any: a `search.Search`, whose module imports this one; so are the other types below.
     @abstractmethod

@@ -85,7 +85,7 @@ _SAMPLE_CAUTION: Final = 0.7
 _ASKEW: Final = 1.5
 _SAME_M: Final = 2e-4
 # Number of points used to move a candidate to the nearby surface; later fits, to cells of the
-# sample and then of all points, use all of them.
+# sample and then of the cloud, use all points.
 _FIT_POINTS: Final = 20_000
 # Number of points used to estimate the extent of a candidate.
 _SPREAD_POINTS: Final = 5_000

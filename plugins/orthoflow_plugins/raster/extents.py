@@ -189,8 +189,8 @@ class Reach:
     """The depth to search, and the minimum buffer.
 
     Attributes:
-        front_m: buffer towards the viewer; None to determine it.
-        behind_m: buffer behind the plane; None to determine it.
+        front_m: buffer towards the viewer; None if it is to be determined.
+        behind_m: buffer behind the plane; None if it is to be determined.
         least_m: minimum of a determined buffer.
     """
 
