@@ -27,7 +27,7 @@ DEPTH_SPAN_MM: Final = 10.0
 COLOUR_SPAN_GREY: Final = 60.0
 DISPLACEMENT_SPAN_CELLS: Final = 1.0
 _LONGEST_PX: Final = 1000
-# In larger images, squares of cells are averaged before drawing.
+# In images with more cells than this, squares of cells are averaged before drawing.
 _WHOLE_CELLS: Final = 1 << 24
 # Drawn length of the 95th percentile of displacements, as a share of the longer image side.
 _ARROW_SHARE: Final = 0.06

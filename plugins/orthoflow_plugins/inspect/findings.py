@@ -35,7 +35,8 @@ _MOST_WITHOUT_CAP: Final = 0.5
 # Minimum length of a distance between check points, as a share of the longest one. Shorter
 # distances depend more on single points than on the scale.
 _LENGTH_LEAST_SHARE: Final = 0.25
-# If a wall has more points, every nth is used, since the number of pairs grows quadratically.
+# If a wall has more points than this, every nth is used, since the number of pairs grows
+# quadratically.
 _POINTS_MOST: Final = 1000
 # Suffix of the metrics of the iterated rule if it reached the cap.
 CAPPED: Final = "_capped"

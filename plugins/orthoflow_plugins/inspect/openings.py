@@ -23,12 +23,12 @@ from orthoflow_plugins.inspect.findings import Number, findings_of, higher, lowe
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
-# Walls with more cells are sampled more coarsely, except along the borders of openings.
+# Walls with more cells than this are sampled more coarsely, except along the borders of openings.
 _MAX_SAMPLES: Final = 1 << 24
 # Maximum depth of a recess in the scene.
 _BEHIND_MOST_M: Final = 2.0
-# A recess belongs to a wall if at least the second value, as a share of the cells around it within
-# the first value, is on the face of the wall.
+# Cells around a recess are examined up to the first value, a distance in cells. The recess belongs
+# to the wall if at least the second value, as a share of these cells, is on the wall's face.
 _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
 # An outline matches an opening if their intersection over union (IoU) is at least this.

@@ -90,7 +90,8 @@ if TYPE_CHECKING:
 _TRACED_POINTS: Final = 4000
 # The true colour of a cell is the mean over n x n rays.
 _SUPERSAMPLE: Final = 3
-# Walls with more cells are compared in bands of this size; a band needs about 1 GB of memory.
+# Walls with more cells than this are compared in bands of this size; a band needs about 1 GB of
+# memory.
 _BAND_CELLS: Final = 1 << 23
 # Figures of large walls show every nth row and column, so that about this many remain along the
 # longer side.

@@ -323,7 +323,7 @@ def _improvement(
     )
 
 
-# Patches with a smaller share of known cells are not measured.
+# Patches with a smaller share of known cells than this are not measured.
 _MIN_KNOWN: Final = 0.6
 CORRELATION_AREA_CELLS: Final = 6.0
 """Residuals of smoothed pictures are correlated: there is one independent cell per this many."""

@@ -63,7 +63,7 @@ LEAST: Final = 16
 CLEARLY: Final = 24
 # Mixtures are only used to find the approximate position, so a reduced resolution is enough.
 _LONGEST_SIDE_PX: Final = 2000
-# Mixtures with less contrast, such as those of photos without colours, are not tried.
+# Mixtures with less contrast than this, such as those of photos without colours, are not tried.
 _MIN_GREY_LEVELS: Final = 8.0
 
 

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 # size of the key point.
 _MIN_SIGMA_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
-# Key points whose depths have a larger standard deviation, as at relief edges, are dropped.
+# Key points whose depths have a larger standard deviation than this, as at relief edges, are
+# dropped.
 _MAX_SIGMA_CELLS: Final = 3.0
 # The ratio in openMVG's documentation.
 _PAPER_RATIO: Final = 0.8

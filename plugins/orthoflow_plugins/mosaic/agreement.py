@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 PATCH_CELLS: Final = 64
 _PATCHES_MOST: Final = 200
-# Patches with less contrast show no displacement.
+# Patches with less contrast than this show no displacement.
 _CONTRAST_LEAST_GREY: Final = 3.0
-# Weaker peaks of the correlation are due to chance.
+# Correlation peaks lower than this are due to chance.
 _RESPONSE_LEAST: Final = 0.15
 _ROWS_AT_ONCE: Final = 1024
 

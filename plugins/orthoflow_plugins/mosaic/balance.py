@@ -54,9 +54,9 @@ _KNOWN_LEAST: Final = 0.02
 _SAME_THING: Final = 0.15
 # Logarithms of the focal lengths of one lens differ by less than about this.
 _SAME_ZOOM: Final = 0.1
-# Overlaps with fewer blocks are ignored.
+# Overlaps with fewer blocks than this are ignored.
 _LEAST_BLOCKS: Final = 4
-# Overlaps with more blocks are sampled.
+# Overlaps with more blocks than this are sampled.
 _BLOCKS_MOST: Final = 200
 # An overlap counts as at most this many independent blocks.
 _INDEPENDENT: Final = 50.0

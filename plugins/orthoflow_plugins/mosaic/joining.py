@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Preference = Callable[[slice], NDArray[np.float32]]
 
 NOBODY: Final = -1
-# Walls with more cells are processed in bands of about this many cells.
+# Walls with more cells than this are processed in bands of about this size.
 _BAND_CELLS: Final = 1 << 25
 # Balancing colours temporarily takes more than a hundred bytes per cell.
 _BALANCED_AT_ONCE: Final = 1 << 20

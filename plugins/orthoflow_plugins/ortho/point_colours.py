@@ -46,7 +46,7 @@ _POINTS_LEAST: Final = 4
 # Points with levels outside this range are almost black or clipped.
 _DARKEST: Final = 10
 _BRIGHTEST: Final = 245
-# Scans with fewer squares are ignored.
+# Scans with fewer squares than this are ignored.
 _PLACES_LEAST: Final = 20
 # Maximum share of clipped or almost black points in a square.
 _USELESS_MOST: Final = 0.05

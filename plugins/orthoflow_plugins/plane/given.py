@@ -24,7 +24,7 @@ Vector = tuple[float, float, float]
 
 # Share of the points below the horizontal plane, which is below the scene but above stray echoes.
 _GROUND_SHARE: Final = 0.01
-# A larger share of points outside the rectangle is reported.
+# A larger share of points outside the rectangle than this is reported.
 _STRAY_REPORTED: Final = 1e-3
 # Buffer of skarlatos2012: three tolerances on each side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0

@@ -68,8 +68,8 @@ _CROWDED_LEAST: Final = 0.5
 # Minimum width of a plane in cells; narrower strips do not determine the rotation of the plane
 # about their axis.
 _STRIP_CELLS: Final = 2.5
-# Surfaces with a smaller radius are not planes, if the curvature explains this share of the
-# variance of their cells.
+# Surfaces with a smaller radius than this are not planes if their curvature explains at least the
+# second value as a share of the variance of their cells.
 _RADIUS_LEAST_M: Final = 5.0
 _BENT_SHARE: Final = 0.3
 # Maximum number of passes over the points for one plane, and the share of the fit tolerance by

@@ -32,12 +32,12 @@ _POINTS_PER_CELL: Final = 12.0
 # Thickness of the inner slab as a share of the tolerance, and minimum share of points in it.
 INNER_SHARE: Final = 0.4
 _CROWDED_SHARE: Final = 0.6
-# A part with a smaller share of the plane's cells is accidental and not a piece of the wall.
+# A part with a smaller share of the plane's cells than this is accidental, not a piece of the wall.
 PART_SHARE: Final = 0.03
 # Cells are connected over gaps of up to twice this number of cells.
 _GAP_CELLS: Final = 2
-# A plane whose cells cover a smaller share of its rectangle is a frame or consists of separate
-# parts.
+# A plane whose cells cover a smaller share of its rectangle than this is a frame or consists of
+# separate parts.
 _FILLED_SHARE: Final = 0.5
 # Maximum number of cells along a side in the search for cuts.
 _CUT_CELLS: Final = 64

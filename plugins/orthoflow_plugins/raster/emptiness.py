@@ -22,10 +22,10 @@ Cause = Literal["behind", "before", "hidden", "sparse", "unseen"]
 _TILE_M: Final = 0.05
 # Minimum number of sample points of a surface.
 _POINTS_LEAST: Final = 2
-# Points farther behind a wall belong to another room or the street.
+# Points farther than this behind a wall belong to another room or the street.
 _BEHIND_MOST_M: Final = 4.0
-# Objects farther in front of a wall, such as a portico or a balcony, only count as occluders if
-# stations are known.
+# Objects farther than this in front of a wall, such as a portico or a balcony, only count as
+# occluders if stations are known.
 _BEFORE_MOST_M: Final = 5.0
 # Share of the points in front of a wall that a suggested buffer includes, per cent.
 _BEFORE_PERCENT: Final = 95.0

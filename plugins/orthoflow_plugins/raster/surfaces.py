@@ -52,7 +52,7 @@ _POINTS_AT_ONCE: Final = 1 << 26
 _NEAR_CELLS: Final = 2
 # Minimum number of known neighbours for a decision.
 _KNOWN_LEAST: Final = 6
-# A cell that agrees with fewer neighbours is a speck.
+# A cell that agrees with fewer neighbours than this is a speck.
 _AGREEING_LEAST: Final = 2
 # Sparse cells are compared with neighbours up to this number of rows and columns away.
 _SPARSE_CELLS: Final = 4
