@@ -1,4 +1,4 @@
-"""Overview of many runs: run folders below given folders, their results and differences."""
+"""Overview of several runs: run folders below given folders, with results and differences."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class RunSummary:
         folder: run folder, as found.
         status: `ok`; `failed` if a cell failed; `running`; `unfinished` if interrupted; `damaged`
             if the record cannot be read or its seal is broken.
-        reason: first failure, or why the record cannot be read; empty if there is no problem.
+        reason: first failure, or the reason why the record cannot be read; empty if there is none.
         workflow: name of the workflow.
         run_id: id of the run.
         started: ISO 8601 UTC; empty if unknown.
@@ -105,15 +105,16 @@ def run_folders(folders: Sequence[Path]) -> list[Path]:
 
 
 def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
-    """Summarise run folders one by one; the state of unreadable ones is `damaged`."""
+    """Yield a summary of each run folder; the status of unreadable ones is `damaged`."""
     for folder in folders:
         yield _summary(folder)
 
 
 def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """Return, by folder, the facts that distinguish a run from others of the same workflow.
+    """Return, by folder, the facts that distinguish a run from other runs of its workflow.
 
-    A fact that some runs lack counts as different only if two other runs disagree on it.
+    A fact that is missing in some runs counts as different only if two of the other runs disagree
+    on it.
     """
     facts = {run.folder: run.all_facts for run in runs}
     values: dict[tuple[str, str], set[str]] = {}
@@ -135,7 +136,7 @@ def _sorted_json(value: JsonValue) -> str:
 
 
 def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
-    """Return the names of the headline metrics of the runs, the most frequent first."""
+    """Return the names of the headline metrics of the runs, most frequent first."""
     counts = Counter(name for run in runs for name in run.headlines)
     chosen = sorted(counts, key=lambda name: -counts[name])[:most]
     return [name for name in counts if name in chosen]

@@ -1,4 +1,4 @@
-"""`orthoflow cache`: list, check or clean the store of results."""
+"""`orthoflow cache`: list, check or clean up the store of results."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ cache: Final[click.Command] = LazyGroup(
 def cache_list(store: Path, *, as_json: bool) -> int:
     """List the stored results, most recently used first.
 
-    A product shared by several results is stored once, but counted for each.
+    A product shared by several results is stored once, but its size is counted for each result.
     """
     from orthoflow.engine.store import Store, list_results
 
@@ -77,7 +77,7 @@ def cache_list(store: Path, *, as_json: bool) -> int:
 @click.option("--dry-run", is_flag=True, help="Only show what would be removed.")
 @json_option
 def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: bool) -> int:
-    """Remove incomplete results, products that no result needs, and remains of killed runs."""
+    """Remove incomplete results, products that no result needs, and files left by killed runs."""
     from orthoflow.engine.cleaning import collect_garbage
     from orthoflow.engine.store import Store
 

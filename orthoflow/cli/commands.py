@@ -35,7 +35,7 @@ class Session:
     """State of one call of the program.
 
     Attributes:
-        debug: whether to show tracebacks.
+        debug: whether tracebacks are shown.
         resume_hint: sentence on how to continue after Ctrl-C; empty if that is not possible.
     """
 
@@ -119,7 +119,7 @@ class LazyGroup(click.Group):
     """A group whose `--help` lists summaries without importing the commands.
 
     Args:
-        summaries: name of a command -> one line, in the order of the help.
+        summaries: name of a command -> its one-line summary, in the order shown in the help.
         target: import string of the commands, `package.module:attribute`; `{}` is replaced by the
             name.
     """
@@ -179,7 +179,7 @@ DEFAULT_STORE: Final = Path(".orthoflow")
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """Settings of the command line that override those of a workflow file."""
+    """Settings from the command line that override those in a workflow file."""
 
     sets: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -207,7 +207,7 @@ def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
 
 
 def _together(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
-    """Return a decorator that adds arguments and options in the order of the help."""
+    """Return a decorator that adds arguments and options in the order shown in the help."""
 
     def add(command: _Decorated) -> _Decorated:
         for option in reversed(options):
@@ -384,7 +384,7 @@ def _sentences(error: OrthoflowError) -> list[str]:
     n_problems = len(getattr(error, "problems", ()))
     if not n_problems:
         return [f"error: {str(error) or type(error).__name__}"]
-    # Lines that begin with file:line:column, which editors and other tools parse.
+    # Each line begins with file:line:column, which editors and other tools parse.
     return [*str(error).split("\n"), f"error: {counted(n_problems, 'problem')}"]
 
 
@@ -403,7 +403,7 @@ def echo_lint(workflow: Workflow) -> None:
 
 
 def code_for(findings: Iterable[str], consequence: str) -> int:
-    """Report records that were changed, and return the exit code."""
+    """Report changes to sealed records, and return the exit code."""
     lines = [f"error: {one}; {consequence}" for one in findings if one]
     if not lines:
         return EXIT_GOOD

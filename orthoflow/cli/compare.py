@@ -22,7 +22,7 @@ from orthoflow.cli.tables import (
 if TYPE_CHECKING:
     from orthoflow.records.compare import Pair, RunComparison
 
-# Fields of each run in JSON.
+# Fields of a run that the JSON output contains.
 _OF_RUNS: Final = ("run_id", "name", "created_by", "status", "started", "ended", "seed")
 
 
@@ -37,10 +37,10 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
 
     Shows differences in inputs, workflows, parameters, versions and environments, and how far
     metrics and products differ. Steps are paired by address, or else by the methods and parameters
-    of all varied steps upstream. Differences by rounding (a millionth) are omitted, and identical
-    differences of several steps or repeats share a row; --json contains all values, including times
-    and memory. The exit code is 3 if the seal of a record is broken; `orthoflow verify` also checks
-    large arrays, which are not read here if their digests are the same.
+    of all varied steps upstream. Rounding differences (up to a millionth) are omitted, and
+    identical differences of several steps or repeats share a row; --json contains all values,
+    including times and memory. The exit code is 3 if the seal of a record is broken; `orthoflow
+    verify` also checks large arrays, which are not read here if their digests are the same.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.compare import compare_runs
@@ -57,7 +57,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
 
 
 def _as_json(comparison: RunComparison) -> dict[str, object]:
-    """Return a comparison as JSON; every row contains whether both values are the same."""
+    """Return a comparison as JSON; every row states whether both values are the same."""
     return {
         "runs": [
             {name: getattr(record, name) for name in _OF_RUNS}

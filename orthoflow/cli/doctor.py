@@ -74,7 +74,7 @@ class Finding:
         verdict: ok, limited (works with a restriction) or missing.
         found: version, size or setting.
         cost: consequence and remedy; empty if ok.
-        core: whether orthoflow cannot work without it.
+        core: whether orthoflow requires it.
     """
 
     name: str
@@ -117,7 +117,7 @@ def _print(findings: list[Finding], *, is_broken: bool) -> None:
 
 
 def _libraries() -> list[str]:
-    """Return the names of the libraries that an installation brings."""
+    """Return the names of the libraries that are installed with orthoflow."""
     # On Linux, open3d comes as open3d-cpu.
     return sorted((direct_requirements(DISTRIBUTION) or frozenset()) - {"open3d"})
 

@@ -249,7 +249,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    # These copy the record, including arrays that were not read, or print its seal.
+    # These formats copy the record, including arrays that were not read, or print its seal.
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:

@@ -39,8 +39,8 @@ def run(
 
     Args:
         workflow: a file, or the name of a shipped workflow.
-        set: parameters by `step.parameter` or `step.variant.parameter`; `{"sweep": [...]}` makes a
-            variant of each value; arrays may be used instead of lists.
+        set: parameters by `step.parameter` or `step.variant.parameter`; `{"sweep": [...]}` creates
+            a variant for each value; arrays may be used instead of lists.
         inputs: files by name of the input.
         datasets: a CSV file with a table of datasets, or a mapping as in a workflow, `{"hall":
             {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`; paths are relative to the working
@@ -109,5 +109,5 @@ def _json(where: str, value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert arrays and numbers of libraries to Python's types, and paths to text."""
+    """Convert the array and number types of libraries to those of Python, and paths to text."""
     return value.tolist() if callable(getattr(value, "tolist", None)) else os.fspath(value)

@@ -38,7 +38,7 @@ _RECIPES: Final = ("photos-on-scan", "direct", "plan")
 )
 @json_option
 def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json: bool) -> int:
-    """Inspect each FILE, or the files in a folder, and write a commented workflow for them.
+    """Inspect each FILE, or the files in a folder, and write a workflow with comments for them.
 
     Scans, photos, calibrations, check points, manually measured ties, and cameras and orthoimages
     from other programs are recognised by their content. The result is a shipped workflow with these
@@ -69,7 +69,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
 
 
 def _write(output: Path, text: str) -> None:
-    """Write the file, unless it has been created meanwhile."""
+    """Write the file, unless it has been created in the meantime."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         with output.open("x", encoding="utf-8") as stream:

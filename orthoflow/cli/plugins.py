@@ -330,12 +330,12 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
     """Run every conformance check that applies to the method ID, and report violated rules.
 
     `--quick` runs the checks that are useful during development: parameters, outputs, unmodified
-    inputs, progress and cancellation, runs on one core and on two, rejection of invalid clouds. The
-    full set, for use before publication, adds a run in a new process and an empty folder, random
-    input, and known properties of the example.
+    inputs, progress and cancellation, runs on one core and on two, and rejection of invalid clouds.
+    The full set, for use before publication, adds a run in a new process and an empty folder,
+    random input, and known properties of the example.
 
-    A problem that prevents all runs is reported once, and other rules are skipped. The exit code is
-    1 if a rule is violated, and 4 if the method cannot be loaded.
+    A problem that prevents all runs is reported once, and the other checks are skipped. The exit
+    code is 1 if a rule is violated, and 4 if the method cannot be loaded.
     """
     from orthoflow.testing import conformance_cases
 
@@ -372,7 +372,7 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
 
 @contextmanager
 def _sharing_kernels(method_id: str) -> Iterator[None]:
-    """Let the checks use the compiled kernels of this user, and keep newly compiled ones."""
+    """Let the checks use and extend the cache of compiled kernels of this user."""
     from orthoflow.engine.kernels import VARIABLE, kernel_folder, kernels_in
     from orthoflow.engine.keys import method_facts
 

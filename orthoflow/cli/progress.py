@@ -1,4 +1,4 @@
-"""Progress of a running workflow: a live table on a terminal, plain lines elsewhere."""
+"""Progress of a running workflow: a live table on a terminal, and plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _MIN_ELAPSED_S: Final = 2.0
 _REFRESH_PER_S: Final = 4
 # Maximum time between lines in a log file.
 _EVERY_S: Final = 10.0
-# Shorter times of starting, loading and compiling are not reported.
+# Shorter times for starting, loading and compiling are not reported.
 _MIN_MORE_S: Final = 2.0
 _STYLES: Final = {
     "running": "cyan",
@@ -53,12 +53,12 @@ class CellState:
     """A cell of a run in progress.
 
     Attributes:
-        state: `waiting`, `running`, or its outcome.
+        state: `waiting`, `running`, or the outcome of the cell.
         fraction: progress reported by the step, 0 to 1.
-        text: current activity, or the reason for its outcome.
-        started: clock time in seconds.
-        wall_s: duration.
-        took_s: previous duration of this or a similar cell; None if unknown.
+        text: current activity of the cell, or the reason for its outcome.
+        started: clock time of its start in seconds.
+        wall_s: duration in seconds.
+        took_s: duration of an earlier run of this or a similar cell in seconds; None if unknown.
     """
 
     state: str = "waiting"
@@ -69,7 +69,7 @@ class CellState:
     took_s: float | None = None
 
     def left_s(self, now_s: float) -> float | None:
-        """Return the remaining time in seconds, from its earlier duration or else its progress."""
+        """Estimate the remaining time in seconds from an earlier duration, or from progress."""
         if self.state == "waiting":
             return self.took_s
         if self.state != "running":
@@ -87,20 +87,20 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
 
     Args:
         cells: all cells.
-        now_s: time of the clock that gave `started`.
+        now_s: current time of the clock used for `started`.
         jobs: number of cells that run at the same time.
     """
     left = [
         cell.left_s(now_s)
         for cell in cells
-        # Stored and skipped steps take no time, and do not help to predict others.
+        # Stored and skipped steps take no time, and their durations do not predict those of others.
         if cell.state == "running" or (cell.state == "waiting" and cell.took_s != 0.0)
     ]
     known = [seconds for seconds in left if seconds is not None]
     n_unknown = len(left) - len(known)
     if not left:
         return ""
-    # Otherwise a few short steps would suggest that a run of minutes is nearly finished.
+    # Otherwise a few short steps would suggest that a run that takes minutes is nearly finished.
     if not known or n_unknown > len(known):
         return "remaining time not yet known"
     seconds = about(max(*known, sum(known) / jobs, 0.0))
@@ -121,10 +121,10 @@ def about(seconds: float) -> str:
 
 
 class Progress:
-    """Display of a run: a table on a terminal, log lines elsewhere.
+    """Display of a run: a table on a terminal, and log lines elsewhere.
 
     Attributes:
-        every_s: interval of lines on running steps in a log.
+        every_s: interval in seconds between log lines on running steps.
         console: console of the terminal; None if there is no terminal.
     """
 
@@ -177,7 +177,7 @@ class Progress:
             echo_error(f"{line} ({self.n_ended} of {self._n_cells})" if is_end else line)
 
     def _applied(self, event: RunEvent) -> str:
-        """Apply an event; return its line for a log, or an empty text."""
+        """Apply an event; return a log line about it, or an empty text."""
         with self._lock:
             match event:
                 case RunStarted():
@@ -212,7 +212,7 @@ class Progress:
         return ""
 
     def _reported_line(self, address: str, one: Diagnostic) -> str:
-        """Format a diagnostic in a line; empty for notes, and for codes reported before."""
+        """Format a diagnostic as a line; empty for notes, and for codes already reported."""
         if one.is_summary:
             return f"{address}: {one.text}"
         if one.severity == "note" or not self._methods.isdisjoint(one.settled_by):
@@ -271,7 +271,7 @@ class Progress:
         return Group(self.table(), Text(f"{ended}, {left}" if left else ended, style="dim"))
 
     def table(self) -> Table:
-        """Return the table; if too long, only running, failed and waiting cells."""
+        """Return the table; if it is too long, only its running, failed and waiting cells."""
         from rich.table import Table
         from rich.text import Text
 
@@ -321,7 +321,7 @@ def _end_text(event: CellFinished, more_s: float) -> str:
 
 @contextmanager
 def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[Callable[[str], None]]:
-    """Show an activity outside of cells, with its duration so far, while the block runs.
+    """While the block runs, show an activity that is not part of a cell, and its duration so far.
 
     Yields:
         A function that names the current part of the activity.

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from orthoflow.records.replay import ReplayedMetric
 
 _NOTHING: Final = "-"
-# Why a metric is not the same, by verdict.
+# Verdict -> why a metric is not the same.
 _CAUSES: Final = {
     "different": "unknown: the products of its step are identical",
     "code changed": "the code of a method on which it depends has changed",
@@ -168,7 +168,7 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
     try:
         yield fresh
     except (CancelledStepError, ClusterError, KeyboardInterrupt):
-        # Finished results are kept for another call of the same command.
+        # Keep finished results, which the same command reuses when it is called again.
         raise
     except BaseException:
         shutil.rmtree(fresh, ignore_errors=True)

@@ -145,7 +145,7 @@ def run_workflow(
         plan = plan_run(cells, loaded, catalog, opened, options)
     run_id = new_run_id()
     folder = output or new_run_folder(loaded.name, run_id)
-    # Held until the record is written, so that `cache gc` does not remove its results.
+    # Mark the store as in use until the record is written, so that `cache gc` removes no results.
     with opened.in_use(), _json_log(json_log, plan) as log:
         # Shown before the run, which may take minutes.
         echo_lint(loaded)
@@ -176,7 +176,7 @@ def run_workflow(
 
 
 def _report_unfinished(folder: Path) -> None:
-    """Write the report of an interrupted run: existing results, and how to resume.
+    """Write the report of an interrupted run: its results so far, and how to resume it.
 
     Failures, e.g. due to a full disk, are ignored, since the results are already stored.
     """
@@ -235,7 +235,7 @@ def executed(  # noqa: PLR0913 - parts of a run
 
 @contextmanager
 def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
-    """Write the diagnostics of each cell, including cached ones, as JSON lines when it ends.
+    """When a cell ends, write its diagnostics as JSON lines, including those of cached cells.
 
     Raises:
         ArgumentError: the file cannot be written.
@@ -266,7 +266,7 @@ def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
 
     Args:
         run: the finished run.
-        kept: addresses of the cells computed before an interruption.
+        kept: addresses of the cells that were computed before an interruption.
         took_s: duration of the whole run.
     """
     cells = run.record.cells

@@ -72,13 +72,13 @@ def runs(
 ) -> int:
     """List the runs in and below each FOLDER, by default the working directory.
 
-    A row shows when a run was made, with which workflow, its outcome, the quality of its baseline
-    (the median over several datasets), and the parameters and inputs in which it differs from other
-    runs of the workflow. Results of `export --split` inside a run are listed only if their folder
-    is given. For runs without a record, and for unreadable records, the reason is shown. --table
-    FILE merges the given runs, or those in the given folders, into one table with a row per cell
-    and metric; cells with the same methods, parameters, seeds and data in several runs are merged,
-    and `environments` is the number of machines.
+    A row shows when and with which workflow a run was made, its outcome, the quality of its
+    baseline (the median over several datasets), and the parameters and inputs in which it differs
+    from other runs of the workflow. Results of `export --split` inside a run are listed only if
+    their folder is given. For runs without a record, and for unreadable records, the reason is
+    shown. --table FILE merges the given runs, or those in the given folders, into one table with a
+    row per cell and metric; cells with the same methods, parameters, seeds and data in several runs
+    are merged, and `environments` is the number of machines.
     """
     if table is not None:
         return _write_table(folders, table)
@@ -220,7 +220,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
 
 
 def _facts_text(facts: Mapping[str, object]) -> str:
-    """Describe the differences of a run, as far as they fit on a line."""
+    """Describe how a run differs from others, as far as this fits on a line."""
     parts = []
     for name, value in facts.items():
         text = json.dumps(value, ensure_ascii=False)

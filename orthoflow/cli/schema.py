@@ -22,7 +22,7 @@ def schema(*, as_json: bool) -> int:
     from orthoflow.workflow.views import workflow_schema
 
     del as_json
-    # For programs; without whitespace it is half as large.
+    # Without whitespace, the text, which only programs read, is half as large.
     schema_text = json.dumps(
         workflow_schema(discover_catalog()), separators=(",", ":"), ensure_ascii=False
     )

@@ -44,10 +44,10 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     """Summarise RUN, a run folder or its run.h5: inputs, steps, metrics, warnings, environment.
 
     If there are many metrics, only those that measure quality are printed; --all prints all of
-    them. With variants, there is a row per combination; over datasets, its values are medians. For
-    a folder that contains runs, their table is printed, as `orthoflow runs` does. The exit code is
-    3 if the seal of the record is broken; `orthoflow verify` also checks large arrays, which are
-    not read here.
+    them. With variants, there is a row per combination; with several datasets, its values are
+    medians over them. For a folder that contains runs, their table is printed, as `orthoflow runs`
+    does. The exit code is 3 if the seal of the record is broken; `orthoflow verify` also checks
+    large arrays, which are not read here.
     """
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.records.open import open_run

@@ -1,4 +1,4 @@
-"""Plain text for terminals: aligned tables, distances of products, quantities, JSON."""
+"""Plain text for terminals: aligned tables, differences between products, quantities, and JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool
 
     Args:
         cells: cells of the run.
-        run: its folder or record, for the hint on how to print the remaining ones.
+        run: folder or record of the run, for the hint on how to print the remaining diagnostics.
         is_whole: whether to print all of them, including notes.
     """
     from orthoflow.diagnostics import FIRST_SHOWN, grouped, standing
@@ -83,11 +83,11 @@ def echo_json(value: object) -> None:
 
 
 def echo_distances(distances: Sequence[ProductDistance], most: int | None = None) -> None:
-    """Print a row per product, the reasons for differences, and the number of each verdict.
+    """Print a row per product, the reasons for differences, and how often each verdict occurs.
 
     Args:
-        distances: distances of products.
-        most: maximum number of rows, those with differences first; None for all.
+        distances: comparisons of products.
+        most: maximum number of rows (those with differences come first); None for all.
     """
     rows = first_rows(distances, most, lambda item: item.verdict == "identical")
     echo_table(
@@ -158,7 +158,7 @@ def size(n_bytes: float) -> str:
 
 
 def number(value: float) -> str:
-    """Format a number with six significant digits; counts with all digits.
+    """Format a number with six significant digits, or a count with all its digits.
 
     >>> number(2251930.0), number(0.0012345678), number(-3.0)
     ('2251930', '0.00123457', '-3')

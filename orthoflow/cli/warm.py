@@ -34,9 +34,9 @@ _RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
 def warm(workflow: str | None, *, as_json: bool) -> int:
     """Compile the kernels of all built-in methods, or of those in WORKFLOW, on simulated rooms.
 
-    Later runs of the same user then need not compile them. They are kept in the user's cache
-    (~/.cache/orthoflow), or in the folder given by the variable NUMBA_CACHE_DIR if only this user
-    may write there; never in a store.
+    Later runs by the same user then do not have to compile them. Compiled kernels are kept in the
+    user's cache (~/.cache/orthoflow), or in the folder given by the variable NUMBA_CACHE_DIR if
+    only this user may write there; never in a store.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.kernels import all_kernels

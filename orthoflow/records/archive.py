@@ -90,8 +90,8 @@ def write_crate(
 ) -> tuple[Path, ...]:
     """Write a run as an RO-Crate: record, report, products, workflow and their metadata.
 
-    Input files are referenced by their digests, not copied: they may be large and belong to others.
-    To include them, embed them in the record, see `write_embedded`.
+    Input files are referenced by their digests, not copied, because they may be large and belong to
+    others. To include them, embed them in the record (see `write_embedded`).
 
     Args:
         run: the run.
@@ -131,9 +131,9 @@ def _copy_files(run: Run, folder: Path) -> list[str]:
             shutil.copyfile(run.path, folder / RECORD_FILE)
     pages = [REPORT_FILE, *pages_of(run).values()]
     wanted = [*pages]
-    # The report contains links to these files, if it was written with links.
+    # A report that was written with links refers to these files.
     wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
-    # Files may be in another folder than the record and its signature.
+    # The other files may be in a folder other than that of the record and its signature.
     signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
     signed = copy_files(run.path.parent, folder, [signature], ()) if not is_new else ()
     wanted += [
@@ -237,7 +237,7 @@ def _refs(identifiers: Iterable[str]) -> list[JsonValue]:
 
 
 def _file_id(file: RecordedFile) -> str:
-    """Return an id made from the content of a file that is not in the crate (RFC 6920)."""
+    """Return an id derived from the content of a file that is not in the crate (RFC 6920)."""
     digest = base64.urlsafe_b64encode(bytes.fromhex(file.sha256)).decode().rstrip("=")
     return f"ni:///sha-256;{digest}"
 
@@ -392,7 +392,7 @@ def _add_cell(
         record: record that contains the cell.
         cell: a cell that was executed.
         position: index of the cell in the run, from 0.
-        given: `address.port` of each output of an earlier cell -> formal parameter.
+        given: `address.port` of each output of an earlier cell -> id of its formal parameter.
     """
     tool = _add_method(crate, cell)
     variant = cell.assignment.get(cell.step, "")

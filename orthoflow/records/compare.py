@@ -47,11 +47,11 @@ class Distance:
 
     Attributes:
         unit: `m`, `px`, `grey`, `deg`, or `1` for plain numbers.
-        largest: largest absolute difference in that unit; None if values cannot be subtracted
+        largest: largest absolute difference in `unit`; None if values cannot be subtracted
             (different shapes or types, missing values, NaN instead of a number).
-        limit: tolerance of the field with the largest difference.
-        field: name of that field, e.g. `walls/0/depth_m`.
-        n_values: number of values in that unit that differ by more than their tolerance.
+        limit: tolerance of `field`.
+        field: name of the field with the largest difference, e.g. `walls/0/depth_m`.
+        n_values: number of values in `unit` that differ by more than their tolerance.
     """
 
     unit: str
@@ -66,13 +66,13 @@ class ProductDistance:
     """Comparison of two products that are expected to be equal.
 
     Attributes:
-        cell: address of their cell.
+        cell: address of the cell that produced them.
         port: output port of the cell.
         type_name: product type.
         verdict: `identical` (same bits), `within tolerance`, `different`, or `not measured` if the
-            digests differ and the arrays of one of them are not available.
-        left: digest of the first product; empty if it has none.
-        right: digest of the second product; empty if it has none.
+            digests differ and the arrays of one product are not available.
+        left: digest of the product in the first run; empty if there is none.
+        right: digest of the product in the second run; empty if there is none.
         distances: one distance per unit in which the products differ.
         reason: one sentence for `different` and `not measured`, otherwise empty.
     """
@@ -183,7 +183,7 @@ def _distance(
 
 
 def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
-    """Add the name and unit given next to a value in the metadata to its difference."""
+    """Add to the difference of a metadata value the name and unit given next to the value."""
     path = difference.name.split("/")
     beside: JsonValue = dict(payload.metadata)
     for part in path[:-1]:
@@ -198,7 +198,7 @@ def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
 
 
 def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
-    """Return the tolerance of a field; for 16-bit grey levels it is multiplied by 257."""
+    """Return the tolerance of a field, multiplied by 257 for 16-bit grey levels."""
     is_deep = tolerance.unit == "grey" and any(
         array.dtype == np.uint16 and path.rpartition("/")[2] == name
         for path, array in payload.arrays.items()
@@ -236,7 +236,7 @@ class Pair(Generic[Side]):
     """The values of one item in two runs.
 
     Attributes:
-        cell: address of its cell; empty if it belongs to the whole run.
+        cell: address of the cell; empty for items of the whole run.
         name: name of the input, parameter, metric or package.
         left: value in the first run; None if there is none.
         right: value in the second run; None if there is none.
@@ -349,9 +349,11 @@ class ComparedMetric:
     Attributes:
         value: value of the metric.
         unit: unit of the value.
-        is_cost: whether it is a time or memory, which depend on the machine and its load.
-        is_cached: whether an earlier run computed the cell; costs are then those of that run.
-        environment: id of the environment in which it was computed.
+        is_cost: whether the metric is a time or memory use, which depends on the machine and its
+            load.
+        is_cached: whether an earlier run computed the cell; costs are then those of the earlier
+            run.
+        environment: id of the environment in which the metric was computed.
         better: which values are better; empty if there is no better direction.
         headline: whether the metric describes the quality of the result.
     """
@@ -381,13 +383,13 @@ class RunComparison:
         workflow: unified diff of the workflow texts; empty if they are the same.
         overrides: command-line options that changed the workflow.
         inputs: files of each input, without folders.
-        cells: method, version, seed and status of each cell, under its address in the first run if
-            it exists there.
+        cells: method, version, seed and status of each cell, by its address in the first run if it
+            exists there.
         readdressed: address in the second run -> address in the first run, where the two differ,
             e.g. for a step and for a variant with the same parameters.
         parameters: resolved parameters of each cell.
         environment: Python, system, processor and packages; several values are separated by commas.
-            Packages that are in one run only are left out if no method of either run requires them.
+            Packages recorded in only one run are omitted if no method of either run requires them.
         metrics: metrics of each cell.
         products: comparison of each product of the cells that exist in both runs.
     """
@@ -449,10 +451,11 @@ class RunComparison:
         """Return the parameters of both runs next to each other.
 
         Args:
-            changed: only those that differ.
+            changed: whether to return only parameters that differ.
 
         Returns:
-            Columns `cell`, `parameter`, `left` and `right`; None if a run does not have it.
+            Columns `cell`, `parameter`, `left` and `right`; None if a run does not have the
+            parameter.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -531,7 +534,7 @@ def compare_metrics(left: Run, right: Run) -> tuple[Pair[ComparedMetric], ...]:
         for address in both
         for row in _pairs(address, *(_metrics(run.cells[address]) for run in (left, right)))
     )
-    # Keep a metric that is declared as a cost in only one of the runs.
+    # Keep metrics that only one of the runs declares as a cost.
     return tuple(
         row for row in rows if not all(side.is_cost for side in (row.left, row.right) if side)
     )
@@ -561,7 +564,7 @@ def _per_cell(
 
 
 def _readdressed(left: Run, right: Run) -> dict[str, str]:
-    """Find cells of the second run that have another address in the first.
+    """Find cells of the second run that have a different address in the first.
 
     Names of variants are only labels: cells with the same methods and parameters correspond, then
     cells with the same address.
@@ -592,7 +595,7 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
 def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
     """Return the name of a cell of the second run: the address of its counterpart in the first."""
     if address not in readdressed and address in readdressed.values():
-        # There is no counterpart, and the address belongs to another cell of the first run.
+        # There is no counterpart, and in the first run, this address belongs to a different cell.
         return f"{address} ({right.record.run_id})"
     return readdressed.get(address, address)
 

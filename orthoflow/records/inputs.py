@@ -83,7 +83,7 @@ def find_inputs(
         digests: cache of digests, so that each file is read only once.
         given: `NAME=PATH` as for `--input`.
         extracted: input -> files extracted from the record.
-        noted: caches of other stores that may contain paths of the files.
+        noted: digest caches of other stores that may contain paths of the files.
 
     Raises:
         InvalidArgumentsError: `given` contains a name that is not an input of the workflow.
@@ -182,13 +182,13 @@ class PlacedInputs:
             return Path(self._stack.enter_context(made))
 
     def named(self, entry: RecordedInput, paths: tuple[Path, ...]) -> tuple[Path, ...]:
-        """Return the files found for an input, under their recorded names and in recorded order.
+        """Return the files found for an input, with their recorded names and in the recorded order.
 
         Raises:
             StoreError: the disk cannot be written to.
         """
         names = [file.name for file in entry.files]
-        # Files with the same name are sorted by folder, so they need new folders to keep their
+        # Files with the same name are sorted by folder, so new folders are needed to keep their
         # order.
         if [path.name for path in paths] == names and len(set(names)) == len(names):
             return paths

@@ -1,4 +1,4 @@
-"""Opening of finished and unfinished runs."""
+"""Functions that open finished and unfinished runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _INTERRUPTED: Final = CancelledStepError.__name__
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run; a running or interrupted run contains the results so far.
+    """Open a run; a running or interrupted run is opened with the results so far.
 
     Args:
         path: a run folder, or the `run.h5` in it.
@@ -55,18 +55,19 @@ def has_outline(folder: Path) -> bool:
 
 
 def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
-    """Open an unfinished run; cells without a result are given as skipped.
+    """Open an unfinished run; cells without a result have the status `skipped`.
 
     Its record is in a temporary folder, which is removed at exit.
 
     Args:
         folder: run folder.
-        publish: write the products of an interrupted run into the run folder; otherwise they are
-            written next to the temporary record, unless the run folder already contains them.
+        publish: whether to write the products of an interrupted run into the run folder; otherwise
+            they are written next to the temporary record, unless the run folder already contains
+            them.
 
     Raises:
-        ArgumentError: its outline or its store is missing or unreadable, or the run is still in
-            progress.
+        ArgumentError: the outline or the store of the run is missing or unreadable, or the run is
+            still in progress.
         StoreError: the disk cannot be written to.
     """
     from orthoflow.engine.store import Store  # noqa: PLC0415 - only who looks at such a run

@@ -1,4 +1,4 @@
-"""Replay: planning a recorded run again from its record, after all checks."""
+"""Replay: checks whether a recorded run can be repeated, and plans it from its record."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class Replay:
     """A replay that is ready to start.
 
     Attributes:
-        workflow: workflow in the record.
-        plan: plan of its cells with the recorded parameters and seeds.
+        workflow: workflow read from the record.
+        plan: plan of the workflow's cells with the recorded parameters and seeds.
         notes: changes that may affect results: code, libraries, Python, processor.
         changed_methods: ids of methods whose code has changed but whose result version has not.
     """
@@ -175,7 +175,7 @@ def _inconsistencies(run: Run) -> Iterator[str]:
 
 
 def _loose_ends(run: Run) -> Iterator[str]:
-    """Yield inputs of cells that are neither inputs of the run nor outputs of earlier cells."""
+    """Yield cell inputs that are neither inputs of the run nor outputs of earlier cells."""
     given = {"inputs": {entry.name for entry in run.record.inputs}}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
@@ -188,7 +188,7 @@ def _loose_ends(run: Run) -> Iterator[str]:
 
 
 def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return missing methods, and differences of installed methods, without duplicates."""
+    """Return missing methods, and differences from recorded methods, without duplicates."""
     missing: list[str] = []
     others: list[str] = []
     for cell in run.record.cells:
@@ -243,7 +243,7 @@ def _cell(recorded: RecordedCell, workflow: Workflow) -> Cell:
         params=recorded.params,
         params_set=recorded.params_set,
         inputs={port: _source(product.source) for port, product in recorded.inputs.items()},
-        # A method without a seed also gets a generator, but does not use it.
+        # A method that uses no seed is also passed a generator, but does not use it.
         seed=recorded.seed or 0,
         cores=variant.cores if variant else None,
         timeout_s=variant.timeout_s if variant else None,
@@ -297,7 +297,7 @@ DIFFERING: Final = frozenset({"code changed", "different"})
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayedMetric:
-    """A metric that is in a record or that a replay computed.
+    """A metric from a record, from a replay, or from both.
 
     Attributes:
         cell: address of the cell.
@@ -367,7 +367,7 @@ def replayed_metrics(
 
 
 def _is_of_identical(cell: RecordedCell, identical: set[str]) -> bool:
-    """Whether inputs and outputs of a step have the same bits in both runs."""
+    """Whether the inputs and outputs of a step have the same bits in both runs."""
     taken = {given.source for given in cell.inputs.values()}
     given = {f"{cell.address}.{port}" for port in cell.outputs}
     return all(one in identical or one.startswith("inputs.") for one in taken | given)

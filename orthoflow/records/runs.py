@@ -98,7 +98,7 @@ class MetricRow(Metric):
 
     @property
     def titled(self) -> str:
-        """Title with the unit; counts, shares and yes/no have no unit."""
+        """Title with the unit; counts, shares and yes/no metrics have no unit."""
         return self.title if self.unit in _UNITLESS else f"{self.title} / {self.unit}"
 
 
@@ -192,13 +192,13 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
 
 
 def described_file(folder: Path, path: str) -> PublishedFile:
-    """Return size and digest of a file in a folder that the caller has just written."""
+    """Return the size and digest of a file that the caller has just written into a folder."""
     file = path_inside(folder, path)
     return PublishedFile(path=path, size_bytes=file.stat().st_size, sha256=file_sha256(file))
 
 
 def require_unchanged(run: Run, *paths: Path) -> None:
-    """Refuse published files that differ from the record, before other files are derived from them.
+    """Refuse changed published files, before other files are derived from them.
 
     Args:
         run: the run.
@@ -250,8 +250,8 @@ class Run:
     Attributes:
         path: the record file.
         record: everything in the record except the arrays of products.
-        output: reads an output by address and port from the open record; None to open the record
-            for each output.
+        output: function that reads an output, by address and port, from the open record; if None,
+            the record is opened for each output.
         files_folder: folder of the run's files, if it is not the folder of the record.
         home: run folder of an unfinished run, whose record is elsewhere.
         content_sha256: digest that seals the record; empty if it was not read from a file.
@@ -304,9 +304,9 @@ class Run:
         Args:
             address: address of the cell; with `variants`, the name of the step suffices.
             repeat: number of the repeat, from 0.
-            variants: name of a step with variants, or `data` -> variant or dataset; of a sweep, the
-                name before the parameters suffices if only one value matches. Entries on which the
-                cell does not depend are ignored.
+            variants: name of a step with variants, or `data` -> variant or dataset; for a sweep,
+                the part of the name before the parameters suffices if only one variant matches.
+                Entries on which the cell does not depend are ignored.
 
         Raises:
             ArgumentError: the run has no such cell, or several.
@@ -397,7 +397,7 @@ class Run:
         return figures[name]
 
     def payload(self, address: str, port: str) -> Payload:
-        """Return an output as named arrays and JSON; needs no plugin.
+        """Return an output as named arrays and JSON metadata, which requires no plugin.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell has no such output.
@@ -472,7 +472,7 @@ class Run:
 
     @property
     def files(self) -> Mapping[str, tuple[Path, ...]]:
-        """Published files by cell address; cells without files are omitted."""
+        """Published files by the address of their cell; cells without files are omitted."""
         found = {address: published_files(self.folder, address) for address in self.cells}
         return {address: files for address, files in found.items() if files}
 
@@ -528,7 +528,7 @@ def find_record(path: str | Path) -> Path:
 
 @contextmanager
 def record_errors(path: Path) -> Iterator[None]:
-    """Convert any error while reading a record into an error of one sentence.
+    """Convert any error that occurs while reading a record into a one-sentence error.
 
     Raises:
         RecordError: replaces all errors except orthoflow's own and missing permission.
@@ -543,7 +543,7 @@ def record_errors(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise ArgumentError(f"{path} cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        # h5py raises any of these for damaged files, depending on the damaged structure.
+        # For damaged files, h5py raises various errors, depending on the damaged structure.
         if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
             raise ArgumentError(f"{path} is not a file; give a run folder or its run.h5") from error
         raise RecordError(f"{path} is not a record or is damaged: {error}{_AWAY}") from error
@@ -617,8 +617,8 @@ def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]
 
     Args:
         folder: the folder, created if missing.
-        contents: relative path -> function that returns the bytes, or None for no file; called in
-            threads.
+        contents: relative path -> function, called in a thread, that returns the bytes, or None for
+            no file.
 
     Returns:
         The number of files written.
@@ -663,7 +663,7 @@ def copy_files(
     known = {file.path: file for file in published}
     for path in paths:
         if path in known:
-            # Each file is hashed once; published files may have gigabytes.
+            # Hash each file only once: published files may have gigabytes.
             state = published_state(source, known[path])
             if state == "missing":
                 continue
@@ -723,7 +723,7 @@ def datasets_of(run: Run) -> tuple[str, ...]:
 
 
 def parts_of(run: Run) -> dict[str, Run]:
-    """Return the part of a run for each dataset, including shared cells, as a separate run.
+    """Return, for each dataset, its part of a run, including shared cells, as a separate run.
 
     Products are read from the record of the whole run.
     """

@@ -25,7 +25,7 @@ _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema
 _FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _GEOTIFF: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _ORTHO: Final = "_ortho.tif"
-# Files of an orthoimage, by the end of their names: key, media type, roles.
+# Files of an orthoimage, by the end of their names: key, media type and roles.
 _BESIDE: Final = {
     "_ortho.tif": ("image", _GEOTIFF, ["data"]),
     "_ortho_mask.tif": ("mask", "image/tiff; application=geotiff", ["metadata"]),
@@ -55,7 +55,7 @@ class _Ortho:
 
     @property
     def item_path(self) -> PurePosixPath:
-        """Path of its item; the name `wall_0_ortho.json` is taken by the file with its position."""
+        """Path of its item, other than `wall_0_ortho.json`, the sidecar with its position."""
         return self.path.with_name(f"{self.path.stem}.item.json")
 
 
@@ -75,7 +75,8 @@ def write_stac(run: Run, folder: Path) -> int:
         f"{PRODUCTS_FOLDER}/{path.parent.name}/{path.name}": address
         for address, files in run.files.items()
         for path in files
-        # Repeats have the same content, and the # in their names would begin a fragment of a link.
+        # Omit repeats: they have the same content, and in a link, the # in their names would begin
+        # a fragment.
         if run.cells[address].repeat == 0 and path.name.endswith(tuple(_BESIDE))
     }
     copied = copy_files(run.folder, folder, inside, run.record.published)

@@ -1,4 +1,4 @@
-"""Records as tables: CSV files, joined runs, diagnostics as JSON, common points."""
+"""Records as tables: CSV files, joined runs, diagnostics as JSON, and common points."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CommonPoints:
-    """Statistics of an inspection over the points that all comparable cells found.
+    """Statistics of an inspection over the points that all comparable inspections found.
 
     Attributes:
         cell: address of the inspection.
@@ -66,8 +66,8 @@ class CommonPoints:
 def common_points(run: Run) -> tuple[CommonPoints, ...]:
     """Compare the inspections of each step over their common points.
 
-    Inspections are compared per dataset, seed and repeat. Those without common points, such as
-    those that match features, and those whose products are not in the record give no rows.
+    Inspections are compared per dataset, seed and repeat. Inspections without common points, such
+    as those that match features, and those whose products are not in the record are omitted.
 
     Raises:
         RecordError: the record is damaged.
@@ -225,7 +225,7 @@ class JoinedCell:
     """A cell in all records that contain it.
 
     Attributes:
-        found: run and cell, in the order of the runs.
+        found: each run with its entry of the cell, in the order of the runs.
         choices: step with variants -> method and parameters used for this cell.
         dataset: name of the dataset; empty if the run has only one.
         seed: seed of the workflow or of the sweep.
@@ -243,11 +243,11 @@ class JoinedCell:
 
     @property
     def n_environments(self) -> int:
-        """Number of environments in which it was computed; results may differ by rounding."""
+        """Number of environments in which the cell was computed; results may differ by rounding."""
         return len({cell.environment for _, cell in self.found})
 
     def values(self) -> Iterator[tuple[MetricRow, list[float]]]:
-        """Yield each metric as given in the first record, and its values in all records."""
+        """Yield each metric of the first record, and its values in all records."""
         rows = [cell_metrics(cell) for _, cell in self.found]
         first = {row.metric: row for found in reversed(rows) for row in found}
         for name in dict.fromkeys(row.metric for found in rows for row in found):
@@ -296,8 +296,8 @@ class RunSet:
             Columns `dataset`, `seed`, `variant.<step>` for each step with variants, `method`,
             `metric`, `value` as given in the first record, `unit`, `better`, `step`, `cell`
             (address in the first record), `repeat`, `runs` and `environments` (numbers of records
-            that contain the cell, and of their environments), `lowest` and `highest` of the values
-            in these records.
+            that contain the cell, and of their environments), and `lowest` and `highest` (extreme
+            values in these records).
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -375,7 +375,7 @@ class RunSet:
         known = self._identities.get((run.path, cell.address))
         if known is not None:
             return known
-        # Ends the recursion if cells of a forged record depend on themselves.
+        # This entry ends the recursion if cells of a forged record depend on themselves.
         self._identities[run.path, cell.address] = ""
         inputs: dict[str, JsonValue] = {}
         for port, given in cell.inputs.items():

@@ -222,9 +222,9 @@ def _read_key(path: Path, password: Callable[[], str] | None = None) -> Any:
     return key
 
 
-# Contradictions within a record; they may have been there when it was written.
+# Kinds of contradictions within a record, which may date from when it was written.
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
-# Prefix of metrics that repeat findings of an inspection.
+# Prefix of metrics that repeat findings from the product of an inspection.
 _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
 # Text before the digests at the end of a page.
 _PAGE_MARK: Final = "orthoflow report of"
@@ -236,7 +236,7 @@ _WRONG: Final[dict[PublishedState, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Note:
-    """A remark about files next to a record that does not make the record invalid.
+    """A remark about files next to a record; it does not make the record invalid.
 
     Attributes:
         code: `missing` or `foreign` published files, a `page` that was changed or shows another
@@ -264,8 +264,8 @@ class Verification:
         n_inputs: number of input files in the record whose digest was checked.
         n_published: number of unchanged published files.
         n_pages: number of unchanged report pages of this record.
-        n_others: number of unchanged figures, and of other files of a crate.
-        unchecked: files of the folder that cannot be checked, in words.
+        n_others: number of unchanged figures and other files of a crate.
+        unchecked: description of the files in the folder that cannot be checked.
         signed_with: fingerprint of the signer's key; empty unless requested and valid.
     """
 
@@ -287,7 +287,7 @@ class Verification:
 def verify_run(
     path: str | Path, *, also_published: bool = True, signer: Path | None = None
 ) -> Verification:
-    """Check seal, digests, cache keys and required fields of a record, and the published files.
+    """Check the seal, digests, cache keys and required fields of a record, and published files.
 
     Missing published files only cause a note, because a record may be passed on alone.
 
@@ -396,7 +396,7 @@ def page_of(page: str, run: Run) -> str:
 
 
 def _page_states(folder: Path, content_sha256: str) -> dict[str, bool]:
-    """Return for each page next to a record whether it is unchanged and shows that record."""
+    """Return, for each page next to a record, whether it is unchanged and shows this record."""
     names = [REPORT_FILE] if os.path.lexists(folder / REPORT_FILE) else []
     names += [f"{PAGES_FOLDER}/{name}" for name in sorted(files_below(folder, PAGES_FOLDER))]
     return {name: _is_own_page(folder, name, content_sha256) for name in names}
@@ -425,14 +425,14 @@ def _page_note(folder: Path, name: str) -> Note:
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
-    """Return the changes to a record since it was sealed; empty if none were found.
+    """Return the changes made to a record since it was sealed; empty if none were found.
 
     This is fast because the arrays of products and the input files are not checked: reading a
     product checks its digest (`Run.payloads`), and `verify_run` checks everything.
 
     Args:
         run: the run.
-        of_all: check everything, before the whole record is passed on.
+        of_all: check everything, as is needed before the whole record is passed on.
     """
     findings = verify_record(run.path, with_arrays=of_all)
     places = [finding.place for finding in findings if finding.code not in _OWN_FAULTS]
@@ -487,8 +487,8 @@ def _check_others(
     metadata of a crate contain digests of all its files.
 
     Returns:
-        Findings, notes on missing files, the number of unchanged files, and the files that cannot
-        be checked, in words.
+        Findings, notes on missing files, the number of unchanged files, and a description of the
+        files that cannot be checked.
     """
     folder, findings = run.folder, []
     known = {file.path: file for file in run.record.published}
@@ -502,7 +502,7 @@ def _check_others(
         known[name] = PublishedFile(path=name, size_bytes=len(content), sha256=digest)
         states[name] = published_state(folder, known[name]), "the record"
     for name, file in (crate or {}).items():
-        # Large files are hashed once.
+        # Avoid hashing large files twice.
         if known.get(name) != file:
             states[name] = published_state(folder, file), METADATA_FILE
     findings += [
@@ -535,7 +535,7 @@ def _left_over(folder: Path, checked: Set[str]) -> Iterator[str]:
     for place, _, below in os.walk(folder):
         for name in below:
             path = Path(place, name).relative_to(folder)
-            # `_published_notes` lists the additional files in the folder of products.
+            # Additional files in the products folder are reported by `_published_notes`.
             if path.as_posix() not in checked and path.parts[0] != PRODUCTS_FOLDER:
                 tops.setdefault(path.parts[0], []).append(path.as_posix())
     for top, paths in sorted(tops.items()):
@@ -546,11 +546,11 @@ def _left_over(folder: Path, checked: Set[str]) -> Iterator[str]:
 
 
 def _figure_states(run: Run) -> dict[str, bool]:
-    """Return for each figure next to a record whether it shows the figure of the record."""
+    """Return, for each figure file next to a record, whether it shows the recorded figure."""
     try:
         figures = figure_files(run, run.cells)
     except RecordError:
-        # Such names are never written as files.
+        # Figures with invalid names are never written to files.
         return {}
     found = {f"{FIGURES_FOLDER}/{path}": figure for path, figure in figures.items()}
     states = in_order(lambda item: _is_same_figure(run.folder, *item), found.items())
@@ -559,7 +559,7 @@ def _figure_states(run: Run) -> dict[str, bool]:
 
 
 def _is_same_figure(folder: Path, path: str, figure: RecordedFigure) -> bool | None:
-    """Return whether a file shows a figure, possibly in another format; None without a file."""
+    """Return whether a file shows a figure, in any format; None if there is no such file."""
     try:
         with open_below(folder, path) as stream:
             content = stream.read(LARGEST_PAGE_BYTES)
@@ -576,7 +576,7 @@ def _is_same_figure(folder: Path, path: str, figure: RecordedFigure) -> bool | N
 
 
 def _crate_files(folder: Path) -> dict[str, PublishedFile] | str | None:
-    """Return the files in the metadata of a crate; a sentence if they are damaged; None if none."""
+    """Return the files in the metadata of a crate; a sentence if damaged; None if missing."""
     try:
         with open_below(folder, METADATA_FILE) as stream:
             # Any: entities of any kind.
@@ -588,7 +588,7 @@ def _crate_files(folder: Path) -> dict[str, PublishedFile] | str | None:
                 sha256=str(entity["sha256"]),
             )
             for entity in crate["@graph"]
-            # Input files outside the crate have the scheme ni.
+            # The ids of input files outside the crate have the scheme `ni`.
             if "sha256" in entity and not str(entity["@id"]).startswith("ni:")
         }
     except FileNotFoundError:

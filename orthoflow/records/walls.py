@@ -57,8 +57,8 @@ def delivered_walls(products: Path) -> tuple[WallDescription, ...]:
 def add_errors(folder: Path, address: str, cells: Sequence[RecordedCell]) -> None:
     """Add the errors of a run that affect orthoimages to their sidecars, as `errors`.
 
-    These are diagnostics of severity `error` of the cell and those upstream that concern no single
-    wall; errors of one wall appear in its covered share.
+    These are diagnostics with the severity `error` from the cell and from cells upstream that do
+    not concern a single wall; errors on one wall are reflected in its covered share.
 
     Args:
         folder: published files of the cell.
@@ -80,7 +80,7 @@ def add_errors(folder: Path, address: str, cells: Sequence[RecordedCell]) -> Non
 def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
     """Write `walls.json` into the products of a run, if there are orthoimages.
 
-    If there are several combinations, the last one is used, as for drawings.
+    If there are several combinations of variants, the last one is used, as for drawings.
 
     Args:
         products: folder with the files of all cells.
@@ -163,14 +163,14 @@ class WallResult:
     Attributes:
         number: number of the wall, as in its files.
         name: name of the wall.
-        about: description of its orthoimage; None if there is none.
-        plane_index: index of its plane in `planes.json`; None if unknown.
-        frame: frame of its largest raster.
+        about: description of the orthoimage; None if there is no orthoimage.
+        plane_index: index of the plane in `planes.json`; None if unknown.
+        frame: frame of the largest raster.
         rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, if present.
-        accuracy: phrases on the expected error of its orthoimage, the noise of its plane, and the
-            inspections of this wall; each is based only on data of this wall.
+        accuracy: phrases on the expected error of the orthoimage, the noise of the plane, and the
+            inspections of this wall; each is based only on data from this wall.
         colours: how the colours of the photos were changed; None if there is no orthoimage.
-        intensity_source: `laser`, or `luminance` if it is the grey value of the colours.
+        intensity_source: `laser`, or `luminance` if the intensity is the grey value of the colours.
     """
 
     number: int
@@ -191,7 +191,7 @@ class UncountedPoints:
     Attributes:
         cell: address of the inspection that failed; empty if no inspection uses check points.
         sentence: end of a sentence about unmeasured accuracy, with the reason.
-        phrase: the same without the reason, which has no translation, for drawings.
+        phrase: the same for drawings, without the reason, for which there is no translation.
     """
 
     cell: str
@@ -209,7 +209,7 @@ class RoomResults:
         planes: all planes; None if the record has none.
         checkpoints: surveyed points; None if there are none.
         inspections: address -> displacements found in these orthoimages, with wall numbers.
-        openings: openings of these walls, by wall number, then from left to right.
+        openings: openings in these walls, sorted by wall number, then from left to right.
     """
 
     address: str
@@ -225,7 +225,7 @@ class RoomResults:
         return next((wall.frame.map_crs for wall in self.walls if wall.frame.map_crs), None)
 
     def openings_of(self, wall: WallResult) -> tuple[Opening, ...]:
-        """Openings of one wall."""
+        """Openings in one wall."""
         return tuple(opening for opening in self.openings if opening.wall == wall.number)
 
 
@@ -241,7 +241,7 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
         for given in cell.inputs.values()
         if given.type_name == CheckPoints.type_name
     ]
-    # Only check points from files count; those of a simulated room were not given by the user.
+    # Only check points from files count, as the user did not provide those of a simulated room.
     read = [name for name, cell in run.cells.items() if cell.method.startswith("read.")]
     sources = [source.rpartition(".")[0] for _, source in looking]
     place = _upstream_product(run, tuple(sources or read), CheckPoints.type_name)
@@ -266,8 +266,8 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         run: a finished run, with the published files of its record.
         cell: address of the cell with orthoimages or rasters of walls; by default the last cell
             that produced orthoimages, otherwise the last that produced walls.
-        wall: number of the only wall requested, so that files of other walls are not needed; if
-            there is no such wall, all are returned.
+        wall: number of a single wall to return, in which case the files of other walls are not
+            needed; if there is no such wall, all are returned.
 
     Raises:
         ArgumentError: there is no such cell, or there are no rasters.
@@ -319,7 +319,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
 
 
 def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
-    """Return the rasters published by a cell: wall and kind -> path relative to the run folder."""
+    """Return the rasters published by a cell: wall, kind -> path relative to the run folder."""
     folder = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/"
     return {
         (int(found[1]), found[2]): file.path
@@ -329,7 +329,7 @@ def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
 
 
 def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
-    """Refuse a missing published orthoimage: an older raster would be shown in its place."""
+    """Refuse a missing published orthoimage; otherwise an older raster would be shown instead."""
     for (number, kind), path in _rasters(run, address).items():
         is_wanted = kind == "ortho" and wall in {None, number}
         if is_wanted and not (run.folder / path).exists():

@@ -1,4 +1,4 @@
-"""Writing of a run: first the published products, then the record, which completes the run."""
+"""Functions that write a run: first its published products, then the record, which completes it."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ def publish_products(
     files_of: Mapping[str, Mapping[str, Mapping[Path, str]]],
     run_id: str,
 ) -> tuple[PublishedFile, ...]:
-    """Fill `products/` of a run folder; one from an interrupted attempt is replaced.
+    """Fill `products/` of a run folder, replacing the files of an interrupted attempt.
 
     Args:
         run_folder: existing folder.
         cells: all cells of the run.
         files_of: address -> output port -> files in the store, with the expected SHA-256 of each.
-        run_id: inserted into the names of the coordinate systems of walls.
+        run_id: id of the run, inserted into the names of wall coordinate systems.
 
     Returns:
         The published files, sorted by path.
@@ -143,10 +143,10 @@ def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
 
 
 def _replaced(cells: Iterable[RecordedCell]) -> set[str]:
-    """Return the outputs, as `address.port`, that a later cell replaces by one of the same type.
+    """Return, as `address.port`, outputs that a later cell replaces with one of the same type.
 
-    An output such as planes whose sides were found later would contradict its successor. Products
-    read from files are kept.
+    An earlier output, such as planes whose sides are determined later, would contradict its
+    replacement. Products read from files are kept.
     """
     made = {
         cell.address
@@ -215,11 +215,11 @@ def recorded_cell(
 
     Args:
         cell: the cell without a result.
-        result: its result in the store.
+        result: result of the cell in the store.
         store: store with the figures.
         sources: source of each input port.
         embedded: product types whose arrays are written into the record.
-        cached_from: id of the earlier run that computed it; empty if this run did.
+        cached_from: id of the earlier run that computed the result; empty if this run did.
 
     Raises:
         DamageError: a figure is missing or damaged.
@@ -268,8 +268,8 @@ def write_run(
 ) -> Run:
     """Write `products/` and `run.h5` of a run.
 
-    `run.h5` gets its name last: a folder that contains it is finished; in any other folder, the
-    same command writes all files again.
+    `run.h5` gets its name last, so that a folder that contains it is finished; in any other folder,
+    repeating the command writes all files again.
 
     Args:
         outcome: outcome of the engine.
@@ -287,7 +287,7 @@ def write_run(
     Raises:
         DamageError: an object that the record needs was damaged in the store and has been removed;
             resuming the run recomputes it.
-        StoreError: the disk cannot be written to, or a step could not read or write it.
+        StoreError: the disk cannot be written to, or could not be read or written by a step.
         InputError: an input file to embed was changed during the run.
         ArgumentError: another run is using the folder.
     """
@@ -371,9 +371,9 @@ def files_of_outputs(
 def begin_run(
     plan: RunPlan, workflow: Workflow, run_folder: Path, store: Store, run_id: str
 ) -> None:
-    """Write the outline of a run that starts: its record, with all cells skipped.
+    """Write the outline of a run at its start: its record, with all cells skipped.
 
-    It is used to show the run before it is finished, see `open.open_unfinished`.
+    The outline is used to show the run before it is finished; see `open.open_unfinished`.
 
     Raises:
         StoreError: the disk cannot be written to.
@@ -406,11 +406,11 @@ def _embedded_types(plan: RunPlan, *, embed: bool = False) -> frozenset[str]:
 def executed_and_written(
     execute: Callable[[], RunOutcome], write: Callable[[RunOutcome], Run]
 ) -> tuple[RunOutcome, Run]:
-    """Execute a run and write it; results found damaged in the store are recomputed.
+    """Execute a run and write it; results that turn out to be damaged in the store are recomputed.
 
     Args:
-        execute: resumes the run each time it is called, as `engine.scheduler.execute` does.
-        write: calls `write_run`.
+        execute: function that resumes the run at each call, as `engine.scheduler.execute` does.
+        write: function that calls `write_run`.
 
     Raises:
         DamageError: results in the store are damaged repeatedly.
@@ -486,7 +486,7 @@ def build_record(
 
 
 def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = ()) -> Run:
-    """Write the record of a run again, with all products and input files embedded.
+    """Write another record of a run, with all products and input files embedded.
 
     Args:
         run: the run.

@@ -19,28 +19,28 @@ class Choices:
 
     Attributes:
         cell: address of the cell to export.
-        license_text: license of a crate.
-        author: author of a crate.
-        scale: n of 1 : n of sheets.
+        license_text: license of an RO-Crate.
+        author: author of an RO-Crate.
+        scale: denominator n of the scale 1 : n of sheets.
         paper: paper size of sheets.
         grid: spacing of the grid crosses in the unit of the sheets; 0 for none.
         units: unit of numbers on sheets.
         title_block: file with the office's title block.
-        beside: rasters to show beside the orthoimage on sheets.
+        beside: rasters to show next to the orthoimage on sheets.
         embed: whether to include every product and input.
         split: whether to write a record per dataset.
         inputs: input files, `NAME=PATH`.
         store: store with products that the record references but does not contain.
         colour: source of the colours of points.
-        wall: number of the only wall to export.
+        wall: number of a single wall to export.
         box: corners of the part to export, as text.
         clean: whether to remove isolated points.
         relief: whether to model walls from their depths.
         heights_m: heights of plans above the floor.
-        through: lines of sections, `x,y,x,y`.
+        through: lines of sections, each `x,y,x,y`.
         dimensions: whether to write lengths next to the lines of plans and sections.
         language: language of labels.
-        light: azimuth and altitude of a raking light, `315,25`.
+        light: azimuth and altitude in degrees of a raking light, e.g. `315,25`.
         base_url: address at which an IIIF folder will be published.
         figure_format: format of figures: `pdf`, `svg` or `png`.
     """

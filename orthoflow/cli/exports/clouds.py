@@ -138,7 +138,7 @@ def _makers_of_cameras(cells: Any) -> dict[str, Any]:
 
 
 def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
-    """Return photos and cameras of the last cell of a branch that oriented any."""
+    """Return the photos and cameras from the last cell of a branch that oriented any photos."""
     makers = _makers_of_cameras(cells)
     if not makers:
         return ()

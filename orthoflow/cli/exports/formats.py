@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class Writer(Protocol):
-    """Writer of a format."""
+    """Function that writes a format."""
 
     def __call__(self, run: Run, folder: Path, chosen: Choices, /) -> str:
-        """Write to a folder, created by `make_empty` after all checks; return a summary."""
+        """Write to a folder, which `make_empty` creates after all checks; return a summary."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Format:
 
     Attributes:
         writer: import string `module:function` of a `Writer`, relative to `orthoflow.cli.exports`.
-        summary: its content, for the help.
+        summary: what is written, for the help.
         takes_rasters: whether it reads GeoTIFFs that the run published.
     """
 

@@ -57,7 +57,7 @@ def store_of(run: Run, given: Path) -> Path:
     """Return the store with the products that a record references but does not contain.
 
     If `given` is the default, stores above the run folder are considered, too, because a run may be
-    exported from another folder than the one in which it was made.
+    exported from a folder other than the one in which it was made.
     """
     from orthoflow.engine.store import Store
 
@@ -104,7 +104,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
 
 
 def wanted_wall(number: int, known: Mapping[int, _Wall], who: str, does: str) -> _Wall:
-    """Return the wall with a number, which is the index of its plane in `planes.json`.
+    """Return the wall with the given number, the index of its plane in `planes.json`.
 
     Args:
         number: value of `--wall`.
@@ -129,7 +129,7 @@ def numbers_of(text: str, count: int, expected: str) -> list[float]:
     Args:
         text: value of an option.
         count: required number of numbers.
-        expected: the option and its format, for the error message.
+        expected: the option and the format of its value, for the error message.
 
     Raises:
         ArgumentError: the text has another format.
@@ -156,7 +156,7 @@ def make_empty(folder: Path) -> None:
 
 
 def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:
-    """Return the cells with the same variants, dataset and repeat as a cell, where applicable."""
+    """Return the cells that share the variants, dataset and repeat of a cell, where applicable."""
     chosen = run.cell(address)
     return {
         name: cell
@@ -171,7 +171,7 @@ def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:
 def last_product(
     run: Run, cells: Mapping[str, RecordedCell], cls: type[ProductT], store: Path
 ) -> ProductT | None:
-    """Return the product of a type from the last of the cells that has one, or None.
+    """Return the product of the given type from the last cell that has one, or None.
 
     Raises:
         ArgumentError: neither the record nor the store contains the product.

@@ -49,7 +49,7 @@ def _write_texts(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write the figures of a cell, or of all cells with the plan of photos and curves of sweeps."""
+    """Write the figures of a cell, or those of all cells, the plan of photos and sweep curves."""
     from functools import partial
 
     from orthoflow.records.runs import figure_files, write_files
@@ -88,7 +88,7 @@ def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write a crate, optionally with an embedded record."""
+    """Write an RO-Crate, optionally with all products and inputs embedded in its record."""
     from orthoflow.records.archive import NO_LICENSE, write_crate
     from orthoflow.records.runs import REPORT_FILE
     from orthoflow.report import write_page
@@ -96,7 +96,7 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     make_empty(folder)
     license_text = chosen.license_text or NO_LICENSE
     if run.files_folder is not None:
-        # If the record was alone in its folder, its rasters were restored to a folder of their own.
+        # If the folder contained only the record, its rasters were restored to a separate folder.
         write_page(run, run.folder / REPORT_FILE)
     if chosen.embed:
         run = embedded(run, folder, chosen)
@@ -145,7 +145,7 @@ def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def embedded(run: Run, folder: Path, chosen: Choices) -> Run:
-    """Write a record with every product and input file, and return it opened."""
+    """Write a record that contains every product and input file, and return the opened run."""
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.engine.store import Store
     from orthoflow.records.write import write_embedded

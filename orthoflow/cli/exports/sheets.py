@@ -63,13 +63,13 @@ def write_drawings(
 
     Args:
         folder: output folder, created after the layout.
-        drawn: returns the drawings at a scale.
+        drawn: function that returns the drawings at a given scale.
         chosen: the options.
-        alone: file name of a drawing with one sheet.
-        several: file name of a drawing with several sheets.
+        alone: file name of a drawing that fits on one sheet.
+        several: file name of a drawing that needs several sheets.
 
     Returns:
-        n of 1 : n, and the number of sheets.
+        The denominator n of the scale 1 : n, and the number of sheets.
     """
     given = [paper_of(chosen.paper)] if chosen.paper else []
     usual = SCALES_FT if chosen.units == "ft" else SCALES
@@ -194,7 +194,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _warn(walls: Sequence[WallResult]) -> None:
-    """Name the walls that are drawn although their orthoimages should not be delivered."""
+    """Warn of walls that are drawn although their orthoimages should not be delivered."""
     few = [
         f"{wall.name} ({wall.about.reason})"
         for wall in walls
@@ -205,7 +205,7 @@ def _warn(walls: Sequence[WallResult]) -> None:
 
 
 def _coarse(walls: Sequence[WallResult], scale: int) -> str:
-    """Return which pictures have fewer than 150 pixels per inch, and at which scale they do not."""
+    """Return which pictures have fewer than 150 pixels per inch, and a scale that avoids this."""
     coarse = [wall for wall in walls if _ppi(wall, scale) < _LEAST_PPI]
     if not coarse:
         return ""
@@ -219,7 +219,7 @@ def _coarse(walls: Sequence[WallResult], scale: int) -> str:
 
 
 def usual_scale(least: float) -> int:
-    """Return the smallest n of a usual scale 1 : n that is at least as large.
+    """Return the smallest n of the usual scales 1 : n that is not below the given value.
 
     >>> usual_scale(30.2), usual_scale(20.1), usual_scale(200.0), usual_scale(2.4), usual_scale(9)
     (50, 25, 200, 5, 10)
@@ -279,7 +279,7 @@ def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Ch
 
 
 def _scaled(drawing: Drawing, wall: WallResult, chosen: Choices, scale: int) -> Drawing:
-    """Set the scale of a drawing, and its grid and note on resolution, which depend on it."""
+    """Set the scale of a drawing, and the grid and note on resolution that depend on the scale."""
     ppi = _ppi(wall, scale)
     values = {"mm": f"{1e3 * wall.frame.gsd_m:g}", "ppi": f"{ppi:.0f}"}
     coarse = (Phrase(key="coarse", values={"least": f"{_LEAST_PPI:.0f}"}),)
@@ -299,12 +299,12 @@ def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
 
 
 def _first_kind(wall: WallResult) -> str:
-    """Return `ortho`, or else a raster of the scan."""
+    """Return `ortho` if the wall has one, or else the kind of a raster of the scan."""
     return next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
 
 
 def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
-    """Return the kinds of pictures to draw of a wall."""
+    """Return the kinds of pictures of a wall to draw."""
     for kind in chosen.beside:
         if kind not in wall.rasters:
             raise ArgumentError(

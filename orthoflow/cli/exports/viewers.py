@@ -1,4 +1,4 @@
-"""Exports for viewing: the room as a textured model, orthoimages as tiles with a page."""
+"""Exports for viewing: a textured model of the room, and orthoimages as tiles with a page."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
 def _depths(
     run: Run, address: str, orthos: Sequence[OrthoFile], wall: int | None
 ) -> dict[int, Path]:
-    """Return the published depth rasters of walls, by number."""
+    """Return the published depth rasters of walls by wall number."""
     walls = room_results(run, address, wall).walls
     found = {wall.number: wall.rasters["depth"] for wall in walls if "depth" in wall.rasters}
     for ortho in orthos:
