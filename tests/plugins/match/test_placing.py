@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,12 +17,11 @@ from orthoflow_plugins.match.placing import Placed, confirmed, places_of
 from orthoflow_plugins.match.ties import TiePiece
 
 from orthoflow.files.images import decode_image, encode_png, photo_grey
-from orthoflow.products import Photo, Wall
+from orthoflow.products import Photo, Photos, Wall
 from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
 
 SCENE = ms.textured_wall(1)
-PHOTO = ms.photo_of(SCENE, ms.camera_before(), calibrated=False)
 
 
 def patchy_wall() -> Wall:
@@ -33,11 +33,13 @@ def patchy_wall() -> Wall:
     return replace(wall, intensity=(0.5 + sign * (wall.intensity - 0.5)).astype(np.float32))
 
 
-STRUCTURES = [structures.wall_structure(patchy_wall())]
+@cache
+def patchy_structure() -> structures.WallStructure | None:
+    return structures.wall_structure(patchy_wall())
 
 
 def placed(photo: Photo) -> Placed | None:
-    places = places_of(0, photo, STRUCTURES)
+    places = places_of(0, photo, [patchy_structure()])
     assert not any(place.is_clear for place in places[1:])
     return next((place for place in places if place.is_clear), None)
 
@@ -61,17 +63,16 @@ def test_a_photo_is_placed_whatever_its_lens_and_however_it_was_held() -> None:
 
 
 def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
-    mirrored = np.ascontiguousarray(decode_image(PHOTO.encoded, "a.png")[:, ::-1])
-    assert placed(replace(PHOTO, encoded=encode_png(mirrored))) is None
+    photo = ms.photo_of(SCENE, ms.camera_before(), calibrated=False)
+    mirrored = np.ascontiguousarray(decode_image(photo.encoded, "a.png")[:, ::-1])
+    assert placed(replace(photo, encoded=encode_png(mirrored))) is None
     other = ms.textured_wall(2)
     assert placed(ms.photo_of(other, ms.camera_before(), calibrated=False)) is None
     # On a wall without intensity, there are no positions.
     blind = replace(patchy_wall(), intensity=None)
-    assert places_of(0, PHOTO, [structures.wall_structure(blind)]) == []
+    assert places_of(0, photo, [structures.wall_structure(blind)]) == []
 
 
-SCENE = ms.textured_wall(1)
-WALLS = mw.walls(1)
 CAMERAS = [
     ms.camera_before(),
     ms.camera_before(centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
@@ -79,11 +80,19 @@ CAMERAS = [
 ]
 
 
-PHOTOS = ms.photos(
-    *(ms.photo_of(SCENE, camera, name=f"{nth}.png") for nth, camera in enumerate(CAMERAS))
-)
-ON_WALLS = (WALLS.walls, [structures.wall_structure(wall) for wall in WALLS.walls])
 NEAR = pytest.approx(0.0, abs=1e-9)
+
+
+@cache
+def on_walls() -> tuple[Sequence[Wall], list[structures.WallStructure | None]]:
+    walls = mw.walls(1).walls
+    return walls, [structures.wall_structure(wall) for wall in walls]
+
+
+@cache
+def photos() -> Photos:
+    shots = enumerate(CAMERAS)
+    return ms.photos(*(ms.photo_of(SCENE, camera, name=f"{nth}.png") for nth, camera in shots))
 
 
 def place(
@@ -109,15 +118,15 @@ def place(
 
 def paired(photo: int) -> PhotoPairs:
     """Return key point matches of a photo with the wall."""
-    features = [wall_features(WALLS.walls[0], PairingParams().max_features)]
-    return pair_photo(photo_grey(PHOTOS.photos[photo]), features, PairingParams())
+    features = [wall_features(mw.walls(1).walls[0], PairingParams().max_features)]
+    return pair_photo(photo_grey(photos().photos[photo]), features, PairingParams())
 
 
 def chosen(
     places: dict[int, Sequence[Placed]], recognised: Mapping[int, PhotoPairs] | None = None
 ) -> dict[int, float]:
     """Return the displacements of the chosen positions in metres, by photo."""
-    found = confirmed(PHOTOS, places, recognised or {}, ON_WALLS)
+    found = confirmed(photos(), places, recognised or {}, on_walls())
     return {
         k: float((place.camera.centre_world - CAMERAS[k].centre_world)[0])
         for k, place in found.items()
@@ -193,7 +202,7 @@ def test_what_is_not_known_and_its_border_has_no_structure() -> None:
 
 
 def test_a_piece_of_the_wall_lies_where_it_was_taken_from() -> None:
-    (wall,) = WALLS.walls
+    (wall,) = mw.walls(1).walls
     structure = structures.wall_structure(wall)
     assert structure is not None
     assert wall.intensity is not None

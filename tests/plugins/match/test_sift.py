@@ -102,8 +102,8 @@ HAND_SCENE = ms.textured_wall(0)
 HAND_CAMERA = ms.camera_before(centre=(1.3, -2.6, 1.1))
 
 
-HAND_PHOTO = ms.photo_of(HAND_SCENE, HAND_CAMERA)
-WALLS = mw.walls(0)
+def hand_photo() -> Photo:
+    return ms.photo_of(HAND_SCENE, HAND_CAMERA)
 
 
 def measured(*names: str) -> Ties:
@@ -121,10 +121,10 @@ def measured(*names: str) -> Ties:
 
 
 def test_ties_by_hand_stand_behind_those_that_are_found(tmp_path: Path) -> None:
-    alone, _ = sift(tmp_path, HAND_PHOTO, WALLS)
+    alone, _ = sift(tmp_path, hand_photo(), mw.walls(0))
     assert alone.by_hand is None
     hand = measured("a.png", "stranger.png", "a.png")
-    both, _ = sift(tmp_path, HAND_PHOTO, WALLS, hand)
+    both, _ = sift(tmp_path, hand_photo(), mw.walls(0), hand)
     count = len(alone.photo)
     np.testing.assert_array_equal(both.pixels_photo[:count], alone.pixels_photo)
     np.testing.assert_array_equal(both.pixels_photo[count:], hand.pixels_photo[[0, 2]])
@@ -136,7 +136,7 @@ def test_ties_by_hand_stand_behind_those_that_are_found(tmp_path: Path) -> None:
 
 
 def test_a_tie_by_hand_lies_on_the_nearest_wall(tmp_path: Path) -> None:
-    (wall,) = WALLS.walls
+    (wall,) = mw.walls(0).walls
     moves = np.array([[0.0, 1.0, 0.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     frames = [replace(wall.frame, origin_world=wall.frame.origin_world + move) for move in moves]
     walls = tuple(replace(wall, frame=frame, intensity=None) for frame in frames)
@@ -144,16 +144,18 @@ def test_a_tie_by_hand_lies_on_the_nearest_wall(tmp_path: Path) -> None:
         measured("a.png", "a.png", "a.png"),
         points_world=np.array([[1.0, 0.9, 1], [5.5, 0.2, 1], [1.0, 0.3, 1]]),
     )
-    ties, _ = sift(tmp_path, HAND_PHOTO, replace(WALLS, walls=walls), hand)
+    ties, _ = sift(tmp_path, hand_photo(), replace(mw.walls(0), walls=walls), hand)
     np.testing.assert_array_equal(ties.wall, [0, 1, 2])
 
 
 def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
-    bare = replace(WALLS, walls=tuple(replace(wall, intensity=None) for wall in WALLS.walls))
+    bare = replace(
+        mw.walls(0), walls=tuple(replace(wall, intensity=None) for wall in mw.walls(0).walls)
+    )
     with pytest.raises(MethodError, match="neither intensity nor colour"):
-        sift(tmp_path, HAND_PHOTO, bare)
+        sift(tmp_path, hand_photo(), bare)
     hand = measured("a.png", "a.png")
-    inputs = {"photos": ms.photos(HAND_PHOTO), "walls": bare, "hand": hand}
+    inputs = {"photos": ms.photos(hand_photo()), "walls": bare, "hand": hand}
     cameras = {"cameras": ms.cameras(ms.oriented(HAND_CAMERA))}
     for method, more in ((MatchSift, {}), (MatchGuided, cameras)):
         ctx = mw.context(tmp_path)
