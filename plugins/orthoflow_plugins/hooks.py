@@ -21,9 +21,7 @@ _METHODS: Final = {
     "geometry",
     "register.similarity:RegisterSimilarity": "translation, rotation and scale from pairs of "
     "points, with sigma0 and residuals",
-    "plane.hough2d:Hough2d": (
-        "Hough transform of the plan, with cells weighted by number of points"
-    ),
+    "plane.hough2d:Hough2d": "Hough transform of the plan, with cells weighted by number of points",
     "plane.hough3d:Hough3d": "Hough transform of voxels, for planes in any direction",
     "plane.ransac:Ransac": "random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or "
     "the plan",
@@ -37,14 +35,12 @@ _METHODS: Final = {
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
     "match.sift:MatchSift": "match RootSIFT key points of photos and walls, if mutually best and "
     "distinct by the ratio test",
-    "match.sides:FaceByPhotos": (
-        "determine the fronts of planes from photos, where they were only assumed"
-    ),
+    "match.sides:FaceByPhotos": "determine from photos the fronts of planes that were only assumed",
     "match.guided:MatchGuided": "match photos with the walls again, starting from a first pose",
     "orient.pnp:OrientPnp": "orient each photo separately from its ties, with its accuracy or "
     "the reason for its rejection",
     "orient.dlt:OrientDlt": (
-        "orient each photo by a DLT (direct linear transform), with or without distortion"
+        "orient each photo by direct linear transform, with or without distortion"
     ),
     "orient.bundle:OrientColmapBundle": "bundle adjustment of all photos, with ties to the walls "
     "and between photos",
@@ -56,9 +52,7 @@ _METHODS: Final = {
     "to the viewer",
     "ortho.dsm_backward:DsmBackward": "each cell of a wall takes its colour from the photos that "
     "show it",
-    "ortho.dsm_forward:DsmForward": (
-        "each pixel of a photo is projected onto the wall that it shows"
-    ),
+    "ortho.dsm_forward:DsmForward": "project each pixel of a photo onto the wall that it shows",
     "mosaic.seams:MosaicSeams": "one orthoimage per wall from its layers",
     "segment.openings:SegmentOpenings": "outlines of windows, doors and niches from depths, "
     "lines of sight and the orthoimage",
