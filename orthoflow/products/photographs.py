@@ -219,13 +219,13 @@ class TieWall:
         shapes = np.shape(self.corners_world), np.shape(self.normal_world)
         if shapes != ((4, 3), (3,)):
             raise ProductError(
-                f"a wall of ties must have 4 corners and a normal of 3 numbers each, got shapes "
-                f"{shapes[0]} and {shapes[1]}"
+                "the wall of a tie must have 4 corners and a normal, each with 3 coordinates; "
+                f"got the shapes {shapes[0]} and {shapes[1]}"
             )
 
     @classmethod
     def of(cls, wall: Wall) -> Self:
-        """Return the description of a rastered wall for ties."""
+        """Return the description of a wall for its ties."""
         frame = wall.frame
         return cls(
             name=wall.name,

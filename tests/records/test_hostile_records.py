@@ -79,7 +79,7 @@ def test_names_that_lead_elsewhere_are_found_and_nothing_is_written_there(
         assert done.exit_code == (3 if command[0] == "replay" else done.exit_code), done.output
         assert done.exit_code in (0, 3), (command, done.output)
         if what == "figure" and command in (("report",), ("export", "--to", "figures")):
-            assert "so its file cannot be written" in done.output
+            assert "so the figures cannot be written to files" in done.output
     assert everything(tmp_path) == before
 
 

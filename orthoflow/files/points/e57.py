@@ -111,8 +111,8 @@ def _read_header(
     axes = next((axes for axes in (_CARTESIAN, _SPHERICAL) if set(names) >= set(axes)), None)
     if axes is None:
         raise InputError(
-            f"{path.name}: scan {index} has the fields {', '.join(sorted(names))}, expected "
-            "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation"
+            f"{path.name}: scan {index} has the fields {', '.join(sorted(names))}; expected "
+            f"{', '.join(_CARTESIAN)} or {', '.join(_SPHERICAL)}"
         )
     renamed = [dict(zip(axes, _CARTESIAN, strict=True)).get(name, name) for name in names]
     columns = columns_of_names(renamed, intensity_field=intensity_field)

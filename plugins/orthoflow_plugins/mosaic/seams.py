@@ -374,7 +374,7 @@ def _report_empty(ctx: StepContext, image: Orthoimage) -> None:
         OrthoMask.NONE: "are in no oriented photo (check why photos were refused, or take another)",
         OrthoMask.OCCLUDED: "are hidden in all photos, or seen too obliquely (take a "
         "photo from another side)",
-        OrthoMask.NO_SURFACE: "have no surface (see the step that rastered the wall)",
+        OrthoMask.NO_SURFACE: "have no surface (see the step that computed the raster of the wall)",
     }
     shares = {state: count_cells(image.mask, state) / image.mask.size for state in words}
     if shares[OrthoMask.NONE] + shares[OrthoMask.OCCLUDED] < _EMPTY_WORTH_WORDS:

@@ -100,7 +100,7 @@ NO_INTENSITY: Final = DiagnosticSpec(
 DEPTH_ONLY: Final = DiagnosticSpec(
     code="scan-without-intensity-and-colour",
     severity="warning",
-    text="the cloud has neither intensity nor colour; only the depths of walls are rastered",
+    text="the cloud has neither intensity nor colour; only the depths of walls are rasterised",
 )
 NO_POINT: Final = DiagnosticSpec(
     code="wall-without-points",

@@ -270,8 +270,8 @@ class SimulateRoom(Method):
                 )
             if self.design_seed is not None and self.decoration != "drawn":
                 raise ValueError(
-                    f"design_seed {self.design_seed} draws a room, but decoration is "
-                    f"{self.decoration}: set decoration to drawn, or omit design_seed"
+                    f"design_seed {self.design_seed} applies only to drawn rooms, but decoration "
+                    f"is {self.decoration}: set decoration to drawn, or omit design_seed"
                 )
             return self
 

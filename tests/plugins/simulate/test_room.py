@@ -183,7 +183,7 @@ def test_a_design_has_a_seed_of_its_own_and_errors_have_that_of_the_cell(tmp_pat
     np.testing.assert_array_equal(centres[1, 7], centres[2, 7])
     assert not np.array_equal(centres[1, 7], centres[1, 8])
     assert not np.array_equal(rooms[1, 7].cloud.x[:1000], rooms[2, 7].cloud.x[:1000])
-    with pytest.raises(ValueError, match="design_seed 7 draws a room, but decoration is designed"):
+    with pytest.raises(ValueError, match="design_seed 7 applies only to drawn rooms"):
         SimulateRoom.Params(design_seed=7)
 
 
