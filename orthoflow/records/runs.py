@@ -605,7 +605,8 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
             if sentence := name_problem(figure.name) or path_problem(path):
                 problem = problem or f"the figure {figure.name!r} of {address} {sentence}"
     if twice := colliding(path for path, _ in named):
-        problem = problem or f"two figures have the same name, {twice!r}, if case is ignored"
+        same = "on file systems that ignore case, two figures have the same name"
+        problem = problem or f"{same}, {twice!r}"
     if problem:
         raise RecordError(f"{run.path}: {problem}, so the figures cannot be written to files")
     return dict(named)
