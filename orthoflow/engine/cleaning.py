@@ -21,7 +21,7 @@ class Damage:
 
     Attributes:
         name: path relative to the store's folder.
-        what: the damaged file; for a result, its damaged or missing files.
+        what: the damaged file; for a result, the damaged or missing files it refers to.
     """
 
     name: str
@@ -70,7 +70,7 @@ def check_store(store: Store) -> Soundness:
 
 
 def _named_by_digest(folder: Path) -> tuple[str, ...]:
-    """Return the digests that name files of the store; other files are ignored."""
+    """Return the digests that are file names in a folder of the store; ignore other files."""
     names = (path.name.removesuffix(".json") for path in folder.glob("*"))
     return tuple(sorted(name for name in names if re.fullmatch("[0-9a-f]{64}", name)))
 
@@ -126,7 +126,7 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
             kept |= result.objects
     objects = [path for path in _children(store.objects) if path.name not in kept]
     half_written = store.results.glob(".*-*")
-    # Remove results first: if the process is killed in between, no result is left without objects.
+    # Remove results first: if the process is then killed, no result is left without its objects.
     unneeded = (*results, *objects, *_children(store.scratch), *half_written)
     freed_bytes = sum(size_of(path) for path in unneeded)
     for path in () if is_dry else unneeded:

@@ -50,11 +50,11 @@ _LOOK_S: Final = 1.0
 
 
 def look_around(path: str, methods: str) -> tuple[str, str]:
-    """Check the environment of a worker; runs on each worker before it gets a task.
+    """Check the environment of a worker; called on each worker before it gets a task.
 
     Returns:
         The content of the file, or the reason why it cannot be read; and how the methods or
-        libraries of the worker differ, empty if they are the same.
+        libraries of the worker differ from those given, empty if they are the same.
     """
     try:
         seen = Path(path).read_text(encoding="utf-8")
@@ -70,9 +70,9 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
         task: what to run.
         name: name of the task in the scheduler.
         topic: topic for progress messages.
-        retries: maximum number of repetitions after a loss of the worker.
-        methods: the plan's methods, see `methods_text`; empty for a worker in the process that made
-            the plan.
+        retries: maximum number of repetitions after the worker is lost.
+        methods: the plan's methods (see `methods_text`); empty for a worker in the process that
+            made the plan.
     """
     worker = get_worker()
     home = Path(task.folder)
@@ -135,8 +135,8 @@ _CONNECT_S: Final = 15.0
 _PATIENCE_S: Final = 60.0
 _WATCH_S: Final = 2.0
 _CLOSE_S: Final = 5.0
-# Switches off frequent polling: by default, each worker profiles its thread 100 times a second and
-# checks its event loop 50 times a second.
+# These settings disable frequent polling: by default, each worker profiles its thread 100 times a
+# second and checks its event loop 50 times a second.
 _QUIET: Final = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
@@ -186,7 +186,7 @@ class DaskExecutor:
 
     @property
     def capacity(self) -> Capacity:
-        """Return how many tasks the present workers can run at the same time."""
+        """Return how many tasks the current workers can run at the same time."""
         return self._capacity
 
     def start(self, task: Task) -> None:
@@ -231,14 +231,14 @@ class DaskExecutor:
         return ends
 
     def cancel(self) -> None:
-        """End all tasks; their workers notice within a second, and stop the processes."""
+        """End all tasks; the workers notice this within a second, and stop the processes."""
         self._is_cancelled = True
         for _, future in self._running.values():
             with suppress(Exception):
                 future.cancel()
 
     def close(self) -> None:
-        """Release all tasks still running; their workers stop them by themselves."""
+        """Release all tasks still running, which the workers then stop by themselves."""
         self.cancel()
         cluster = self._client.cluster
         # Suppress Dask's messages about lost connections: they are expected here.
@@ -282,7 +282,7 @@ class DaskExecutor:
             self._messages.put((str(address), EVENTS.validate_json(text, strict=True)))
 
     def _watch(self) -> None:
-        """Check every two seconds which workers are present."""
+        """Check every two seconds which workers are connected."""
         now = time.monotonic()
         if now - self._looked < _WATCH_S:
             return
@@ -368,7 +368,7 @@ def _client(address: str, capacity: Capacity) -> Client:
             resources={CORES: capacity.n_cores},
             # Steps run in child processes; their memory is monitored by `LocalExecutor`.
             memory_limit=0,
-            # Not accessible from other machines.
+            # With this address, the dashboard is not accessible from other machines.
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,

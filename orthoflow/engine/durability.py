@@ -16,7 +16,7 @@ from typing import Final
 from orthoflow.errors import StoreError
 from orthoflow.untrusted_text import open_file
 
-# Errors of the store's disk, which are not the fault of a method.
+# Errors caused by the store's disk, not by a method.
 _BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.ENXIO})
 
 
@@ -30,7 +30,7 @@ def is_broken(error: OSError, folder: Path) -> bool:
 
 
 def store_error(error: OSError, folder: Path) -> StoreError:
-    """Convert an OSError into a StoreError of one sentence that contains the folder."""
+    """Convert an OSError into a StoreError with a one-sentence message that names the folder."""
     reason = error.strerror or str(error)
     failure = StoreError(f"cannot write to {folder}: {reason}; fix this, or choose another folder")
     failure.errno = error.errno
@@ -39,7 +39,7 @@ def store_error(error: OSError, folder: Path) -> StoreError:
 
 @contextmanager
 def writing_to(folder: Path) -> Iterator[None]:
-    """Convert each OSError in the block into a StoreError that contains the folder.
+    """Convert any OSError raised in the block into a StoreError that names the folder.
 
     Raises:
         StoreError: the disk is full or fails, or permission is denied.
@@ -62,7 +62,7 @@ def sync(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Make all files and folders in a folder survive a power cut, except its own name."""
+    """Make everything in a folder survive a power cut, but not the name of the folder itself."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
 
@@ -91,7 +91,7 @@ def place_folder(aside: Path, final: Path) -> bool:
     """Rename a finished folder to its final name.
 
     Returns:
-        False if another process was first; the new folder then keeps its temporary name.
+        False if another process was faster; the new folder then keeps its temporary name.
 
     Raises:
         StoreError: the disk cannot be written to.
@@ -183,8 +183,8 @@ def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bo
     Args:
         path: path of the file, for the error message.
         descriptor: file descriptor of the same file.
-        is_shared: allow other shared locks at the same time.
-        waits: wait until other processes release the file.
+        is_shared: whether to allow other shared locks at the same time.
+        waits: whether to wait until other processes release the file.
 
     Returns:
         False if another process holds the lock.
@@ -224,10 +224,10 @@ def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
 
     Args:
         path: lock file, created if missing.
-        busy: message of the error if another process holds the lock.
+        busy: error message if another process holds the lock.
 
     Raises:
-        StoreError: another process holds the lock, or as for `shared_lock`.
+        StoreError: another process holds the lock, or a condition of `shared_lock` applies.
     """
     with _opened_lock(path) as descriptor:
         if not lock_file(path, descriptor):

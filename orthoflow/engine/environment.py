@@ -42,7 +42,7 @@ def environment(threads: int) -> RecordedEnvironment:
 
 @cache
 def packages() -> dict[str, str]:
-    """Return name -> version of installed distributions; the first of a name is used."""
+    """Return name -> version of installed distributions; the first one with a name counts."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions():
         # Skip metadata that is not text, or lacks name or version.
@@ -100,7 +100,7 @@ def time_of_file(mtime_s: float) -> str:
 
 
 def time_in_a_name() -> str:
-    """Return the current time in UTC as digits that sort, for use in file names."""
+    """Return the current time in UTC as digits in sortable order, for use in file names."""
     return f"{datetime.now(UTC):%Y%m%d-%H%M%S}"
 
 

@@ -1,4 +1,4 @@
-"""SHA-256 of input files, cached while the file system reports no change.
+"""SHA-256 of input files, cached as long as the file system reports no change.
 
 The paths of files are stored, too: records contain no folders, so replays and exports use these
 paths to find the input files of an earlier run.
@@ -22,7 +22,7 @@ from orthoflow.errors import InputError
 from orthoflow.geometry.threads import in_order
 from orthoflow.sdk.lines import one_line, text_of_path
 
-# A file changed so shortly before hashing may change again without a new time stamp.
+# A file that was changed this recently before hashing may change again with the same time stamp.
 _SETTLED_NS: Final = 2_000_000_000
 
 
@@ -32,7 +32,8 @@ class FileRef(RecordedFile):
 
     Attributes:
         path: path of the file.
-        identity: file system attributes, used only to detect changes while a step reads the file.
+        identity: file system attributes, used only to detect changes of the file while a step reads
+            it.
     """
 
     path: Path
@@ -103,7 +104,7 @@ class FileDigests:
         self._places[sha256] = place
 
     def place(self, sha256: str) -> Path | None:
-        """Return the recorded path of a digest; the file may be missing or changed."""
+        """Return the path recorded for a digest; the file there may be missing or changed."""
         place = self._places.get(sha256)
         return None if place is None else Path(place)
 

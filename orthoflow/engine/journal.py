@@ -63,8 +63,8 @@ class CellFinished:
     Attributes:
         address: address of the cell.
         result: its result, with status ok, failed or skipped.
-        cached: whether the result was in the store, even if this run stored it before an
-            interruption.
+        cached: whether the result was in the store, including results that this run stored before
+            an interruption.
     """
 
     address: str
@@ -169,8 +169,8 @@ class Journal:
         """Append a line and sync it to the disk.
 
         Args:
-            event: event of the line.
-            facts: other fields, see `JournalLine`; `time` is the current time unless given.
+            event: event to write.
+            facts: other fields of `JournalLine`; `time` is the current time unless given.
 
         Raises:
             StoreError: the disk cannot be written to.
@@ -234,7 +234,7 @@ def _parsed(lines: bytes) -> list[JournalLine]:
 
 
 def require_run_folder(folder: Path, name: str) -> None:
-    """Check a run folder in the same way as `Journal`, before any input is read.
+    """Check a run folder as `Journal` does, but before any input is read.
 
     Args:
         folder: the run folder; it may be missing.
@@ -309,7 +309,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def is_running(folder: Path) -> bool:
-    """Whether a living process executes the run in a folder."""
+    """Whether a live process is executing the run in a folder."""
     return is_locked(folder / JOURNAL)
 
 

@@ -1,13 +1,13 @@
 """Folders for compiled numba kernels: private to the user, and never shared.
 
-Compiled kernels are pickles, and loading a pickle runs code. They are therefore never stored in a
-store or working folder, which people share, and never copied from one. The folder belongs to the
-user or root, and nobody else may write to it; if there is no such folder, kernels are kept in a
-temporary folder of this process.
+Compiled kernels are pickles, and loading a pickle runs code. They are therefore never written to a
+store or working folder, which several people may share, and never copied from one. The folder
+belongs to the user or root, and nobody else may write to it; if there is no such folder, kernels
+are kept in a temporary folder of this process.
 
-orthoflow's own kernels are found by their content, see `geometry.compiling`. Kernels of plugins are
-cached by numba itself, which checks only the file of the kernel and not the code that it calls in
-other files; each version of a plugin's code therefore has its own folder.
+orthoflow's own kernels are identified by their content (see `geometry.compiling`). Kernels of
+plugins are cached by numba itself, which checks only the file of the kernel and not the code that
+it calls in other files; each version of a plugin's code therefore has its own folder.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from pathlib import Path
 from typing import Final
 
 VARIABLE: Final = "NUMBA_CACHE_DIR"
-# Each takes about 60 MB.
+# The kernels of one version of a plugin's code take about 60 MB.
 _MAX_STATES: Final = 8
 
 
 def private_folder(name: str) -> Path:
     """Return a folder of the user's cache that nobody else can write to; create it if missing.
 
-    It is `$XDG_CACHE_HOME/orthoflow/<name>` or `~/.cache/orthoflow/<name>`. If that cannot be
-    created, or others may write to it, a temporary folder is used, which is removed at exit.
+    It is `$XDG_CACHE_HOME/orthoflow/<name>` or `~/.cache/orthoflow/<name>`. If this folder cannot
+    be created, or others may write to it, a temporary folder is used, which is removed at exit.
     """
     with suppress(OSError, RuntimeError):
         own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "orthoflow"
@@ -44,11 +44,11 @@ def private_folder(name: str) -> Path:
 
 
 def kernel_folder(state: str) -> Path:
-    """Return a folder for compiled kernels, see `all_kernels`.
+    """Return a folder for compiled kernels (see `all_kernels`).
 
     Args:
-        state: digest of a plugin's code, whose most recent versions are kept; empty for orthoflow's
-            own kernels.
+        state: digest of a plugin's code (only the most recent versions are kept); empty for
+            orthoflow's own kernels.
     """
     root = all_kernels()
     if not state or str(root) == os.environ.get(VARIABLE):
@@ -97,7 +97,7 @@ def _temporary() -> tempfile.TemporaryDirectory[str]:
 
 @contextmanager
 def kernels_in(folder: Path) -> Iterator[None]:
-    """Make numba cache kernels of this process in a folder while the block runs."""
+    """While the block runs, make numba cache the kernels of this process in a folder."""
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = str(folder)
     reload_numba_config()

@@ -40,7 +40,7 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 # cannot.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
 _CORE: Final = frozenset({"numpy", "numba", "scipy", "opencv-python-headless"})
-# Requirements that do not affect results: command line, records, pages, drawings, metadata.
+# Requirements that do not affect results: command line, records, pages, drawings and metadata.
 _WITHOUT_EFFECT: Final = frozenset(
     {"click", "ezdxf", "filelock", "h5py", "iiif-prezi3", "jinja2", "libusb-package", "matplotlib"}
     | {"networkx", "pluggy", "prov", "psutil", "pydantic", "pystac", "reportlab", "rich", "rocrate"}
@@ -79,7 +79,7 @@ class MethodFacts(MethodIdentity):
 
     @property
     def kernels(self) -> str:
-        """Name of the folder for a plugin's kernels; empty for built-in methods."""
+        """Name of the folder for kernels of the plugin; empty for built-in methods."""
         if self.target.startswith(f"{_BUILT_IN_PACKAGE}."):
             return ""
         return hashlib.sha256("".join(self.code.values()).encode()).hexdigest()
@@ -104,7 +104,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     """Load a method and determine what its results depend on.
 
     Raises:
-        PluginError: the method, or a library it needs, is missing or broken.
+        PluginError: the method, or a library that it needs, is missing or broken.
     """
     entry = catalog.method(method_id)
     cls: type[Method] = entry.load()
@@ -166,7 +166,7 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
         },
     }
     if facts.determinism == "exact" and cell.repeat:
-        # A repeat recomputes the same result to time it, so it needs its own key.
+        # A repeat recomputes the same result to measure the time, so it needs its own key.
         preimage["repeat"] = cell.repeat
     text = canonical_json(preimage)
     return CellKey(key=hashlib.sha256(text.encode()).hexdigest(), preimage=text)
@@ -208,9 +208,9 @@ def _tools(cls: type[Method]) -> dict[str, str]:
 def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mapping[str, str]:
     """Return the versions of the libraries that can affect results of a plugin's methods.
 
-    These are the requirements of its distribution and of orthoflow, and other libraries that its
-    sources import, as far as they are installed. Libraries that only display or store results are
-    excluded.
+    These are the requirements of the plugin's distribution and of orthoflow, and other libraries
+    that the plugin's sources import, as far as they are installed. Libraries that only display or
+    store results are excluded.
 
     Args:
         distribution: distribution of the plugin.
@@ -236,7 +236,7 @@ def _imported(sources: Iterable[Path]) -> set[str]:
     modules -= {path.stem for path in sources} | {path.parent.name for path in sources} | _OUR_OWN
     if not modules:
         return set()
-    # `metadata.packages_distributions` lists the same in a quarter of a second, for each command.
+    # `metadata.packages_distributions` lists the same, but takes a quarter of a second per command.
     listed = re.compile(
         rf"^(?:{'|'.join(map(re.escape, sorted(modules)))})(?:[/.]|$)", re.MULTILINE
     )
@@ -279,7 +279,7 @@ def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
 
 
 def files_digest(files: Iterable[Path]) -> str:
-    """Return the digest of names and contents of files; cached while they are unchanged."""
+    """Return the digest of the names and contents of files; cached while they are unchanged."""
     return _digest(_states(files))
 
 
@@ -308,7 +308,7 @@ def methods_text(methods: Mapping[str, MethodFacts]) -> str:
 
 
 def misfit(methods: str) -> str:
-    """Return how the methods installed here differ from a plan's; empty if they agree."""
+    """Return how the methods installed here differ from those of a plan; empty if they agree."""
     catalog = discover_catalog()
     for name, planned in json.loads(methods).items():
         try:

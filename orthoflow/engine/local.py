@@ -129,7 +129,7 @@ class Executor(Protocol):
         """
 
     def cancel(self) -> None:
-        """Ask all tasks to stop; they end through `poll`, after a grace period by force."""
+        """Ask all tasks to stop, by force after a grace period; `poll` returns their results."""
 
     def close(self) -> None:
         """Stop all tasks still running, immediately."""
@@ -146,7 +146,7 @@ class InlineExecutor:
         Args:
             capacity: limits for a task.
             listen: called with the address of a task and its message.
-            is_interrupted: whether the user asked to stop; called while a task runs, too.
+            is_interrupted: returns whether the user asked to stop; also called while a task runs.
         """
         self.capacity = capacity
         self._listen = listen
@@ -223,7 +223,7 @@ def start_process(
     failure: Exception | None = None
     with _starting, _start_conditions():
         context.set_forkserver_preload(PRELOADED)
-        # If the server was killed, the process does not respond: start both again.
+        # If the server was killed, the process does not respond; then start both again.
         for _ in range(2):
             process = context.Process(target=target, args=arguments, name=name)
             try:
@@ -270,7 +270,7 @@ def _start_conditions() -> Iterator[None]:
 def _variables(task: Task) -> Mapping[str, str]:
     """Return the environment variables for the process of a task."""
     variables = dict(os.environ)
-    # Only useful for debugging kernels, which requires `--executor inline`.
+    # This variable is only useful for debugging kernels, which requires `--executor inline`.
     variables.pop("NUMBA_DISABLE_JIT", None)
     return variables | {
         **dict.fromkeys(_THREAD_VARIABLES, str(task.cores)),
@@ -289,10 +289,10 @@ class _Step:
         task: the task.
         process: the process of the task.
         pipe: messages of the process, see `worker.run_step`.
-        clock: start time, monotonic seconds.
-        reason: why the executor stopped the process; None otherwise.
+        clock: start time in seconds of the monotonic clock.
+        reason: reason why the executor stopped the process; None if it did not.
         is_victim: whether the process was stopped for lack of memory.
-        kill_at: end of the grace period, monotonic seconds.
+        kill_at: end of the grace period in seconds of the monotonic clock.
         peak_bytes: peak memory of the process, measured from outside.
         result: result that the process sent.
     """
@@ -307,7 +307,7 @@ class _Step:
         with writing_to(Path(task.folder).parent):
             task.scratch.mkdir(parents=True, exist_ok=True)
         self.task = task
-        # Truncate the log, but do not follow a link in its place.
+        # Truncate an existing log, but do not follow a link in its place.
         opened = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW
         with writing_to(Path(task.log).parent):
             os.close(os.open(task.log, opened, 0o666))
@@ -418,7 +418,7 @@ class LocalExecutor:
         pipes = [step.pipe for step in steps if not step.pipe.closed]
         timeout_s = 0.0 if ends else timeout_s
         wait([*pipes, *(step.process.sentinel for step in steps)], timeout_s)
-        # Determined before the last messages are read: no process sends a message after its end.
+        # Determine this before reading the last messages: no process sends a message after its end.
         ended = [step for step in steps if not step.process.is_alive()]
         for step in steps:
             self._read(step)
@@ -478,7 +478,7 @@ class LocalExecutor:
     def _guard_memory(self) -> None:
         """Stop the step that uses the most memory if the machine is running out of memory."""
         floor, steps = memory_shortage(), _all_running.copy()
-        # One at a time, because a killed process does not release its memory immediately.
+        # Stop one step at a time, because a killed process does not release its memory immediately.
         if not floor or any(step.is_victim for step in steps.values()):
             return
         held = {pid: tree_memory(pid) for pid in steps}

@@ -39,7 +39,7 @@ def tree_memory(root: int) -> int:
 
 
 def memory_shortage() -> int:
-    """Return the minimum free memory in bytes if less than that is available, otherwise 0.
+    """Return the required free memory in bytes if less than that is available, otherwise 0.
 
     The minimum is 512 MiB or 3 % of the total; with less, a machine fails unpredictably.
     """
@@ -49,9 +49,9 @@ def memory_shortage() -> int:
 
 
 def is_for_want_of_memory(error: BaseException) -> bool:
-    """Whether an error means lack of memory, also in loading a library or starting a thread.
+    """Whether an error means lack of memory, even when loading a library or starting a thread.
 
-    In these two cases, lack of memory is known only from the message.
+    In these two cases, only the message shows that memory is lacking.
     """
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "allocate memory" in str(error)
@@ -71,10 +71,10 @@ _COMPILER_LOCK: Final = "numba:compiler_lock"
 
 
 class LoadingMeter:
-    """Measures how long this process loads modules and compiles kernels while the block runs.
+    """Measures how long a block spends on loading modules and compiling kernels.
 
     Concurrent loading in several threads is counted once. Loading in a daemon thread does not delay
-    the method: only its processor time is counted.
+    the method, so only its processor time is counted.
     """
 
     def __init__(self) -> None:

@@ -42,7 +42,7 @@ _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
 _ABSENT: Final = "absent"
 _FORCED: Final = "forced"
-# Files with camera parameters or positions of images, which may be the same for several images.
+# Files with camera parameters or image positions, which may be the same for several images.
 _SIDECARS: Final = frozenset({".aae", ".jgw", ".pgw", ".prj", ".tfw", ".wld", ".xmp"})
 # Time to start a process and to read and store its products.
 _START_S: Final = 1.0
@@ -57,7 +57,7 @@ class RunOptions(Selection):
         executor: `local` (a child process per cell), `inline` (this process, for debugging) or
             `dask` (a child process per cell, on the workers of a cluster).
         scheduler: address of the Dask scheduler; if empty, `jobs` local workers are created.
-        retries: maximum number of repetitions of a cell after a loss of its worker.
+        retries: maximum number of repetitions of a cell after its worker is lost.
         force: steps to run even if their results are in the store.
     """
 
@@ -80,17 +80,17 @@ class RunOptions(Selection):
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedCell:
-    """A cell and how it will be treated.
+    """A cell, and what the run will do with it.
 
     Attributes:
         cell: the cell.
-        status: `cached`, `will run`, `skipped`, or `unknown yet` if its inputs are not yet known.
+        status: `cached`, `will run`, `skipped`, or `unknown yet` if the inputs are not yet known.
         reason: reason for the status, such as the changes since the most similar earlier result.
         key: cache key; None if its inputs are not known.
         inputs: port -> product, as far as known.
         result: stored result of a cached cell.
-        took_s: expected duration, from the earlier call with the most similar parameters; 0 for
-            cells that do not run, None if unknown.
+        took_s: expected duration in seconds, from the earlier call with the most similar
+            parameters; 0 for cells that do not run, None if unknown.
     """
 
     cell: Cell
@@ -148,7 +148,7 @@ def plan_run(
     store: Store,
     options: RunOptions | None = None,
 ) -> RunPlan:
-    """Plan a run: hash the inputs, compute the keys and look them up. No cell is run.
+    """Plan a run without running any cell: hash inputs, compute cache keys, and look them up.
 
     Raises:
         ArgumentError: an option refers to a step that does not exist.
@@ -182,7 +182,7 @@ def _require_distinct(
     inputs: Mapping[str, PlannedInput | None],
     methods: Mapping[str, MethodFacts],
 ) -> None:
-    """Refuse input files that a step would count twice: copies, or links to one file.
+    """Refuse input files that a step would use twice: copies, or links to the same file.
 
     Raises:
         InputError: two files of an input have the same content.
@@ -285,7 +285,7 @@ class _Planner:
             before = _ingredients(earlier.key_preimage)
             return sum(before.get(name) != value for name, value in params.items())
 
-        # If several are equally similar, the most recent one is used.
+        # If several calls are equally similar, the most recent one is used.
         nearest = min(self._before(cell.method), key=n_changed, default=None)
         return None if nearest is None else nearest.wall_s + _START_S
 

@@ -34,7 +34,7 @@ _LIBRARIES: Final = (
 def load_libraries() -> None:
     """Load the libraries; errors are ignored here and reported by the steps."""
     if address_space() is not None:
-        # Some libraries crash if memory is short, and would take all steps with them.
+        # If memory is short, some libraries crash, which would end all steps.
         return
     for name in _LIBRARIES:
         with suppress(Exception):

@@ -80,11 +80,11 @@ class CellResult(CellOutcome):
 
     Attributes:
         format: name and version of the JSON format.
-        run_id: id of the run that computed it.
-        environment: environment in which it was computed; None if it was not computed.
+        run_id: id of the run that computed the result.
+        environment: environment in which the result was computed; None if it was not computed.
         inputs: port -> product.
         outputs: port -> product.
-        figures: figures of the method.
+        figures: figures drawn by the method.
         is_bug: whether the method raised an unexpected exception; the log contains the traceback.
         exit_code: exit code of the error class, 0 if ok.
     """
@@ -100,7 +100,7 @@ class CellResult(CellOutcome):
 
     @property
     def objects(self) -> frozenset[str]:
-        """Return the names of its objects in the store: products and figures."""
+        """Return the names of the objects to which the result refers: products and figures."""
         products = {ref.digest.removeprefix("sha256:") for ref in self.outputs.values()}
         return frozenset(products | {figure.sha256 for figure in self.figures})
 

@@ -92,7 +92,7 @@ class RunOutcome:
 
     @property
     def failed(self) -> Mapping[str, CellResult]:
-        """Return the failed cells, without the cells skipped because of them."""
+        """Return the failed cells, without those that were skipped because of a failure."""
         return {
             address: result for address, result in self.results.items() if result.status == "failed"
         }
@@ -104,7 +104,7 @@ class RunOutcome:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 if no cell failed, the common exit code of the failures (2 or 4), or 1."""
+        """Return 0 if no cell failed, 2 or 4 if all failures have that exit code, or else 1."""
         codes = {result.exit_code for result in self.failed.values()}
         if not codes:
             return 0
@@ -132,7 +132,8 @@ def execute(
         run_id: id of a new run, generated if empty; a resumed run keeps its own.
 
     Raises:
-        ArgumentError: the run folder contains a finished run or other files, or a path is not text.
+        ArgumentError: the run folder contains a finished run or other files, or a path cannot be
+            encoded as text.
         StoreError: the disk cannot be written to, or the run folder is in use.
         DamageError: an input of a step was damaged in the store and has been removed; the same call
             recomputes it.
@@ -242,7 +243,7 @@ class _Run:
         )
 
     def _advance(self, executor: Executor) -> None:
-        """Finish or start each cell whose inputs are known, as far as cores are free."""
+        """Finish each cell whose inputs are known, or start it if enough cores are free."""
         for address, planned in list(self._waiting.items()):
             if address not in self._ready:
                 self._prepare(planned.cell)
@@ -251,7 +252,7 @@ class _Run:
             if ready is None or self._is_under_way(ready[0]):
                 continue
             key, refs = ready
-            # A cell of this run with the same key may have ended meanwhile.
+            # A cell of this run with the same key may have ended in the meantime.
             known = self._known(planned.cell, key) if key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
@@ -260,7 +261,7 @@ class _Run:
                 self._start(planned.cell, key, refs, executor)
 
     def _prepare(self, cell: Cell) -> None:
-        """Use a stored result, or make the cell ready, once its inputs are known."""
+        """Once the inputs of a cell are known, use a stored result or mark the cell as ready."""
         needed = cell.sources
         if not all(address in self._results for address in needed):
             return
@@ -307,7 +308,7 @@ class _Run:
         return result
 
     def _require_sound(self, cell: Cell, refs: Mapping[str, ProductRef]) -> None:
-        """Check all bytes of the products that a cell uses; remove damaged ones."""
+        """Check all bytes of the products that a cell uses, and remove damaged products."""
         for port, ref in refs.items():
             if isinstance(cell.inputs[port], CellOutput) and not self._store.is_sound(ref.digest):
                 raise DamageError(f"{cell.inputs[port]}, which {cell.address} uses, was damaged")
@@ -369,7 +370,7 @@ class _Run:
         remove_tree(Path(task.folder))
         cell = next(one.cell for one in self._plan.cells if one.cell.address == task.address)
         if result.error_type == DamageError.__name__:
-            # Not the method's fault: its inputs were damaged after they had been checked.
+            # The method is not at fault: its inputs were damaged after they had been checked.
             self._require_sound(cell, {port: given.ref for port, given in task.inputs.items()})
             raise DamageError(result.error_message)
         if result.status == "ok" and self._plan.methods[cell.method].is_code_unchanged():
@@ -377,7 +378,8 @@ class _Run:
             self._store.put_result(task.key, result)
             self._store.trust(result)
         elif result.status == "ok":
-            # If stored, the result would be attributed to the code of its key, which has changed.
+            # Do not store the result: it would be attributed to the code in its key, which has
+            # changed.
             changed = _CODE_CHANGED.of("", {})
             self.report(cell.address, _event_of(changed))
             result = _reporting(result, changed)
@@ -385,7 +387,7 @@ class _Run:
 
     def _settle(self, cell: Cell, result: CellResult, *, is_cached: bool = False) -> None:
         self._waiting.pop(cell.address, None)
-        # The result may come from another workflow; use the names of this one.
+        # The result may come from another workflow; use the step names of this one.
         named = (
             placed(one, self._settings[cell.address], self._step_of) for one in result.diagnostics
         )
@@ -454,7 +456,7 @@ def _executor_of(
         plan: plan of the run.
         scratch: scratch folder of the run.
         listen: called with messages of steps.
-        is_asked_to_stop: whether the run is interrupted.
+        is_asked_to_stop: returns whether the run was interrupted.
 
     Raises:
         PluginError: Dask is not installed.

@@ -139,7 +139,7 @@ class StoredProduct:
 
 
 class Store:
-    """A folder of products and results, which concurrent runs may share.
+    """A folder with products and results that concurrent runs may share.
 
     The store never contains incomplete data: each file and folder is created under a temporary
     name, synced and renamed.
@@ -163,7 +163,7 @@ class Store:
         self._sound: set[tuple[Path, int, int, int, int]] = set()
 
     def file_digests(self) -> FileDigests:
-        """Return the cache of input file digests; call its `save` at the end."""
+        """Return the cache of input file digests; its `save` must be called at the end."""
         return FileDigests(self.folder / "digests.json")
 
     @contextlib.contextmanager
@@ -185,7 +185,7 @@ class Store:
 
         Args:
             product: the product; if the store already contains it with the same published files,
-                that one is kept.
+                the stored one is kept.
             publisher: function that writes the published files.
 
         Raises:
@@ -221,8 +221,8 @@ class Store:
         Args:
             digest: digest of the product.
             cls: class of the product.
-            is_checked: skip the check of its bytes, which the coordinator has already done for
-                steps.
+            is_checked: whether the bytes are already checked (as the coordinator does for steps),
+                so that the check is skipped.
 
         Raises:
             DamageError: the product is missing or damaged.
@@ -334,7 +334,7 @@ class Store:
     # Results ------------------------------------------------------------------------------------
 
     def result(self, key: str) -> CellResult | None:
-        """Return the result of a key; None if missing or obviously incomplete."""
+        """Return the result with a key; None if it is missing or obviously incomplete."""
         return self.look_up(key)[0]
 
     def look_up(self, key: str) -> tuple[CellResult | None, str]:
@@ -386,7 +386,7 @@ class Store:
         return sum(folder_size(self.objects / name) for name in result.objects)
 
     def put_result(self, key: str, result: CellResult) -> None:
-        """Store the result of a cell; its objects must be in the store already.
+        """Store the result of a cell, whose objects must already be in the store.
 
         Raises:
             StoreError: the disk cannot be written to.
@@ -396,7 +396,7 @@ class Store:
         write_whole(self.results / f"{key}.json", result_to_json(result).encode())
 
     def earlier_results(self, method: str, *, limit: int = 20) -> tuple[CellResult, ...]:
-        """Return results of a method, complete or not, most recently used first."""
+        """Return the results of a method, complete or not, most recently used first."""
         dated = []
         for path in self.results.glob("*.json"):
             with contextlib.suppress(OSError):
@@ -472,7 +472,7 @@ class Store:
         Raises:
             StoreError: the file or folder cannot be removed.
         """
-        # Another process may have removed it first and stored an intact one.
+        # Another process may have removed the object in the meantime and stored an intact one.
         if not os.path.lexists(path) or not damaged():
             return
         try:
@@ -510,7 +510,7 @@ def _describe(folder: Path, name: str, type_name: str) -> Mapping[str, tuple[int
 
 
 def _read_description(folder: Path) -> StoredProduct | None:
-    """Read `object.json`; None if it is missing, damaged or of another object."""
+    """Read `object.json`; None if it is missing, damaged or describes another object."""
     try:
         text = (folder / DESCRIPTION).read_text(encoding="utf-8")
         found = _codec().validate_json(text, strict=True)
@@ -534,7 +534,7 @@ def _files_of(folder: Path) -> Mapping[str, tuple[int, str]]:
 
 
 def stores_at(folder: str | Path) -> tuple[Store, ...]:
-    """Return the store in a folder as a tuple, empty if there is no folder; nothing is created."""
+    """Return a tuple with the store in a folder, empty if there is no folder; create nothing."""
     return (Store(Path(folder)),) if Path(folder).is_dir() else ()
 
 
@@ -564,12 +564,12 @@ class StoredResult:
     Attributes:
         key: cache key.
         method: method id.
-        run_id: id of the run that computed it.
-        ended: when it finished, ISO 8601, UTC.
-        last_used: when a run last used or computed it, ISO 8601, UTC.
-        size_bytes: size of its products, including published files; products shared by several
-            results are counted in each.
-        is_complete: whether all its products and figures exist.
+        run_id: id of the run that computed the result.
+        ended: when its computation ended, ISO 8601, UTC.
+        last_used: when a run last used or computed the result, ISO 8601, UTC.
+        size_bytes: size of the result's products, including published files; products shared by
+            several results are counted in each.
+        is_complete: whether all products and figures of the result exist.
     """
 
     key: str

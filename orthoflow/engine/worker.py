@@ -71,7 +71,7 @@ from orthoflow.untrusted_text import shown
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Publisher
 
-# Leaves room for the method's own message, which is truncated earlier, and the text around it.
+# Limit with room for the method's own message, which is truncated earlier, and the text around it.
 _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
 _OOM_SCORE: Final = "900"
@@ -85,7 +85,7 @@ class TaskInput:
 
     Attributes:
         ref: reference to the product.
-        target: import string of its class; empty for files.
+        target: import string of the product class; empty for files.
         input_name: name of the workflow input; empty for products.
         files: files of the workflow input.
     """
@@ -154,7 +154,7 @@ class Task(MethodIdentity):
 Listener = Callable[[StepEvent], None]
 
 
-# Messages from the process of a step: one of these prefixes, then JSON.
+# Messages from the process of a step consist of one of these prefixes, followed by JSON.
 EVENT: Final = b"event "
 RESULT: Final = b"result "
 
@@ -245,7 +245,7 @@ class _EventPipe:
         self._sent = StepEvent(kind="progress", text="", fraction=0.0)
 
     def listen(self, event: StepEvent) -> None:
-        """Send an event; progress at most ten times a second, other events also to the log.
+        """Send an event: progress at most ten times a second; other events are also logged.
 
         A progress event with a new text but the same fraction is always sent, as a new activity.
         """
@@ -273,7 +273,7 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
     Args:
         task: the task; its folder must exist.
         listen: called with progress, log lines and diagnostics.
-        is_cancelled: whether the task should stop.
+        is_cancelled: returns whether the task should stop.
     """
     started = now()
     meter, progress = LoadingMeter(), _ProgressWithCompiling(listen)
@@ -315,7 +315,7 @@ def failed_result(task: Task, error: OrthoflowError) -> CellResult:
 
 
 def blank_result(task: Task) -> CellResult:
-    """Return a result with everything that is known before the task runs."""
+    """Return a result that contains everything known before the task runs."""
     return CellResult(
         status="ok",
         key=task.key,
@@ -329,7 +329,7 @@ def blank_result(task: Task) -> CellResult:
 
 
 def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
-    """Convert any exception of a method into an OrthoflowError with one sentence."""
+    """Convert any exception raised by a method into an OrthoflowError with one sentence."""
     if isinstance(error, OrthoflowError):
         return error
     if is_for_want_of_memory(error):
@@ -349,7 +349,8 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
 
 def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        # Not a StoreError: the method needed more than is available, so it counts as failed.
+        # Do not return a StoreError: the method needed more than is available, so it counts as
+        # failed.
         return StepFailedError(str(store_error(error, store)))
     return store_error(error, store) if is_broken(error, store) else None
 
@@ -404,11 +405,11 @@ class _Call:
         return self._context.diagnostics
 
     def costs(self) -> Costs:
-        """Return the cost of the call so far."""
+        """Return the costs of the call so far."""
         return Costs(
             wall_s=self._wall_s,
             cpu_s=self._processor_s,
-            # The executor samples the memory of a step in a process of its own.
+            # The executor samples the memory of a step that runs in its own process.
             peak_rss_mib=round(process_memory() / MIB, 1),
             stored_mib=self._stored_mib,
             compile_s=round(self._meter.total_s, 4),
@@ -444,7 +445,7 @@ class _Call:
         return result
 
     def _cpu_s(self) -> float:
-        """Processor seconds of this process and its children, without loading and compiling."""
+        """Processor seconds of this process and its children, excluding loading and compilation."""
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         own_s = time.process_time() - self._meter.processor_s
         return own_s + children.ru_utime + children.ru_stime
@@ -523,5 +524,5 @@ def _trace(error: BaseException) -> str:
         text = "".join(traceback.format_exception(error))
     except Exception:  # noqa: BLE001 - its own text may raise one
         text = ""
-    # The end contains the error.
+    # Keep the end, which contains the error.
     return text[-_LONGEST_TRACE:].encode(errors="backslashreplace").decode()

@@ -1,1 +1,1 @@
-"""Workflow files: reading, checking, and expansion into cells."""
+"""Workflow files: reading, checks, and expansion into cells."""

@@ -1,4 +1,4 @@
-"""Checks across the parts of a workflow: connections, comparison, implausible values."""
+"""Checks that concern several parts of a workflow: connections, comparison, and plausibility."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ def _types(
     input_names: Collection[str],
     log: ProblemLog,
 ) -> Callable[[Location, Reference], str | None]:
-    """Return a function that finds the product types of references."""
+    """Return a function that looks up the product type of a reference."""
     given = {step.name: _ports(step, are_given=True) for step in steps}
 
     def type_of(location: Location, reference: Reference) -> str | None:
-        """Return the product type of a reference; None if it is unknown, which is reported."""
+        """Return the product type of a reference; if it is unknown, report this and return None."""
         name, source = reference.name, reference.source
         if reference.is_input and name in input_names:
             return FILES
@@ -164,7 +164,8 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
         try:
             TopologicalSorter(sources).prepare()
         except CycleError as error:
-            # Each step of this list is the source of the next; the last is the same as the first.
+            # Each step in this list is a source of the next; the last step is the same as the
+            # first.
             names_in_cycle: list[str] = error.args[1]
         else:
             return
@@ -195,7 +196,7 @@ def check_comparison(
     if section is None:
         return None
     names = {
-        # The name of a swept variant is still valid; it refers to the variants of all its values.
+        # The name of a swept variant is still valid; it refers to the variants for all its values.
         step.name: list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
         for step in steps
         if step.is_varied
@@ -256,7 +257,7 @@ def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
 
 
 def _families(step: DraftStep) -> dict[str, list[str]]:
-    """Return name of a swept variant -> variants of its values."""
+    """Return name of a swept variant -> names of the variants for its values."""
     found: dict[str, list[str]] = {}
     for call in step.calls:
         if call.family:
@@ -287,7 +288,7 @@ def _known(
     names: Mapping[str, Sequence[str]],
     log: ProblemLog,
 ) -> dict[str, str]:
-    """Return the entries with a known factor and a known level; report the others."""
+    """Return the entries whose factor and level are known; report the others."""
     chosen: dict[str, str] = {}
     for factor, level in assignment.items():
         known = names.get(factor)
@@ -313,7 +314,7 @@ def _known(
 
 
 def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequence[str]) -> str:
-    """Return why a metric pattern matches nothing; empty if it may match a metric."""
+    """Return the reason why a metric pattern matches nothing; empty if it may match a metric."""
     step, _, metric = pattern.partition(".")
     if not _has_wildcard(step) and step not in step_names:
         return (
@@ -368,7 +369,8 @@ _GSD: Final = "gsd_m"
 _CROP: Final = "crop"
 # Prefix of the methods that find photos on walls.
 _MATCHING: Final = "match."
-# Limits for pixel sizes of walls and plans: finer than any scan, coarser than any building drawing.
+# Limits for pixel sizes of walls and plans: finer than any scan, or coarser than any building
+# drawing.
 _MIN_GSD_M: Final = 0.0001
 _MAX_GSD_M: Final = 0.5
 _MILLIMETRES: Final = 1000.0
@@ -435,7 +437,7 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
 
 
 def _calls(workflow: Workflow, parameter: str) -> Iterator[tuple[str, str, StepVariant]]:
-    """Yield origin, step and call: all calls, and those whose `parameter` a dataset sets."""
+    """Yield origin, step and call, for all calls and for those whose `parameter` a dataset sets."""
     for step in workflow.steps.values():
         for variant in step.variants:
             yield "", step.name, variant

@@ -70,14 +70,14 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     Args:
         name_or_path: an existing file, or the name of a shipped recipe.
         catalog: the installed plugins.
-        sets: `step[.variant].param=value`, as for `--set`.
-        inputs: `NAME=PATH`, as for `--input`; relative to the working directory.
+        sets: settings `step[.variant].param=value`, as for `--set`.
+        inputs: `NAME=PATH`, as for `--input`; paths are relative to the working directory.
         datasets: table that replaces the datasets in the file, as for `--datasets`, or the content
             of the section itself.
         only_data: names of datasets, as for `--only-data`.
-        set_files: YAML files of `step.parameter: value`, as for `--set-file`; values in `sets` take
-            precedence.
-        also_files: report missing input files together with other problems of the file.
+        set_files: YAML files with lines `step.parameter: value`, as for `--set-file`; values in
+            `sets` take precedence.
+        also_files: whether to report missing input files together with other problems of the file.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
@@ -98,7 +98,8 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         if not log.has((key,)):
             log.report((key,), needed)
     if not log.has((_STEPS,)):
-        # The other sections refer to steps: checking them too would report each name as a problem.
+        # The other sections refer to steps, so that checking them would report each name as a
+        # problem.
         _sections(log)
         log.raise_any()
     profiles = [_read_profile(Path(name), log) for name in set_files]

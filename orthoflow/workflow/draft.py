@@ -1,4 +1,4 @@
-"""Drafting of a workflow: recognises the given files and inserts them into a shipped recipe."""
+"""Drafting of a workflow: recognition of files, and their insertion into a shipped recipe."""
 
 from __future__ import annotations
 
@@ -63,17 +63,17 @@ class Recognised:
     """A recognised file, or a folder that is a single item.
 
     Attributes:
-        kind: its type; `unknown` if no method reads it.
+        kind: type of the item; `unknown` if no method reads it.
         path: path of the file.
-        summary: description of the content, or why it is not recognised.
+        summary: description of the content, or the reason why it is not recognised.
         n_points: number of points of a scan.
         n_photos: number of photos, including photos in a scan.
-        n_posed: number of photos in a scan that have lens and pose.
+        n_posed: number of photos in a scan whose lens and pose are known.
         fields: non-empty point attributes of a scan, without coordinates.
-        lens: camera and focal length of a photo, from its EXIF data.
+        lens: names of camera and focal length of a photo, from its EXIF data.
         size_px: width and height of a photo.
         matrix: fx, fy, cx, cy of a text file with a camera matrix.
-        is_text: whether it is a text file that is no readable scan.
+        is_text: whether it is a text file that cannot be read as a scan.
         up: up axis suggested by the surfaces, if it is clearly not z.
         advice: suggested settings and inputs, as far as they follow from the data.
     """
@@ -236,7 +236,7 @@ def _axis_up(points_m: NDArray[np.float64]) -> str:
 def _seen_in(
     scan: ScanFile, unit_m: NDArray[np.float64]
 ) -> tuple[frozenset[str], NDArray[np.float64]]:
-    """Return non-empty fields of a scan's first points, and their (n, 3) positions in metres."""
+    """Return non-empty fields of a scan's first points, and the points (n, 3) in metres."""
     kept: list[NDArray[np.float64]] = []
     found: set[str] = set()
     n_seen = 0
@@ -270,14 +270,14 @@ def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
 # Usual extents of terrestrial scans.
 _MAX_EXTENT_M: Final = 2000.0
 _MIN_EXTENT_M: Final = 0.2
-# Number of points read of a scan, and number of bytes read of a photo, which begins with EXIF.
+# Number of points read from a scan, and number of bytes read from a photo, which begins with EXIF.
 _LOOKED_AT: Final = 1_000_000
 _HEAD_BYTES: Final = 1 << 20
 _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
 
 def _table(path: Path) -> Recognised:
-    """Recognise a table of points or ties; otherwise a text scan, whose lines contain no names."""
+    """Recognise a table of points or ties, or else a text scan, whose lines contain no names."""
     with path.open("rb") as file:
         head = file.read(_FIRST_LINE_BYTES).decode("utf-8", "replace")
     if matrix := _matrix_in(head):
@@ -306,7 +306,7 @@ def _table(path: Path) -> Recognised:
 
 
 def _matrix_in(text: str) -> tuple[float, ...]:
-    """Return fx, fy, cx and cy of a text that begins with a 3 x 3 camera matrix; else ()."""
+    """Return fx, fy, cx and cy from a text that begins with a 3 x 3 camera matrix; otherwise ()."""
     try:
         values = [float(word) for word in re.split(r"[\s,;]+", text.strip())[:9]]
     except ValueError:
@@ -331,7 +331,7 @@ _TABLES: Final[
 
 
 def _is_cloud(rows: Sequence[object]) -> bool:
-    """Whether all point names are numbers with decimals, so that they are coordinates instead."""
+    """Whether all point names are decimal numbers, so that they are in fact coordinates."""
     names = [str(getattr(row, "name", "")) for row in rows]
     return all(re.fullmatch(r"[-+]?\d+\.\d*(e[-+]?\d+)?", name) for name in names)
 
@@ -366,13 +366,13 @@ def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recogni
 
 Recipe: TypeAlias = Literal["photos-on-scan", "direct", "plan"]
 
-# Steps that replace a missing scan.
+# Steps that take the place of a missing scan.
 _STAND_INS: Final = ("room", "check")
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
 _FEW_SCANS: Final = 3
-# Places beyond are easier to read as absolute paths.
+# Paths that begin with this are easier to read as absolute paths.
 _FAR: Final = "../../.."
 
 
@@ -401,11 +401,11 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     Args:
         found: recognised files.
         target: path of the workflow; paths in it are relative to its folder.
-        recipe: recipe to use; None for orthoimages from photos if there are photos, otherwise from
-            the colours of the scan.
+        recipe: recipe to use; if None, orthoimages are made from photos if there are any, otherwise
+            from the colours of the scan.
 
     Raises:
-        InputError: there is no scan, or there are no photos and the recipe needs some.
+        InputError: there is no scan, or there are no photos although the recipe needs them.
     """
     by_kind: dict[FileKind, list[Recognised]] = {}
     for item in found:
@@ -434,7 +434,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         scans = by_kind["scan"] = own_formats
     own_photos = [scan for scan in scans if scan.n_photos]
     has_posed = any(scan.n_posed for scan in own_photos)
-    # Images without a pose are mostly for viewing, and matching would not find them on the walls.
+    # Images without a pose are mostly for viewing, and matching would not locate them on the walls.
     is_usual = bool(by_kind.get("photos") or has_posed)
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
@@ -566,7 +566,7 @@ def _place(path: Path, target: Path) -> str:
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
-    """Return paths of photos; of a folder whose photos are all used, its path or a pattern."""
+    """Return paths of photos; for a folder whose photos are all used, its path or a pattern."""
     paths = [item.path for item in items]
     places: dict[Path, None] = {}
     for path in paths:
@@ -601,7 +601,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _word(name: str) -> str:
-    """Return the name of a file for a comment, without line breaks."""
+    """Return the name of a file without line breaks, for use in a comment."""
     return json.dumps(name, ensure_ascii=False)[1:-1]
 
 
@@ -610,7 +610,7 @@ def _quoted(text: str) -> str:
 
 
 def _seen(text: str) -> str:
-    """Escape all invisible characters as in YAML: some of them end lines and comments."""
+    """Escape all invisible characters as in YAML, because some of them end lines and comments."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
         for letter in text
@@ -618,7 +618,7 @@ def _seen(text: str) -> str:
 
 
 def _without_stand_ins(steps: str) -> str:
-    """Remove the simulated room from the steps, and inspections that are only possible with it."""
+    """Remove the simulated room, and inspections that are impossible without it, from the steps."""
     blocks = re.split(r"^(?=  \w+:)", steps, flags=re.MULTILINE)
     has_room = any(block.startswith("  room:") for block in blocks)
     kept = [

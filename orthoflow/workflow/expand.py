@@ -29,13 +29,13 @@ from orthoflow.workflow.model import (
 )
 from orthoflow.workflow.parameters import SWEEP
 
-# Factor -> level, for the dataset, the seed and each step with variants.
+# Factor (dataset, seed or step with variants) -> level.
 Assignment: TypeAlias = dict[str, str]
 #: steps of a workflow with all variants, datasets, seeds and repeats, excluded ones included
 MOST_CELLS: Final = 20_000
 # Product type of methods that measure the quality of results.
 _JUDGEMENT: Final = "inspection"
-# `error_type` of a cell skipped because of optional data, unlike one skipped after a failure.
+# `error_type` of a cell that is skipped because of optional data and not after a failure.
 NOT_ASKED_FOR: Final = "not-asked-for"
 _SEED_BITS: Final = 53  # exact in all JSON readers, including those that only use doubles
 
@@ -67,8 +67,8 @@ class Cell:
 
     Attributes:
         address: `step`, or `step@step=variant,...` with the variants of upstream steps in graph
-            order, preceded by `data=name` and `seed=n` if it depends on them, and followed by `#n`
-            for repeats 1, 2, ...
+            order, preceded by `data=name` and `seed=n` if the cell depends on them, and followed by
+            `#n` for repeats 1, 2, ...
         step: name of the step.
         assignment: step -> variant for each step with variants that affects this cell, including
             its own, preceded by `data` -> dataset and `seed` -> seed.
@@ -82,10 +82,11 @@ class Cell:
         seed: seed derived from (seed of the workflow or assignment, method id, repeat).
         cores: requested number of cores; None for all.
         timeout_s: time limit in seconds; None if there is none.
-        skip_reason: why the cell will not run (optional data is not given); empty if it will run.
-        skip_type: the same as the `error_type` of its result.
-        variant: name of its variant in the file, which a sweep may have multiplied; empty if the
-            step has none.
+        skip_reason: reason why the cell will not run (optional data is not given); empty if it
+            will.
+        skip_type: the same reason as the `error_type` of the result.
+        variant: name that the workflow file gives to its variant, from which a sweep may have
+            generated it; empty if the step has none.
     """
 
     address: str
@@ -105,7 +106,7 @@ class Cell:
 
     @property
     def setting(self) -> str:
-        """Return the prefix for its parameters in settings: `step`, or `step.variant`."""
+        """Return the prefix of its parameters in settings: `step`, or `step.variant`."""
         return f"{self.step}.{self.variant}" if self.variant else self.step
 
     @property
@@ -116,7 +117,7 @@ class Cell:
 
 
 def is_plain(cells: Iterable[Cell]) -> bool:
-    """Whether nothing varies, so that each step has only one cell."""
+    """Whether nothing varies between cells, so that each step has only one."""
     return all(cell.address == cell.step for cell in cells)
 
 
@@ -160,7 +161,7 @@ def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set
 
 
 def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
-    """Sort steps so that each follows its upstream steps, otherwise in the order of the file."""
+    """Sort steps so that each follows its upstream steps, and otherwise in file order."""
     waiting = list(steps)
     ordered: dict[str, None] = {}
     while waiting:
@@ -335,8 +336,8 @@ class _Node:
     causes: tuple[str, ...] = ()
 
 
-# Source of a port (the first available candidate, or None), factors on which this choice depends,
-# and changes of inputs that would provide a source.
+# Source of a port (the first available candidate, or None), the factors on which this choice
+# depends, and the changes of inputs that would provide a source.
 _Choice: TypeAlias = tuple[CellOutput | WorkflowInput | None, Assignment, tuple[str, ...]]
 
 
@@ -426,7 +427,7 @@ class _Expansion:
     def _repeats(
         self, cell: Cell, before: Mapping[str, Cell], *, is_reached: bool
     ) -> Iterator[Cell]:
-        """Yield the repeats 1, 2, ... of a cell: its own, and those caused by upstream repeats.
+        """Yield the repeats 1, 2, ... of a cell: requested ones, and those caused by upstream ones.
 
         Repeat n uses repeat n of each upstream cell that has one, and otherwise its first
         execution.
@@ -453,7 +454,7 @@ class _Expansion:
             yield replace(cell, address=address, repeat=repeat, inputs=inputs, seed=seed)
 
     def _differs(self, address: str, before: Mapping[str, Cell]) -> bool:
-        """Whether there is a repeat with an address whose result may differ from the first.
+        """Whether the repeat with an address exists and its result may differ from the first one.
 
         Repeats of a deterministic method only measure its time, unless its inputs differ.
         """
@@ -509,7 +510,7 @@ class _Expansion:
         return _Node(cell=cell, dependence=dependence, causes=causes)
 
     def _stopped_by(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
-        """Return the change of inputs that would avoid a skip by condition; empty if none."""
+        """Return the change of inputs that would avoid a skip due to a condition; empty if none."""
         if step.unless and self._input_name(step.unless, full) in self.present:
             return f"without the input {step.unless}"
         if step.only_if and self._input_name(step.only_if, full) not in self.present:
@@ -582,8 +583,8 @@ class _Expansion:
 def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> set[str]:
     """Return the steps that the workflow compares; they run once per repeat of an upstream step.
 
-    They are the steps in `compare.metrics` and all inspections that match its wildcards; without
-    `metrics`, all inspections.
+    These are the steps in `compare.metrics` and all inspections that match its wildcards; without
+    `metrics`, they are all inspections.
     """
     metrics = workflow.compare.metrics if workflow.compare else ()
     patterns = [pattern.partition(".")[0] for pattern in metrics] or ["*"]

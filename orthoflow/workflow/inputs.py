@@ -41,9 +41,9 @@ from orthoflow.workflow.parameters import (
 )
 from orthoflow.workflow.source import ProblemLog, read_text, validate
 
-#: bytes of a table of datasets
+#: limit for the bytes of a table of datasets
 MOST_TABLE_BYTES: Final = 4_000_000
-#: datasets of a table
+#: limit for the datasets in a table
 MOST_DATASETS: Final = 10_000
 _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200
@@ -55,7 +55,7 @@ _SEPARATORS: Final = (";", "\t", ",")
 
 
 class MissingInputsError(InputError):
-    """Input files are missing; `problems` lists them, or the first few."""
+    """Input files are missing; `problems` lists all of them or the first few."""
 
     def __init__(self, problems: Sequence[str], *, most: int = 100) -> None:
         self.problems = tuple(problems)
@@ -85,7 +85,7 @@ def input_specs(
 
 
 def written_files(source: str) -> Mapping[str, tuple[str, ...]]:
-    """Return the files given for each input in a workflow file, ignoring `--input`."""
+    """Return the files that a workflow file gives for each input, regardless of `--input`."""
     log = ProblemLog(file="")
     log.parse(source)
     file = validate(WorkflowFile, {"inputs": log.get(("inputs",)) or {}}, log) or WorkflowFile()
@@ -114,7 +114,7 @@ class InputOption:
 
     @property
     def without_folder(self) -> str:
-        """Return the option for a record, without folders of this machine."""
+        """Return the option as it is recorded, without folders of this machine."""
         return f"--input {self.name}={Path(self.path).name}"
 
 
@@ -133,7 +133,7 @@ def read_input_options(texts: Sequence[str], log: ProblemLog) -> tuple[InputOpti
 def override_inputs(
     specs: Mapping[str, WorkflowInputSpec], options: Sequence[InputOption], log: ProblemLog
 ) -> dict[str, WorkflowInputSpec]:
-    """Replace input files by those on the command line; several options of one name are joined."""
+    """Replace input files with those on the command line; options for the same name are joined."""
     changed = dict(specs)
     for option in options:
         name = option.name
@@ -179,8 +179,8 @@ def some_of(names: Collection[str]) -> str:
 def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
     """Find the files of each input, sorted by name; None for an optional input without files.
 
-    A path may be a file, a folder (all files in it and its subfolders, except hidden ones) or a
-    pattern (all files that match it, with `**` for folders at any depth).
+    A path may be a file, a folder (all files except hidden ones in the folder and its subfolders)
+    or a pattern (all matching files; `**` matches folders at any depth).
 
     Raises:
         InputError: a file is missing, a folder is empty, a pattern has no match, or a required
@@ -304,7 +304,8 @@ class _Origin:
         log: log of the file.
         folder: base folder of relative paths.
         table: name of the table; empty for the workflow itself.
-        is_given: whether the datasets were given from Python, relative to the working directory.
+        is_given: whether the datasets were given from Python, with paths relative to the working
+            directory.
     """
 
     log: ProblemLog
@@ -321,9 +322,9 @@ class DatasetReader:
         folder: folder of the workflow.
         inputs: inputs of the workflow, including `--input`.
         steps: steps of the workflow.
-        overrides: overrides by `--set`, which take precedence over those of datasets.
+        overrides: overrides from `--set`, which take precedence over those from datasets.
         calls: (step, variant) -> valid method call without datasets.
-        log: log for the problems.
+        log: log to which problems are added.
     """
 
     folder: Path
@@ -334,12 +335,12 @@ class DatasetReader:
     log: ProblemLog
 
     def read(self, table: str | Mapping[str, JsonValue]) -> dict[str, Dataset]:
-        """Read the table given with `--datasets`, or else the section, which may refer to a table.
+        """Read the table given with `--datasets`, or else the section, which may name a table.
 
         Args:
             table: path from the command line, relative to the working directory; empty if there is
-                none. From Python it may be the content of the section, with paths relative to the
-                same directory.
+                none. From Python, the content of the section may be given instead, with paths
+                relative to the same directory.
         """
         if isinstance(table, Mapping):
             log = self.log.beside("datasets=", "")
@@ -444,7 +445,7 @@ class DatasetReader:
             f"there is no input {key}{did_you_mean(key, self.inputs)}; inputs: "
             f"{', '.join(self.inputs) or 'none'}{meant}",
             at_key=True,
-            # Problems of a table column are reported once, not for each row.
+            # Problems with a table column are reported once, not for each row.
             shown=(key,) if origin.table else None,
         )
 
@@ -464,7 +465,7 @@ class DatasetReader:
                     continue
                 call = self.calls.get(name)
                 overrides = (*assigned[name], *self.overrides.get(name, ()))
-                # Mistakes of the call itself are reported once, at their own positions.
+                # Mistakes in the call itself are reported once, at their own positions.
                 resolved = resolve_call(draft, overrides, self.log, blame if call else None)
                 if call is not None:
                     calls[name] = resolved
@@ -501,9 +502,9 @@ def read_rows(log: ProblemLog) -> Document:
     """Read a table as the section `datasets`: a mapping from names to datasets.
 
     Columns are separated by semicolons, tabs or commas. A column whose name contains a dot or is
-    `seed` goes into `set` of the dataset, with its values read as YAML; empty fields are omitted.
-    Keys have the position of their column in the header, so that a problem of a column is reported
-    once.
+    `seed` becomes an entry of `set` of the dataset, with its values read as YAML; empty fields are
+    omitted. Keys have the position of their column in the header, so that a problem with a column
+    is reported once.
     """
     rows = _rows(log)
     header = next(rows, None)
@@ -581,7 +582,7 @@ def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
 
 
 def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
-    """Return the columns, including unnamed ones; empty if the table cannot be used."""
+    """Return the columns of a table, including unnamed ones; empty if the table cannot be used."""
     names = [field.text for field in header]
     for index, (name, position) in enumerate(header):
         if name and name in names[:index]:
@@ -602,7 +603,7 @@ def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
 
 
 def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog) -> _Field | None:
-    """Return the dataset name of a row; None if it is invalid, which is reported."""
+    """Return the dataset name in a row; if it is invalid, report this and return None."""
     names = [column.text for column in columns]
     for index, field in enumerate(row):
         if field.text and not "".join(names[index : index + 1]):

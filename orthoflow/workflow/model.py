@@ -1,4 +1,4 @@
-"""The workflow format: models of the file, and the checked workflow that is made from them.
+"""The workflow format: models of the file, and the checked workflow built from them.
 
 The models of the file define the format: checks, JSON Schema and `docs/workflow-format.md` are
 derived from them. Relations between keys are checked in `document` and `checks`.
@@ -103,7 +103,7 @@ class Reference:
 
     @property
     def is_input(self) -> bool:
-        """Whether it refers to an input of the workflow."""
+        """Whether the reference is to an input of the workflow."""
         return self.source == INPUTS
 
     def __str__(self) -> str:
@@ -155,7 +155,7 @@ def _each_once(values: list[_Item]) -> list[_Item]:
 _Name: TypeAlias = Annotated[str, AfterValidator(check_name)]
 _Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1)]
 _Flag: TypeAlias = Annotated[bool, Strict()]
-# Integers, except `true`, which Python treats as one.
+# Integers, but not `true`, which Python treats as an integer.
 _Positive: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=_MOST_OF_A_NUMBER)]
 _Seed: TypeAlias = Annotated[int, Strict(), Field(ge=0, le=_MOST_OF_A_NUMBER)]
 _Repeats: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=MOST_REPEATS)]
@@ -168,7 +168,7 @@ _IS_TEXT: Final = WithJsonSchema({"type": "string"})
 _Source: TypeAlias = Annotated[Reference, BeforeValidator(_reference), _IS_TEXT]
 _InputSource: TypeAlias = Annotated[Reference, BeforeValidator(_input_reference), _IS_TEXT]
 _Metric: TypeAlias = Annotated[str, Strict(), AfterValidator(_metric)]
-# Levels are text, so a seed is converted.
+# Levels are text, so seeds are converted to text.
 _Level: TypeAlias = Annotated[
     str,
     Field(min_length=1),
@@ -333,7 +333,7 @@ class DatasetSection(BaseModel):
 
 
 class DatasetsSection(FileSection):
-    """The datasets of a file, of a table, or given from Python."""
+    """The datasets from a file, from a table, or given from Python."""
 
     datasets: dict[_Name, DatasetSection]
 
@@ -386,7 +386,7 @@ class SeedSection(FileSection):
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Return the seed, or all of a sweep."""
+        """Return the seed, or all seeds of a sweep."""
         return tuple(self.seed.sweep) if isinstance(self.seed, SeedSweep) else (self.seed,)
 
 
@@ -446,10 +446,11 @@ class WorkflowInputSpec:
     Attributes:
         name: name of the input.
         files: files, folders and glob patterns; empty if none are given.
-        optional: whether steps that need it are skipped if it is missing.
+        optional: whether steps that need the input are skipped if it is missing.
         folder: base folder of relative paths: the folder of the workflow, or the working directory
             for paths from the command line.
-        is_given: whether it was given with `--input`, so that it must exist even if it is optional.
+        is_given: whether files were given with `--input`, so that they must exist even if the input
+            is optional.
         table: datasets table and line that contain the files, e.g. `rooms.csv:3`; empty for the
             workflow itself.
         place: position of the files in the document; None if they do not come from a file.
@@ -476,8 +477,9 @@ class StepVariant:
         repeat: number of executions, with different seeds if the method is random.
         cores: requested number of cores; None for all.
         timeout_s: time limit in seconds; None if there is none.
-        swept: swept parameter -> value of this variant; a subset of `params_set`.
-        family: name in the file of the variant that a sweep multiplied; not in the record.
+        swept: swept parameter -> its value in this variant; a subset of `params_set`.
+        family: name that the workflow file gives to the variant from which a sweep generated this
+            one; not in the record.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -544,8 +546,8 @@ class Dataset:
         inputs: input -> files; the name of the input `scan` is `scan@<dataset>`.
         sets: parameters as written, `step.parameter` -> JSON.
         seeds: root seeds for this dataset; empty to use those of the workflow.
-        calls: (step, variant) -> method call with these parameters, if they change it; not stored
-            in records, whose cells contain the parameters.
+        calls: (step, variant) -> method call with these parameters, only for calls that they
+            change; not stored in records, whose cells contain the parameters.
     """
 
     name: str
@@ -563,13 +565,13 @@ class Workflow:
         name: name of the workflow.
         path: path of the file.
         source: text of the file as written.
-        seed: root seed; the first one of a sweep.
+        seed: root seed; the first of the seeds if they are swept.
         seeds: root seeds if they are swept; otherwise empty.
         inputs: inputs by name.
         steps: steps by name, in the order of the file.
         compare: the comparison; None if only the baseline runs.
-        overrides: `--set ...` and `--input ...` that changed the document, in order; files without
-            their folders.
+        overrides: options `--set ...` and `--input ...` that changed the document, in order, with
+            files given without their folders.
         datasets: datasets by name; empty if the workflow runs once, on its inputs.
         only_data: names of the selected datasets; empty for all.
     """
@@ -594,7 +596,7 @@ class Workflow:
 
     @cached_property
     def data_inputs(self) -> frozenset[str]:
-        """Inputs that any dataset sets, selected or not, so that a selection changes no address."""
+        """Inputs that any dataset, even unselected, sets; so a selection changes no address."""
         return frozenset(name for item in self.datasets.values() for name in item.inputs)
 
     @cached_property
@@ -628,7 +630,7 @@ class Workflow:
         return shared | {spec.name: spec for item in chosen for spec in item.inputs.values()}
 
     def with_input_specs(self, specs: Mapping[str, WorkflowInputSpec]) -> Workflow:
-        """Return the workflow with its inputs replaced, given by name."""
+        """Return the workflow with other inputs, which are given by name."""
         datasets = {
             item.name: replace(
                 item, inputs={name: specs.get(one.name, one) for name, one in item.inputs.items()}

@@ -41,10 +41,11 @@ class DraftCall:
         name: name of the variant; empty for a step without variants.
         call: content of the mapping, with parameters that are not swept.
         method: class of the method; None if it cannot be loaded.
-        kind: ports of its kind, which is known even if the method is not.
+        kind: ports of the call's kind, which is known even if the method is not.
         swept: parameters and values of this variant, if it comes from a sweep.
         family: name of the original variant, if it comes from a sweep.
-        is_unswept: whether the file sweeps it and the command line sets a single value.
+        is_unswept: whether the file sweeps a parameter for which the command line sets a single
+            value.
     """
 
     location: Location
@@ -63,7 +64,7 @@ class DraftCall:
 
     @property
     def is_source(self) -> bool:
-        """Whether its kind does not allow variants."""
+        """Whether the kind of the call does not allow variants."""
         return self.kind is not None and self.kind.is_source
 
     @property
@@ -73,7 +74,7 @@ class DraftCall:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names that `--set` may use for it.
+        """Return the names by which `--set` may refer to the call.
 
         A step without variants can be addressed by the name of its method, so that
         `plane.hough2d.cell_m` works in recipes with and without variants; a swept variant can also
@@ -122,7 +123,7 @@ Overrides: TypeAlias = dict[tuple[str, str], tuple[Override, ...]]
 def overrides_of_options(
     sets: Sequence[str], steps: Sequence[DraftStep], log: ProblemLog
 ) -> Overrides:
-    """Find the method calls of each `--set`; report options that match none."""
+    """Find the method calls to which each `--set` applies; report options that match none."""
     assigned: Overrides = {}
     for text in sets:
         report = partial(log.report_option, f"--set {text}")
@@ -142,13 +143,13 @@ def overrides_of_settings(
     *,
     is_column: bool = False,
 ) -> Overrides:
-    """Find the method calls of each `step.parameter: value` of a mapping.
+    """Find the method calls to which each `step.parameter: value` in a mapping applies.
 
     Args:
         settings: the mapping.
         location: location of the mapping in the document.
         steps: steps of the workflow.
-        log: log for the problems.
+        log: log to which problems are added.
         is_column: whether the keys are table columns; problems then refer only to the key, so that
             each is reported once.
     """
@@ -261,7 +262,7 @@ def resolve_call(
     Args:
         draft: the method call.
         overrides: overrides, applied in order to the parameters in the file.
-        log: log for problems of the parameters in the file.
+        log: log for problems with the parameters in the file.
         blame: used instead of `log`, for a call that is valid without the overrides.
 
     Returns:
@@ -299,15 +300,15 @@ def _resolved(
         with guarded():
             checked = model.model_validate_json(json.dumps(as_set), strict=True)
             resolved: dict[str, JsonValue] = checked.model_dump(mode="json")
-            # Check defaults like given values, so that the resolved parameters can be validated
-            # again.
+            # Check defaults in the same way as given values, so that the resolved parameters can be
+            # validated again.
             model.model_validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
         for loc, message, _ in mistakes(error, model, dict(as_set), draft.id):
             name = str(loc[0]) if loc else ""
             if report := reports.get(name, blame):
-                # The position of a report identifies the parameter, but no key inside it, and for
-                # datasets not even the parameter.
+                # A reported position identifies the parameter but not a key inside it; for
+                # datasets, not even the parameter.
                 inside = ProblemLog(file="").path(loc) or f"the parameters of {draft.id}"
                 is_named = name in reports and len(loc) == 1
                 report(message if is_named else f"{inside}: {message}")
@@ -352,7 +353,7 @@ def expand_sweeps(
     `--set` for a swept parameter replaces the sweep, and may itself be a sweep.
 
     Returns:
-        The steps, and the overrides of their calls, including the swept values.
+        The steps with these variants, and the overrides of their calls, including the swept values.
     """
     expanded: list[DraftStep] = []
     kept: Overrides = {}
@@ -483,7 +484,7 @@ def _numbered(name: str) -> Iterator[str]:
 
 
 def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) -> list[str]:
-    """Name the combinations of a sweep by their exact values, or else by an index.
+    """Name the combinations of a sweep by their exact values, or else by indices.
 
     The names do not depend on the order of the combinations.
 
@@ -505,7 +506,7 @@ def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) 
     is_short = all(re.fullmatch(NAME_PATTERN, name) for name in names)
     if is_stated and is_short and len({*names}) == len(names):
         return names
-    # Number them in the order of their values, so that the order of the list does not matter.
+    # Number the combinations by their values, so that their order in the list does not matter.
     keys = [[_ordered(one[name]) for name in sorted(one)] for one in combinations]
     in_order = sorted(range(len(keys)), key=keys.__getitem__)
     before = before[: _LETTERS - len(f"-{SWEEP}-{len(keys)}")]

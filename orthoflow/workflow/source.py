@@ -15,7 +15,7 @@ from orthoflow.files.yaml_positions import Document, Location, Position, path_te
 from orthoflow.products.product import JsonValue
 from orthoflow.untrusted_text import open_file
 
-#: bytes of a workflow file
+#: limit for the bytes of a workflow file
 MOST_BYTES: Final = 400_000
 _INSTALLED: Final = Path(__file__).parent / "shipped"
 _CHECKOUT: Final = Path(__file__).parents[2] / "workflows"
@@ -45,7 +45,7 @@ def shipped_workflow(name: str) -> Path:
 
 
 def find_workflow(name_or_path: str | Path) -> Path:
-    """Return the path of an existing file, or else of a shipped recipe.
+    """Return the path of an existing file, or else that of a shipped recipe.
 
     Raises:
         WorkflowError: there is no such file or recipe.
@@ -85,7 +85,7 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
 
 # Problems -----------------------------------------------------------------------------------------
 
-#: problems of a workflow that are reported at once
+#: limit for the problems of a workflow that are reported at once
 MOST_PROBLEMS: Final = 100
 _SNIPPET_WIDTH: Final = 120
 Model = TypeVar("Model", bound=BaseModel)
@@ -122,7 +122,8 @@ class Problem:
 
     def __str__(self) -> str:
         head = f"{self.place}{self.message}"
-        # Show only a part of a long line around the column, so that it does not hide the message.
+        # Show only the part of a long line around the column, so that the line does not hide the
+        # message.
         is_long = len(self.text) > _SNIPPET_WIDTH
         start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2) if is_long else 0
         cut = self.text[start : start + _SNIPPET_WIDTH]
@@ -135,7 +136,7 @@ class Problem:
 
 
 class _ProblemsError(OrthoflowError):
-    """Several problems, one or more lines each; `problems` contains them as data."""
+    """Several problems, each with one or more lines; `problems` contains them as data."""
 
     def __init__(self, problems: tuple[Problem, ...]) -> None:
         self.problems = problems
@@ -147,7 +148,7 @@ class InvalidWorkflowError(_ProblemsError, WorkflowError):
 
 
 class UnusablePluginError(_ProblemsError, PluginError):
-    """A workflow is valid, but plugins it needs are not; `problems` lists where they are used."""
+    """A workflow is valid, but needs plugins that are unusable; `problems` lists where."""
 
 
 class InvalidArgumentsError(_ProblemsError, ArgumentError):
@@ -162,7 +163,7 @@ class ProblemLog:
         file: the workflow file as given by the user.
         lines: lines of the file.
         document: values with their positions; empty before parsing.
-        unnamed: first key of locations that is omitted in paths, if any.
+        unnamed: first key that is omitted from locations when they are formatted as paths, if any.
     """
 
     file: str
@@ -172,7 +173,7 @@ class ProblemLog:
     _found: list[tuple[_Origin, Problem]] = field(default_factory=list)
 
     def parse(self, text: str) -> Document | None:
-        """Parse YAML; problems are added, and None is returned if nothing can be read."""
+        """Parse YAML and add its problems; return None if nothing can be read."""
         found = read_yaml(text, self)
         self.document = found or NOTHING
         return found
@@ -212,7 +213,7 @@ class ProblemLog:
         at_key: bool = False,
         shown: Location | None = None,
     ) -> None:
-        """Add a problem of the value, or of its key, at a location in the document.
+        """Add a problem with the value, or with its key, at a location in the document.
 
         Args:
             location: location in the document.
@@ -224,18 +225,18 @@ class ProblemLog:
         self.add(self.position(location, at_key=at_key), path, message)
 
     def report_plugin(self, location: Location, message: str) -> None:
-        """Add a problem of a plugin that is needed at a location."""
+        """Add a problem with a plugin that is needed at a location."""
         problem = self._at(self.position(location), self.path(location), message)
         self._add("plugin", problem)
 
     def report_input(self, place: Problem | None, message: str) -> None:
-        """Add a problem of input files; it does not make the file itself invalid."""
+        """Add a problem with input files; it does not make the workflow file invalid."""
         if len(self._found) < 2 * MOST_PROBLEMS:
             nowhere = Problem(file=self.file, message="")
             self._add("input", replace(place or nowhere, message=message))
 
     def report_option(self, option: str, message: str) -> None:
-        """Add a problem of a command-line option, e.g. `--set wall.gsd_m=0`."""
+        """Add a problem with a command-line option, e.g. `--set wall.gsd_m=0`."""
         self._add("option", Problem(file=option, message=message))
 
     def place(self, location: Location) -> Problem | None:
@@ -244,11 +245,11 @@ class ProblemLog:
         return self._at(position, self.path(location), "") if position.line else None
 
     def position(self, location: Location, *, at_key: bool = False) -> Position:
-        """Return the position of a value or its key; if missing, of the enclosing value."""
+        """Return the position of a value or its key, or that of the enclosing value if missing."""
         return self.document.position(location, at_key=at_key)
 
     def path(self, location: Location) -> str:
-        """Format a location: `steps.wall.in.cloud[1]`, without indices of non-lists."""
+        """Format a location, e.g. `steps.wall.in.cloud[1]`; only indices into lists are shown."""
         stated, _ = self.document.resolve(location)
         return path_text(stated[1:] if stated[:1] == (self.unnamed,) else stated)
 
@@ -299,7 +300,7 @@ class ProblemLog:
 def validate(
     model: type[Model], data: JsonValue, log: ProblemLog, location: Location = ()
 ) -> Model | None:
-    """Validate the content of a document; all mistakes are reported at their positions.
+    """Validate the content of a document, and report all mistakes at their positions.
 
     Invalid parts are then left out of the model, so that later checks can use the valid parts.
 

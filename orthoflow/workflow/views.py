@@ -34,7 +34,7 @@ from orthoflow.workflow.model import (
 # `Any`: JSON.
 Schema: TypeAlias = dict[str, Any]
 _SWEEP: Final = {"$ref": "#/$defs/SweepSection"}
-# Parts of a parameter's schema that remain at the top level if a sweep is allowed, for editors.
+# Parts of a parameter's schema that, for editors, remain at the top level if a sweep is allowed.
 _SHOWN: Final = ("description", "default")
 
 
@@ -48,8 +48,9 @@ class _Untitled(GenerateJsonSchema):
 def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     """Return the JSON Schema (2020-12) of workflows, for editors and other programs.
 
-    Methods that cannot be loaded are omitted. The schema is for completion, and checks less than
-    `load_workflow`: not how keys depend on each other, nor whether references and ports match.
+    Methods that cannot be loaded are omitted. The schema is intended for completion, and checks
+    less than `load_workflow`: neither dependences between keys, nor whether references and ports
+    match.
     """
     methods = list(_loadable(catalog))
     schema = WorkflowFile.model_json_schema(by_alias=True, schema_generator=_Untitled)
@@ -217,10 +218,10 @@ class _Resolved(BaseModel):
 
 
 def resolved_json(workflow: Workflow) -> str:
-    """Return the workflow with all defaults and overrides as canonical JSON.
+    """Return the workflow, including all defaults and overrides, as canonical JSON.
 
-    Paths from the command line are reduced to their last part: records contain no folders of the
-    machine on which they were made.
+    Paths from the command line are reduced to their last part, because records contain no folders
+    of the machine on which they were made.
     """
     document: dict[str, object] = {
         "orthoflow": FORMAT,
@@ -267,7 +268,7 @@ def workflow_from_resolved(resolved: str, source: str) -> Workflow:
         source: text of the workflow file as written.
 
     Raises:
-        WorkflowError: the text is not a resolved workflow, or is of a newer format.
+        WorkflowError: the text is not a resolved workflow, or has a newer format.
     """
     try:
         workflow = _from_resolved(_Resolved.model_validate_json(resolved, strict=True), source)
