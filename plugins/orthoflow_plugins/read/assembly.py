@@ -1,4 +1,4 @@
-"""Assembly of a cloud from blocks of several files without copying; rounding of coordinates."""
+"""Assembly of a cloud from the blocks of several files without copies; coordinate rounding."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from orthoflow_plugins.read.scales import ColourScale
 
 # Coordinates rounded more coarsely than this limit the detail of an orthoimage.
 COARSE_M: Final = 0.005
-# If offsets are less accurate, a warning is reported.
+# If offsets have a coarser resolution than this, a warning is reported.
 FINE_M: Final = 5e-5
 _POINT_BYTES: Final = 40
 _MOST_SCANS: Final = 2**16
@@ -29,7 +29,8 @@ _MOST_SCANS: Final = 2**16
 _POPULATE_WRITE: Final = 23
 _ROUNDING_SAMPLE: Final = 20_000
 _ROUNDING_VALUES: Final = 10
-# However coarsely coordinates are rounded, a twentieth of a scan's points cannot have one position.
+# However coarsely coordinates are rounded, a twentieth of a scan's points cannot have the same
+# position.
 _REPEATED_SAMPLE: Final = 2000
 _REPEATED_SHARE: Final = 0.05
 _FEWEST_REPEATED: Final = 20
@@ -53,11 +54,11 @@ class ScanCount:
         unit_m: metres per unit along x, y and z.
         start: index of the first point in the cloud.
         stop: index after the last point in the cloud.
-        n_read: number of points in the file.
+        n_read: number of points of the scan in the file.
         left_out: number of points not in the cloud, by cause.
         n_without_rgb: number of points in the cloud without a valid colour.
-        rounding_m: step to which coordinates are rounded, 0 if it is small.
-        colours: scale of the colours, or None if there are none.
+        rounding_m: step in metres to which coordinates are rounded; 0 if it is small.
+        colours: scale of the colours; None if there are no colours.
         first_far_m: first point that is too far away; empty if there is none.
         repeated_m: position shared by so many points that they cannot be laser returns, or None.
     """
@@ -112,7 +113,7 @@ class CloudAssembly:
         Args:
             ctx: context of the step.
             files: files to read.
-            unit_m: returns metres per unit of a scan, along x, y and z.
+            unit_m: function that returns metres per unit of a scan, along x, y and z.
             box_m: (2, 3) lowest and highest coordinates of the points to keep; None for all.
         """
         self._ctx, self._box_m, self._unit_m = ctx, box_m, unit_m
@@ -142,7 +143,7 @@ class CloudAssembly:
         """Read all blocks of a file.
 
         Raises:
-            InputError: the file is damaged, or none of its points are usable.
+            InputError: the file is damaged, or none of its points is usable.
         """
         counts = [
             ScanCount(
@@ -179,7 +180,7 @@ class CloudAssembly:
         """Check that points are left in the cloud.
 
         Raises:
-            InputError: all points are of other classes or outside the box.
+            InputError: all points belong to other classes or are outside the box.
         """
         if self.n_points:
             return
@@ -195,16 +196,16 @@ class CloudAssembly:
 
     @property
     def offsets(self) -> list[NDArray[Any]]:
-        """Return x, y and z relative to the origin, cut to the actual number of points."""
+        """Return x, y and z relative to the origin, truncated to the actual number of points."""
         return [self._arrays[name][: self.n_points] for name in "xyz"]
 
     def array(self, name: str) -> NDArray[Any] | None:
-        """Return another array, cut to the actual number of points; None if no file has it."""
+        """Return another array, truncated to the number of points; None if no file has it."""
         array = self._arrays.get(name)
         return None if array is None else array[: self.n_points]
 
     def colour_mask(self) -> NDArray[Any]:
-        """Return the mask of valid colours, cut to the actual number of points."""
+        """Return the mask of valid colours, truncated to the actual number of points."""
         if "has_rgb" not in self._arrays:
             self._arrays["has_rgb"] = self._new("has_rgb", np.bool_)
             self._arrays["has_rgb"][: self.n_points] = True
@@ -262,7 +263,7 @@ class CloudAssembly:
     def _kept(
         self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: ScanCount
     ) -> NDArray[np.bool_] | slice:
-        """Return a mask of the points (n, 3) to keep, or a slice if all are; count the others."""
+        """Return a mask of the points (n, 3) to keep, or a slice for all; count the others."""
         usable: NDArray[np.bool_] | slice = slice(None)
         # NaN propagates through minimum and maximum, and compares as False.
         if not np.all(np.abs(bounds) < FARTHEST_M) and len(points):
@@ -327,8 +328,8 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
         unit_m: the file's unit in metres.
 
     Returns:
-        For each axis, the largest step of which all values are multiples; the smallest of these, or
-        0 if it is less than `COARSE_M` or unknown.
+        The smallest over the axes of the largest step of which all values are multiples; 0 if it is
+        less than `COARSE_M` or unknown.
     """
     sample = points[:: max(1, len(points) // _ROUNDING_SAMPLE)]
     found = []

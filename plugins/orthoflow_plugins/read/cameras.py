@@ -47,12 +47,12 @@ class ReadCameras(Method):
 
     Poses must be in the frame of the scan; `orient.given` reports cameras that see no wall. Photos
     are identified by their file names, with or without suffix, and by their folders if several have
-    the same name. A photo is not oriented if the files do not contain it, if it was disabled there,
-    or if its lens differs from OpenCV's models by more than half a pixel; the reason is reported.
-    Smaller differences are reported, too.
+    the same name. A photo is not oriented if the files do not contain it, if it is disabled in
+    them, or if its lens differs from OpenCV's models by more than half a pixel; the reason is
+    reported. Smaller differences are reported, too.
 
-    Of a run of orthoflow, give the folder with `cameras.json` and `ties.csv`: poses then keep their
-    covariance and their ties, from which the errors of orthoimages are predicted.
+    For a run of orthoflow, give the folder with `cameras.json` and `ties.csv`: poses then keep
+    their covariances and ties, from which the errors of orthoimages are predicted.
 
     Photos with a fisheye lens must have been split into cube faces by `read.photos`, which needs
     the lens for this; each face gets the pose of the whole photo.
@@ -163,7 +163,7 @@ def _ties(paths: Sequence[Path], names: Sequence[str], params: ReadCameras.Param
         points_world=UNITS_M[params.unit]
         * np.array([tie.position for tie in found]).reshape(-1, 3),
         sigma_px=np.array([tie.sigma_px or 0.0 for tie in found], dtype=np.float64),
-        # The file does not contain it.
+        # The file does not contain the standard deviations.
         sigma_m=np.zeros(count),
         role=np.array(roles, dtype=np.uint8),
         residual_px=np.array([tie.residual_px or unknown for tie in found]).reshape(-1, 2),
@@ -198,7 +198,7 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
             "size and not rotated"
         )
     translation_m = unit_m * np.asarray(found.translation, dtype=np.float64)
-    # Negated, so that NaN is refused, too.
+    # The comparison is negated, so that NaN is refused, too.
     if not np.abs(translation_m).max() < FARTHEST_M:
         raise InputError(
             f"photo {photo.name} was taken {np.abs(translation_m).max():.3g} m from the origin, "
@@ -233,7 +233,7 @@ class GivenByName:
         self._n_named = Counter(_file_name(photo.name).lower() for photo in photos)
 
     def of_photo(self, name: str, folder: str = "") -> GivenCamera | None:
-        """Return the camera of a photo, by its name or its name without suffix; None if not found.
+        """Return the camera of a photo, found by its name with or without suffix, or None.
 
         A photo NAME_front.png may be a face of NAME, whose lens is a fisheye or a panorama. If
         several cameras have the photo's name, the one whose folders match best is returned; if this
@@ -250,7 +250,7 @@ class GivenByName:
         return _nearest(found, folder, is_only=is_only)
 
     def _named(self, name: str) -> list[GivenCamera]:
-        """Return the cameras of a file name or its stem, with the same letter case if possible."""
+        """Return the cameras with a file name or its stem, in the same letter case if possible."""
         for wanted in (name, PurePath(name).stem):
             found = self._by_name.get(wanted.lower(), [])
             if found:
@@ -278,7 +278,7 @@ def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> Giv
     Args:
         found: cameras with the photo's file name.
         folder: folder of the photo.
-        is_only: no other photo has this file name.
+        is_only: whether no other photo has this file name.
     """
     if not found:
         return None

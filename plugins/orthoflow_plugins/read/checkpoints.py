@@ -21,11 +21,11 @@ class ReadCheckpoints(Method):
     World coordinates are those of the scan's files. The position in an orthoimage can be given in
     three ways. `wall,u_px,v_px` are the number of the wall and the column and row in its
     orthoimage, counted from the corner as in GIS programs, so that the centre of the first cell is
-    at (0.5, 0.5). `map_x,map_y` are the X and Y that a GIS shows for the GeoTIFF, in metres: in the
-    plane of the wall, or easting and northing (`crs` of `raster.grid`), which do not need `wall`.
-    Eastings and northings remain valid for any cell size, and for images from other programs.
-    `shown_x,shown_y,shown_z` are the coordinates in metres of the point shown there, as saved from
-    the report; they are valid for any cell size and crop of the same scan.
+    at (0.5, 0.5). `map_x,map_y` are the X and Y in metres that a GIS shows for the GeoTIFF:
+    positions in the plane of the wall, or easting and northing (`crs` of `raster.grid`), for which
+    `wall` is not needed. Eastings and northings remain valid for any cell size, and for images from
+    other programs. `shown_x,shown_y,shown_z` are the world coordinates in metres of the position in
+    the image, as saved from the report; they are valid for any cell size and crop of the same scan.
     """
 
     id = "read.checkpoints"

@@ -1,4 +1,4 @@
-"""Pictures of input data: a cloud from above and from its scanner, contact sheet of photos."""
+"""Pictures of input data: views of a cloud from above and its scanner, and contact sheets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLAN_SAMPLE: Final = 250_000
 _POLAR_SIDE_PX: Final = 1200
 _POLAR_SAMPLE: Final = 2_000_000
 
-# Maximum numbers of rows and of columns of a scan that are drawn as lines over a wall.
+# Maximum number of rows, and of columns, of a scan that are drawn as lines over a wall.
 _LINES: Final = 24
 # Colours of these rows and of these columns.
 _ROW_RGB: Final = (235, 165, 20)
@@ -89,7 +89,7 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
 
     This is the view in the scanner's own angles, in which straight edges are curved (Figure 2 of
     markiewicz2015). If the station is known, the picture is oriented with up and left as seen from
-    it. The result is None if the cloud has no grid or no intensity.
+    the station. The result is None if the cloud has no grid or no intensity.
     """
     if cloud.row is None or cloud.column is None or cloud.intensity is None or not len(cloud):
         return None
@@ -100,7 +100,7 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     row, column = (array[index].astype(np.int64) for array in (cloud.row, cloud.column))
     row, column = row - row.min(), column - column.min()
     size = np.array([row.max() + 1, column.max() + 1])
-    # Not more pixels than sampled points.
+    # Use no more pixels than sampled points.
     coarser = max(float(size.max()) / _POLAR_SIDE_PX, math.sqrt(float(size.prod()) / len(index)))
     across = max(1, math.ceil(coarser))
     rows, columns = -(-size // across)
@@ -136,7 +136,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     station = _station(cloud, scan)
     viewer = level.mean(axis=0) if station is None else basis_from_up(cloud.up) @ station
     on_wall = np.abs(level[:, :2] @ [along[1], -along[0]] - distance_m) <= _WALL_REACH_M
-    # To the right, as seen from the scanner.
+    # Make `right` point to the right as seen from the scanner.
     right = along if viewer[:2] @ [along[1], -along[0]] > distance_m else -along
     places = np.column_stack([level[:, :2] @ right, -level[:, 2]])[on_wall]
     low, high = np.percentile(places, [0.1, 99.9], axis=0)
@@ -200,7 +200,7 @@ class ContactSheet:
 
 
 def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:
-    """Return the scan with the most points, and an even sample of its points."""
+    """Return the scan with the most points, and an evenly spaced sample of its points."""
     index = np.arange(0, len(cloud), max(1, len(cloud) // _POLAR_SAMPLE))
     if cloud.scan is None:
         return 0, index
@@ -239,7 +239,7 @@ def _fullest_cell(distances_m: NDArray[np.float64]) -> tuple[int, float]:
 
 
 def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Yield the points (indices) of evenly chosen lines of a scan."""
+    """Yield the indices of the points on evenly chosen lines of a scan."""
     numbers = np.unique(lines)
     for number in numbers[:: max(1, len(numbers) // _LINES)]:
         mine = np.flatnonzero(lines == number)
@@ -268,7 +268,8 @@ def _ways_of_grid(
     rays = (offsets - station) @ basis_from_up(cloud.up).T
     elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
     upward = float(np.cov(row, elevation)[0, 1]) >= 0.0
-    # Mean directions of the columns; steps between them keep their sign where a panorama closes.
+    # Mean directions of the columns; differences between them keep their sign where a panorama
+    # closes.
     east, north = (np.bincount(column, rays[:, axis]) for axis in (0, 1))
     azimuth = np.arctan2(north, east)[np.bincount(column) > 0]
     steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
@@ -276,7 +277,7 @@ def _ways_of_grid(
 
 
 def _shortened(name: str, n_letters: int) -> str:
-    """Cut a name in the middle, since photo names differ at their ends; OpenCV needs ASCII."""
+    """Shorten a name in the middle, since photo names differ at their ends, to ASCII for OpenCV."""
     label = name.encode("ascii", "replace").decode()
     if len(label) <= n_letters:
         return label

@@ -32,7 +32,7 @@ NO_MASKS: Final = DiagnosticSpec(
 
 
 class Masks:
-    """Mask pictures and polygons, those already used, and files that are not masks."""
+    """Mask pictures and polygons, which of them have been used, and files that are not masks."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class Masks:
 
         Args:
             beside: pictures found among the photos.
-            given: files of the input for masks.
+            given: files of the input `masks`.
 
         Raises:
             InputError: none of the given files is a mask, a polygon file is invalid, or a photo has
@@ -127,7 +127,7 @@ class Masks:
 
 
 def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
-    """Return the files among photos that are masks of others: NAME_mask.png of NAME.jpg."""
+    """Return the files among photos that are masks of other photos: NAME_mask.png for NAME.jpg."""
     stems = {path.stem for path in paths}
     return frozenset(
         path

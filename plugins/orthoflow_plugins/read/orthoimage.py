@@ -33,8 +33,9 @@ class ReadOrthoimage(Method):
     orthoflow's rasters; a copy of `wall_0_intensity.json` is sufficient. Files from orthoflow need
     no JSON file. X and Y have the same meaning as in orthoflow's GeoTIFF files. At the origin, they
     have the values `x_of_left_m` and `height_of_top_m` of the JSON file, or 0 if it does not
-    contain these. Thus, size, cell size and extent may differ from those of the wall. `wall` in the
-    JSON file is the number of the wall: the index of its plane in `planes.json`, as in file names.
+    contain these. Thus, the size, cell size and extent of the image may differ from those of the
+    wall's raster. `wall` in the JSON file is the number of the wall: the index of its plane in
+    `planes.json`, as in file names.
     """
 
     id: ClassVar[str] = "read.orthoimage"

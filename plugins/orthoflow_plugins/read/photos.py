@@ -102,13 +102,13 @@ class ReadPhotos(Method):
 
     A panorama, from an E57 file or listed in `panoramas`, is split into six photos, the faces of a
     cube, as PNG files without distortion. Photos that have a fisheye lens (OpenCV's model) or are
-    panoramas according to the calibration or the given cameras are split in the same way; of the
-    faces of a fisheye photo, only the parts shown in the photo are used.
+    panoramas according to the calibration or the given cameras are split in the same way; only the
+    parts of the faces that a fisheye photo shows are used.
 
     The content of the files is kept unchanged and never re-encoded. Pixels are those of the stored
     array, that is, the EXIF orientation is recorded but not applied. In a TIFF file with several
     pages, the photo is the largest page that is not a preview. Every photo is decoded once, so that
-    damaged files are found here and not an hour later.
+    damaged files are found here and not in a later step.
 
     Pixels that are transparent, black in a mask, or inside polygons are used neither for ties nor
     for colours. Masks are pictures NAME_mask.png next to NAME.jpg, or files of the input `masks`:
@@ -217,7 +217,7 @@ class _Source:
     Attributes:
         name: name of the photo.
         content: a file, the content of a photo in an E57 file, or a cube face.
-        lens: lens parameters read from that file, or None.
+        lens: lens parameters read from the E57 file, or None.
         whole: name of the wide photo that a cube face was cut from, or "".
         folder: folder of the file within the input.
     """
@@ -388,7 +388,7 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
     """Refuse undeveloped camera raw files, because photos must not be omitted unnoticed.
 
     Raises:
-        InputError: there is a raw file without a photo of the same name.
+        InputError: there is a raw file without a photo with the same name.
     """
     developed = {Path(name).stem.lower() for name in photos}
     raw = [
@@ -405,7 +405,7 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
 
 
 def _given(files: InputFiles | None) -> GivenByName | None:
-    """Return cameras from other programs; those in E57 files belong to the photos in them."""
+    """Return cameras from other programs; those from E57 files are for the photos in them."""
     if files is None or all(path.suffix.lower() == E57_SUFFIX for path in files.paths):
         return None
     return GivenByName(read_given_cameras(files.paths))
@@ -423,10 +423,11 @@ def _calibration(files: InputFiles | None) -> CalibratedLenses | None:
 
 
 def _require_whole(name: str, encoded: bytes) -> str:
-    """Return a remark on an intact but unusual photo, or an empty text.
+    """Check that a photo is intact; return a remark if it is unusual, otherwise an empty text.
 
     Raises:
-        InputError: it is not a photo, its format is not supported, or a part of it is missing.
+        InputError: the file is not a photo, its format is not supported, or a part of it is
+            missing.
     """
     problem = unreadable(encoded)
     if problem:

@@ -19,7 +19,7 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, ScanCount, resolution_m
 from orthoflow_plugins.read.scales import IntensityScale
 
-# If two sides of a scan are shorter than the first value or longer than the second, the unit is
+# If two sides of a scan are shorter than the first value, or longer than the second, the unit is
 # probably wrong.
 _SMALL_M: Final = 1.0
 _LARGE_M: Final = 1000.0
@@ -160,7 +160,7 @@ def report_scales(
     scales: Sequence[IntensityScale | None],
     clipped: Sequence[int],
 ) -> None:
-    """Report intensities outside the range in the metadata, and scans on different scales."""
+    """Report intensities outside the range in the metadata, and scans with different scales."""
     for count, scale, n_clipped in zip(counts, scales, clipped, strict=True):
         if scale is None:
             continue
@@ -324,7 +324,7 @@ def report_summary(
 
 
 def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) -> None:
-    """Warn if surfaces are horizontal and vertical with respect to an axis other than up."""
+    """Warn if surfaces are level and upright with respect to an axis other than the given one."""
     axis = None if quality is None else quality.plainly_up(up_vector(up))
     if quality is None or axis is None:
         return
@@ -333,7 +333,7 @@ def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) 
 
 
 def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
-    """Report quality metrics; warn if the cloud is thick or scans disagree."""
+    """Report quality metrics; warn if the cloud is thick or its scans disagree."""
     if quality is None:
         return
     sigma_mm, step_mm = 1e3 * quality.sigma_m, 1e3 * quality.scan_step_m

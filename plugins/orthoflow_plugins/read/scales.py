@@ -28,13 +28,14 @@ _FULL: Final[dict[RgbScale, float]] = {
 
 _BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
-# An intensity with at least this correlation is considered a copy of the grey of the colours. The
+# An intensity with at least this correlation with the grey of the colours is considered a copy. The
 # correlation is 0.99997 for lion-takanawa, whose intensity is such a copy; laser intensity at
 # 532..1550 nm correlates far less, unless a scene has only two colours.
 _LUMINANCE_CORRELATION: Final = 0.999
 # Two roundings to 8 bits cause differences of 0.4 grey levels.
 _ROUNDING_LEVELS: Final = 0.7
-# Values outside these percentiles by more than the distance between them are extreme.
+# Values are extreme if they are outside these percentiles by more than the distance between the
+# two.
 _PERCENTILES: Final = (2.0, 98.0)
 # If the data of all scans cover less than this part of the range in the metadata, the latter is the
 # range of the sensor, and pictures scaled by it would be black.
@@ -57,7 +58,7 @@ class IntensityScale:
     Attributes:
         low: intensity that maps to 0.
         high: intensity that maps to 1.
-        rule: source of the scale: `intensity_max`, `stated`, `nominal`, `data`.
+        rule: source of the scale: `intensity_max`, `stated`, `nominal` or `data`.
         stated: limits in the scan's metadata that are not used because the data do not fit.
     """
 
@@ -94,12 +95,12 @@ def choose_scales(
     Returns:
         The user's scale if given; otherwise, the limits in the metadata if the data are within them
         and cover more than a small part; otherwise, the range of the data, which is common to scans
-        with similar ranges. If scans differ, this range is replaced by the first nominal range that
-        the data fill.
+        with similar ranges. If scans differ, this range is replaced with the first nominal range
+        that the data fill.
     """
     scales: list[IntensityScale | None] = [None] * len(ranges)
     known = [(seen, one) for seen, one in zip(ranges, stated, strict=True) if seen and one]
-    # Position of the largest values between the limits, 0..1.
+    # Largest value of each scan, as a share of the range between its limits.
     parts = [(s[1] - one[0]) / (one[1] - one[0]) for s, one in known if _is_within(s, one)]
     largest_part = max(parts, default=0.0)
     groups: list[tuple[list[int], tuple[float, float]]] = []
@@ -152,7 +153,7 @@ def _join(
 
 
 def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
-    """Scale in place to 0..1; values that are not finite become NaN.
+    """Scale intensities in place to 0..1; values that are not finite become NaN.
 
     Args:
         intensity: (n,) values as read.
@@ -189,7 +190,8 @@ def correlation_with_grey(
     """Return the correlation of the intensity with the grey of the colours if it is a copy of it.
 
     Returns:
-        None if the two differ by more than rounding errors, or if too few points have both.
+        The correlation; None if the two differ by more than rounding errors, or if too few points
+        have both.
     """
     step = max(1, len(intensity) // _SAMPLE)
     values = intensity[::step].astype(np.float64)
@@ -216,13 +218,13 @@ class ColourScale:
     """Determines the scale of a scan's colours while they are read.
 
     LAS stores 8-bit colours in the low byte, or multiplied by 256 or 257; text and PLY have 0..1 or
-    0..255; some files have values from 10-bit and 12-bit cameras that were not scaled to 16 bits. A
-    block that exceeds the current scale corrects the colours stored before. A limit in the metadata
-    is used if the data reach more than 1/255 of it and do not exceed it.
+    0..255; some files have values from 10-bit and 12-bit cameras that were not scaled to 16 bits.
+    If a block exceeds the current scale, the colours stored so far are rescaled. A limit in the
+    metadata is used if the data reach more than 1/255 of it and do not exceed it.
 
     Attributes:
         scale: scale of the values so far.
-        misfit: the limit in the metadata, if the data do not fit it.
+        misfit: the limit in the metadata if the data do not fit it, otherwise None.
         largest: largest value so far, except for a few outliers.
     """
 
@@ -273,7 +275,7 @@ class ColourScale:
             before[:] = np.rint(before * np.float32(full[self.scale] / full[seen]))
             self.scale = seen
         fits = limit is None or full[self.scale] == limit or self.largest <= 1.0
-        # A 16-bit limit may be stated for any 16-bit data.
+        # Metadata may contain a 16-bit limit for any 16-bit data.
         self.misfit = None if fits or (limit == 65280.0 and self.scale == "16 bit") else limit
 
 
@@ -300,7 +302,7 @@ def _to_bytes(
     if scale == "stated limit" and limit is not None:
         scaled = values * np.float32(255.0 / limit)
     elif scale == "16 bit":
-        # Exact for 8-bit values times 256 and times 257.
+        # This is exact for 8-bit values times 256 and times 257.
         scaled = np.floor(values / np.float32(256.0))
     elif scale is not None and scale != "8 bit":
         scaled = values * np.float32(255.0 / _FULL[scale])

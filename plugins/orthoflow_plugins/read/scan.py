@@ -1,4 +1,4 @@
-"""`read.scan`: point files from scanners and other programs, joined to one cloud."""
+"""`read.scan`: point files from scanners and other programs, merged into one cloud."""
 
 from __future__ import annotations
 
@@ -393,8 +393,8 @@ def _choose_stations(
     """Return stations (s, 3) and their source: those of the files, or the user's viewpoint.
 
     The origin is used as the station of a scan without a pose only if there is a single such scan
-    and it can have been taken from there. A scan in its scanner's frame surrounds or faces the
-    origin, whereas a cloud in survey coordinates can be anywhere.
+    and it could have been taken from the origin. A scan in its scanner's frame surrounds or faces
+    the origin, whereas a cloud in survey coordinates can be anywhere.
 
     Args:
         counts: statistics of the scans with points.

@@ -96,7 +96,7 @@ def _is_in_photo(tie: MeasuredTie, photos: Mapping[str, Photo]) -> bool:
 
 
 def _problem(tie: MeasuredTie, photos: Mapping[str, Photo]) -> str:
-    """Return why a tie is not in any photo."""
+    """Return the reason why a tie is not in any photo."""
     photo = photos.get(tie.photo)
     if photo is None:
         near = difflib.get_close_matches(tie.photo, photos, n=1)

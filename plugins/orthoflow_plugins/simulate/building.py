@@ -26,7 +26,7 @@ class Paint:
         rgb: ground colour, 0..255.
         reflectance: laser reflectance, 0..1.
         contrast: contrast, 0..1.
-        period_m: size of the motif.
+        period_m: size of the motif in metres.
         seed: seed that selects one of the textures of this kind.
     """
 
@@ -87,7 +87,8 @@ class SceneDraft:
         """Return the scene, with its origin at (0, 0, 0).
 
         Args:
-            spectral_gap: 0 if the laser measures the visible patterns, 1 if different ones.
+            spectral_gap: 0 if the laser measures the visible patterns, 1 if it measures different
+                ones.
         """
         surfaces = self.surfaces
         holes = [(i, hole) for i, surface in enumerate(surfaces) for hole in surface.holes]
@@ -180,7 +181,7 @@ class Side:
             self.box(bar, depth_m, paint, base_m=base_m)
 
     def recess(self, extent: Extent, depth_m: float, paint: Paint, *, plane: int = -1) -> Extent:
-        """Add a recess `depth_m` behind the wall; return the hole to cut into the wall."""
+        """Add a recess `depth_m` deep; return the hole that must be cut into the wall."""
         self.place(extent, -depth_m, paint, SurfaceRole.RECESS, plane=plane)
         self.rims(extent, (-depth_m, 0.0), paint, SurfaceRole.RECESS)
         return extent
@@ -207,7 +208,7 @@ def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m
         draft: the draft to which rectangles are added.
         omega_deg: direction of the outward normal, as in markiewicz2015.
         phi_deg: inclination of the outward normal.
-        distance_m: distance of the wall from the room's origin.
+        distance_m: distance from the room's origin to the wall.
     """
     omega, phi = math.radians(omega_deg), math.radians(phi_deg)
     outward = np.array(
@@ -224,7 +225,7 @@ def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m
 
 
 def flat_side(draft: SceneDraft, *, normal: tuple[float, float, float], height_m: float) -> Side:
-    """Return an empty floor or ceiling at a height above the room's origin, normal inwards."""
+    """Return an empty floor or ceiling at the given height above the room's origin."""
     n = np.array(normal) / np.linalg.norm(normal)
     right = np.array([1.0, 0.0, 0.0]) - n[0] * n
     right /= np.linalg.norm(right)
@@ -251,7 +252,7 @@ def add_block(
         draft: the draft to which rectangles are added.
         base: (3,) centre of its bottom, metres.
         yaw_deg: rotation about the vertical; at 0 the length is along x.
-        size_m: length, depth, height.
+        size_m: length, depth and height.
         paint: texture of all its faces.
     """
     yaw = math.radians(yaw_deg)

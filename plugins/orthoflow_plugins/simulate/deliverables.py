@@ -37,7 +37,7 @@ _VERTICAL_EDGE: Final = "vertical edge"
 # Spacing of the painted lines of a fresco, in periods (see `geometry.scene_rays`).
 _LATTICE: Final = 0.9
 _CLEAR_M: Final = 0.04
-# Index of the main wall in `scene.plane_index`; it is built first.
+# Value of `scene.plane_index` for the main wall, which is built first.
 _MAIN_WALL: Final = 0
 _INSIDE_M: Final = 0.004
 _LIFT_M: Final = 0.01
@@ -74,7 +74,7 @@ def cloud_of(delivery: Delivery) -> PointCloud:
     """Return the cloud; a shift of the world only changes its origin and its stations."""
     points = delivery.scan.points
     x, y, z = (
-        # There are no rounding errors if axes are only permuted.
+        # No rounding errors occur if axes are only permuted.
         np.asarray(
             sum(
                 share * axis
@@ -115,7 +115,7 @@ def truth_of(
         delivery: the scanned room.
         cloud: its points in world coordinates.
         shots: its photos, in the room frame.
-        parameters: parameters of the simulation, for information.
+        parameters: parameters of the simulation, which are only recorded.
     """
     rectangle = delivery.scan.points.rectangle
     scene = delivery.room.scene
@@ -198,8 +198,8 @@ def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> tuple[float, f
     """Measure the point spacing on a plane from 10 cm tiles; None if no tile is fully on it.
 
     Returns:
-        The spacing of a square grid with the same density, in metres: its median and its 90th
-        percentile over the wall.
+        The spacing of a square grid with the same density, in metres: median and 90th percentile
+        over the tiles.
     """
     frame = frame_over(truth.planes.corners[plane], truth.planes.normal[plane], gsd_m=_TILE_M)
     counts = np.zeros(frame.shape, dtype=np.int64)
@@ -258,7 +258,7 @@ def _true_planes(
 
 
 def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDArray[np.float64]:
-    """Return the RMS distances of points from their planes, summed in order."""
+    """Return the RMS distance of points from their planes, summed in a fixed order."""
     offsets = planes.offset - planes.normal @ cloud.origin
     sums = np.zeros(len(planes))
     for start in range(0, len(cloud), _CHUNK):
@@ -281,7 +281,7 @@ class _Spots(Rows):
     in_rectangle: NDArray[np.float64]
 
     def moved(self, step: NDArray[np.float64]) -> _Spots:
-        """Return the positions moved by one vector (2,), or by one vector each (n, 2)."""
+        """Return the positions moved by a common vector (2,), or each by its own vector (n, 2)."""
         return _Spots(rectangle=self.rectangle, in_rectangle=self.in_rectangle + step)
 
     def points(self, scene: Scene) -> NDArray[np.float64]:
@@ -297,9 +297,9 @@ class _Spots(Rows):
 def check_points(delivery: Delivery, views: SceneCameras, *, n_most: int) -> CheckPoints:
     """Choose check points of each class on the main wall.
 
-    `flat` points are crossings of the painted lines of a fresco with 4 cm of plain wall around
-    them; `vertical edge` points are front corners of mouldings. Each is seen from at least one
-    station.
+    `flat` points are crossings of the painted lines of a fresco that are surrounded by 4 cm of
+    plain wall; `vertical edge` points are front corners of mouldings. Each point is visible from at
+    least one station.
 
     Args:
         delivery: the scanned room.
@@ -383,7 +383,7 @@ def _are_seen(
 
 
 def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.bool_]:
-    """Return a mask (n,) of positions at the surface, whichever rectangle they belong to."""
+    """Return a mask (n,) of positions that lie on the visible surface, whatever its rectangle."""
     points, normals = spots.points(scene), scene.normal[spots.rectangle]
     inwards = np.where(np.einsum("ij,ij->i", normals, points) > 0.0, -1.0, 1.0)[:, None] * normals
     hits = views.cast(points + _LIFT_M * inwards, -inwards)
@@ -391,7 +391,7 @@ def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.b
 
 
 def _spread(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:
-    """Return points far from each other; each is the farthest from all chosen before."""
+    """Return points far from each other; each is the one farthest from those chosen before."""
     if len(points) <= n_most:
         return points
     chosen = [0]

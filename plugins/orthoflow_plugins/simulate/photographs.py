@@ -42,7 +42,8 @@ _FURNITURE_M: Final = -0.45
 _WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
-# Legs and upper body of a person: lower and upper end above the room's origin, and half the width.
+# Legs and upper body of a person: heights of lower and upper end above the room's origin, and half
+# the width.
 _BODY_M: Final = ((-1.45, -0.6, 0.17), (-0.6, 0.3, 0.25))
 _ABSENT: Final = 0.5
 _OF_PEOPLE: Final = (
@@ -74,8 +75,8 @@ class Film:
 
     Attributes:
         noise_grey: standard deviation of the noise per pixel and channel, grey levels.
-        vignetting: share of the light lost in the corners.
-        supersample: number of rays per side of a pixel.
+        vignetting: share of the light that is lost in the corners.
+        supersample: number of rays along each side of a pixel.
         exposures: maximum relative deviation of the exposure of a photo.
     """
 
@@ -91,14 +92,14 @@ def _block(
     return tuple((wall, a, b) for wall in walls for b in up for a in along)
 
 
-# Width and height of a photo on the wall and distance from it, metres; targets: number of the wall
-# and (a, b) on it.
+# Width and height of the area shown on the wall, distance from the wall, in metres; targets: number
+# of the wall and (a, b) on it.
 _LAYOUTS: Final = {
     # Six photos of the main wall with 25 % overlap.
     "quick": ((2.4, 1.8), 2.6, _block((-1.75, 0.0, 1.75), (-0.65, 0.75))),
     # Eight photos of four walls, each showing a whole wall.
     "variant1": ((5.9, 3.5), 3.95, _block((-0.1, 0.1), (0.05,), range(4))),
-    # A block over the main wall with 70 % overlap along the rows and 50 % between them.
+    # A block over the main wall with 70 % overlap along rows of photos and 50 % between rows.
     "variant2": (
         (2.4, 1.8),
         2.6,
@@ -123,7 +124,7 @@ def planned_shots(
 
     Args:
         layout: the layout of the photos.
-        rng: random generator of lens and positions.
+        rng: random generator for the lens and the positions.
         gsd_m: pixel size on the wall.
         obliquity_deg: maximum intended angle between optical axis and wall normal.
         geometry: positions of the walls.
@@ -176,7 +177,7 @@ def planned_shots(
 def with_passers_by(
     scene: Scene, n_photos: int, count: int, rng: np.random.Generator
 ) -> tuple[Scene, ...]:
-    """Return each photo's scene with people in front of the main wall; empty if there are none.
+    """Return each photo's scene with people in front of the main wall; empty without people.
 
     Each person appears in about half of the photos, chosen at random, 0.5 to 1.4 m in front of the
     wall and always in the same clothes.
@@ -231,7 +232,7 @@ def take_photos(
         shots: the photos.
         film: degradation of the images.
         ctx: context of the step.
-        rng: random generator of all noise.
+        rng: random generator for all noise.
         intrinsics: known calibration of the camera, or None.
     """
     if not shots:

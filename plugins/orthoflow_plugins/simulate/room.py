@@ -1,4 +1,4 @@
-"""`simulate.room`: a simulated, scanned and photographed palace room with its truth."""
+"""`simulate.room`: scans and photos of a simulated palace room, with ground truth."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
 
 
 class SimulateRoom(Method):
-    """Scan and photograph a decorated room with relief, niche, door and a free-standing object.
+    """Scan and photograph a decorated room with relief, a niche, a door and a free-standing object.
 
     There are two scans per station: a panorama and a detail scan of the main wall. Points are
     ordered by scan, then by column, then by row from bottom to top. The noise of a distance depends
@@ -57,10 +57,10 @@ class SimulateRoom(Method):
     distances of two surfaces are mixed. All noise is a function of the seed and the position in the
     scan, so it does not depend on threads.
 
-    Photos are taken with one hand-held camera with Brown distortion, slightly off target and
-    rotated, as JPEG files in the sRGB colours of the scene. `photos` is empty for `photo_layout:
-    none`, and `calibration` is empty if the camera is not calibrated. The EXIF focal length, with
-    an error of up to 2 %, is always known.
+    Photos are taken with one hand-held camera with Brown distortion, slightly misaimed and rotated,
+    and are stored as JPEG files in the sRGB colours of the scene. `photos` is empty for
+    `photo_layout: none`, and `calibration` is empty if the camera is not calibrated. The EXIF focal
+        length, with an error of up to 2 %, is always known.
     """
 
     id: ClassVar[str] = "simulate.room"

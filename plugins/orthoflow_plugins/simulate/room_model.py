@@ -1,9 +1,9 @@
 """The simulated room: four decorated walls that are not exactly perpendicular, and objects.
 
 The room frame is in metres, z up, with the origin in the middle of the room 1.5 m above the floor.
-The main wall is that of markiewicz2015: omega 102 deg, inclined by 0.8 deg. Alternatively, walls
-are generated at random, with cornices, pilasters, niches, panels and recessed doors; the positions
-of all planes can be random as well.
+The main wall has the position of that in markiewicz2015: omega 102 deg, inclined by 0.8 deg.
+Alternatively, walls are generated at random, with cornices, pilasters, niches, panels and recessed
+doors; the positions of all planes can be random as well.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _DRAWN_FLOOR_M: Final = (0.03, 0.07)
 _DRAWN_CEILING_M: Final = (-0.05, 0.05)
 # Visible area of the main wall.
 _MAIN_WALL_M2: Final = 16.7
-# Maximum share of textile on the main wall, and its share in the designed room.
+# Maximum share of the main wall covered by textile, and the share in the designed room.
 MOST_TEXTILE: Final = 0.35
 TEXTILE_BY_DESIGN: Final = 0.095
 
@@ -57,8 +57,8 @@ OAK: Final = Paint(TextureKind.WOOD, (132, 92, 58), 0.35, 0.4, 0.12, 13)
 _DARK: Final = Paint(TextureKind.PLAIN, (92, 88, 84), 0.2, 0.4, seed=14)
 _OBJECT: Final = Paint(TextureKind.TILES, (38, 96, 160), 0.3, 0.5, 0.09, 15)
 _DAMASK: Final = Paint(TextureKind.TEXTILE, (150, 62, 58), 0.4, period_m=0.15, seed=102)
-# Walls: name; ground and extent from corner to corner of a random wall; ground of the designed
-# wall.
+# Walls: name; background texture and extent from corner to corner of a random wall; background
+# texture of the designed wall.
 _WALLS: Final = (
     (
         "main wall",
@@ -109,7 +109,7 @@ _PLAQUE_TRIES: Final = 40
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Positions of the planes of a room, in its frame.
+    """Positions of the planes of a room, in the room frame.
 
     Attributes:
         walls: omega and phi in degrees and distance in metres of the main, opposite, right and left
@@ -129,7 +129,7 @@ class Geometry:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Geometry:
-        """Return a random room about as large as the designed one, with other plane positions."""
+        """Return random plane positions of a room that is about as large as the designed one."""
 
         def about(value: float, width: float) -> float:
             return value + float(rng.uniform(-width, width))
@@ -151,7 +151,7 @@ class Geometry:
         )
 
     def sides(self, draft: SceneDraft) -> list[Side]:
-        """Return the empty main, opposite, right and left wall."""
+        """Return the main, opposite, right and left walls, still empty."""
         return [
             wall_side(draft, omega_deg=omega_deg, phi_deg=phi_deg, distance_m=distance_m)
             for omega_deg, phi_deg, distance_m in self.walls
@@ -187,13 +187,13 @@ def build_room(
     """Build the room.
 
     Args:
-        rng: random generator of the four walls; None for the designed walls.
+        rng: random generator for the four walls; None for the designed walls.
         relief: scale of all mouldings; 1 for the designed size (up to 15 cm).
         obstacle: whether a free-standing object is in front of the main wall.
-        spectral_gap: 0 if the laser measures the painted patterns, 1 if different ones.
+        spectral_gap: 0 if the laser measures the visible patterns, 1 if it measures different ones.
         textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
         n_plaques: maximum number of plaques on a random main wall.
-        geometry: positions of its planes.
+        geometry: positions of the planes of the room.
     """
     draft = SceneDraft()
     sides = geometry.sides(draft)
@@ -325,7 +325,7 @@ def _build_wall(
 
 
 def _cloths(share: float) -> list[Extent]:
-    """Return extents of cloth that cover a share of the main wall, starting in its middle."""
+    """Return extents of cloth that cover a share of the main wall, starting from its middle."""
     middle: Extent = (-0.73, 0.83, -1.3, 1.3)
     by_design: Extent = (-0.45, 0.65, -0.45, 1.0)
     beside: list[Extent] = [
@@ -420,7 +420,7 @@ def draw_wall(
     relief: float = 1.0,
     cloth: Extent | None = None,
 ) -> list[Extent]:
-    """Build a random wall with relief up to 0.3 m and recesses up to 0.45 m deep.
+    """Build a random wall with relief of up to 0.3 m and recesses up to 0.45 m deep.
 
     Returns the extents of its recesses.
 
@@ -429,11 +429,12 @@ def draw_wall(
     Args:
         wall: the wall.
         name: name of its plane.
-        ground: texture of the wall and its niches.
+        ground: background texture of the wall and its niches.
         span: positions of the two adjoining walls, metres.
-        rng: random generator of the objects.
+        rng: random generator for the objects.
         relief: scale of all relief.
-        cloth: extent of a cloth with a repeated motif; openings of the wall are cut out of it, too.
+        cloth: extent of a cloth with a repeated motif; openings of the wall are cut out of the
+            cloth, too.
     """
     plane = wall.true_plane(name, _FULL)
     top_m = _draw_cornice(wall, relief, rng)
@@ -480,7 +481,7 @@ def _overlap(one: Extent, other: Extent) -> bool:
 
 
 def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
-    """Return a random extent of cloth that covers a share of the main wall; None if it is 0."""
+    """Return a random extent of cloth that covers a share of the main wall; None for 0."""
     if share <= 0.0:
         return None
     a0, a1 = _WALLS[0][2]

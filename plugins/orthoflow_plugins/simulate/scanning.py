@@ -3,10 +3,10 @@
 Noise depends only on the position in the angular grid, so it does not depend on threads.
 
 A laser and a camera measure different reflectances. At the single wavelength of a laser, red lead,
-gold, wet plaster and retouchings have another order of brightness than in the three broad bands of
-a camera. In the simulation, reflectance decreases with red and increases with green, each with a
-gain and a power that depend on the material; wet patches are darker, and retro-reflecting spots
-saturate the detector.
+gold, wet plaster and retouchings rank differently in brightness than in the three broad bands of a
+camera. In the simulation, reflectance decreases with red and increases with green, each with a gain
+and a power that depend on the material; wet patches are darker, and retro-reflecting spots saturate
+the detector.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ _PLACES: Final = (("scan", np.uint16), ("row", np.uint32), ("column", np.uint32)
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
 
-# Coordinates of the stations along the main wall, towards it and above the origin, metres; away
-# from all objects.
+# Coordinates of the stations along the main wall, towards it and above the origin, metres; all
+# stations are away from objects.
 _STATIONS_M: Final = (
     (-1.15, -0.10, 0.0),
     (1.20, 0.15, 0.12),
@@ -59,7 +59,7 @@ _STATIONS_M: Final = (
 # Maximum random displacement of a station along the same axes.
 _STATIONS_DRAWN_M: Final = (0.3, 0.3, 0.15)
 # Ranges of the random values per material: reflectance of black, decrease with red, increase with
-# green, and their powers.
+# green, and the powers of these two.
 _BLACK: Final = (0.75, 0.9)
 _RED: Final = (0.6, 0.85)
 _GREEN: Final = (0.4, 0.65)
@@ -70,7 +70,7 @@ _WET_M: Final = 0.7
 _WET_FROM: Final = 0.6
 _WET_DARKER: Final = 0.45
 _WAVES: Final = 24
-# Distance from the middle at which the room is bent by `bending_m`.
+# Distance from the middle of the room at which points are displaced by `bending_m`.
 _BENT_M: Final = 5.0
 _SPOT_EVERY_M: Final = 0.4
 _SPOT_SHARE: Final = 0.05
@@ -105,17 +105,17 @@ class Errors:
     """The errors of the scanner.
 
     Attributes:
-        noise_m: standard deviation of a distance at 3 m, perpendicular to a plain wall.
+        noise_m: standard deviation of a distance measured at 3 m, perpendicular to a plain wall.
         outlier_share: share of points at a random distance.
-        beam_m: diameter of the laser spot; distances are mixed if the spot is on two surfaces.
-        colour_noise: standard deviation of a colour, grey levels.
+        beam_m: diameter of the laser spot; distances are mixed if the spot covers two surfaces.
+        colour_noise: standard deviation of the noise of a colour channel, grey levels.
         inversion: share of inverted contrast in the laser reflectance (see `laser_reflectance`).
         band_seed: seed of the laser reflectances of materials and of the common errors of points.
-        registration_m: standard deviation of each coordinate of a station.
+        registration_m: standard deviation of the error of each coordinate of a station.
         bending_m: displacement 5 m from the middle of the room, as caused by drift along a path.
         shared_m: standard deviation, per coordinate, of errors common to neighbouring points of all
             scans, as in clouds from photos.
-        shared_length_m: correlation length of these errors.
+        shared_length_m: correlation length of the errors common to neighbouring points.
     """
 
     noise_m: float
@@ -222,7 +222,7 @@ def planned_sweeps(
             n_rows=max(1, math.floor((highest - lowest) / coarse)),
             seed=int(seeds[2 * index]),
         )
-        # The smallest angular window that contains the main wall.
+        # Determine the smallest angular window that contains the main wall.
         rays = rim - station
         azimuths = np.arctan2(rays[:, 1], rays[:, 0]) - forward
         azimuths = (azimuths + math.pi) % (2.0 * math.pi) - math.pi
@@ -413,7 +413,7 @@ def laser_reflectance(
         colours: (4, n) red, green, blue 0..255, and the reflectance of the texture.
         inversion: 0 if the laser measures the reflectance of the textures, 1 if all contrast
             follows from the response of the materials.
-        seed: seed of materials, patches and spots.
+        seed: seed for materials, patches and spots.
     """
     plain: NDArray[np.float64] = colours[3].astype(np.float64)
     if inversion == 0.0:
