@@ -1,4 +1,4 @@
-"""Bands of rows, since large rasters are kept in files and never completely in memory."""
+"""Bands of rows: large rasters are kept in files and never completely in memory."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-# Creates a zeroed array from a name, a shape and a type, in a memory-mapped file if it is large.
+# Function that creates a zeroed array from a name, a shape and a type, in a memory-mapped file if
+# the array is large.
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
 # Finished rasters with more cells are kept in files, because there may be many walls.
 IN_MEMORY_CELLS: Final = 1 << 22
-# Temporary arrays of a band need about 16 MB per byte of a cell.
+# With this limit, temporary arrays of a band need about 16 MB per byte of a cell.
 _BAND_CELLS: Final = 1 << 24
 
 
@@ -29,7 +30,7 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
 
     Args:
         shape: numbers of rows and columns, and the further dimensions of a cell.
-        multiple: the height of every band except the last is a multiple of this number.
+        multiple: number of which the height of every band except the last is a multiple.
 
     Yields:
         The rows of each band, from top to bottom.

@@ -1,4 +1,4 @@
-"""Compiled projection by a camera with distortion, for all steps that project points."""
+"""Compiled projection through a camera with distortion, for all steps that project points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras with distortion: projection of points, rays of pixels, derivatives of lens models.
+"""Cameras with distortion: projection, rays through pixels, and lens derivatives.
 
 The centre of the first pixel is at (0.5, 0.5). In OpenCV, it is at (0, 0); all conversions between
 the two conventions use the functions of this module.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.frames import rotation_from_vector
 
-# Difference between orthoflow's pixel coordinates and OpenCV's.
+# orthoflow's pixel coordinates minus OpenCV's.
 HALF_PIXEL: Final = 0.5
 
 
@@ -159,7 +159,7 @@ class ViewingCamera:
         return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
     def rays_camera(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return ray directions (n, 3) with z = 1, in camera axes, of pixels (n, 2).
+        """Return directions (n, 3) with z = 1, in camera axes, of rays through pixels (n, 2).
 
         Raises:
             GeometryError: the distortion cannot be inverted, for example beyond the radius at which
@@ -176,13 +176,13 @@ class ViewingCamera:
     def bent_rays(
         self, pixels_photo: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the distorted directions x / z and y / z of pixels (2, n) = (u, v)."""
+        """Return the distorted directions x / z and y / z for pixels (2, n) = (u, v)."""
         u, v = np.asarray(pixels_photo, dtype=np.float64)
         b = (v - self.cy) / self.fy
         return (u - self.cx - self.skew * b) / self.fx, b
 
     def rays_world(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return unit ray directions (n, 3) in world axes of pixels (n, 2)."""
+        """Return unit directions (n, 3), in world axes, of rays through pixels (n, 2)."""
         rays = self.rays_camera(pixels_photo) @ self.rotation
         unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         return unit
@@ -250,12 +250,12 @@ def opencv_matrix(lens: ViewingCamera) -> NDArray[np.float64]:
 
 POSE_PARAMETERS: Final = 6
 # Standard deviation of ln(focal length) with EXIF, which contains the focal length in whole
-# millimetres or as a full-frame equivalent, but not the focusing distance.
+# millimetres or as a full-frame equivalent, but not the focus distance.
 _EXIF_SIGMA: Final = 0.05
 # Standard deviation of ln(focal length) without EXIF: the range of common lenses.
 _UNKNOWN_SIGMA: Final = 0.35
 # Standard deviations of the other parameters of an uncalibrated lens. Fixing them at zero distorts
-# the pose, so that errors of photos were 2.4 times the predicted ones and 1.7 times those with free
+# the pose, so that photo errors were 2.4 times the predicted errors and 1.7 times those with free
 # parameters. Pixels are square to 1/1000, which corresponds to more than a pixel at the edge of an
 # image.
 _ASPECT_SIGMA: Final = 1e-3
@@ -317,7 +317,7 @@ def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
     """Return the prior standard deviations of an uncalibrated lens.
 
     Args:
-        longer_px: longer side of its photos, pixels.
+        longer_px: longer side of the photos, pixels.
         has_exif: whether the focal length is known from EXIF.
     """
     return LensFreedom(
@@ -332,7 +332,7 @@ def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
 
 @dataclass(frozen=True, kw_only=True)
 class Linear:
-    """The projection of points by a camera, with derivatives.
+    """The projection of points through a camera, with derivatives.
 
     Attributes:
         pixels: (n, 2) pixels; NaN behind the camera.
@@ -483,5 +483,5 @@ def _lens_columns(
 
 
 def _factor(logarithm: float) -> float:
-    """Return the factor for a change of a logarithm; at most e, to prevent divergence."""
+    """Return the factor for a change of a logarithm, at most e to prevent divergence."""
     return math.exp(min(1.0, max(-1.0, logarithm)))

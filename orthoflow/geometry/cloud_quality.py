@@ -14,7 +14,7 @@ from orthoflow.geometry.robust import median_deviation
 
 
 def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
-    """Estimate the point spacing on a wall from the numbers of points per cell.
+    """Estimate the point spacing on a wall from the number of points in each cell.
 
     Cells are merged 2 x 2 until blocks with points contain at least four points on average. Then
     hardly any block on a scanned surface is empty by chance, so the area of the blocks with points
@@ -49,14 +49,14 @@ def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
     return sums
 
 
-# Sides of pieces in metres; the next value is used if pieces contain too few points.
+# Sides of surface pieces in metres; the next value is used if pieces contain too few points.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
 _PIECES_MOST: Final = 300
 _PIECES_LEAST: Final = 20
 # Minimum number of points of one scan in a piece, and maximum number of points used.
 _POINTS_LEAST: Final = 30
 _POINTS_MOST: Final = 4000
-# Number of points processed together; small enough for the processor's cache.
+# Number of points processed together, small enough for the processor's cache.
 _AT_ONCE: Final = 1 << 16
 _HASH_BITS: Final = 20
 _CUBE_BITS: Final = 21
@@ -66,7 +66,8 @@ _LOOKED_AT_MOST: Final = 4_000_000
 # Odd numbers with well distributed bits, so that the upper bits of a product depend on all bits.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
 # A piece is a single surface if at least this share of its points is near its plane, if the scatter
-# of the points is below this share of its side, and if they extend over it in both directions.
+# of the points is below this share of the side of the piece, and if they extend over the piece in
+# both directions.
 _SURFACE_SHARE: Final = 0.85
 _SCATTER_SIDES: Final = 0.1
 _COVER_SIDES: Final = 0.15
@@ -78,7 +79,7 @@ _SURE_SIGMAS: Final = 3.0
 _AGREE_M: Final = 0.001
 # Tolerance for level and upright pieces; noise tilts the smallest pieces by 2 degrees.
 _SQUARE_DEG: Final = 5.0
-# If fewer pieces than this share are level, the given up direction is wrong, since hardly any
+# If the share of level pieces is below this, the given up direction is wrong, since hardly any
 # building lacks level surfaces.
 _LEVEL_NONE: Final = 0.03
 _LEVEL_PLAIN: Final = 0.15
@@ -94,11 +95,11 @@ class CloudQuality:
         side_m: side of the pieces.
         n_pieces: number of measured pieces.
         sigma_m: thickness, the robust standard deviation of a scan's points from the surface.
-        width_95_m: width of the range that contains 95 % of these distances.
+        width_95_m: width of the range that contains 95 % of the distances from the surface.
         scan_step_m: distance from a point to the nearest point of the same scan.
-        scans_apart_m: distance between scans of the same piece, perpendicular to it; None if fewer
-            than 20 pieces are in more than one scan.
-        sigma_apart_m: standard deviation of that distance due to the scatter of points.
+        scans_apart_m: distance between scans of the same piece, perpendicular to the piece; None if
+            fewer than 20 pieces are in more than one scan.
+        sigma_apart_m: standard deviation of `scans_apart_m` due to the scatter of points.
         normals: (n_pieces, 3) unit normals of the pieces, with arbitrary sign.
     """
 
@@ -128,7 +129,7 @@ class CloudQuality:
         `up` is wrong if no surface is level with respect to it and many are inclined, while all
         surfaces are level or upright with respect to one axis, and some of them are level. The
         result is None for slopes, single walls, and rooms whose walls are parallel to the axes,
-        since they look the same along each axis.
+        since these look the same along each axis.
         """
         level, square = self.square_shares(up)
         for axis, direction in enumerate(np.eye(3)):
@@ -145,7 +146,7 @@ class CloudQuality:
 
     @property
     def disagrees(self) -> bool:
-        """Whether scans are farther apart than their scatter and than could be due to chance."""
+        """Whether scans are farther apart than their scatter and than chance could explain."""
         if self.scans_apart_m is None:
             return False
         limit_m = max(self.sigma_m, _AGREE_M, _SURE_SIGMAS * self.sigma_apart_m)
@@ -231,7 +232,7 @@ def _cubes(
     *,
     axes: Sequence[int] = (0, 1, 2),
 ) -> list[NDArray[np.uint32]]:
-    """Return the indices of cubes along axes, counted from the lowest point."""
+    """Return the indices of cubes along axes, counted from the lowest coordinates."""
     return [
         ((offsets[axis][chosen] - lows[axis]) * np.float32(1.0 / side_m)).astype(np.uint32)
         for axis in axes
@@ -294,7 +295,7 @@ def _measured(
 
 
 def _frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return two axes in the plane of most points (n, 3) and its normal, as rows."""
+    """Return, as rows, axes of the plane that fits most points (n, 3), and its normal."""
     kept = np.ones(len(points), dtype=np.bool_)
     axes = np.eye(3)
     for _ in range(3):
@@ -313,7 +314,7 @@ def _farthest(
     middles: dict[np.uint16, float],
     main: np.uint16,
 ) -> tuple[float, float]:
-    """Return the largest distance of a scan from the main scan, and its standard deviation."""
+    """Return the largest distance between a scan and the main scan, and its standard deviation."""
     others = [one for one in middles if one != main]
     if not others:
         return np.nan, np.nan

@@ -37,7 +37,8 @@ from orthoflow.geometry.compile_events import report_compiling
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
-# Maximum number of files in the cache, of about 40 kB each. One version of orthoflow has about 400.
+# Maximum number of files in the cache, each about 40 kB. One version of orthoflow has about 400
+# files.
 _MAX_FILES: Final = 8000
 
 
@@ -47,7 +48,7 @@ def compiled(function: _Kernel) -> _Kernel:
     Threads are started by `geometry.threads`, because numba's parallel loops take seconds longer to
     compile.
     """
-    # The wrapper for callers in C is not needed.
+    # A wrapper for callers in C is not needed.
     kernel = _compilable(function, nogil=True, no_cfunc_wrapper=True)
     # If there is no writable folder for the cache, each process compiles its kernels.
     if isinstance(kernel, Dispatcher):
@@ -70,8 +71,8 @@ def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
 class _LinkedCode(CPUCodeLibrary):
     """Code of a function that only kernels call.
 
-    It is linked into a kernel before it is optimised and translated into machine code; to do both
-    for the function itself would take as long as for a kernel.
+    The code is linked into a kernel before optimisation and translation into machine code; doing
+    both for the function itself would take as long as for a kernel.
     """
 
     def add_llvm_module(self, ll_module: Any) -> None:
@@ -99,7 +100,7 @@ class _PartLowering(NativeLowering):
         super().run_pass(state)  # type: ignore[no-untyped-call]
         code, lowered = state.library, state.cr
         module = lowered.fndesc.lookup_module()
-        # A function without an address.
+        # Make a function without an address.
         entry = _dynfunc.make_function(module, name, "", 0, lowered.env, (code,))
         state.targetctx.insert_user_function(entry, lowered.fndesc, [code])
         state.cr = lowered._replace(cfunc=entry)
@@ -110,7 +111,7 @@ class _PartCompiler(CompilerBase):
     """Compiler of functions that only kernels call."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's passes, with another translation."""
+        """Return numba's passes, with the translation replaced."""
         self.state.flags.no_compile = True
         pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state)  # type: ignore[no-untyped-call]
         pipeline.passes = [
@@ -280,7 +281,7 @@ def _all_code(code: CodeType) -> Iterator[CodeType]:
 
 
 def _field_names(type_: object) -> tuple[object, ...]:
-    """Return field names of named tuples among types, because numba compares only field types."""
+    """Return the field names of any named tuples in types: numba compares only field types."""
     if isinstance(type_, types.NamedTuple | types.NamedUniTuple):
         fields = type_.instance_class._fields
         return (fields, *map(_field_names, type_.types))
@@ -301,7 +302,8 @@ def _give_constants_no_version(kernel: Any) -> None:
             named = dict(zip(kws, map(types.unliteral, kws.values()), strict=True))
             return template_for(tuple(map(types.unliteral, args)), named)
         except TypingError:
-            # A tuple with members of different types can be indexed only by constants.
+            # Keep constants here: a tuple with members of different types can only be indexed by
+            # constants.
             return template_for(args, kws)
 
     kernel.get_call_template = template_for_any
@@ -325,7 +327,7 @@ class _Compilation(event.Listener):
         """
         kernel = event.data["dispatcher"]
         if self._depth == 0:
-            # The compiler makes many objects and no garbage worth looking for.
+            # The compiler creates many objects but hardly any garbage, so collection is suspended.
             self._was_collecting = gc.isenabled()
             gc.disable()
         self._depth += 1

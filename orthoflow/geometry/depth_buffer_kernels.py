@@ -12,7 +12,7 @@ from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.slabs import Offsets
 
-# Limit of counts, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
+# Maximum count per voxel, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
 COUNT_MOST: Final = 2000
 
 # Points closer to the projection centre belong to the camera or its tripod.
@@ -73,7 +73,7 @@ def splat_points(
     Args:
         points: offsets from the origin of the cloud.
         camera: (25,) parameters of a camera for these offsets.
-        around: number of points in 3 x 3 x 3 voxels; a surface covers about 9 voxel faces in them,
+        around: number of points in 3 x 3 x 3 voxels; a surface covers about 9 voxel faces in these,
             from which the point spacing follows.
         n_least: minimum number of points around a point, including itself; other points are
             outliers.

@@ -59,7 +59,7 @@ def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def across(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross product of two vectors (3,), twenty times as fast as `np.cross`."""
+    """Return the cross product of two vectors (3,) twenty times as fast as `np.cross`."""
     a, b, c = first.tolist()
     d, e, f = second.tolist()
     return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
@@ -169,10 +169,11 @@ def signed_area(ring: NDArray[np.float64]) -> float:
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
-# A plane is a floor or ceiling if the angle between its normal and the vertical is smaller. With a
-# nearly vertical normal, the direction to the right of the viewer would depend on noise.
+# A plane is a floor or ceiling if the angle between its normal and the vertical is smaller than
+# this. With a nearly vertical normal, the direction to the right of the viewer would depend on
+# noise.
 LEVEL_LIMIT_DEG: Final = 10.0
-# Coordinates in survey frames on Earth are smaller; larger ones are corrupt.
+# Coordinates in survey frames on Earth are smaller than this; larger ones are corrupt.
 #: metres from the origin; points farther away are ignored with a warning
 FARTHEST_M: Final = 1e9
 _LEAST_COSINE: Final = math.cos(math.radians(LEVEL_LIMIT_DEG))
@@ -197,11 +198,11 @@ class WallFrame:
         width: number of columns.
         height: number of rows.
         map_crs: coordinate system of a raster that is a map, with u to the east and v to the south:
-            an EPSG code, or `site` for an unnamed world system; None if it is not a map.
+            an EPSG code, or `site` for an unnamed world system; None if the raster is not a map.
         up: unit vector of heights; None if unknown.
-        name: name of the wall, used in the name of the coordinate system of its raster.
-        left_m: distance along the wall from its left edge to the left edge of this raster, if it
-            is a part of a wall.
+        name: name of the wall, used in the name of the raster's coordinate system.
+        left_m: distance along the wall from the left edge of the wall to that of this raster, if
+            the raster shows a part of a wall.
     """
 
     origin_world: NDArray[np.float64]
@@ -235,12 +236,12 @@ class WallFrame:
 
     @property
     def raster_axes(self) -> RasterAxes:
-        """The meaning of X and Y in files of this raster.
+        """The meaning of X and Y in the files of this raster.
 
-        For upright walls, X is the distance along the wall and Y the height, exact at the top edge.
-        For floors and ceilings, X and Y are the horizontal world axes; rows of a ceiling go north,
-        so that it can be superimposed on the floor. For sloping planes, and if up is unknown, X and
-        Y are distances from the top-left corner.
+        For upright walls, X is the distance along the wall, and Y is the height, which is exact at
+        the top edge. For floors and ceilings, X and Y are the horizontal world axes; rows of a
+        ceiling go north, so that it can be superimposed on the floor. For sloping planes, and if up
+        is unknown, X and Y are distances from the top-left corner.
         """
         if self.map_crs is not None:
             return "map"
@@ -272,10 +273,10 @@ class WallFrame:
 
     @property
     def crs(self) -> str:
-        """Name of the coordinate system in files: that of the map or of the wall.
+        """Name of the coordinate system of the map or of the wall, as in files.
 
-        The latter consists of the name of the wall and a hash of the world position of X = Y = 0.
-        The name is therefore the same for all rasters and parts of a wall, and differs between
+        For a wall, it consists of the name of the wall and a hash of the world position of X = Y =
+        0. The name is therefore the same for all rasters and parts of a wall, and differs between
         walls.
         """
         if self.map_crs is not None:
@@ -295,7 +296,7 @@ class WallFrame:
         )
 
     def of_rows(self, rows: slice) -> WallFrame:
-        """Return the frame of the given rows."""
+        """Return the frame of the part of the raster with the given rows."""
         corner = self.origin_world + rows.start * self.gsd_m * self.v_world
         return replace(self, origin_world=corner, height=rows.stop - rows.start)
 
@@ -309,7 +310,7 @@ class WallFrame:
     def world_from_wall(
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Return world points (n, 3) of wall positions (n, 2) = (column, row) and depths (n,)."""
+        """Return the world points (n, 3) at positions (n, 2) = (column, row) and depths (n,)."""
         # In notebooks, a single position may be given as a list of two numbers.
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
@@ -329,11 +330,11 @@ class WallFrame:
         )
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return X and Y (n, 2) in files, metres, of wall positions (n, 2)."""
+        """Return the X and Y (n, 2), as in files, in metres, of wall positions (n, 2)."""
         return np.array(self.raster_corner_m) + self.gsd_m * pixels_wall * [1.0, self.raster_down]
 
     def wall_from_raster(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return wall positions (n, 2) = (column, row) of X and Y (n, 2) in files."""
+        """Return the wall positions (n, 2) = (column, row) of X and Y (n, 2), as in files."""
         pixels: NDArray[np.float64] = (
             (places_m - np.array(self.raster_corner_m)) * [1.0, self.raster_down] / self.gsd_m
         )

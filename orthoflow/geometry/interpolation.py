@@ -20,7 +20,7 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.threads import in_parts
 
-# Cells are used up to the distance of the nearest one plus this number of cells.
+# Cells are used up to the distance to the nearest one plus this number of cells.
 _BEYOND_CELLS: Final = 1.0
 # Cells within this squared distance, the eight neighbours, are always used.
 _NEIGHBOURS_SQUARE: Final = 2.0
@@ -30,12 +30,12 @@ _SIGMA_SHARE: Final = 0.5
 _WEIGHT_LEAST: Final = 1e-6
 # Regularisation that reduces a slope to zero if the points hardly determine it.
 _RIDGE: Final = 0.005
-# Points with a smaller difference of squared distances count as equally near.
+# Points whose squared distances differ by less than this count as equally near.
 _AS_NEAR: Final = 1e-6
 
 
 class CellValues(NamedTuple):
-    """Values of the cells of a raster, as flat arrays; empty arrays are ignored.
+    """Values of the cells of a raster as flat arrays; empty arrays are ignored.
 
     Attributes:
         depth_m: float32, NaN if void.
@@ -63,13 +63,13 @@ def cell_values(
 
 
 class Surroundings(NamedTuple):
-    """Cells of a raster from which others are interpolated.
+    """Cells of a raster from which other cells are interpolated.
 
     Attributes:
-        places: (cells, 2) float32 position of the points to the right of and below the centre of
-            their cell, in cells; NaN for cells that are not used.
+        places: (cells, 2) float32 offsets of the points to the right and downwards from the centre
+            of their cell, in cells; NaN for cells that are not used.
         width: number of columns of the raster.
-        layer_m: depths with a larger difference belong to different surfaces.
+        layer_m: maximum difference between depths on the same surface.
     """
 
     places: NDArray[np.float32]
@@ -96,7 +96,7 @@ def interpolate(
     Args:
         cells: (n,) flat indices of the cells to interpolate.
         around: cells from which they are interpolated.
-        values: values of these cells and, if known, depths of the cells to interpolate.
+        values: values of the surrounding cells and, if known, depths of the cells to interpolate.
         into: output; may be `values` if no cell in `cells` is used to interpolate others.
         reach_cells: maximum distance to the nearest cell that can be used.
         threads: number of threads.
@@ -220,7 +220,7 @@ def _find_lenders(
 def _keep_layer(
     n: int, surface_m: float, layer_m: float, depth_m: NDArray[np.float32], lenders: _Lenders
 ) -> int:
-    """Keep the neighbours that are on one surface; return their number."""
+    """Keep only the neighbours on one surface; return their number."""
     kept = 0
     for k in range(n):
         if abs(depth_m[lenders.cells[k]] - surface_m) <= layer_m:

@@ -1,9 +1,9 @@
 """Evenly distributed key points of pictures, and matching of their descriptors.
 
 OpenCV's SIFT shifts all key points by a quarter of a pixel to the right and down unless its precise
-upscaling is enabled (opencv issue 23123; with version 5.0, a shift of 0.25 px was measured for all
-sizes). The shift would be a systematic error of an orientation, so it is subtracted if the default
-upscaling is used.
+upscaling is enabled (opencv issue 23123; with version 5.0, a shift of 0.25 px was measured for key
+points of all sizes). The shift would be a systematic error of an orientation, so it is subtracted
+if the default upscaling is used.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MIN_SIDE_PX: Final = 16
 # The unit of RootSIFT entries is 1/512. Sums of their products are below 2^24, so float32 products
 # are exact, regardless of the order of summation in a BLAS library.
 _QUANTA: Final = 512.0
-# Number of pairs whose descriptors are gathered at once (2 x 32 MB).
+# Number of pairs whose descriptors are processed at once (2 x 32 MB).
 _PAIRS_AT_ONCE: Final = 65_536
 # Number of entries in a block of distances; its 12 MB fit into a processor's cache.
 _BLOCK_ENTRIES: Final = 3_000_000
@@ -70,7 +70,7 @@ def root_sift(raw: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class Features(Rows):
-    """Key points of an image; any first n are the strongest n, distributed over the image.
+    """Key points of an image; any first n are the strongest n distributed over the image.
 
     Attributes:
         pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
@@ -107,7 +107,7 @@ class Features(Rows):
         return replace(self, pixels=self.pixels * factor, sizes_px=self.sizes_px * factor)
 
     def mirrored(self, width_px: float) -> Features:
-        """Return the key points of the image of this width, mirrored left to right.
+        """Return the key points of the image, which has this width, after mirroring left to right.
 
         In a descriptor, mirroring reverses the order of the rows of the 4 x 4 fields and the sense
         of rotation of the 8 directions, both relative to the main direction.
@@ -283,7 +283,7 @@ class Window:
 def mutual_matches(
     first: NDArray[np.float32], second: NDArray[np.float32], *, ratio: float
 ) -> Matches:
-    """Match descriptors that are mutually nearest and clearly nearer than the second nearest.
+    """Match descriptors that are mutually nearest and distinctly nearer than the second nearest.
 
     Args:
         first: (n, d) integer values, small enough that products are exact in float32.

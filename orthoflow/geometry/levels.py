@@ -1,4 +1,4 @@
-"""Conversion of colour levels with 8 or 16 bits per channel, in proportion to white.
+"""Conversion between colour levels with 8 and 16 bits per channel, in proportion to white.
 
 255 in 8 bits corresponds to 65535 in 16 bits; an 8-bit level times 257 is its 16-bit level.
 """
@@ -20,7 +20,7 @@ Level: TypeAlias = type[np.uint8] | type[np.uint16]
 REC_601: Final = np.array([0.299, 0.587, 0.114])
 # 16-bit levels per 8-bit level.
 DEEPER: Final = 257
-# Number of steps of the table from linear light to levels, between which it is nearly linear.
+# Number of steps of the table from linear light to levels, which is nearly linear within a step.
 _STEPS: Final = 1 << 16
 # A picture has a single tone if at least this share of its cells is almost black, almost white, or
 # within one of 256 levels of the median.
@@ -54,7 +54,7 @@ def in_levels(colours: Colours, level: Level) -> Colours:
 
 
 def level_of(colours: Colours) -> Level:
-    """Return the number of bits of colours."""
+    """Return the number of bits per channel of colours."""
     return np.uint16 if colours.dtype == np.uint16 else np.uint8
 
 

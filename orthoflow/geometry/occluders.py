@@ -1,4 +1,4 @@
-"""Points of the whole cloud that hide others in photos."""
+"""Points of the whole cloud that hide other points in photos."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VOXELS_MOST: Final = 1 << 24
 # Side of a voxel, which is small enough to separate the legs of a chair, and large enough to
 # contain several points of a surface.
 _VOXEL_CELLS: Final = 6.0
-# Scanners do not measure at shorter ranges. Points there are errors, even if they are dense.
+# Scanners do not measure at ranges shorter than this. Points there are errors, even if dense.
 _BLIND_M: Final = 0.3
 # A voxel is empty if fewer than one in this many rays of a station end in it. A 1 mm rod stops a
 # larger share of the rays through a 0.2 m cube.
@@ -36,7 +36,7 @@ _N_ELEVATIONS: Final = 90
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
 # Around the corner of a surface, there are a quarter of these points; at its edge, there are half.
 _CORNER_SHARE: Final = 0.25
-# Limit of the share of point pairs in the same voxel; closer to 1 in 27 than to 1 in 9.
+# Maximum share of point pairs in the same voxel; closer to 1 in 27 than to 1 in 9.
 _SPREAD_SHARE: Final = 0.07
 _SAMPLED_MOST: Final = 1 << 20
 # Points with fewer points around them (including themselves) are outliers and hide nothing.
