@@ -133,13 +133,17 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     assert {name for name, row in rows.items() if row["status"] == "damaged"} == {
         "torn", "linked", "pipe", "waiting",
     }  # fmt: skip
-    assert rows["torn"]["reason"].startswith("torn/run.h5 cannot be read, the file is damaged")
+    assert rows["torn"]["reason"].startswith(
+        "torn/run.h5 cannot be read because the file is damaged"
+    )
     assert all(rows[name]["reason"] for name in ("linked", "pipe"))
     assert "its journal cannot be read: " in rows["waiting"]["reason"]
     assert not [name for name in rows if "loop" in name]
     shown = asked("show", "torn")
     assert shown.exit_code == 3
-    assert shown.output.startswith("error: torn/run.h5 cannot be read, the file is damaged: ")
+    assert shown.output.startswith(
+        "error: torn/run.h5 cannot be read because the file is damaged: "
+    )
     assert shown.output.endswith("; use another copy, and check it with `orthoflow verify`\n")
     assert shown.output.count("\n") == 1
     assert rows["hostile"]["workflow"] == "\x1b[2Jred"
