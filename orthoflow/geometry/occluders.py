@@ -146,7 +146,7 @@ def occluders_in(
         stations = np.unique(stations_world, axis=0) - cloud.origin
         _forget_passed(grid, points, stations, _CORNER_SHARE * n_few)
         _forget_around(grid, stations)
-    # In a larger voxel, the number of points of a linear object is larger by this factor.
+    # In larger voxels, the number of points on a linear object increases by this factor.
     n_asked = math.ceil(n_least * larger)
     return Occluders(
         origin=cloud.origin, points=points, around=grid, n_least=n_asked, threads=threads
@@ -228,7 +228,7 @@ def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_fe
 def _forget_passed(
     grid: VoxelGrid, points: Offsets, stations: NDArray[np.float64], n_few: float
 ) -> None:
-    """Reject voxels through which nearly all rays of the stations passed.
+    """Reject voxels through which nearly all rays from the stations passed.
 
     Stray points of a dense scan can be as dense as points of a surface, especially near a station,
     but only a small share of the rays in their direction ends at them. Near a station in a thinned

@@ -70,7 +70,7 @@ class Corner:
 
 
 def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the line where two planes intersect: its point nearest to the origin, its direction.
+    """Return the line where two planes intersect: point nearest to the origin, and direction.
 
     The result is None if the planes are nearly parallel.
     """
@@ -182,7 +182,7 @@ def _common(first: list[Interval], second: list[Interval]) -> Iterator[Interval]
 
 
 def _distance(edge: Edge, point: NDArray[np.float64]) -> float:
-    """Return the distance of a point from a line segment."""
+    """Return the distance between a point and a line segment."""
     begin, end = edge.ends_world
     along = float(np.clip((point - begin) @ (end - begin) / edge.length_m**2, 0.0, 1.0))
     return float(np.linalg.norm(point - begin - along * (end - begin)))
@@ -190,7 +190,7 @@ def _distance(edge: Edge, point: NDArray[np.float64]) -> float:
 
 # Maximum distance between the end of a wall's points and the corner with the next wall.
 _JOINED_M: Final = 1.0
-# Parallel walls that are closer to each other are one wall with relief.
+# Parallel walls that are closer to each other than this are one wall with relief.
 _RELIEF_M: Final = 0.5
 
 

@@ -159,7 +159,7 @@ def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner
 # The entries of a chunk (16 MB) stay in the cache of the processor between passes.
 _CHUNK: Final = 1 << 20
 
-# Gaps are filled from the nearest cells and from cells up to one cell farther away.
+# Gaps are filled from the nearest cells and from cells at most one cell farther away.
 _BESIDE_GAPS_CELLS: Final = 2
 
 _Value = TypeVar("_Value", bound=np.generic)

@@ -33,7 +33,7 @@ def median_deviation(values: NDArray[np.floating], middle: float | None = None) 
 def least_absolute(
     design: NDArray[np.float64], wanted: NDArray[np.float64], held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Solve design x = wanted in the L1 norm, by least squares with weights of 1 / residual.
+    """Solve design x = wanted in the L1 norm by least squares with weights of 1 / residual.
 
     Args:
         design: (n, k) design matrix.
@@ -53,7 +53,7 @@ _SAMPLES: Final = 300_000
 
 
 def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
-    """Estimate the standard deviation of a depth from second differences of neighbours.
+    """Estimate the standard deviation of depths from second differences between neighbours.
 
     Edges do not influence the median of the differences. The result is 0 if no three adjacent cells
     of the raster (rows, cols) are measured.

@@ -22,10 +22,11 @@ class ColourPhotos(Method):
     """Assign each point the colour of the photo that shows it best.
 
     A point is visible unless a nearer point of the cloud hides it; outliers are ignored (the depth
-    buffer of `ortho.dsm-backward`). If several photos see it, the one with the most pixels per
-    metre is used, with a lower weight near its border; the colour is interpolated between four
-    pixels. This makes it possible to create direct orthoimages (`ortho.pointcloud-direct`) from the
-    same photos as with the other methods, even if the cloud has no colours.
+    buffer of `ortho.dsm-backward`). If several photos show the point, the one with the most pixels
+    per metre is used, with a lower weight near the border of a photo; the colour is interpolated
+    between four pixels. This makes it possible to create direct orthoimages
+    (`ortho.pointcloud-direct`) from the same photos as those used by the other methods, even if the
+    cloud has no colours.
     """
 
     id: ClassVar[str] = "colour.photos"

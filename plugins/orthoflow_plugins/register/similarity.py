@@ -25,8 +25,8 @@ class RegisterSimilarity(Method):
     """Fit translation, rotation and scale to pairs of points, and transform the cloud.
 
     This is the seven-parameter transformation of skarlatos2012. `points` are positions in the
-    cloud's coordinates, `control` the surveyed positions; points with the same name form a pair.
-    All pairs have the same weight. `sigma0_mm` is the standard deviation of one coordinate;
+    cloud's coordinates, and `control` are the surveyed positions; points with the same name form a
+    pair. All pairs have the same weight. `sigma0_mm` is the standard deviation of one coordinate;
     `left_out_rms_mm` is computed from the distance between each control point and its position
     predicted from the other pairs, so no pair influences its own distance. The transformed cloud
     has the up direction of the control points.
@@ -142,7 +142,7 @@ def fit_similarity(
     Args:
         points_source: (n, 3) metres, n >= 3, not on one line.
         points_target: (n, 3) metres, the same points.
-        with_scale: fit seven parameters; otherwise six, with a scale of 1.
+        with_scale: whether to fit seven parameters; otherwise, six are fitted and the scale is 1.
 
     Raises:
         GeometryError: there are too few points, or they are on one line.
@@ -177,7 +177,7 @@ def _require_same_hand(
     *,
     with_scale: bool,
 ) -> None:
-    """Refuse lists that are mirror images, since their fit is poor and its scale is wrong.
+    """Refuse lists that are mirror images: their fit is poor, and the fitted scale is wrong.
 
     Raises:
         GeometryError: the fit is far better if one of the lists is mirrored.

@@ -19,7 +19,7 @@ from orthoflow.products import OpeningKind, PointCloud, SurfaceMask, Wall
 _NECK_CELLS: Final = 3
 # An area is `through` if at least this share of its cells is crossed by rays.
 _CROSSED_LEAST: Final = 0.1
-# Otherwise, it is `no data` if at least this share of its cells is empty.
+# Any other area is `no data` if at least this share of its cells is empty.
 _EMPTY_LEAST: Final = 0.5
 # If more than this share of the measured cells is behind the plane, the plane is not the wall's
 # face.
@@ -31,7 +31,7 @@ _TILE_M: Final = 0.05
 _POINTS_MOST: Final = 1 << 22
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 _BLOCK: Final = 1 << 18
-# If stations are unknown, only points up to these distances behind and in front of the plane are
+# If stations are unknown, only points within these distances behind and in front of the plane are
 # used.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 1.5
@@ -148,7 +148,7 @@ class Relief:
         is_empty: (rows, cols) bool, depth unknown.
         is_crossed: (rows, cols) bool, True where rays passed through.
         depth_m: (rows, cols) float32 depth in front of the plane; NaN where empty.
-        face_m: depth of the wall's face; 0 if the face is the plane.
+        face_m: depth of the wall's face; 0 if the face is in the plane.
     """
 
     gsd_m: float
@@ -169,7 +169,7 @@ class Area:
         corner: row and column of the first cell of `cells` in the relief.
         cells: (rows, cols) bool, True in the opening, without holes and with a margin.
         kind: kind of the opening.
-        depth_m: distance of its back behind the wall's face; None if nothing was measured.
+        depth_m: distance from the wall's face to the back of the opening; None if not measured.
     """
 
     corner: tuple[int, int]

@@ -43,7 +43,7 @@ _UPRIGHT: Final = math.sin(math.radians(30.0))
 # A surface farther behind the plane is not the face of the same wall.
 _FACE_FARTHEST_M: Final = 0.3
 # An empty area must fill at least this share of its bounding rectangle; round windows fill more,
-# scan shadows less.
+# and scan shadows less.
 _FILLED_LEAST: Final = 0.7
 # If the wall was measured along less than this share of an outline, the area is at the border of
 # the scan and not an opening.
@@ -187,7 +187,7 @@ class SegmentOpenings(Method):
 def _found_on(
     inputs: SegmentOpenings.In, place: int, params: SegmentOpenings.Params, ctx: StepContext
 ) -> tuple[list[Opening], int]:
-    """Return a wall's openings, and the number of areas rejected for their border or shape."""
+    """Return a wall's openings, and the number of areas rejected due to their border or shape."""
     wall, slab = inputs.walls.walls[place], inputs.walls.slab(place)
     lines = None if inputs.cloud is None else sight_lines(inputs.cloud, slab)
     relief = relief_of(wall, lines, params.behind_m)
@@ -267,7 +267,7 @@ def _grey(
 ) -> NDArray[np.float32] | None:
     """Return grey values (rows, cols), 0..255, of the wall's orthoimage in the relief's cells.
 
-    The result is None if there is no suitable orthoimage; unpainted cells are NaN.
+    The result is None if there is no suitable orthoimage; cells without colour are NaN.
     """
     known = () if images is None else images.images
     image = next((each for each in known if each.number == wall.plane_index), None)

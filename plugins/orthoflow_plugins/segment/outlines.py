@@ -18,7 +18,7 @@ from orthoflow_plugins.segment.areas import Area, Relief
 _STRAIGHT_CELLS: Final = 2.0
 # After lines have been fitted, two sides are joined if their corner deviates by no more than this.
 _JOINED_CELLS: Final = 1.0
-# Lines are fitted only to sides longer than this, and no corner is moved farther.
+# Lines are fitted only to sides longer than this, and no corner is moved farther than this.
 _FITTED_CELLS: Final = 8.0
 # Sides that meet at a smaller angle are not intersected; their corner is kept.
 _TURN_LEAST: Final = math.sin(math.radians(15.0))
@@ -93,7 +93,7 @@ class Outline:
 
     @property
     def seen_of_all(self) -> float:
-        """Share of the whole outline along which the wall was measured."""
+        """Share of the total length of the outline along which the wall was measured."""
         return float(self.lengths @ self.seen_share / self.lengths.sum())
 
 
