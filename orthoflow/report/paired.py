@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -177,7 +178,8 @@ class MetricOverDatasets:
         known = [one for one in self.methods if one.n == most and math.isfinite(one.median)]
         if better not in BETTER or len(known) < 2:
             return ""
-        best, after = sorted(known, key=lambda one: badness(one.median, better))[:2]
+        best, *others = sorted(known, key=lambda one: badness(one.median, better))
+        after = others[0]
         if self.ranks is not None:
             is_clear = best.name in self.ranks.leading and after.name not in self.ranks.leading
         else:
@@ -185,8 +187,9 @@ class MetricOverDatasets:
             is_clear = len(self.methods) == 2 and any(pair.p_holm < _SHOWN_P for pair in pairs)
         unit = "1" if is_flag(unit) else unit
         values = [f"{one.name} ({number_with_unit(one.median, unit)})" for one in (best, after)]
-        if is_rounding(best.median, after.median):
-            return f"{values[0]} and {after.name} are level."
+        level = [one.name for one in others if is_rounding(best.median, one.median)]
+        if level:
+            return f"Level: {values[0]}, {first_few(level, most=_MAX_NAMED)}."
         return (
             f"{values[0]} is best, {values[1]} next; the difference is "
             f"{'' if is_clear else 'not '}significant."
@@ -363,7 +366,8 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
 
     Args:
         names: names of the methods, at least three.
-        badness_of: (datasets, methods) values, of which smaller ones are better.
+        badness_of: (datasets, methods) values, of which smaller ones are better. Values that differ
+            only by rounding (`is_rounding`) are ties, as in the paired comparisons.
     """
     from scipy.stats import (  # noqa: PLC0415 - takes half a second
         friedmanchisquare,
@@ -372,6 +376,8 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
     )
 
     n, k = badness_of.shape
+    # Friedman's test ranks the values again, so ties are made in the values.
+    badness_of = np.array([_with_ties(row) for row in badness_of])
     means = rankdata(badness_of, axis=1).mean(axis=0)
     is_level = bool((badness_of == badness_of[:, :1]).all())
     quantile = float(studentized_range.ppf(1.0 - _SHOWN_P, k, math.inf)) / math.sqrt(2.0)
@@ -381,6 +387,16 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
         p=1.0 if is_level else float(friedmanchisquare(*badness_of.T).pvalue),
         critical_difference=quantile * math.sqrt(k * (k + 1) / (6.0 * n)),
     )
+
+
+def _with_ties(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Replace values that differ from the smallest of their group only by rounding by that one."""
+    tied = values.copy()
+    order = np.argsort(values)
+    for before, place in pairwise(order):
+        if is_rounding(tied[before], values[place]):
+            tied[place] = tied[before]
+    return tied
 
 
 def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
@@ -395,10 +411,14 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     if not rows:
         return ""
     tested = [one.paired for _, one in rows if one.paired and math.isfinite(one.paired.p)]
+    # If all n differences have the same sign, p is 2 / 2^n. All comparisons are counted, because
+    # more of them can be tested with more datasets.
+    enough = 2 + math.floor(math.log2(len(rows) / _SHOWN_P))
+    needed = f"at least {enough} datasets are needed for all comparisons ({len(rows)})"
     if not tested:
         return (
-            f"{n_datasets} datasets are not enough for a claim: at least {_MIN_SHOWN} are needed "
-            "on which the results differ, all computed in one environment"
+            f"{n_datasets} datasets are not enough for a claim: {needed}, with results that "
+            f"differ, all computed in one environment; {_MIN_SHOWN} for a single comparison"
         )
     leads, level = [], []
     for name in dict.fromkeys(one.name for _, one in rows):
@@ -429,13 +449,11 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     else:
         sentences.append(f"No difference is significant in any of {len(judged)} metrics ({_TEST})")
         n, n_tests = max(pair.wins + pair.losses for pair in tested), len(tested)
-        # If all n differences have the same sign, p is 2 / 2^n.
         if (least := n_tests * 2.0 ** (1 - n)) >= _SHOWN_P:
-            enough = 2 + math.floor(math.log2(n_tests / _SHOWN_P))
             sentences.append(
-                f"None could be: with {n} datasets and {n_tests} comparisons, the smallest "
-                f"possible p is {min(1.0, least):.2g}; at least {enough} datasets are needed, or "
-                "fewer metrics (compare.metrics)"
+                f"None could be: with {n} datasets and {n_tests} testable comparisons, the "
+                f"smallest possible p is {min(1.0, least):.2g}; {needed}, or fewer metrics "
+                "(compare.metrics)"
             )
     ranked = [
         f"{metric.column.title} ({', '.join(metric.ranks.leading)})"

@@ -217,7 +217,7 @@ def test_methods_are_compared_at_equal_values_of_a_sweep() -> None:
         "plane=ransac-0.02": "plane=hough-0.02",
         "plane=ransac-0.1": "plane=hough-0.1",
     }
-    assert found.lead == "plane=hough-0.02 (0.02 mm) and plane=ransac-0.02 are level."
+    assert found.lead == "Level: plane=hough-0.02 (0.02 mm), plane=ransac-0.02."
 
 
 def leading(n_better: int, n_level: int, n_rooms: int = 12) -> MetricOverDatasets:
@@ -233,7 +233,7 @@ def test_what_is_shown_to_lead_is_stated_of_six_at_most() -> None:
     assert who_leads([over({"a": (1.0, 2.0), "b": (3.0, 4.0)}, "")], 2) == ""
     assert who_leads([over({"a": (1.0, 2.0)})], 2) == ""
     few = who_leads([leading(1, 0, 4)], 4)
-    assert few.startswith("4 datasets are not enough for a claim: at least 6 are needed ")
+    assert few.startswith("4 datasets are not enough for a claim: at least 6 datasets ")
     assert who_leads([leading(0, 2)], 12).startswith(
         "No difference is significant in any of 1 metrics"
     )
@@ -244,7 +244,12 @@ def test_what_is_shown_to_lead_is_stated_of_six_at_most() -> None:
     assert both.endswith("not significantly different from it: size (plane=good0)")
     # With six rooms, p is at least 2 / 2^6, times 2 comparisons.
     few = who_leads([leading(2, 0, 6)], 6)
-    assert "with 6 datasets and 2 comparisons, the smallest possible p is 0.062; at least 7" in few
+    assert "and 2 testable comparisons, the smallest possible p is 0.062; at least 7 data" in few
+    # Comparisons that cannot be tested yet are counted, so that the number does not rise later.
+    for n_rooms in (2, 6):
+        same = over({name: [1.0] * n_rooms for name in "abc"})
+        few = who_leads([leading(2, 0, n_rooms), *[same] * 5], n_rooms)
+        assert "at least 9 datasets are needed for all comparisons (12)" in few
     six, seven = (who_leads([leading(n, 0)], 12) for n in (6, 7))
     assert (six.count(" better in "), "more" in six) == (6, False)
     assert (seven.count(" better in "), " and 1 more. By" in seven) == (6, True)
@@ -300,8 +305,18 @@ def test_mean_ranks_are_those_of_a_worked_example() -> None:
     assert found.critical_difference == pytest.approx(1.25, abs=0.01)
     assert 0.01 < found.p < 0.05
     assert found.leading == ("+m+cf", "+m", "+cf", "C4.5")
-    level = mean_ranks(("a", "b", "c"), np.ones((6, 3)))
-    assert (level.p, level.leading) == (1.0, ("a", "b", "c"))
+
+
+def test_differences_due_to_rounding_are_ties() -> None:
+    for step in (0.0, 1e-14):
+        level = mean_ranks(("a", "b", "c"), 1.0 + step * np.tile([1.0, 2.0, 3.0], (6, 1)))
+        assert (level.p, level.leading) == (1.0, ("a", "b", "c"))
+        assert set(level.ranks.values()) == {2.0}
+    # Three of six rooms are tied: (3 * 2 + 3 * place) / 6; p is that of scipy with the ties.
+    rooms = np.array([[1.0, 2.0, 3.0]] * 3 + [[4e-14, 5e-14, 6e-14]] * 3)
+    half = mean_ranks(("a", "b", "c"), rooms)
+    assert half.ranks == {"a": 1.5, "b": 2.0, "c": 2.5}
+    assert half.p == pytest.approx(math.exp(-3.0))
 
 
 def test_the_interval_of_a_median_covers_it_as_often_as_stated() -> None:
