@@ -189,7 +189,7 @@ class MetricOverDatasets:
         values = [f"{one.name} ({number_with_unit(one.median, unit)})" for one in (best, after)]
         level = [one.name for one in others if is_rounding(best.median, one.median)]
         if level:
-            return f"Level: {values[0]}, {first_few(level, most=_MAX_NAMED)}."
+            return f"{values[0]} is level with {first_few(level, most=_MAX_NAMED)}."
         return (
             f"{values[0]} is best, {values[1]} next; the difference is "
             f"{'' if is_clear else 'not '}significant."

@@ -217,7 +217,7 @@ def test_methods_are_compared_at_equal_values_of_a_sweep() -> None:
         "plane=ransac-0.02": "plane=hough-0.02",
         "plane=ransac-0.1": "plane=hough-0.1",
     }
-    assert found.lead == "Level: plane=hough-0.02 (0.02 mm), plane=ransac-0.02."
+    assert found.lead == "plane=hough-0.02 (0.02 mm) is level with plane=ransac-0.02."
 
 
 def leading(n_better: int, n_level: int, n_rooms: int = 12) -> MetricOverDatasets:
