@@ -22,6 +22,7 @@ from orthoflow_provenance.document import (
     sha256_text,
 )
 
+from orthoflow.engine.journal import RECORD_FILE
 from orthoflow.errors import ArgumentError
 from orthoflow.products import Inspection
 from orthoflow.products.product import JsonValue
@@ -227,12 +228,16 @@ class JoinedCell:
     Attributes:
         found: each run with its entry of the cell, in the order of the runs.
         choices: step with variants -> method and parameters used for this cell.
+        settings: parameters (`step.name`), methods (`step.use`) and result versions
+            (`method.result_version`) of this and all earlier steps; for steps with variants, only
+            the result version.
         dataset: name of the dataset; empty if the run has only one.
         seed: seed of the workflow or of the sweep.
     """
 
     found: tuple[tuple[Run, RecordedCell], ...]
     choices: Mapping[str, Choice]
+    settings: Mapping[str, Value]
     dataset: str
     seed: str
 
@@ -289,11 +294,38 @@ class RunSet:
                     found.setdefault(self._identity(run, cell), []).append((run, cell))
         return tuple(self._joined(tuple(same)) for same in found.values())
 
+    @cached_property
+    def differing(self) -> tuple[str, ...]:
+        """Settings in which the runs differ, except differences between datasets of one run."""
+        in_runs: dict[str, dict[Path, set[Value]]] = defaultdict(lambda: defaultdict(set))
+        by_dataset: dict[str, dict[str, set[Value]]] = defaultdict(lambda: defaultdict(set))
+        used: dict[str, dict[Path, set[str]]] = defaultdict(lambda: defaultdict(set))
+        for one in self.cells:
+            for run, cell in one.found:
+                used[cell.step][run.path].update(
+                    name for name in one.settings if name.endswith(".use")
+                )
+                for name, value in one.settings.items():
+                    in_runs[name][run.path].add(value)
+                    by_dataset[name][one.dataset].add(value)
+        found: set[str] = set()
+        for names in used.values():
+            every = list(names.values())
+            found |= set[str]().union(*every) - every[0].intersection(*every)
+        for name, runs in in_runs.items():
+            is_of_dataset = any(len(values) > 1 for values in runs.values())
+            groups = by_dataset[name].values() if is_of_dataset else [set.union(*runs.values())]
+            if any(len(values) > 1 for values in groups):
+                found.add(name)
+        return tuple(name for name in in_runs if name in found)
+
     def metrics(self) -> pd.DataFrame:
         """Return one row per cell and metric.
 
         Returns:
-            Columns `dataset`, `seed`, `variant.<step>` for each step with variants, `method`,
+            Columns `run` (the first that contains the cell), `dataset`, `seed`, `variant.<step>`
+            for each step with variants, a column for each other setting in which the runs differ
+            (`wall.gsd_m`; `wall.use` is the method; missing if it does not apply), `method`,
             `metric`, `value` as given in the first record, `unit`, `better`, `step`, `cell`
             (address in the first record), `repeat`, `runs` and `environments` (numbers of records
             that contain the cell, and of their environments), and `lowest` and `highest` (extreme
@@ -308,12 +340,14 @@ class RunSet:
         """Return statistics over datasets, seeds and repeats of all records; cells count once.
 
         Returns:
-            One row per combination of variants, step, method and metric, with `n`, `median`,
-            `mean`, `standard_deviation` (NaN for a single value), `lowest` and `highest`.
+            One row per combination of variants, differing settings, step, method and metric, with
+            `n`, `median`, `mean`, `standard_deviation` (NaN for a single value), `lowest` and
+            `highest`.
         """
         names = [f"variant.{step}" for step in self.steps]
-        keys = [*names, "step", "method", "metric", "unit", "better"]
-        values = self.metrics().astype({"value": float}).groupby(keys, sort=False)["value"]
+        keys = [*names, *self.differing, "step", "method", "metric", "unit", "better"]
+        table = self.metrics().astype({"value": float})
+        values = table.groupby(keys, sort=False, dropna=False)["value"]
         return values.agg(
             n="count",
             median="median",
@@ -326,13 +360,18 @@ class RunSet:
     def rows(self) -> Iterator[tuple[Value, ...]]:
         """Yield the rows of `metrics`, beginning with the header."""
         variants = tuple(f"variant.{step}" for step in self.steps)
-        yield ("dataset", "seed", *variants, "method", "metric", "value", *_BEHIND, *_RANGE)
+        varied = (*variants, *self.differing)
+        yield ("run", "dataset", "seed", *varied, "method", "metric", "value", *_BEHIND, *_RANGE)
         names = self._variant_names
         for one in self.cells:
             chosen = (
                 names[step, one.choices[step]] if step in one.choices else "" for step in self.steps
             )
-            front: tuple[Value, ...] = (one.dataset, int(one.seed), *chosen, one.cell.method)
+            settings = (one.settings.get(name) for name in self.differing)
+            front: tuple[Value, ...] = (
+                *(_place(one.found[0][0]), one.dataset, int(one.seed)),
+                *(*chosen, *settings, one.cell.method),
+            )
             for row, values in one.values():
                 yield (
                     *front,
@@ -366,6 +405,11 @@ class RunSet:
             found=same,
             choices={
                 one.step: _choice(one) for one in reversed(upstream) if one.step in self.steps
+            },
+            settings={
+                name: value
+                for one in reversed(upstream)
+                for name, value in _settings(one, is_varied=one.step in self.steps)
             },
             dataset=factors.get(DATA, ""),
             seed=factors.get(SEED, str(run.record.seed)),
@@ -405,6 +449,21 @@ def join_runs(runs: Sequence[Run]) -> RunSet:
     if not runs:
         raise ArgumentError("give at least one run, a run folder or its run.h5")
     return RunSet(runs=tuple(runs))
+
+
+def _place(run: Run) -> str:
+    """Return the folder of a run, or the path of its record if it has another name."""
+    return str(run.folder if run.path.name == RECORD_FILE else run.path)
+
+
+def _settings(cell: RecordedCell, *, is_varied: bool) -> Iterator[tuple[str, Value]]:
+    """Yield the settings of a cell; lists and the like as JSON."""
+    yield f"{cell.method}.result_version", cell.result_version
+    if not is_varied:
+        yield f"{cell.step}.use", cell.method
+        for name, value in cell.params.items():
+            known = value if isinstance(value, str | int | float) else json.dumps(value)
+            yield f"{cell.step}.{name}", known
 
 
 def _choice(cell: RecordedCell) -> Choice:

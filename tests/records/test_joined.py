@@ -57,6 +57,12 @@ def test_the_same_cell_of_two_records_is_one_whatever_it_is_called() -> None:
     found = rms(join_runs([ours, run_of("b", plane("fine", 0.2, 2.0))]))
     assert found[0][0] == "fine (tolerance_m=0.01)"
     assert found[2][0] == "fine (tolerance_m=0.2)"
+    # Variants of one run differ by their names alone, a new version by its number.
+    newer = replace(plane("other", 0.1, 1.0), method="plane.other", result_version=7)
+    assert join_runs([run_of("a", plane("x", 0.1, 1.0), newer)]).differing == ()
+    older = replace(newer, result_version=6)
+    versions = join_runs([run_of("a", newer), run_of("b", older)]).differing
+    assert versions == ("plane.other.result_version",)
 
 
 def test_other_data_or_another_version_is_another_cell() -> None:
@@ -103,6 +109,24 @@ def test_statistics_are_over_the_union_each_cell_once() -> None:
     assert row["standard_deviation"] == pytest.approx(7**0.5)
 
 
+def test_statistics_are_never_over_different_parameters() -> None:
+    def chosen(name: str, gsd_m: float, *values: float) -> Run:
+        cells = (
+            replace(plane("x", 0.1, value, repeat=n), assignment={}, params={"gsd_m": gsd_m})
+            for n, value in enumerate(values)
+        )
+        return run_of(name, *cells)
+
+    runs = join_runs([chosen("a", 0.02, 1.0, 3.0), chosen("b", 0.02, 1.0), chosen("c", 0.008, 7.0)])
+    table = runs.metrics()
+    found = table[table["metric"] == "rms_mm"][["run", "plane.gsd_m", "value", "runs"]]
+    wanted = [("a", 0.02, 1.0, 2), ("a", 0.02, 3.0, 1), ("c", 0.008, 7.0, 1)]
+    assert list(found.itertuples(index=False, name=None)) == wanted
+    table = runs.statistics()
+    found = table[table["metric"] == "rms_mm"][["plane.gsd_m", "n", "mean"]]
+    assert list(found.itertuples(index=False, name=None)) == [(0.02, 2, 2.0), (0.008, 1, 7.0)]
+
+
 def test_the_command_and_the_library_give_one_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,7 +138,7 @@ def test_the_command_and_the_library_give_one_table(
     assert done.exit_code == 0, done.output
     with Path("all.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    wanted = {"dataset", "seed", "method", "metric", "value", "unit", "better"}
+    wanted = {"run", "paint.grey", "dataset", "seed", "method", "metric", "value", "unit", "better"}
     assert wanted <= rows[0].keys()
     table = orthoflow.open_runs(["first", "second"]).metrics()
     assert list(table.columns) == list(rows[0])
