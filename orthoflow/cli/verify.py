@@ -34,9 +34,10 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
 
     Recomputes the seal of the file, the digest of every product and input file in the record, and
     every cache key; checks that redundant entries of the record agree, and that published files,
-    report pages, figures and the files of a crate match it. Missing files, files that are not in
-    the record, and a changed report are only noted; with --strict they are errors. Files that
-    cannot be checked, such as logs, are listed. With --signer, the record must be signed with that
+    report pages, figures and the files and metadata of a crate match it. Missing files, files that
+    are not in the record, and a changed report in a run folder are only noted; with --strict they
+    are errors. In a crate, a changed report is always an error. Files that cannot be checked, such
+    as logs, are listed. With --signer, the record must be signed with that
     key. The exit code is 3 if something differs, or if RUN is not a record or has another version.
     """
     from orthoflow.records.verify import verify_run

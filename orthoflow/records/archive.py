@@ -73,6 +73,8 @@ _CONTEXT: Final[list[JsonValue]] = [
     "https://w3id.org/ro/terms/workflow-run/context",
     {"buildInstructions": "https://codemeta.github.io/terms/buildInstructions"},
 ]
+# Properties that are not derived from the record: of the crate, and of its other entities.
+_FREE: Final = {"./": {"license", "author", "creator", "description"}, "": {"description"}}
 _MEDIA_TYPES: Final = {".h5": "application/x-hdf5", ".tif": "image/tiff", ".yaml": "text/yaml"}
 _UNIT_CODES: Final = {
     "s": "https://qudt.org/vocab/unit/SEC",
@@ -183,6 +185,50 @@ def crate_metadata(
             if source not in taken:
                 _add_final(crate, source, given[source], product)
     return {"@context": _CONTEXT, "@graph": list(crate.entities.values())}
+
+
+def metadata_differences(
+    record: RunRecord, files: Sequence[PublishedFile], stated: Mapping[str, Any]
+) -> list[str]:
+    """Return the entity and property of each difference between a crate's metadata and a record.
+
+    The order of lists is ignored, as are the facts that only the author of a crate knows: license,
+    author, descriptions, persons and organizations.
+
+    Args:
+        record: record of the run.
+        files: the files of the crate, according to the metadata.
+        stated: the metadata.
+
+    Raises:
+        RecordError: a cell of the record uses a product that no cell produced.
+    """
+    made = crate_metadata(record, files, license_text="")
+    differences = [] if stated.get("@context") == made["@context"] else ["@context"]
+    expected = {entity["@id"]: entity for entity in _entities(made)}
+    missing = dict.fromkeys(expected)
+    for entity in _entities(stated):
+        identifier = entity["@id"]
+        missing.pop(identifier, None)
+        if identifier in expected:
+            known, free = expected[identifier], _FREE["./" if identifier == "./" else ""]
+            differences += [
+                f"{identifier} {name}"
+                for name in dict.fromkeys([*known, *entity])
+                if name not in free and _unordered(known.get(name)) != _unordered(entity.get(name))
+            ]
+        elif entity.get("@type") not in ("Person", "Organization"):
+            differences.append(f"{identifier} (added)")
+    return [*differences, *(f"{identifier} (missing)" for identifier in missing)]
+
+
+def _entities(crate: Mapping[str, Any]) -> list[dict[str, Any]]:
+    entities: list[dict[str, Any]] = crate["@graph"]
+    return entities
+
+
+def _unordered(value: Any) -> Any:
+    return sorted(value, key=json.dumps) if isinstance(value, list) else value
 
 
 class _Crate:

@@ -52,6 +52,7 @@ from orthoflow.records.runs import (
     record_errors,
 )
 from orthoflow.untrusted_text import first_few, parse_json
+from orthoflow.version import __version__
 
 SIGNATURE_SUFFIX: Final = ".sig"
 # Keys and signatures have a few hundred bytes.
@@ -492,10 +493,15 @@ def _check_others(
     """
     folder, findings = run.folder, []
     known = {file.path: file for file in run.record.published}
-    crate = _crate_files(folder)
-    if isinstance(crate, str):
-        findings.append(crate)
-        crate = {}
+    crate, free = None, ""
+    try:
+        if (metadata := _crate_metadata(folder)) is not None:
+            crate = _crate_files(metadata)
+            different, free = _metadata_state(run.record, metadata, list(crate.values()))
+            findings += different
+    except (UnsafeFileError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        findings.append(f"{METADATA_FILE} is not the metadata of a crate, or is damaged: {error}")
+        crate = crate or {}
     states: dict[str, tuple[PublishedState, str]] = {}
     for name, content in crate_texts(run.record).items() if crate is not None else ():
         digest = hashlib.sha256(content).hexdigest()
@@ -525,12 +531,18 @@ def _check_others(
         findings,
         [Note(code="missing", text=text)] if gone else [],
         len({name for name, is_same in figures.items() if is_same} | same),
-        tuple(_left_over(folder, checked)),
+        tuple(_left_over(folder, checked, free)),
     )
 
 
-def _left_over(folder: Path, checked: Set[str]) -> Iterator[str]:
-    """Yield the files of a folder that were not checked; folders with the number of their files."""
+def _left_over(folder: Path, checked: Set[str], free: str) -> Iterator[str]:
+    """Yield the files of a folder that were not checked; folders with the number of their files.
+
+    Args:
+        folder: the folder.
+        checked: paths of the checked files.
+        free: the part of the metadata of a crate that was not checked.
+    """
     tops: dict[str, list[str]] = {}
     for place, _, below in os.walk(folder):
         for name in below:
@@ -540,7 +552,7 @@ def _left_over(folder: Path, checked: Set[str]) -> Iterator[str]:
                 tops.setdefault(path.parts[0], []).append(path.as_posix())
     for top, paths in sorted(tops.items()):
         if top == METADATA_FILE:
-            yield f"{top} (author, license and descriptions)"
+            yield f"{top} ({free})" if free else top
         else:
             yield f"{top}/ ({len(paths)} files)" if len(paths) > 1 else paths[0]
 
@@ -575,26 +587,48 @@ def _is_same_figure(folder: Path, path: str, figure: RecordedFigure) -> bool | N
         return False
 
 
-def _crate_files(folder: Path) -> dict[str, PublishedFile] | str | None:
-    """Return the files in the metadata of a crate; a sentence if damaged; None if missing."""
+def _crate_metadata(folder: Path) -> Any:
+    """Return the metadata of a crate; None if the folder is not a crate."""
     try:
         with open_below(folder, METADATA_FILE) as stream:
-            # Any: entities of any kind.
-            crate: Any = parse_json(stream.read(_LARGEST_METADATA).decode())
-        return {
-            entity["@id"]: PublishedFile(
-                path=entity["@id"],
-                size_bytes=int(entity["contentSize"]),
-                sha256=str(entity["sha256"]),
-            )
-            for entity in crate["@graph"]
-            # The ids of input files outside the crate have the scheme `ni`.
-            if "sha256" in entity and not str(entity["@id"]).startswith("ni:")
-        }
+            return parse_json(stream.read(_LARGEST_METADATA).decode())
     except FileNotFoundError:
         return None
-    except (UnsafeFileError, OSError, ValueError, KeyError, TypeError) as error:
-        return f"{METADATA_FILE} is not the metadata of a crate, or is damaged: {error}"
+
+
+def _crate_files(crate: Any) -> dict[str, PublishedFile]:
+    """Return the files in the metadata of a crate."""
+    return {
+        entity["@id"]: PublishedFile(
+            path=entity["@id"],
+            size_bytes=int(entity["contentSize"]),
+            sha256=str(entity["sha256"]),
+        )
+        for entity in crate["@graph"]
+        # The ids of input files outside the crate have the scheme `ni`.
+        if "sha256" in entity and not str(entity["@id"]).startswith("ni:")
+    }
+
+
+def _metadata_state(
+    record: RunRecord,
+    crate: Any,
+    files: Sequence[PublishedFile],
+) -> tuple[list[str], str]:
+    """Return a finding if the metadata differ from the record, and what was not checked.
+
+    Another version may describe the same record with other entities.
+    """
+    from orthoflow.records.archive import metadata_differences  # noqa: PLC0415 - loads prov
+
+    try:
+        different = metadata_differences(record, files, crate)
+    except RecordError as error:
+        return [f"{METADATA_FILE}: {error}"], "everything except the digests of files"
+    if different and record.created_by != f"orthoflow {__version__}":
+        return [], f"everything except the digests of files: check it with {record.created_by}"
+    found = [f"{METADATA_FILE}: differs from the record in {first_few(different)}"]
+    return found if different else [], "author, license and descriptions"
 
 
 def _unnamed(path: Path, record: RunRecord) -> list[str]:

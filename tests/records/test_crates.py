@@ -218,6 +218,24 @@ def test_changed_files_of_a_crate_are_found(studio: Studio, tmp_path: Path) -> N
         "1 files of the crate are missing: workflow-resolved.json"
     ]
     assert found.unchecked[0] == "more.txt"
+    crate = json.loads((studio.folder / "crate" / metadata.name).read_text())
+    stated = {entity["@id"]: entity for entity in crate["@graph"]}
+    crate["@graph"].append({"@id": "#me", "@type": "Person", "name": "A. Nemo"})
+    stated["./"] |= {"license": "CC0", "author": {"@id": "#me"}, "description": "A wall."}
+    stated["./"]["hasPart"].reverse()
+    metadata.write_text(json.dumps(crate))
+    assert not [text for text in verify_run(folder).findings if text.startswith(metadata.name)]
+    stated["./"]["datePublished"] = "2020-01-01"
+    stated["#engine"]["softwareVersion"] = "9"
+    stated["#setting-paint/grey"]["value"] = 132
+    stated["#run-of-paint"]["startTime"] = "2020-01-01"
+    crate["@graph"].append({"@id": "#metric-paint/iou", "@type": "PropertyValue", "value": 0.999})
+    metadata.write_text(json.dumps(crate))
+    [text] = [text for text in verify_run(folder).findings if text.startswith(metadata.name)]
+    assert text == (
+        "ro-crate-metadata.json: differs from the record in ./ datePublished, "
+        "#engine softwareVersion, #run-of-paint startTime and 2 more"
+    )
 
 
 def test_tables_hold_what_the_record_says(studio: Studio) -> None:
