@@ -29,7 +29,8 @@ def sign(run: Path, key: Path) -> int:
     that passes verification is signed. `orthoflow verify RUN --signer FILE` checks the signature
     with your public key.
     """
-    from orthoflow.records.verify import SIGNATURE_SUFFIX, sign_record, verify_run
+    from orthoflow.records.seals import SIGNATURE_SUFFIX
+    from orthoflow.records.verify import sign_record, verify_run
 
     verification = verify_run(run)
     if verification.findings:

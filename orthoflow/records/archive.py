@@ -49,7 +49,7 @@ from orthoflow.records.runs import (
     pages_of,
     path_inside,
 )
-from orthoflow.records.verify import SIGNATURE_SUFFIX, page_of
+from orthoflow.records.seals import SIGNATURE_SUFFIX, page_of
 from orthoflow.version import DISTRIBUTION
 
 Entity: TypeAlias = dict[str, JsonValue]

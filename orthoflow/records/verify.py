@@ -51,10 +51,10 @@ from orthoflow.records.runs import (
     read_run,
     record_errors,
 )
+from orthoflow.records.seals import PAGE_MARK, SIGNATURE_SUFFIX
 from orthoflow.untrusted_text import first_few, parse_json
 from orthoflow.version import __version__
 
-SIGNATURE_SUFFIX: Final = ".sig"
 # Keys and signatures have a few hundred bytes.
 _LARGEST_BYTES: Final = 64 << 10
 _LARGEST_METADATA: Final = 1 << 28
@@ -227,8 +227,6 @@ def _read_key(path: Path, password: Callable[[], str] | None = None) -> Any:
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
 # Prefix of metrics that repeat findings from the product of an inspection.
 _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
-# Text before the digests at the end of a page.
-_PAGE_MARK: Final = "orthoflow report of"
 _WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
     "no file": "a link, a folder or a device in place of the published file, or it is unreadable",
@@ -383,19 +381,6 @@ def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
             )
 
 
-def sealed_page(text: str, runs: Sequence[Run]) -> str:
-    """Return a report page with the digests of its records and of its own text appended."""
-    digests = [run.content_sha256 for run in runs if run.content_sha256]
-    sealed = f"{text}\n<!-- {_PAGE_MARK} {' '.join(digests)} "
-    return f"{sealed}page {hashlib.sha256(sealed.encode('utf-8')).hexdigest()} -->\n"
-
-
-def page_of(page: str, run: Run) -> str:
-    """Return a page of another record of the same run, sealed as a page of this record."""
-    text, mark, _ = page.rpartition(f"\n<!-- {_PAGE_MARK}")
-    return sealed_page(text, [run]) if mark else page
-
-
 def _page_states(folder: Path, content_sha256: str) -> dict[str, bool]:
     """Return, for each page next to a record, whether it is unchanged and shows this record."""
     names = [REPORT_FILE] if os.path.lexists(folder / REPORT_FILE) else []
@@ -412,7 +397,7 @@ def _is_own_page(folder: Path, name: str, content_sha256: str) -> bool:
     except (OSError, UnsafeFileError):
         return False
     sealed, _, end = content.rpartition(b"page ")
-    shown = sealed.rpartition(_PAGE_MARK.encode())[2].decode("ascii", "replace").split()
+    shown = sealed.rpartition(PAGE_MARK.encode())[2].decode("ascii", "replace").split()
     own = f"{hashlib.sha256(sealed).hexdigest()} -->\n".encode()
     return end == own and content_sha256 in shown
 

@@ -24,8 +24,8 @@ from orthoflow.records.runs import (
     parts_of,
     write_files,
 )
+from orthoflow.records.seals import sealed_page
 from orthoflow.records.tables import common_points
-from orthoflow.records.verify import sealed_page
 from orthoflow.records.walls import delivered_walls, uncounted_points
 from orthoflow.report.combinations import (
     baseline_addresses,

@@ -18,7 +18,8 @@ from orthoflow_provenance.record import write_record
 from orthoflow.errors import RecordError
 from orthoflow.products.inspections import Finding
 from orthoflow.records.runs import require_unchanged
-from orthoflow.records.verify import Verification, sealed_page, verify_run
+from orthoflow.records.seals import sealed_page
+from orthoflow.records.verify import Verification, verify_run
 from tests.provenance_records import ProductShelf, sample_record
 from tests.report_runs import inspection_product
 
