@@ -81,7 +81,7 @@ def _results(catalog: Catalog, wanted: Collection[str]) -> dict[str, str]:
             cells = {cell.address: cell for cell in expand_cells(loaded, catalog)}
             chosen: set[str] = set()
             for address, cell in cells.items():
-                # Texts, flags and inputs decide which kernels are used; numbers do not.
+                # Text and Boolean parameters and inputs decide which kernels are used.
                 words = {k: v for k, v in cell.params_set.items() if isinstance(v, str | bool)}
                 call = (cell.method, frozenset(words.items()), frozenset(cell.inputs))
                 if cell.method in wanted and not cell.skip_reason and call not in seen:

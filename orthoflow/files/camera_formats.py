@@ -86,7 +86,7 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
             several = f"{len(files)} {suffix} files, one of which must be chosen; "
     names = first_few([path.name for path in paths])
     raise InputError(
-        f"{names or 'nothing'} contains no cameras that orthoflow can read: {several}expected the "
+        f"{names or 'the input'}: no cameras that orthoflow can read: {several}expected the "
         "cameras.json of a run, a folder with COLMAP's cameras.txt and images.txt (or .bin), a "
         "Metashape .xml file, a Bundler .out file with its list of photos (.txt) next to it, a "
         "RealityCapture .csv file, or an E57 file with photos"

@@ -177,8 +177,8 @@ def frame_of_raster(
         if placed.raster_down != raster.down:
             raise InputError(
                 f"{name}: its rows run {'up' if raster.down > 0.0 else 'down'} along Y, but the "
-                "description of the wall next to it requires the opposite order: export it with "
-                "the row order of orthoflow's GeoTIFF"
+                "wall description in the file next to it requires the opposite order: export it "
+                "with the row order of orthoflow's GeoTIFF"
             )
         right_m = raster.corner_m[0] - left_m
         below_m = (raster.corner_m[1] - top_m) * raster.down

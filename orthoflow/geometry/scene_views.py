@@ -196,7 +196,7 @@ class SceneCameras:
 def pixel_directions(
     camera: ViewingCamera, u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return ray directions (3, n) of pixels in world axes, 1 m long along the optical axis."""
+    """Return ray directions (3, n) of pixels, in world axes, whose depth component is 1."""
     found = undistorted(*camera.bent_rays(np.stack([u, v])), camera.distortion)
     rotation = camera.rotation
     ways = np.empty((3, len(u)))

@@ -62,7 +62,7 @@ class Row:
         run: label of the combination's run: workflow and id.
         variants: variant of each step with variants; a dash if the combination does not include the
             step.
-        name: variants as text, with the run if there are several.
+        name: variants as text, with the run if several runs are compared.
         is_baseline: whether the combination is the workflow's baseline.
         failure: first failed cell and reason; empty if no cell failed.
         missing: addresses of cells not reached before the run was interrupted.

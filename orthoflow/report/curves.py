@@ -110,7 +110,7 @@ class Sweep:
 
 
 def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
-    """Yield the sweeps among cells: variants of which several differ in only one number."""
+    """Yield the sweeps among cells: sets of variants that differ in only one number."""
     by_method: dict[tuple[str, str], dict[str, RecordedCell]] = {}
     for cell in cells:
         variant = cell.assignment.get(cell.step)

@@ -258,7 +258,7 @@ class StepContext:
 
         Raises:
             OSError: the disk is full.
-            ProductError: no array has such a type and shape.
+            ProductError: the type or the shape is invalid.
         """
         size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
         if np.dtype(dtype).hasobject or min(shape, default=0) < 0:

@@ -340,9 +340,9 @@ class DatasetsSection(FileSection):
 
 class Comparison(FileSection):
     """A step that depends on variants runs once per combination that affects it. Each of these runs
-    is a cell. The address of a cell consists of the step, dataset, seed, variants and repeat, such
-    as `ortho@plane=ransac,orient=pnp#2`. Without `compare`, only the baseline runs, which is the
-    first variant of each step.
+    is a cell. The address of a cell, such as `ortho@plane=ransac,orient=pnp#2`, consists of the
+    step, dataset, seed, variants and repeat. Without `compare`, only the baseline runs, which is
+    the first variant of each step.
     """  # noqa: D205
 
     design: Design = Field(

@@ -1,8 +1,8 @@
 """The record of a run as one HDF5 file: the document, the contents it references, and the seal.
 
-`/document` is the record. Everything else in the file is either referenced in it by digest
-(products and the bytes of files) or repeats parts of it for users of HDFView and h5py (a group per
-cell, and a table of metrics). `/seal` is the digest of the whole file.
+`/document` is the record. It references products and the bytes of files by digest. Other groups
+repeat parts of it for users of HDFView and h5py: a group per cell, and a table of metrics. `/seal`
+is the digest of the whole file.
 """
 
 from __future__ import annotations

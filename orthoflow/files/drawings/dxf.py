@@ -297,7 +297,7 @@ def _add_points(space: Modelspace, names: Iterable[str], places: NDArray[np.floa
 
 
 def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: str) -> None:
-    """Add a text with a leader, moved down until it overlaps no other text in plan view."""
+    """Add a label with a leader, moved down until it overlaps no other label in plan view."""
     added = space.add_text(shown(text), height=_TEXT_M, dxfattribs={"layer": layer})
     placed = space.query("TEXT")[:-1]
     others = [(*one.dxf.insert.vec2, len(one.dxf.text)) for one in placed]

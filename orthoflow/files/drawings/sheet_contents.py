@@ -514,7 +514,7 @@ def axes_of(frame: WallFrame) -> Axes:
 
 
 def up_words(up: NDArray[np.float64]) -> str:
-    """Return the signed axis of the scan along which heights are measured, or a vector."""
+    """Return the up direction as text: a signed axis of the scan or, if oblique, a vector."""
     if up.shape != (3,):
         return "?"
     if float(np.abs(up).max()) < 1.0 - 1e-9:

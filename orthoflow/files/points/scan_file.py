@@ -232,7 +232,7 @@ def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
 
 @contextmanager
 def reading(path: Path, format_name: str) -> Iterator[None]:
-    """Convert any error that a library raises while reading a file into a sentence about it.
+    """Convert errors of a library that reads a file to an `InputError` with a one-line message.
 
     Raises:
         InputError: the library failed.

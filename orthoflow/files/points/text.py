@@ -409,7 +409,7 @@ def read_tables(
 
 
 def _take_block(file: BinaryIO, n_lines: int | None, end: int | None) -> bytes:
-    """Read the next complete lines of a file, up to a number of lines and an offset."""
+    """Read the next complete lines, up to a given number of lines and a given offset."""
     size = _BLOCK_BYTES if end is None else min(_BLOCK_BYTES, end - file.tell())
     block = file.read(size)
     if block and not block.endswith(b"\n"):

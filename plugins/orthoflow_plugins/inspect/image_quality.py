@@ -1,6 +1,6 @@
 """Properties of an orthoimage that every inspection reports.
 
-These are completeness, the share of filled cells, sharpness, and the shares of stretched areas.
+These are the completeness, the sharpness, and the shares of filled cells and of stretched areas.
 
 Sharpness is measured at edges in the image: their width, and the MTF that follows from their
 profile. A surface that a photo sees at a grazing angle covers few pixels, which are then stretched

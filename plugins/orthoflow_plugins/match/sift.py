@@ -93,11 +93,11 @@ class MatchSift(Method):
         )
         structure: Literal["never", "confirmed"] = Field(
             default="confirmed",
-            description="Compare photos without clear key point matches with the walls by edges, "
-            "at many scales, in colours, intensity and relief. confirmed: accept a position if "
+            description="If a photo has no clear key point matches, compare its edges with those "
+            "of the walls in colours, intensity and relief. confirmed: accept a position if "
             "another photo, also placed on the walls, shows the same key points there. The errors "
-            "of such ties are correlated, so the predicted error of an orientation from them is "
-            "too small; match.guided measures them again.",
+            "of such ties are correlated, so the predicted error of an orientation computed from "
+            "them is too small; match.guided measures the ties again.",
         )
 
     class In(Ports):

@@ -102,7 +102,7 @@ class Setup:
 
     @property
     def walls(self) -> list[Wall]:
-        """The walls in the resolution at which they are matched."""
+        """The walls at the resolution used for matching."""
         return [target.wall for target in self.targets]
 
 
@@ -269,7 +269,7 @@ def _traced(
 
 
 def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) -> float:
-    """Return the RMS displacement on the walls that another pose causes at the ties."""
+    """Return the RMS displacement of the ties, in cells, between the two poses."""
     squares = []
     for piece in pieces:
         projection = view.projections[piece.wall]

@@ -533,7 +533,7 @@ _SHOWN: Final = Gate(
     value=lambda c: c.error is not None,
     limit=1.0,
     reason=lambda *_: (
-        "with this pose, the photo would show none of the walls on which its ties are"
+        "with this pose, the photo would show none of the walls that contain its ties"
     ),
 )
 

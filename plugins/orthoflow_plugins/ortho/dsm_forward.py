@@ -176,7 +176,7 @@ def _layer(
 
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
-    """Return rays (n, m, 3) of every 16th pixel: columns, rows, and metres along the normal."""
+    """Return rays (n, m, 3) of every 16th pixel, in columns, rows and metres of depth."""
     from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     frame = surface.frame

@@ -167,7 +167,7 @@ class Candidate:
 class Proposer:
     """What a detector contributes to the search, which all detectors share."""
 
-    # Any: a `search.Search`, whose module imports this one; so are the other types below.
+    # Any stands for `search.Search`, here and below, because its module imports this one.
     @abstractmethod
     def propose(self, search: Any) -> Candidate | None:
         """Return the best candidate among the points not yet assigned, or None."""

@@ -232,9 +232,9 @@ class _Room:
     def crossed_m(
         self, starts: NDArray[np.float64], ways: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where rays (n, 3) from positions (n, 3) enter and leave the voxels, in metres.
+        """Return the distances (metres) at which rays (n, 3) enter and leave the voxel grid.
 
-        If a ray misses the voxels, the exit is before the entry.
+        If a ray misses the grid, the exit is before the entry.
         """
         high_m = self.low_m + self.side_m * np.array(self.occupied.shape)
         with np.errstate(divide="ignore", invalid="ignore"):

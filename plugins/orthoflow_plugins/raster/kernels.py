@@ -303,7 +303,7 @@ class Reach(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Sums over the triangles that cover each cell; all arrays are flat over cells.
+    """Sums over the triangles that cover each cell, indexed by the flat cell number.
 
     Attributes:
         n: uint16 number of triangles.

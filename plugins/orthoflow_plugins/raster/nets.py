@@ -62,8 +62,9 @@ def interpolate_net(
         _interpolate(delaunay, table, slab, found)
     if np.isnan(found).all():
         raise MethodError(
-            "surface tin needs points that span triangles around the cells of each wall, but the "
-            f"{len(taken)} cells with points of this wall do not: use another surface"
+            "surface tin triangulates the points of each wall, but the points in the "
+            f"{len(taken)} occupied cells of this wall form no triangle that covers the centre of "
+            "a cell: use another surface"
         )
     intensity = None if cloud.intensity is None else found[:, 1].copy()
     rgb = None if cloud.rgb is None else np.rint(np.nan_to_num(found[:, -3:])).astype(np.uint8)
