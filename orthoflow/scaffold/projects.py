@@ -107,9 +107,8 @@ def _check(project: Project, folder: Path, catalog: Catalog) -> None:
         _check_new_kind(project, catalog)
     elif project.kind not in catalog.kinds:
         raise ArgumentError(
-            "no installed plugin declares the kind "
-            f"{project.kind}{did_you_mean(project.kind, catalog.kinds)}; kinds: "
-            f"{', '.join(catalog.kinds)}"
+            f"no installed plugin declares the kind {project.kind}"
+            f"{did_you_mean(project.kind, catalog.kinds)}; kinds: {', '.join(catalog.kinds)}"
         )
     if taken := catalog.methods.get(project.method_id):
         raise ArgumentError(

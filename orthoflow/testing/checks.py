@@ -110,10 +110,7 @@ def outputs_are_valid(subject: Subject) -> None:
             f"output {name} is a {product.type_name}, but {port.type_name} is declared",
         )
         again = type(product).from_payload(product.to_payload())
-        require(
-            digest_of(again) == run.digests[name],
-            f"output {name} changes when it is stored and loaded",
-        )
+        require(digest_of(again) == run.digests[name], f"storing changes output {name}")
     for metric in run.metrics:
         require(metric.unit, f"metric {metric.name} has no unit (`1` for counts and shares)")
         require(
