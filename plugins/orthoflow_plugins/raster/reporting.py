@@ -145,7 +145,7 @@ def warn(
         if is_close or filled >= _SHARE_WORTH_WORDS:
             measured = np.count_nonzero(wall.count) / wall.count.size
             larger = (
-                f"set {{step}}.gsd_m to {_least_gsd_m(step_m):g} or more to interpolate fewer cells"
+                f"set {{step}}.gsd_m={_least_gsd_m(step_m):g} or larger to interpolate fewer cells"
             )
             ctx.report(
                 CLOSE_CELLS,
