@@ -33,7 +33,7 @@ _PUT_TOGETHER = {
         "{name}_median_{unit}",
     ),
     *("all_{finding.name}", "wall_{finding.wall}_{finding.name}", "worst_{item.name}"),
-    *("{name}_share", "label_{kind}_mean"),
+    *("{name}_share", "{state.name.lower()}_share", "label_{kind}_mean"),
 }
 
 
