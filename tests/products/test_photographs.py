@@ -55,7 +55,7 @@ def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:
 
 
 def test_walls_and_radii_of_another_shape_are_refused() -> None:
-    with pytest.raises(ProductError, match=r"4 corners and a normal .* got shapes \(1, 3\)"):
+    with pytest.raises(ProductError, match=r"4 corners and a normal, .*; got the shapes \(1, 3\)"):
         TieWall(corners_world=((0.0, 0.0, 0.0),), normal_world=(0.0, -1.0, 0.0))
     with pytest.raises(ProductError, match="one value per photo, got 1 values for 2 photos"):
         ties(search_radius_px=(22.0,))

@@ -273,7 +273,7 @@ class Cell(MosaicSeams):
 """
 BESIDE_SAYS = {
     "mosaic.cell": ("mosaics-show-cells-in-place", "wall 0 at 0.006 m: colours are shifted by "),
-    "orient.sure": ("stated-errors-of-poses-hold", "e+03 times the standard deviations"),
+    "orient.sure": ("stated-errors-of-poses-hold", "times the standard deviations"),
 }
 
 
