@@ -12,7 +12,6 @@ kernels assign single numbers.
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import uuid
 from collections.abc import Callable, Iterator
@@ -23,15 +22,10 @@ from typing import Any, Final, TypeVar, cast
 
 import numba
 import numpy as np
-from numba import _dynfunc  # type: ignore[attr-defined]  # the stubs leave it out
 from numba.core import config, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.core.codegen import CPUCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import register_pass
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import TypingError
-from numba.core.typed_passes import NativeLowering
 
 from orthoflow.geometry.compile_events import report_compiling
 
@@ -49,95 +43,37 @@ def compiled(function: _Kernel) -> _Kernel:
     compile.
     """
     # A wrapper for callers in C is not needed.
-    kernel = _compilable(function, nogil=True, no_cfunc_wrapper=True)
-    # If there is no writable folder for the cache, each process compiles its kernels.
-    if isinstance(kernel, Dispatcher):
-        with suppress(RuntimeError):
-            # Numba has no public attribute for the cache.
-            vars(kernel)["_cache"] = _KernelCache(function)  # type: ignore[no-untyped-call]
-    return cast("_Kernel", kernel)
+    return cast("_Kernel", _kept(function, nogil=True, no_cfunc_wrapper=True))
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Inline a function of a few instructions into the kernels that call it."""
-    return cast("Callable[..., Any]", _compilable(function, inline="always"))
+    return cast("Callable[..., Any]", _kept(function, inline="always"))
 
 
 def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the Python version of a function that only kernels call, for occasional calls."""
+    """Return the Python version of an inlined function, for occasional calls."""
     return cast("Callable[..., Any]", getattr(kernel, "py_func", kernel))
 
 
-class _LinkedCode(CPUCodeLibrary):
-    """Code of a function that only kernels call.
-
-    The code is linked into a kernel before optimisation and translation into machine code; doing
-    both for the function itself would take as long as for a kernel.
-    """
-
-    def add_llvm_module(self, ll_module: Any) -> None:
-        """Add code without optimising it."""
-        self._final_module.link_in(ll_module)
-
-    def finalize(self) -> None:
-        """Link the functions that are called."""
-        for library in dict.fromkeys(self._linking_libraries):
-            code = library._get_module_for_linking()  # noqa: SLF001 - as numba's libraries do
-            self._final_module.link_in(code, preserve=True)
-        self._finalized = True
-
-
-@register_pass(mutates_CFG=True, analysis_only=False)  # type: ignore[no-untyped-call]
-class _PartLowering(NativeLowering):
-    """Translation of a function that only kernels call."""
-
-    _name = "part_lowering"
-
-    def run_pass(self, state: Any) -> bool:
-        """Translate the function, and make it known to its callers."""
-        name = state.func_id.func_qualname
-        state.library = _LinkedCode(state.targetctx.codegen(), name)  # type: ignore[no-untyped-call]
-        super().run_pass(state)  # type: ignore[no-untyped-call]
-        code, lowered = state.library, state.cr
-        module = lowered.fndesc.lookup_module()
-        # Make a function without an address.
-        entry = _dynfunc.make_function(module, name, "", 0, lowered.env, (code,))
-        state.targetctx.insert_user_function(entry, lowered.fndesc, [code])
-        state.cr = lowered._replace(cfunc=entry)
-        return True
-
-
-class _PartCompiler(CompilerBase):
-    """Compiler of functions that only kernels call."""
-
-    def define_pipelines(self) -> list[Any]:
-        """Return numba's passes, with the translation replaced."""
-        self.state.flags.no_compile = True
-        pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state)  # type: ignore[no-untyped-call]
-        pipeline.passes = [
-            (_PartLowering if one is NativeLowering else one, text) for one, text in pipeline.passes
-        ]
-        pipeline.finalize()
-        return [pipeline]
-
-
 def kernel_part(function: _Kernel) -> _Kernel:
-    """Compile a function that only kernels call, with each kernel that calls it."""
-    options = {
-        "pipeline_class": _PartCompiler,
-        "no_cpython_wrapper": True,
-        "no_cfunc_wrapper": True,
-    }
-    return cast("_Kernel", _compilable(function, **options))
+    """Compile a function that only kernels call, when a kernel that calls it is compiled."""
+    return cast("_Kernel", _kept(function, no_cpython_wrapper=True, no_cfunc_wrapper=True))
 
 
 # The type is Any, because numba has no types for kernels.
-def _compilable(function: Callable[..., Any], **options: object) -> Any:
+def _kept(function: Callable[..., Any], **options: object) -> Any:
+    """Return a kernel whose compiled code is cached between processes."""
     # Divisions by 0 raise no exception, so that loops can be vectorised.
     kernel = numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload]  # the stubs leave options out
-    # With NUMBA_DISABLE_JIT, the function runs in Python.
-    if isinstance(kernel, Dispatcher):
-        _give_constants_no_version(kernel)
+    if not isinstance(kernel, Dispatcher):
+        # With NUMBA_DISABLE_JIT, the function runs in Python.
+        return kernel
+    # If there is no writable folder for the cache, each process compiles its kernels.
+    with suppress(RuntimeError):
+        # Numba has no public attribute for the cache.
+        vars(kernel)["_cache"] = _KernelCache(function)  # type: ignore[no-untyped-call]
+    _give_constants_no_version(kernel)
     return kernel
 
 
@@ -318,7 +254,6 @@ class _Compilation(event.Listener):
     def __init__(self) -> None:
         self._depth = 0
         self._n_begun = 0
-        self._was_collecting = False
 
     def on_start(self, event: event.Event) -> None:
         """Report the kernel being compiled, and the number compiled so far in this process.
@@ -326,10 +261,6 @@ class _Compilation(event.Listener):
         The total number depends on the data of a step and is unknown.
         """
         kernel = event.data["dispatcher"]
-        if self._depth == 0:
-            # The compiler creates many objects but hardly any garbage, so collection is suspended.
-            self._was_collecting = gc.isenabled()
-            gc.disable()
         self._depth += 1
         self._n_begun += 1
         # Functions that numba generates have no informative names.
@@ -340,8 +271,6 @@ class _Compilation(event.Listener):
         """Report the end of compilation."""
         self._depth -= 1
         if self._depth == 0:
-            if self._was_collecting:
-                gc.enable()
             report_compiling("")
 
 

@@ -390,7 +390,7 @@ _SETTLED_SHARE: Final = 5e-4
 _LINE_WIDTH_M: Final = 1e-4
 
 
-@kernel_part
+@compiled
 def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     """Set `plane` (9,) to normal, centroid, and the variances along the three principal axes.
 

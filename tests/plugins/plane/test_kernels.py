@@ -35,7 +35,6 @@ from orthoflow_plugins.plane.support import Support, SurfaceRaster
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow.geometry.compiling import interpreted
 from orthoflow.geometry.slabs import Offsets, read_only
 from tests import scenes
 from tests.long_loops import seeds
@@ -198,17 +197,17 @@ def test_the_flattest_plane_is_the_smallest_eigenvector(seed: int) -> None:
     shape = scenes.random_rotation(rng) * rng.uniform(0.01, 2.0, 3)
     points = rng.normal(size=(60, 3)) @ shape.T + rng.uniform(-2.0, 2.0, 3)
     plane = np.empty(9)
-    interpreted(flattest)(moments(points, np.ones(60)), plane)
+    flattest(moments(points, np.ones(60)), plane)
     variances, directions = np.linalg.eigh(np.cov(points.T, bias=True))
     np.testing.assert_allclose(plane[3:6], points.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(plane[6:], variances, rtol=1e-6, atol=1e-9)
     assert abs(plane[:3] @ directions[:, 0]) == pytest.approx(1.0, abs=1e-8)
     assert np.linalg.norm(plane[:3]) == pytest.approx(1.0, abs=1e-12)
     # The result is a level plane if the moments have no flattest plane.
-    interpreted(flattest)(moments(np.full((4, 3), 2.0), np.ones(4)), plane)
+    flattest(moments(np.full((4, 3), 2.0), np.ones(4)), plane)
     np.testing.assert_array_equal(plane, [0, 0, 1, 2, 2, 2, 0, 0, 0])
     line = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    interpreted(flattest)(moments(line, np.ones(2)), plane)
+    flattest(moments(line, np.ones(2)), plane)
     np.testing.assert_allclose(plane, [0, 0, 1, 0, 0, 0, 0, 0, 1], atol=1e-8)
 
 
