@@ -320,10 +320,10 @@ def _over(
         )
     ranks = None
     if is_judged and len(ways) >= _MIN_RANKED:
-        alike = [comparable(own, reference) for own in ways]
-        shared = [name for name in measured[reference] if all(name in own for own in alike)]
+        by_method = [comparable(own, reference) for own in ways]
+        shared = [name for name in measured[reference] if all(name in own for own in by_method)]
         rows = np.array(
-            [[badness(own[name][0].value, column.better) for own in alike] for name in shared]
+            [[badness(own[name][0].value, column.better) for own in by_method] for name in shared]
         )
         if len(shared) >= _MIN_TESTED and np.isfinite(rows).all():
             ranks = mean_ranks([one.name for one in methods], rows)
