@@ -1,4 +1,4 @@
-"""Planes, directions and raster frames: pure array arithmetic, without files or clocks."""
+"""Geometry of planes, cameras, rasters and simulated scenes: pure array arithmetic."""
 
 from orthoflow.geometry.frames import (
     Plane,

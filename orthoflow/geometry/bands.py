@@ -1,4 +1,4 @@
-"""Bands of rows: large rasters are kept in files and never completely in memory."""
+"""Bands of rows, so that a large raster is stored in a file and never completely in memory."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-# Function that creates a zeroed array from a name, a shape and a type, in a memory-mapped file if
-# the array is large.
+# Function that creates an array of zeros from a name, a shape and a type; large arrays are in
+# memory-mapped files.
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
-# Finished rasters with more cells are kept in files, because there may be many walls.
+# Rasters with more cells are stored in files, because there may be many walls.
 IN_MEMORY_CELLS: Final = 1 << 22
-# With this limit, temporary arrays of a band need about 16 MB per byte of a cell.
+# A temporary array for a band of this size needs about 16 MB for each byte per cell.
 _BAND_CELLS: Final = 1 << 24
 
 
 def in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-    """Return a zeroed array in memory; an `Allocate` for small rasters."""
+    """Return an array of zeros in memory; implements `Allocate` for small rasters."""
     del name
     return np.zeros(shape, dtype=dtype)
 
@@ -29,8 +29,8 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
     """Divide a raster into bands of rows.
 
     Args:
-        shape: numbers of rows and columns, and the further dimensions of a cell.
-        multiple: number of which the height of every band except the last is a multiple.
+        shape: shape of the raster; the first two entries are the numbers of rows and columns.
+        multiple: the height of each band except the last is a multiple of this number.
 
     Yields:
         The rows of each band, from top to bottom.
@@ -42,11 +42,10 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
 
 @dataclass(frozen=True, kw_only=True)
 class Band:
-    """A band of rows with a margin of rows that influence its result.
+    """A band of rows, and a margin of rows above and below that affect its result.
 
     Attributes:
-        rows: the rows of the band.
-        around: the same rows with a margin above and below, clipped to the raster.
+        around: the rows of the band and its margin, clipped to the raster.
     """
 
     rows: slice

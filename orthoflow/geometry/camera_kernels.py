@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import inlined
 
-# Layout of a camera as a flat float64 array, so that kernels have a single argument:
-# 0..8 rotation rows, 9..11 translation, 12 fx, 13 fy, 14 cx, 15 cy, 16..20 k1 k2 p1 p2 k3,
-# 21 width, 22 height, 23 largest undistorted radius before the lens model folds back, 24 skew.
+# Layout of a camera as a flat float64 array, so that kernels need only one argument: 0..8 rows of
+# the rotation, 9..11 translation, 12 fx, 13 fy, 14 cx, 15 cy, 16..20 k1 k2 p1 p2 k3, 21 width, 22
+# height, 23 largest undistorted radius at which the lens model is monotonic, 24 skew.
 CAMERA_LENGTH = 25
 
 
@@ -21,8 +21,8 @@ def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba inf
 
     The model is Brown's as in OpenCV, but with the first pixel centre at (0.5, 0.5). A point is not
     visible if it is behind the camera, or farther from the axis than the radius at which the
-    distortion polynomial folds back. Beyond this radius, a point would be projected into the image
-    by mistake.
+    distortion polynomial folds back. Beyond this radius, the model could project a point into the
+    image although the camera cannot see it.
     """
     xc = camera[0] * x + camera[1] * y + camera[2] * z + camera[9]
     yc = camera[3] * x + camera[4] * y + camera[5] * z + camera[10]

@@ -1,7 +1,7 @@
 """Cameras with distortion: projection, rays through pixels, and lens derivatives.
 
-The centre of the first pixel is at (0.5, 0.5). In OpenCV, it is at (0, 0); all conversions between
-the two conventions use the functions of this module.
+The centre of the first pixel is at (0.5, 0.5), but at (0, 0) in OpenCV. All conversions between the
+two conventions use the functions of this module.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ class ViewingCamera:
     def shifted(self, origin_world: NDArray[np.float64]) -> ViewingCamera:
         """Return the same camera in coordinates whose origin is at `origin_world` (3,).
 
-        Use this camera to project offsets if survey coordinates are about 10^6 m, because R x + t,
-        a sum of large numbers, would lose the precision of float32 offsets.
+        Use this camera to project offsets from an origin if survey coordinates are about 10^6 m:
+        with such coordinates, R x + t is a sum of large numbers that cancel, which loses precision.
         """
         return replace(self, translation=self.rotation @ origin_world + self.translation)
 
@@ -111,8 +111,8 @@ class ViewingCamera:
         """Return a camera with the same lens and a pose from OpenCV.
 
         Args:
-            turn: rotation vector, (3,) or (3, 1).
-            shift: translation, (3,) or (3, 1).
+            turn: rotation vector in radians, (3,) or (3, 1).
+            shift: translation in metres, (3,) or (3, 1).
             middle: (3,) metres, subtracted from the points that were passed to OpenCV.
         """
         rotation = rotation_from_vector(np.asarray(turn, dtype=np.float64).ravel())
@@ -120,10 +120,10 @@ class ViewingCamera:
         return local.shifted(-middle)
 
     def project(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (u, v, depth in metres) (n, 3) of world points (n, 3).
+        """Project world points (n, 3) to (n, 3) = (u, v, depth in metres).
 
         u and v are NaN for points behind the camera or outside the valid range of the lens model.
-        Points outside the image have pixel coordinates outside its limits.
+        Points may be projected outside the image.
         """
         points = np.asarray(points_world, dtype=np.float64)
         projected = np.empty((len(points), 3))
@@ -135,7 +135,7 @@ class ViewingCamera:
     def _project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project points (3, n) by the formula of `camera_kernels.project_point`."""
         k1, k2, p1, p2, k3 = self.distortion
-        # Infinite and missing points become NaN without a warning.
+        # Suppress NumPy's warnings: infinite and missing points become NaN.
         with np.errstate(all="ignore"):
             x, y, z = (
                 row[0] * points[0] + row[1] * points[1] + row[2] * points[2] + shift
@@ -154,12 +154,12 @@ class ViewingCamera:
         return np.column_stack([u, v, z])
 
     def sees(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of pixels (n, 2) that are inside the image; NaN counts as outside."""
+        """Return a mask (n,) of the pixels (n, 2) inside the image; NaN counts as outside."""
         u, v = pixels_photo[:, 0], pixels_photo[:, 1]
         return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
     def rays_camera(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return directions (n, 3) with z = 1, in camera axes, of rays through pixels (n, 2).
+        """Return the directions (n, 3) of rays through pixels (n, 2), in camera axes with z = 1.
 
         Raises:
             GeometryError: the distortion cannot be inverted, for example beyond the radius at which
@@ -176,13 +176,13 @@ class ViewingCamera:
     def bent_rays(
         self, pixels_photo: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the distorted directions x / z and y / z for pixels (2, n) = (u, v)."""
+        """Return the distorted coordinates (2, n) = (x / z, y / z) of pixels (2, n) = (u, v)."""
         u, v = np.asarray(pixels_photo, dtype=np.float64)
         b = (v - self.cy) / self.fy
         return (u - self.cx - self.skew * b) / self.fx, b
 
     def rays_world(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return unit directions (n, 3), in world axes, of rays through pixels (n, 2)."""
+        """Return the unit directions (n, 3) of rays through pixels (n, 2), in world axes."""
         rays = self.rays_camera(pixels_photo) @ self.rotation
         unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         return unit
@@ -199,8 +199,8 @@ def undistorted(
         distortion: (5,) k1, k2, p1, p2, k3.
 
     Returns:
-        (3, n) rows: x / z, y / z, and the last step, which remains large where the distortion
-        cannot be inverted.
+        (3, n) with the rows x / z, y / z, and the size of the last step, which remains large where
+        the distortion cannot be inverted.
     """
     found = np.empty((3, len(wanted_a)))
     a, b, last_step = found
@@ -254,10 +254,10 @@ POSE_PARAMETERS: Final = 6
 _EXIF_SIGMA: Final = 0.05
 # Standard deviation of ln(focal length) without EXIF: the range of common lenses.
 _UNKNOWN_SIGMA: Final = 0.35
-# Standard deviations of the other parameters of an uncalibrated lens. Fixing them at zero distorts
-# the pose, so that photo errors were 2.4 times the predicted errors and 1.7 times those with free
-# parameters. Pixels are square to 1/1000, which corresponds to more than a pixel at the edge of an
-# image.
+# Standard deviations of the other parameters of an uncalibrated lens. Fixing these parameters at
+# zero distorts the pose: photo errors were then 2.4 times the predicted errors, and 1.7 times the
+# errors with free parameters. The sides of pixels are equal to within 1/1000, which still displaces
+# pixels at the edge of an image by more than a pixel.
 _ASPECT_SIGMA: Final = 1e-3
 _CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
@@ -318,7 +318,7 @@ def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
 
     Args:
         longer_px: longer side of the photos, pixels.
-        has_exif: whether the focal length is known from EXIF.
+        has_exif: whether the EXIF data contain the focal length.
     """
     return LensFreedom(
         focal_sigma=_EXIF_SIGMA if has_exif else _UNKNOWN_SIGMA,
@@ -338,8 +338,9 @@ class Linear:
         pixels: (n, 2) pixels; NaN behind the camera.
         by_camera_point: (n, 2, 3) derivatives with respect to the point in camera axes, pixels per
             metre.
-        by_parameters: (n, 2, 6 + free) derivatives with respect to the rotation vector (applied
-            left of camera_from_world), the translation, and the free lens parameters.
+        by_parameters: (n, 2, 6 + free) derivatives with respect to the rotation vector (its
+            rotation multiplies camera_from_world from the left), the translation, and the free lens
+            parameters.
     """
 
     pixels: NDArray[np.float64]
@@ -348,7 +349,7 @@ class Linear:
 
 
 def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]:
-    """Return the free lens parameters of a camera; the focal length as its logarithm."""
+    """Return the free lens parameters of a camera, with the logarithm of the focal length."""
     values = {
         "focal": math.log(camera.fx),
         "aspect": math.log(camera.fy / camera.fx),
@@ -392,12 +393,12 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
     turned = (camera.rotation @ points.T).T
     x, y, z = turned.T + camera.translation[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Points behind the camera have no pixel; NaN makes the cost infinite.
+        # Points behind the camera have no pixel; their NaN makes the cost infinite.
         z = np.where(z > 1e-9, z, np.nan)
         a, b = x / z, y / z
     bent = _bent(a, b, camera.distortion)
     ad, bd = bent.a, bent.b
-    # Points are the last axis in memory, so each operation below is vectorised over all points.
+    # Points are the last axis in memory, so that the operations below are vectorised over points.
     by_point = np.empty((2, 3, len(points))).transpose(2, 0, 1)
     by_point[:, 0, 0] = camera.fx * bent.a_by_a / z
     by_point[:, 0, 1] = camera.fx * bent.a_by_b / z
@@ -410,7 +411,7 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
     by_point[:, 0] += leaning * by_point[:, 1]
     n_free = POSE_PARAMETERS + len(lens.names)
     by_parameters = np.empty((2, n_free, len(points))).transpose(2, 0, 1)
-    # Derivative with respect to a rotation: -by_point times the cross product matrix, written out.
+    # Derivatives with respect to the rotation: -by_point times the cross product matrix, expanded.
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
         by_parameters[:, :, axis] = (
@@ -483,5 +484,5 @@ def _lens_columns(
 
 
 def _factor(logarithm: float) -> float:
-    """Return the factor for a change of a logarithm, at most e to prevent divergence."""
+    """Limit the factor to the range 1 / e to e, to prevent divergence."""
     return math.exp(min(1.0, max(-1.0, logarithm)))

@@ -14,11 +14,11 @@ from orthoflow.geometry.robust import median_deviation
 
 
 def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
-    """Estimate the point spacing on a wall from the number of points in each cell.
+    """Estimate the point spacing on a wall from the numbers of points in the cells.
 
-    Cells are merged 2 x 2 until blocks with points contain at least four points on average. Then
-    hardly any block on a scanned surface is empty by chance, so the area of the blocks with points
-    is the scanned area.
+    Groups of 2 x 2 cells are merged until the blocks that contain points contain at least four on
+    average. Then hardly any block on a scanned surface is empty by chance, so the total area of the
+    blocks with points is the scanned area.
 
     Args:
         count: (rows, cols) number of points per cell.
@@ -49,7 +49,7 @@ def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
     return sums
 
 
-# Sides of surface pieces in metres; the next value is used if pieces contain too few points.
+# Sides of the surface pieces in metres. If pieces contain too few points, the next value is used.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
 _PIECES_MOST: Final = 300
 _PIECES_LEAST: Final = 20
@@ -61,13 +61,14 @@ _AT_ONCE: Final = 1 << 16
 _HASH_BITS: Final = 20
 _CUBE_BITS: Final = 21
 _GATHERED_MOST: Final = 1_500_000
-# Maximum number of points assigned to cubes; only some slabs of cubes of a larger cloud are used.
+# Maximum number of points assigned to cubes. For larger clouds, only some layers of cubes are used.
 _LOOKED_AT_MOST: Final = 4_000_000
-# Odd numbers with well distributed bits, so that the upper bits of a product depend on all bits.
+# Odd factors with well distributed bits, so that the upper bits of a product depend on all bits of
+# the other factor.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
 # A piece is a single surface if at least this share of its points is near its plane, if the scatter
-# of the points is below this share of the side of the piece, and if they extend over the piece in
-# both directions.
+# of the points is below a given share of the side of the piece, and if they extend over the piece
+# in both directions.
 _SURFACE_SHARE: Final = 0.85
 _SCATTER_SIDES: Final = 0.1
 _COVER_SIDES: Final = 0.15
@@ -75,12 +76,12 @@ _NEAR_SIGMAS: Final = 4.0
 # Standard deviation of the median of n values, relative to that of one value divided by sqrt(n).
 _MEDIAN_SIGMA: Final = 1.2533
 _SURE_SIGMAS: Final = 3.0
-# Scans closer to each other than this agree, even if their scatter is smaller.
+# Scans whose distance is smaller than this agree, even if their scatter is still smaller.
 _AGREE_M: Final = 0.001
-# Tolerance for level and upright pieces; noise tilts the smallest pieces by 2 degrees.
+# Maximum tilt of horizontal and vertical pieces; noise tilts the smallest pieces by 2 degrees.
 _SQUARE_DEG: Final = 5.0
-# If the share of level pieces is below this, the given up direction is wrong, since hardly any
-# building lacks level surfaces.
+# If the share of horizontal pieces is smaller, the given up direction is wrong, since nearly every
+# building has horizontal surfaces.
 _LEVEL_NONE: Final = 0.03
 _LEVEL_PLAIN: Final = 0.15
 _SQUARE_PLAIN: Final = 0.8
@@ -94,10 +95,11 @@ class CloudQuality:
     Attributes:
         side_m: side of the pieces.
         n_pieces: number of measured pieces.
-        sigma_m: thickness, the robust standard deviation of a scan's points from the surface.
+        sigma_m: thickness, the robust standard deviation of the distances of a scan's points from
+            the surface.
         width_95_m: width of the range that contains 95 % of the distances from the surface.
-        scan_step_m: distance from a point to the nearest point of the same scan.
-        scans_apart_m: distance between scans of the same piece, perpendicular to the piece; None if
+        scan_step_m: distance between a point and the nearest point of the same scan.
+        scans_apart_m: distance between scans, perpendicular to a piece that both contain; None if
             fewer than 20 pieces are in more than one scan.
         sigma_apart_m: standard deviation of `scans_apart_m` due to the scatter of points.
         normals: (n_pieces, 3) unit normals of the pieces, with arbitrary sign.
@@ -113,7 +115,7 @@ class CloudQuality:
     normals: NDArray[np.float64]
 
     def square_shares(self, up: NDArray[np.float64]) -> tuple[float, float]:
-        """Return the shares of level pieces, and of pieces that are level or upright.
+        """Return the share of horizontal pieces, and the share of horizontal or vertical pieces.
 
         Args:
             up: (3,) unit vector of the given up direction.
@@ -124,12 +126,12 @@ class CloudQuality:
         return float(is_level.mean()), float((is_level | is_upright).mean())
 
     def plainly_up(self, up: NDArray[np.float64]) -> int | None:
-        """Return the axis (0, 1, 2) that is up according to surfaces; None if `up` may be right.
+        """Return the axis (0, 1, 2) that the surfaces show to be up; None if `up` may be right.
 
-        `up` is wrong if no surface is level with respect to it and many are inclined, while all
-        surfaces are level or upright with respect to one axis, and some of them are level. The
-        result is None for slopes, single walls, and rooms whose walls are parallel to the axes,
-        since these look the same along each axis.
+        `up` is wrong if it makes no surface horizontal and many surfaces inclined, whereas one of
+        the axes makes all surfaces horizontal or vertical, and some of them horizontal. The result
+        is None for slopes, single walls, and rooms whose walls are parallel to the axes, because
+        their surfaces do not show which axis is up.
         """
         level, square = self.square_shares(up)
         for axis, direction in enumerate(np.eye(3)):
@@ -146,7 +148,7 @@ class CloudQuality:
 
     @property
     def disagrees(self) -> bool:
-        """Whether scans are farther apart than their scatter and than chance could explain."""
+        """Whether scans are farther apart than their scatter and chance can explain."""
         if self.scans_apart_m is None:
             return False
         limit_m = max(self.sigma_m, _AGREE_M, _SURE_SIGMAS * self.sigma_apart_m)
@@ -168,7 +170,7 @@ class _Piece:
 def judge_quality(
     offsets: Sequence[NDArray[np.float32]], scan: NDArray[np.uint16] | None
 ) -> CloudQuality | None:
-    """Measure a cloud on a few hundred pieces of surfaces that are distributed over it.
+    """Measure a cloud on a few hundred pieces of surfaces distributed over it.
 
     Args:
         offsets: three arrays (n,) of coordinates in metres.
@@ -240,7 +242,7 @@ def _cubes(
 
 
 def _hash(cubes: Sequence[NDArray[np.uint32]]) -> NDArray[np.uint32]:
-    """Return a 20-bit hash of cubes from their indices along one to three axes."""
+    """Return 20-bit hashes of cubes, given their indices along one to three axes."""
     mixed = reduce(
         np.bitwise_xor, (axis * prime for axis, prime in zip(cubes, _PRIMES, strict=False))
     )
@@ -260,7 +262,7 @@ def _scans(scan: NDArray[np.uint16] | None, chosen: NDArray[np.intp]) -> NDArray
 def _measured(
     points: NDArray[np.float64], scan: NDArray[np.uint16], side_m: float
 ) -> _Piece | None:
-    """Measure one piece; None if it is not a single surface."""
+    """Measure a piece; return None if it is not a single surface."""
     numbers, counts = np.unique(scan, return_counts=True)
     enough = numbers[counts >= _POINTS_LEAST]
     if not len(enough):
@@ -295,7 +297,7 @@ def _measured(
 
 
 def _frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return, as rows, axes of the plane that fits most points (n, 3), and its normal."""
+    """Return two axes of the plane that fits most of the points (n, 3), and its normal, as rows."""
     kept = np.ones(len(points), dtype=np.bool_)
     axes = np.eye(3)
     for _ in range(3):
@@ -327,7 +329,7 @@ def _farthest(
 
 
 def _step_m(on_surface: NDArray[np.float64]) -> float | None:
-    """Return the median distance to the nearest other point (n, 2); None if all coincide."""
+    """Return the median distance of points (n, 2) to their nearest point; None if all coincide."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - loads slowly, and here alone
 
     distances, _ = cKDTree(on_surface).query(on_surface, k=2)

@@ -12,7 +12,7 @@ _listeners: list[Listener] = []
 
 @contextmanager
 def on_compiling(listener: Listener) -> Iterator[None]:
-    """Report the kernels that any thread compiles within a `with` block.
+    """Report the kernels that any thread compiles during a `with` block.
 
     Args:
         listener: called with `compiling NAME (3 so far)` when a compilation begins, and with an

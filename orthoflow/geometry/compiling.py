@@ -1,13 +1,13 @@
-"""Compilation of kernels by numba, always with the same options.
+"""Compilation of kernels by numba, with the same options for all kernels.
 
-Numba compiles wrappers of each function for callers in Python and in C. If the tables of a scene
-are among the arguments, the wrappers take as long to compile as the function itself. Functions that
-are called only by kernels need no wrappers.
+For each function, numba compiles wrappers for callers in Python and in C. If the arguments include
+the tables of a scene, compiling the wrappers takes as long as compiling the function. Functions
+that only kernels call need no wrappers.
 
 Numba caches kernels, but not its own functions, so each process that compiles a kernel also
-compiles the numba functions called by it. The assignment of an array to a slice
-(`part[2:] = array`) makes it compile forty of them just for an error message about shapes, so
-kernels assign single numbers.
+compiles the numba functions called by it. The assignment of an array to a slice (`part[2:] =
+array`) makes numba compile forty of its functions just for an error message about shapes, so
+kernels assign single elements instead.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _MAX_FILES: Final = 8000
 
 
 def compiled(function: _Kernel) -> _Kernel:
-    """Compile a kernel that is called from Python and releases the interpreter lock.
+    """Compile a kernel that is called from Python and releases the GIL.
 
-    Threads are started by `geometry.threads`, because numba's parallel loops take seconds longer to
+    Threads are started by `geometry.threads`; numba's parallel loops would take seconds longer to
     compile.
     """
     # A wrapper for callers in C is not needed.
@@ -47,7 +47,7 @@ def compiled(function: _Kernel) -> _Kernel:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Inline a function of a few instructions into the kernels that call it."""
+    """Inline a short function into the kernels that call it."""
     return cast("Callable[..., Any]", _kept(function, inline="always"))
 
 
@@ -57,14 +57,14 @@ def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def kernel_part(function: _Kernel) -> _Kernel:
-    """Compile a function that only kernels call, when a kernel that calls it is compiled."""
+    """Mark a function that only kernels call; it is compiled together with these kernels."""
     return cast("_Kernel", _kept(function, no_cpython_wrapper=True, no_cfunc_wrapper=True))
 
 
 # The type is Any, because numba has no types for kernels.
 def _kept(function: Callable[..., Any], **options: object) -> Any:
     """Return a kernel whose compiled code is cached between processes."""
-    # Divisions by 0 raise no exception, so that loops can be vectorised.
+    # Divisions by zero must not raise exceptions, because this would prevent vectorisation.
     kernel = numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload]  # the stubs leave options out
     if not isinstance(kernel, Dispatcher):
         # With NUMBA_DISABLE_JIT, the function runs in Python.
@@ -78,7 +78,7 @@ def _kept(function: Callable[..., Any], **options: object) -> Any:
 
 
 class _KernelCache(FunctionCache):
-    """Cache of the compiled code of a function, identified by the content of all its code.
+    """Cache of compiled code whose file names depend on all code that a kernel uses.
 
     Numba itself checks only the file that contains a kernel, not the functions that the kernel
     calls in other files. Here, file names contain a digest of the kernel, all functions that it
@@ -103,7 +103,7 @@ class _KernelCache(FunctionCache):
             self._cache_file.save(key, self._impl.reduce(data))  # type: ignore[no-untyped-call]
 
     def _open_files(self) -> None:
-        """Return the cache files, set up at the first call because callees may be defined later."""
+        """Return the cache files, opened at the first call because callees may be defined later."""
         if not isinstance(self._cache_file, _KernelFiles):
             root = cast("str", vars(config)["CACHE_DIR"])
             folder = Path(root, "kernels") if root else Path(self._cache_path)
@@ -124,8 +124,8 @@ class _KernelCache(FunctionCache):
 class _KernelFiles(IndexDataCacheFile):
     """Files with the index and the compiled versions of a kernel.
 
-    Numba numbers the files of compiled versions. Two processes that compile different versions at
-    the same time may therefore use the same number, and an index may refer to the code of the wrong
+    Numba numbers the files of compiled versions. If two processes compile different versions at the
+    same time, both may use the same number, and an index may refer to the code of the wrong
     version. Here, all file names are unique. A file truncated by a power failure is ignored.
     """
 
@@ -153,7 +153,7 @@ class _KernelFiles(IndexDataCacheFile):
 
 
 def content_digest(function: FunctionType) -> str:
-    """Return the SHA-256 of everything that affects compiled code, except argument types.
+    """Return the SHA-256 of everything except argument types that affects the compiled code.
 
     This includes the bytecode and the constants of the function and of all functions that it calls,
     and the values of module constants used in them.
@@ -180,7 +180,7 @@ def content_digest(function: FunctionType) -> str:
 
 
 def _decisive(function: FunctionType) -> tuple[object, ...]:
-    """Return the code of a function and its nested functions, and values of their globals."""
+    """Return the code of a function and its nested functions, and the values of their globals."""
     cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
     found: list[object] = [function.__defaults__, cells]
     for code in _all_code(function.__code__):
@@ -203,7 +203,7 @@ def _described(value: object) -> bytes:
         return f"{value.__module__}.{value.__qualname__}{fields}".encode()
     if isinstance(value, int | float | complex | str | bytes | None):
         return repr(value).encode()
-    # Use only the name of an object of a library; the digest includes numba's version and the
+    # Use only the names of objects from libraries; the digest includes the version of numba and the
     # platform.
     return str(getattr(value, "__name__", type(value).__name__)).encode()
 
@@ -217,7 +217,7 @@ def _all_code(code: CodeType) -> Iterator[CodeType]:
 
 
 def _field_names(type_: object) -> tuple[object, ...]:
-    """Return the field names of any named tuples in types: numba compares only field types."""
+    """Return the field names of named tuples in types, because numba compares only field types."""
     if isinstance(type_, types.NamedTuple | types.NamedUniTuple):
         fields = type_.instance_class._fields
         return (fields, *map(_field_names, type_.types))
@@ -226,10 +226,10 @@ def _field_names(type_: object) -> tuple[object, ...]:
 
 
 def _give_constants_no_version(kernel: Any) -> None:
-    """Let kernels call the same version of a function for all integers, constant or not.
+    """Make kernels call the same version of a function for constant and variable integers.
 
-    Otherwise, numba would compile a version for each constant, and an unused one for the initial
-    value 0 of a counter.
+    Otherwise, numba would compile a version for each constant, and an unused version for a counter
+    whose initial value is 0.
     """
     template_for = kernel.get_call_template
 
@@ -238,8 +238,8 @@ def _give_constants_no_version(kernel: Any) -> None:
             named = dict(zip(kws, map(types.unliteral, kws.values()), strict=True))
             return template_for(tuple(map(types.unliteral, args)), named)
         except TypingError:
-            # Keep constants here: a tuple with members of different types can only be indexed by
-            # constants.
+            # Keep constants in this case, because only constants can index a tuple with members of
+            # different types.
             return template_for(args, kws)
 
     kernel.get_call_template = template_for_any
@@ -248,7 +248,7 @@ def _give_constants_no_version(kernel: Any) -> None:
 class _Compilation(event.Listener):
     """Reports which kernel is being compiled, including kernels that other kernels call.
 
-    The lock of the compiler ensures that only one thread compiles at a time.
+    Numba's compiler lock ensures that only one thread compiles at a time.
     """
 
     def __init__(self) -> None:
@@ -258,7 +258,7 @@ class _Compilation(event.Listener):
     def on_start(self, event: event.Event) -> None:
         """Report the kernel being compiled, and the number compiled so far in this process.
 
-        The total number depends on the data of a step and is unknown.
+        The total is unknown, because it depends on the data.
         """
         kernel = event.data["dispatcher"]
         self._depth += 1

@@ -10,23 +10,23 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 # Correlation lengths, as shares of the extent of the points of a photo, for rough errors
-# (exponential correlation: matching, structure, steps between scans) and smooth errors (Gaussian
-# correlation: bending, drift of a path, stereo). Errors with shorter correlation lengths are
-# practically independent; errors with longer ones are shifts and tilts of all points, which do not
-# appear in residuals.
+# (exponential correlation, as caused by matching, relief or offsets between scans) and smooth
+# errors (Gaussian correlation, as caused by bending, drift of a scanner path or stereo). Errors
+# with shorter correlation lengths are practically independent; errors with longer correlation
+# lengths shift and tilt all points and do not appear in residuals.
 _ROUGH: Final = (0.04, 0.15, 0.5, 1.5)
 _SMOOTH: Final = (0.05, 0.15, 0.4, 1.0)
 # Ratios of the standard deviation of the common error to that of the independent error. Their prior
 # is uniform on a logarithmic scale and decays exponentially above a ratio of about 1.
 _RATIOS: Final = np.geomspace(0.003, 10.0, 25)
-# Neighbouring points of a photo are averaged in cells. These are the maximum numbers of cells for
-# one photo and for several.
+# Neighbouring points of a photo are averaged in cells. The two limits are the maximum numbers of
+# cells for one photo and for several.
 _MAX_CELLS: Final = 130
 _MAX_CELLS_OF_SEVERAL: Final = 280
 # Side of the smallest cells, as a share of the extent of the points of a photo.
 _FINEST_CELL: Final = 0.02
 _COARSER: Final = 1.15
-# The adjustment absorbs directions of the residuals of which less than this share remains.
+# Directions of the residuals are omitted if the adjustment leaves less than this share of them.
 _ABSORBED: Final = 1e-3
 
 
@@ -37,12 +37,14 @@ class AdjustedPoints:
     Attributes:
         photo: (n,) index of the photo that shows each point.
         places: (n, 3) positions in metres.
-        residuals: (n, 2) observed minus computed, in standard deviations.
-        jacobian: (n, 2, p) derivatives with respect to the unknowns, in standard deviations.
-        by_place: (n, 2, 3) derivatives with respect to the position, standard deviations per metre.
+        residuals: (n, 2) observed minus computed pixel coordinates, in standard deviations.
+        jacobian: (n, 2, p) derivatives of the computed pixel coordinates, in standard deviations,
+            with respect to the unknowns.
+        by_place: (n, 2, 3) derivatives with respect to the position, in standard deviations per
+            metre.
         pulls: (n, p, 3) effect of a position error on the normal equations, per metre.
-        towards: (n, 3) unit vectors out of the surface, in the direction of depth errors, which are
-            the largest errors of a cloud.
+        towards: (n, 3) unit normals of the surface. In this direction, the errors of a cloud are
+            largest.
         cofactors: (p, p) inverse of the normal matrix.
     """
 
@@ -57,7 +59,7 @@ class AdjustedPoints:
 
     @property
     def extent_m(self) -> float:
-        """Median over the photos of the extent of a photo's points, in metres."""
+        """Median, over all photos, of the extent of the points of a photo, in metres."""
         reaches = []
         for photo in np.unique(self.photo):
             mine = self.places[self.photo == photo]
@@ -69,20 +71,20 @@ class AdjustedPoints:
 def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     """Return the covariance (p, p) of an adjustment whose points may have common errors.
 
-    Each residual has an independent error and an error in common with its neighbours: of the
-    positions (common to all photos), of their depths only, or of one photo (due to its lens or to
-    matching). The part of a common error that the adjustment absorbs leaves no residual, so its
-    size and correlation length are never known exactly. Therefore, the covariance is not chosen by
-    a test; it is a mean over all kinds, lengths and sizes of common errors, each weighted by the
-    likelihood of the residuals (restricted likelihood: Harville 1977,
-    doi:10.1080/01621459.1977.10480998; model averaging: Hoeting et al. 1999,
+    Each residual is the sum of an independent error and an error common to neighbouring points. The
+    common error may be one of the positions (common to all photos), of their depths only, or of one
+    photo (due to its lens or to matching). The adjustment absorbs part of a common error, which
+    leaves no residual, so the size and correlation length of the error are never known exactly.
+    Therefore, the covariance is not chosen by a test; it is a mean over all kinds, lengths and
+    sizes of common errors, each weighted by the likelihood of the residuals (restricted likelihood:
+    Harville 1977, doi:10.1080/01621459.1977.10480998; model averaging: Hoeting et al. 1999,
     doi:10.1214/ss/1009212519).
 
     A common shift of all positions leaves no residual at all and is not included.
 
     Args:
         points: the points with known positions.
-        sigma0: standard deviation of unit weight of the whole adjustment. It is used as that of the
+        sigma0: standard deviation of unit weight of the whole adjustment. It is used for the
             independent errors, since position errors do not affect ties between photos.
     """
     # Use only one thread, because synchronisation makes eigenvalue solvers ten times as slow on a
@@ -124,7 +126,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
         return sigma0**2 * points.cofactors
 
     evidence, variances, errors = [], [], []
-    # Mean square, in standard deviations, of the effect of an error of one metre.
+    # Mean square of the effect, in standard deviations, of a position error of one metre.
     unit = float((points.by_place**2).sum()) / (2 * len(cells))
     apart = np.linalg.norm(places[:, None] - places, axis=2) / extent_m
     correlations = [np.exp(-apart / length) for length in _ROUGH]
@@ -172,7 +174,7 @@ def _kinds(
     towards: NDArray[np.float64],
     photo: NDArray[np.float64],
 ) -> list[tuple[list[_Direction], NDArray[np.bool_]]]:
-    """Return the directions of each kind of common error, and a mask (n, n) of pairs sharing it."""
+    """Return the directions of each kind of common error, and a mask (n, n) of affected pairs."""
     axes = [(by_place[:, :, axis].ravel(), pulls[:, :, axis]) for axis in range(3)]
     by_depth = np.einsum("nid,nd->ni", by_place, towards).ravel()
     depth = [(by_depth, np.einsum("npd,nd->np", pulls, towards))]
@@ -195,7 +197,7 @@ def _cells(points: AdjustedPoints, extent_m: float, n_most: int) -> NDArray[np.i
 
 
 def outwards(places: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the normal (3,) of the best-fitting plane of positions, towards a camera."""
+    """Return the unit normal (3,) of the plane that fits positions (n, 3), towards a camera."""
     middle = places.mean(axis=0)
     across = np.linalg.svd(places - middle, full_matrices=False)[2][2]
     return np.asarray(across if (centre - middle) @ across > 0.0 else -across)

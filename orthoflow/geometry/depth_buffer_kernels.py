@@ -24,7 +24,8 @@ class DepthBuffer(NamedTuple):
     """Depths of the nearest points of a cloud, at a reduced scale of a photo.
 
     Attributes:
-        nearest: (rows, cols) float32 metres along the optical axis, infinite if there is no point.
+        nearest: (rows, cols) float32 depth along the optical axis in metres; infinite if there is
+            no point.
         reduction: photo pixels per pixel of the buffer.
     """
 
@@ -33,12 +34,12 @@ class DepthBuffer(NamedTuple):
 
 
 class VoxelGrid(NamedTuple):
-    """Voxels with the local density of points.
+    """Numbers of points in voxels.
 
     Attributes:
         low: (3,) float64 lower corner of the first voxel, metres from the origin of the cloud.
         side_m: side of a voxel.
-        counts: (nx, ny, nz) uint16 number of points in a voxel, or in a voxel and its 26
+        counts: (nx, ny, nz) uint16 number of points in each voxel, or in each voxel and its 26
             neighbours.
     """
 
@@ -68,13 +69,13 @@ def splat_points(
     n_least: int,
     buffer: DepthBuffer,
 ) -> None:
-    """Render points into a depth buffer as squares that are as large as the point spacing.
+    """Render points into a depth buffer as squares with the size of the point spacing.
 
     Args:
         points: offsets from the origin of the cloud.
         camera: (25,) parameters of a camera for these offsets.
-        around: number of points in 3 x 3 x 3 voxels; a surface covers about 9 voxel faces in these,
-            from which the point spacing follows.
+        around: number of points in 3 x 3 x 3 voxels. A surface covers about 9 voxel faces in these,
+            so the number determines the point spacing.
         n_least: minimum number of points around a point, including itself; other points are
             outliers.
         buffer: nearest depths so far, updated in place.

@@ -26,8 +26,8 @@ UP_VECTORS: Final[dict[UpDirection, tuple[float, float, float]]] = {
     "-z": (0.0, 0.0, -1.0),
 }
 
-# Axis e1 for each up axis; e2 = up x e1 completes the right-handed frame, which is (x, y, z) if up
-# = z.
+# Axis e1 for each up axis. e2 = up x e1 completes the right-handed frame; for up = z, the frame is
+# (x, y, z).
 _FIRST_AXES: Final[dict[int, tuple[float, float, float]]] = {
     0: (0.0, 1.0, 0.0),
     1: (0.0, 0.0, 1.0),
@@ -41,15 +41,15 @@ def up_vector(direction: UpDirection) -> NDArray[np.float64]:
 
 
 def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the right-handed frame that defines horizontal directions and angles omega, phi.
+    """Return the right-handed frame that defines horizontal directions, omega and phi.
 
     Args:
         up: (3,) unit vector in world axes.
 
     Returns:
         (3, 3) with the rows e1, e2, up; `basis @ point_world` gives two horizontal coordinates and
-        the height. e1 is the world axis that follows the axis nearest to up (x after z, y after x,
-        z after y), made perpendicular to up. For up = z, this is the identity.
+        the height. e1 is the component perpendicular to up of the world axis that follows the axis
+        nearest to up (x follows z, y follows x, and z follows y). For up = z, this is the identity.
     """
     axis = int(np.argmax(np.abs(up)))
     first = np.array(_FIRST_AXES[axis])
@@ -59,7 +59,7 @@ def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def across(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross product of two vectors (3,) twenty times as fast as `np.cross`."""
+    """Return the cross product of two vectors (3,); `np.cross` takes twenty times as long."""
     a, b, c = first.tolist()
     d, e, f = second.tolist()
     return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
@@ -120,7 +120,7 @@ def angle_between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -
 
 
 def omega_phi_deg(normal: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[float, float]:
-    """Return azimuth (omega, 0 to 360) and elevation (phi, -90 to 90) of a normal, in degrees.
+    """Return the azimuth omega (0 to 360) and elevation phi (-90 to 90) of a normal, in degrees.
 
     markiewicz2015 equation 3: n = (cos phi cos omega, cos phi sin omega, sin phi), in the (e1, e2,
     up) frame of `basis_from_up`.
@@ -141,13 +141,13 @@ def rotation_from_vector(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix (3, 3) of the cross product with a vector (3,) from the left."""
+    """Return M (3, 3) such that M @ x is the cross product of a vector (3,) and x."""
     matrix: NDArray[np.float64] = cross_matrices(vector[None])[0]
     return matrix
 
 
 def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrices (n, 3, 3) of the cross products with vectors (n, 3) from the left."""
+    """Return the matrices of `cross_matrix`, (n, 3, 3), for vectors (n, 3)."""
     matrices = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
     matrices[:, 0, 1], matrices[:, 0, 2] = -z, y
@@ -159,8 +159,8 @@ def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 def signed_area(ring: NDArray[np.float64]) -> float:
     """Return the signed area of an open ring (n, 2), by the shoelace formula.
 
-    It is positive if the ring turns from the first axis to the second. Precision is lost far from
-    the origin, so pass coordinates relative to one of the points.
+    The area is positive if the ring is counter-clockwise in axes with x to the right and y up. Far
+    from the origin, precision is lost, so pass coordinates relative to one of the points.
 
     >>> signed_area(np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]]))
     2.0
@@ -173,8 +173,8 @@ def signed_area(ring: NDArray[np.float64]) -> float:
 # this. With a nearly vertical normal, the direction to the right of the viewer would depend on
 # noise.
 LEVEL_LIMIT_DEG: Final = 10.0
-# Coordinates in survey frames on Earth are smaller than this; larger ones are corrupt.
-#: metres from the origin; points farther away are ignored with a warning
+# Maximum distance of points from the origin in metres. Coordinates in survey frames on Earth are
+# smaller, so points farther away are corrupt; they are ignored with a warning.
 FARTHEST_M: Final = 1e9
 _LEAST_COSINE: Final = math.cos(math.radians(LEVEL_LIMIT_DEG))
 
@@ -185,9 +185,9 @@ RasterAxes = Literal["map", "wall", "level", "plane"]
 class WallFrame:
     """A raster on a plane: u to the right of the viewer, v down, n towards the viewer.
 
-    The world coordinates of a position (column, row) with a depth are
-    `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`. The centre
-    of cell (row, column) is at (column + 0.5, row + 0.5); `u x v = -n`.
+    The world coordinates of a position (column, row) at a given depth are `origin_world + gsd_m *
+    (column * u_world + row * v_world) + depth_m * normal_world`. The centre of cell (row, column)
+    is at (column + 0.5, row + 0.5); `u x v = -n`.
 
     Attributes:
         origin_world: (3,) float64 metres, outer corner of the top-left cell, on the plane.
@@ -197,12 +197,12 @@ class WallFrame:
         gsd_m: side of a cell in metres.
         width: number of columns.
         height: number of rows.
-        map_crs: coordinate system of a raster that is a map, with u to the east and v to the south:
-            an EPSG code, or `site` for an unnamed world system; None if the raster is not a map.
-        up: unit vector of heights; None if unknown.
+        map_crs: coordinate system if the raster is a map, with u to the east and v to the south: an
+            EPSG code, or `site` for a local system. None if the raster is not a map.
+        up: unit vector in the direction of increasing height; None if unknown.
         name: name of the wall, used in the name of the raster's coordinate system.
-        left_m: distance along the wall from the left edge of the wall to that of this raster, if
-            the raster shows a part of a wall.
+        left_m: distance along the wall from its left edge to the left edge of this raster, if the
+            raster shows only part of the wall.
     """
 
     origin_world: NDArray[np.float64]
@@ -236,12 +236,12 @@ class WallFrame:
 
     @property
     def raster_axes(self) -> RasterAxes:
-        """The meaning of X and Y in the files of this raster.
+        """Meaning of X and Y in the files of this raster.
 
         For upright walls, X is the distance along the wall, and Y is the height, which is exact at
-        the top edge. For floors and ceilings, X and Y are the horizontal world axes; rows of a
-        ceiling go north, so that it can be superimposed on the floor. For sloping planes, and if up
-        is unknown, X and Y are distances from the top-left corner.
+        the top edge. For floors and ceilings, X and Y are the horizontal world axes. Y of a ceiling
+        increases with the row number, so that the ceiling can be superimposed on the floor. For
+        sloping planes, and if up is unknown, X and Y are distances from the top-left corner.
         """
         if self.map_crs is not None:
             return "map"
@@ -255,7 +255,7 @@ class WallFrame:
 
     @property
     def raster_corner_m(self) -> tuple[float, float]:
-        """X and Y, in files, of the outer corner of the top-left cell."""
+        """X and Y of the outer corner of the top-left cell, as in files, in metres."""
         axes = self.raster_axes
         if axes == "map":
             return float(self.origin_world[0]), float(self.origin_world[1])
@@ -273,11 +273,11 @@ class WallFrame:
 
     @property
     def crs(self) -> str:
-        """Name of the coordinate system of the map or of the wall, as in files.
+        """Name of the coordinate system, as in files.
 
         For a wall, it consists of the name of the wall and a hash of the world position of X = Y =
-        0. The name is therefore the same for all rasters and parts of a wall, and differs between
-        walls.
+        0. The name is therefore the same for all rasters of a wall and of its parts, and differs
+        between walls.
         """
         if self.map_crs is not None:
             return self.map_crs
@@ -290,7 +290,7 @@ class WallFrame:
 
     @property
     def plane(self) -> Plane:
-        """Plane of the raster."""
+        """Plane that contains the raster."""
         return Plane(
             normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
         )
@@ -301,7 +301,7 @@ class WallFrame:
         return replace(self, origin_world=corner, height=rows.stop - rows.start)
 
     def has_cells_of(self, other: WallFrame) -> bool:
-        """Return whether both frames have the same cells, within 0.001 cells at the corners."""
+        """Return whether both frames have the same cells, to within 0.001 cells at the corners."""
         if self.shape != other.shape:
             return False
         apart = np.abs(self.corners_world() - other.corners_world()).max()
@@ -311,7 +311,7 @@ class WallFrame:
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
         """Return the world points (n, 3) at positions (n, 2) = (column, row) and depths (n,)."""
-        # In notebooks, a single position may be given as a list of two numbers.
+        # In notebooks, users may pass a single position as a list of two numbers.
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
         lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels)), self.normal_world)
@@ -330,11 +330,11 @@ class WallFrame:
         )
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the X and Y (n, 2), as in files, in metres, of wall positions (n, 2)."""
+        """Convert (n, 2) = (column, row) to (n, 2) = (X, Y), in metres as in files."""
         return np.array(self.raster_corner_m) + self.gsd_m * pixels_wall * [1.0, self.raster_down]
 
     def wall_from_raster(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the wall positions (n, 2) = (column, row) of X and Y (n, 2), as in files."""
+        """Convert (n, 2) = (X, Y), in metres as in files, to (n, 2) = (column, row)."""
         pixels: NDArray[np.float64] = (
             (places_m - np.array(self.raster_corner_m)) * [1.0, self.raster_down] / self.gsd_m
         )
@@ -348,7 +348,7 @@ class WallFrame:
         return np.asarray(np.hypot(beside_m, on_wall[:, 2]))
 
     def corners_world(self) -> NDArray[np.float64]:
-        """Return the outer corners (4, 3) of the raster: top-left first, counter-clockwise."""
+        """Return the outer corners (4, 3): top-left first, counter-clockwise for the viewer."""
         columns = np.array([0, 0, self.width, self.width], dtype=np.float64)
         rows = np.array([0, self.height, self.height, 0], dtype=np.float64)
         return self.world_from_wall(np.column_stack([columns, rows]))
@@ -399,7 +399,7 @@ def frame_over(
         raise GeometryError(
             f"the area of a rectangle must not be 0, got corners {corners_world.tolist()}"
         )
-    # Stored corners are rounded, so the axes are made perpendicular to the normal again.
+    # Stored corners are rounded, so make the axes perpendicular to the normal again.
     u = u - (u @ normal) * normal
     u = u / np.linalg.norm(u)
     return WallFrame(
@@ -408,7 +408,8 @@ def frame_over(
         v_world=np.cross(u, normal),
         normal_world=normal.copy(),
         gsd_m=gsd_m,
-        # The tolerance is 1e-6 cells, so that 3.000000001 m with 3 mm cells does not add a column.
+        # With the tolerance of 1e-6 cells, a width of 3.000000001 m and cells of 3 mm gives no
+        # extra column.
         width=max(1, math.ceil(width_m / gsd_m - 1e-6)),
         height=max(1, math.ceil(height_m / gsd_m - 1e-6)),
     )

@@ -1,8 +1,9 @@
-"""Interpolation of raster cells from surrounding points.
+"""Interpolation of raster cells from the surrounding points.
 
-All cells around a cell are used, weighted by the distance of their points from its centre, and a
-plane through their values gives the value at the centre. No direction is preferred. If a raster is
-rotated or mirrored, so is the result, except for the order of summation.
+The value of a cell is that of a plane fitted to the values of the surrounding cells, which are
+weighted by the distance of their points from the centre of the cell. No direction is preferred:
+except for rounding, interpolating a rotated or mirrored raster gives the rotated or mirrored
+result.
 
 This module loads numba, so methods import it inside functions.
 """
@@ -20,22 +21,24 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.threads import in_parts
 
-# Cells are used up to the distance to the nearest one plus this number of cells.
+# Cells are used up to the distance of the nearest one plus this number of cells.
 _BEYOND_CELLS: Final = 1.0
 # Cells within this squared distance, the eight neighbours, are always used.
 _NEIGHBOURS_SQUARE: Final = 2.0
-# Standard deviation of the weights, relative to the distance to the nearest cell (at least 1 cell).
+# Standard deviation of the Gaussian weights, relative to the distance to the nearest cell (at least
+# 1 cell).
 _SIGMA_SHARE: Final = 0.5
-# (1 - x / 8)^8 approximates exp(-x) in a tenth of the time; it is 0 for the outermost cells.
+# Minimum weight. (1 - x / 8)^8, which approximates exp(-x) in a tenth of the time, is 0 for the
+# outermost cells.
 _WEIGHT_LEAST: Final = 1e-6
-# Regularisation that reduces a slope to zero if the points hardly determine it.
+# Regularisation that reduces the slope of the plane to zero if the points hardly determine it.
 _RIDGE: Final = 0.005
 # Points whose squared distances differ by less than this count as equally near.
 _AS_NEAR: Final = 1e-6
 
 
 class CellValues(NamedTuple):
-    """Values of the cells of a raster as flat arrays; empty arrays are ignored.
+    """Values of the cells of a raster in row order; empty arrays are ignored.
 
     Attributes:
         depth_m: float32, NaN if void.
@@ -66,10 +69,10 @@ class Surroundings(NamedTuple):
     """Cells of a raster from which other cells are interpolated.
 
     Attributes:
-        places: (cells, 2) float32 offsets of the points to the right and downwards from the centre
-            of their cell, in cells; NaN for cells that are not used.
+        places: (cells, 2) float32 positions of the points relative to the centre of their cell, to
+            the right and downwards, in cells; NaN for cells that are not used.
         width: number of columns of the raster.
-        layer_m: maximum difference between depths on the same surface.
+        layer_m: maximum difference between depths on the same surface, in metres.
     """
 
     places: NDArray[np.float32]
@@ -88,17 +91,19 @@ def interpolate(
 ) -> NDArray[np.bool_]:
     """Interpolate cells linearly from surrounding cells.
 
-    A void cell is interpolated from the surrounding points of one surface: the surface at its own
-    depth if known, otherwise that of the nearest point (if several are equally near, that of the
-    one nearest to the viewer). The value of a cell with points is shifted from the position of its
-    points to the centre. Results are limited to the range of the surrounding values.
+    A void cell is interpolated from the surrounding points of one surface. This is the surface at
+    the depth of the cell if this depth is known, and otherwise the surface of the nearest point (of
+    several equally near points, the one nearest to the viewer). The value of a cell with points is
+    corrected for the distance of these points from the centre of the cell. Results are limited to
+    the range of the surrounding values.
 
     Args:
-        cells: (n,) flat indices of the cells to interpolate.
+        cells: (n,) indices, in row order, of the cells to interpolate.
         around: cells from which they are interpolated.
         values: values of the surrounding cells and, if known, depths of the cells to interpolate.
         into: output; may be `values` if no cell in `cells` is used to interpolate others.
-        reach_cells: maximum distance to the nearest cell that can be used.
+        reach_cells: maximum distance of the nearest cell with points; cells without points within
+            this distance are not interpolated.
         threads: number of threads.
 
     Returns:
@@ -151,7 +156,7 @@ def interpolate_cells(
     first: int,
     end: int,
 ) -> None:
-    """Interpolate some of the cells; see `interpolate`."""
+    """Interpolate the cells from `first` to `end` (exclusive); see `interpolate`."""
     most = wanted.offsets.shape[0]
     lenders = _Lenders(
         np.empty(most, dtype=np.int64), np.empty(most), np.empty(most), np.empty(most)
@@ -182,7 +187,7 @@ def _find_lenders(
     depth_m: NDArray[np.float32],
     lenders: _Lenders,
 ) -> tuple[int, float]:
-    """Find the neighbours of a cell; return their number, and the decrease of their weights."""
+    """Find the neighbours of a cell; return their number and the sigma of their weights."""
     places, width = around.places, around.width
     height = places.shape[0] // width
     row, column = cell // width, cell % width
@@ -234,7 +239,7 @@ def _keep_layer(
 def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders: _Lenders) -> None:
     """Set the weights of n neighbours by linear regression, weighted by proximity.
 
-    For a cell with points, the weights shift its own value to its centre.
+    For a cell with points, the weights correct its own value for the position of the points.
     """
     per_square = 1.0 / (16.0 * sigma * sigma)
     w, wx, wy, wxx, wxy, wyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -262,7 +267,7 @@ def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders
 
 @kernel_part
 def _mixed(values: NDArray[np.generic], lenders: _Lenders, n: int, own: int) -> float:
-    """Interpolate a cell within the range of n neighbours; `own` is -1 if it has no points."""
+    """Return the interpolated value, limited to the range of n neighbours; `own` is -1 if void."""
     total, least, most = 0.0, math.inf, -math.inf
     if own >= 0:
         total = float(values[own])
