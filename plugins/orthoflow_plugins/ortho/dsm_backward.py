@@ -33,15 +33,15 @@ class DsmBackward(Method):
     """Project each cell of a wall into the photos and take its colour from them.
 
     The depth of a cell gives its point in the world, and the camera with its distortion gives the
-    position of that point in the photo. The cell takes the colour at this position unless the cell
-    is hidden by the relief of the wall (the ray to the camera is traced over the raster) or by
-    points of the cloud in front of the depth range of the wall (a depth buffer in the photo;
-    isolated points are treated as outliers). If the photo has a higher resolution than the wall,
-    colours are averaged over the cell.
+    position of that point in the photo. The cell takes the colour at this position unless something
+    hides the cell. Relief of the wall is found by tracing the ray from the cell to the camera over
+    the raster. Objects in front of the depth range of the wall are found with a depth buffer of the
+    cloud in the photo, which ignores isolated points as outliers. If the photo has a higher
+    resolution than the wall, colours are averaged over the cell.
 
-    The quality of a cell is the number of photo pixels that it covers: the cosine of the angle of
-    incidence times the squared ratio of cell size to photo GSD, decreasing to 0 at the border of
-    the photo.
+    The quality of a cell is the number of photo pixels that it covers, which is the cosine of the
+    angle of incidence times the squared ratio of cell size to photo GSD. It decreases to 0 at the
+    border of the photo.
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
@@ -121,7 +121,6 @@ class DsmBackward(Method):
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:
-    """Return the weighted median."""
     order = np.argsort(values, kind="stable")
     totals = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(totals, totals[-1] / 2.0)])

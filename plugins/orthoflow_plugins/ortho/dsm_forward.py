@@ -1,4 +1,4 @@
-"""`ortho.dsm-forward`: project every pixel of a photo onto the wall that it shows."""
+"""`ortho.dsm-forward`: project the pixels of the photos onto the walls."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _BAND_CELLS: Final = 1 << 23
 
 
 class DsmForward(Method):
-    """Trace the ray of each pixel to the first cell of the surface that it hits, and colour it.
+    """Trace the ray of each pixel to the surface of a wall, and colour the first cell that it hits.
 
     If several pixels hit the same cell, the one closest to the cell centre is used unchanged;
-    colours are not interpolated. Objects in front of the depth range of the wall hide it as in
+    colours are not interpolated. Objects in front of the depth range of the wall hide cells as in
     `ortho.dsm-backward`. If the photo has a lower resolution than the wall, no pixel hits some of
     the cells; narrow gaps are filled from the surrounding cells and marked as filled.
     """
@@ -56,7 +56,7 @@ class DsmForward(Method):
     )
 
     class Params(VisibilityParams):
-        """Choice of pixels, and filling of the gaps between them."""
+        """Visibility of cells, and filling of gaps between coloured cells."""
 
         fill_gap_cells: int = Field(
             default=1,
@@ -100,7 +100,6 @@ def _layer(
     *,
     threads: int,
 ) -> Layer | None:
-    """Project a photo onto one wall; None if no pixel hits it."""
     from orthoflow.geometry.interpolation import Surroundings
     from orthoflow.geometry.narrow_gaps import narrow_gaps
     from orthoflow.geometry.occluders import nothing_in_the_way
@@ -137,8 +136,7 @@ def _layer(
     # Find the cells inside the photo, ignoring occlusion.
     from_anywhere, empty = view._replace(cosine_least=-1.0), nothing_in_the_way(photo.viewer)
     free = surface.relief._replace(bottoms=np.full_like(surface.relief.bottoms, np.inf))
-    # Whether a gap is narrow depends on cells up to two discs away; its colour depends on one more
-    # cell.
+    # The width of a gap depends on cells within two disc radii, and its colour on one more cell.
     reach_rows = 2 * params.fill_gap_cells + 2
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
         inner, width = band.inner, surface.frame.width
@@ -146,7 +144,7 @@ def _layer(
         visible = cells_seen(from_anywhere, free, empty, band.rows, slice(0, width))
         seen = visible.mask == LayerMask.PAINTED
         quality = np.maximum(visible.quality, np.float32(0.0))
-        # This frees 12 bytes per cell before memory for the gaps is needed.
+        # Free 12 bytes per cell before the gaps need memory.
         del visible
         is_painted = pixel != NO_PIXEL
         gaps = narrow_gaps(is_painted, params.fill_gap_cells)
@@ -156,7 +154,7 @@ def _layer(
         rgb = photo.pixels.reshape(-1, 3)[np.maximum(pixel, 0).ravel()].reshape(*pixel.shape, 3)
         rgb[~is_painted] = 0
         nowhere = np.where(is_painted, np.float32(0.0), np.float32(np.nan))
-        # A gap takes the colours around it, whatever surface they are on.
+        # Fill a gap with the colours around it, whatever surface they belong to.
         is_filled = painted_between(
             gaps,
             rgb,
@@ -176,13 +174,16 @@ def _layer(
 
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
-    """Return rays (n, m, 3) of every 16th pixel, in columns, rows and metres of depth."""
+    """Return the rays (n, m, 3) through every 16th pixel, per metre along the optical axis.
+
+    Components along columns and rows are in cells, and those along the normal are in metres.
+    """
     from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     frame = surface.frame
     counts = (viewer.height // RAY_STEP_PX + 2, viewer.width // RAY_STEP_PX + 2)
     rows, columns = np.indices(counts) * float(RAY_STEP_PX)
-    # The last row and column would be outside the image, where a lens model may fold back.
+    # Beyond the image border, a lens model may fold back, so positions are limited to the border.
     places = np.column_stack(
         [np.minimum(columns.ravel(), viewer.width), np.minimum(rows.ravel(), viewer.height)]
     )

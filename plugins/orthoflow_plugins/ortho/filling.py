@@ -1,4 +1,4 @@
-"""Gaps between coloured cells: which to fill (skarlatos2012, section 3), and their colours."""
+"""Selection of the gaps to fill (skarlatos2012, section 3), and computation of their colours."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 
 _WINDOWS: Final = (3, 5, 7)
-# Coloured cells within this distance of a gap need the position of their point.
+# Interpolation needs the point positions of coloured cells within this distance of a gap.
 _BESIDE_CELLS: Final = 2
-# OpenCV propagates colours through successive gaps, but beyond this distance, the effect is less
-# than one 8-bit level.
+# OpenCV fills gaps from cells that it has already filled, so the influence of a cell is unlimited.
+# Beyond this distance, it is less than one 8-bit level.
 _FRONT_CELLS: Final = 64
 
 
 def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
-    """Return the distance in rows up to which a cell may influence how a gap is filled."""
+    """Return the maximum distance, in rows, at which a cell influences how a gap is filled."""
     if inpainting == "none":
         return 0
     reach = max(_WINDOWS) // 2 + math.ceil(radius_px) + 1 + _BESIDE_CELLS
@@ -32,7 +32,7 @@ def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
 
 
 def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """Return a mask of void cells with few void cells around them.
+    """Return a mask of the void cells that have few void cells around them.
 
     The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, including
     the cell itself; all three counts must be within their limits. Cells outside the image count as
@@ -90,8 +90,8 @@ def inpainted(
     if is_void.all() or not is_fillable.any():
         return painted
     # cv2.inpaint treats every cell outside its mask as known, so the black of large voids would
-    # bleed into adjacent gaps. Therefore, first give all void cells the colour of the nearest cell
-    # that is not void.
+    # bleed into adjacent gaps. To prevent this, first copy the colour of the nearest coloured cell
+    # into each void cell.
     _, labels = cv2.distanceTransformWithLabels(
         is_void.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -114,18 +114,18 @@ def painted_between(
     reach_cells: float,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Fill gaps in place by interpolation between the coloured cells around them.
+    """Fill gaps in place by interpolating between the coloured cells around them.
 
     Args:
         gaps: (n,) flat indices of the cells to fill.
         rgb: (rows, cols, 3) 8-bit or 16-bit colours; the gaps are overwritten.
         around: the coloured cells.
         depth_m: (cells,) depth of the surface; NaN if unknown.
-        reach_cells: gaps without a coloured cell within this distance are unchanged.
+        reach_cells: a cell is filled only if there is a coloured cell within this distance.
         threads: number of threads.
 
     Returns:
-        (rows, cols) gaps that were filled.
+        (rows, cols) mask of the cells that were filled.
     """
     from orthoflow.geometry.interpolation import cell_values, interpolate
 

@@ -12,8 +12,8 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
 
-# Rays are exact at every nth pixel and interpolated in between. With focal lengths of 1000 pixels
-# or more, the error is below a hundredth of a pixel.
+# Rays are exact at every nth pixel and interpolated in between. The interpolation error is below a
+# hundredth of a pixel for focal lengths of 1000 pixels or more.
 RAY_STEP_PX: Final = 16
 NO_PIXEL: Final = -1
 _NEAREST_M: Final = 0.05
@@ -24,7 +24,8 @@ class Catch(NamedTuple):
 
     Attributes:
         pixel: (rows, cols) int32 index row * width + column in the photo, or `NO_PIXEL`.
-        square: (rows, cols) float32 squared distance from the cell centre, in cells.
+        square: (rows, cols) float32 squared distance between the cell centre and the point hit by
+            the ray of this pixel, in squared cells.
     """
 
     pixel: NDArray[np.int32]
@@ -37,15 +38,17 @@ def throw_pixels(
 ) -> int:
     """Trace the ray of each pixel to the first cell that it hits; keep one pixel for each cell.
 
-    A cell takes the pixel that hits it closest to its centre, or the first of several. A ray that
-    hits the side of a depth step is ignored, since no cell shows that side.
+    A cell takes the pixel whose ray hits it closest to its centre; of equally close pixels, it
+    takes the first. A ray that hits the side of a depth step is ignored, since that side is not
+    part of any cell.
 
     Args:
         view: the camera in front of the wall.
         relief: the surface, with at least one known depth.
         buffer: depth buffer of other objects.
-        rays: (n, m, 3) directions at the pixel positions `RAY_STEP_PX` * (row, column), as columns,
-            rows and metres along the normal per metre along the optical axis.
+        rays: (n, m, 3) ray directions at the pixel positions `RAY_STEP_PX` * (row, column), per
+            metre along the optical axis; components along columns and rows are in cells, and those
+            along the normal are in metres.
         catch: the chosen pixels, updated.
 
     Returns:
@@ -106,11 +109,11 @@ def throw_pixels(
 def _first_meeting(
     view: WallView, relief: Relief, dc: float, dr: float, dn: float, lowest: float
 ) -> float:
-    """Return the distance along the axis at which a ray hits the surface, or -1.
+    """Return the distance in metres along the optical axis at which a ray hits the surface, or -1.
 
-    The ray is traced from cell to cell, each a flat patch, from the highest surface down to the
-    lowest. A ray that enters a cell below its surface has hit the side of a step. A small height
-    difference is due to noise or a slope, so the cell counts as hit; a larger one is an edge.
+    Each cell is a flat patch. A ray that enters a cell below its surface has hit the side of a
+    depth step. If the height difference is small, it is due to noise or a slope and the cell counts
+    as hit; otherwise, it is an edge and the result is -1.
     """
     rows, columns = relief.depth.shape
     begin = max(_NEAREST_M, (view.height_m - relief.highest_m) / -dn)

@@ -1,4 +1,4 @@
-"""Collection of the layers that photos form on walls."""
+"""Collection of the layers of all walls and photos."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NO_PHOTO: Final = DiagnosticSpec(
 
 
 class LayerStack:
-    """Layers of walls, added photo by photo.
+    """The layers of all walls, added photo by photo.
 
     Attributes:
         painted: layers of photos, in the order in which they were added.
@@ -37,20 +37,20 @@ class LayerStack:
         self._walls, self._ctx = walls, ctx
 
     def allocator(self, wall: int) -> Allocate:
-        """Return a function that allocates the arrays of the next layer, in files."""
+        """Return a function that allocates the arrays of the next layer in memory-mapped files."""
         prefix = f"{wall}.{len(self.painted)}"
         return lambda name, shape, dtype: self._new(f"{prefix}.{name}", shape, dtype)
 
     def scratch(self, wall: int) -> Allocate:
-        """Return a function that allocates temporary arrays, shared by the layers of a wall."""
+        """Return a function that allocates temporary arrays, which the layers of a wall share."""
         return lambda name, shape, dtype: self._new(f"{wall}.scratch.{name}", shape, dtype)
 
     def add(self, layer: Layer) -> None:
-        """Add the layer of a photo; at least one of its cells must have a colour."""
+        """Add a layer, in which at least one cell has a colour."""
         self.painted.append(layer)
 
     def joined(self, level: Level) -> Layers:
-        """Sort the layers by wall, and add an empty layer for each wall that has no layer.
+        """Return the layers sorted by wall, with an empty layer for each wall that no photo shows.
 
         Args:
             level: numpy type of the colours.
@@ -72,7 +72,6 @@ class LayerStack:
         )
 
     def _bare_layer(self, place: int, level: Level) -> Layer:
-        """Return an empty layer of a wall."""
         wall = self._walls.walls[place]
         shape, prefix = wall.frame.shape, f"{place}.bare"
         mask = np.asarray(self._new(f"{prefix}.mask", shape, np.uint8), np.uint8)
@@ -93,7 +92,7 @@ class LayerStack:
 
 
 def count_shown(walls: Walls, layers: Layers) -> tuple[int, int, int]:
-    """Count cells of all walls: with a depth, coloured, and hidden but not coloured."""
+    """Count the cells with a depth, with a colour, and without a colour because they are hidden."""
     n_surface = n_painted = n_hidden = 0
     for place, wall in enumerate(walls.walls):
         masks = [layer.mask for layer in layers.layers if layer.wall == place]

@@ -1,4 +1,4 @@
-"""Project a photo onto a wall, tile by tile: find visible cells and sample their colours."""
+"""Projection of a photo onto a wall, tile by tile: visibility of cells, and their colours."""
 
 from __future__ import annotations
 
@@ -30,27 +30,28 @@ from orthoflow_plugins.ortho.visibility_kernels import (
 Tile = tuple[slice, slice]
 
 TILE_CELLS: Final = 512
-# Maximum side of the part of a photo that covers a tile. This part is then smaller than 27 MB, and
-# its sides are shorter than 32767 pixels, as cv2.remap requires.
+# Maximum side of the part of a photo that shows a tile. This limits the part to 27 MB and keeps its
+# sides shorter than 32767 pixels, as cv2.remap requires.
 _CROP_MOST_PX: Final = 3_000
-# Margin of that part; Lanczos needs 4 pixels, so the result does not depend on the cropping.
+# Margin around this part. Lanczos interpolation needs 4 pixels, so cropping does not change the
+# result.
 _REACH_PX: Final = 5
-# A weaker filter changes colours by less than one level.
+# A narrower filter changes colours by less than one level.
 _SIGMA_LEAST_PX: Final = 0.2
 _BASE_CELLS: Final = 4.0
-# Cells this close to a hidden area are not coloured, because edges in a photo are blurred.
+# Cells this close to a hidden area are not coloured, because edges are blurred in photos.
 _EROSION_CELLS: Final = 1
-# Twenty bits are enough to rank photos by quality, and compress to half the size.
+# Twenty bits are enough to rank photos by quality, and halve the compressed size.
 _QUALITY_BITS: Final = np.uint32(0xFFFFF000)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellFootprint:
-    """Geometry of a photo in the middle of a tile.
+    """Size and direction of photo pixels in the middle of a tile.
 
     Attributes:
-        pixels_across: length of a cell along u in photo pixels.
-        pixels_down: length of a cell along v in photo pixels.
+        pixels_across: width of a cell (along u) in photo pixels.
+        pixels_down: height of a cell (along v) in photo pixels.
         photo_gsd_m: size of a photo pixel perpendicular to the ray.
         obliquity_deg: angle between the ray and the normal of the wall.
         n_cells: number of coloured cells.
@@ -71,7 +72,8 @@ class Painting:
         mask: (rows, cols) uint8 `LayerMask`.
         rgb: (rows, cols, 3) with the bit depth of the photo; None if no cell is coloured.
         quality: (rows, cols) float32; None if no cell is coloured.
-        footprints: footprint of each tile with coloured cells, by first row and column of the tile.
+        footprints: footprint of each tile that has coloured cells; the key is the first row and
+            column of the tile.
     """
 
     mask: NDArray[np.uint8]
@@ -93,20 +95,21 @@ def paint(
     """Project a photo onto a wall.
 
     Args:
-        photo: (height, width, 3), 8 or 16 bits; the result has the same bit depth.
+        photo: (height, width, 3) uint8 or uint16; the colours of the result have the same type.
         view: camera of the photo in the axes of the wall.
         surface: the wall.
         buffer: depth buffer of objects in front of the wall.
-        params: choice of cells, and sampling of colours.
-        allocate: function that allocates zeroed arrays of the layer; those of colours and quality
-            only if a cell is coloured.
-        threads: number of tiles processed at once; it does not change the result.
+        params: visibility of cells, and sampling of colours.
+        allocate: function that allocates zeroed arrays; it is called for colours and quality only
+            if a cell is coloured.
+        threads: number of tiles processed at once.
     """
     import cv2
 
     shape, lock = surface.frame.shape, Lock()
     painting = Painting(mask=np.asarray(allocate("mask", shape, np.uint8), np.uint8))
-    # Patches of 2 x 2 hidden cells need one more cell.
+    # With the additional cell, hidden patches of 2 x 2 cells across the border of the tile are
+    # found.
     margin = _EROSION_CELLS + 1 if params.visibility == "full" else 0
 
     def paint_tile(tile: Tile) -> None:
@@ -167,7 +170,7 @@ def paint(
 def _visible(
     view: WallView, surface: Surface, buffer: DepthBuffer, tile: Tile, margin: int
 ) -> tuple[TileVisibility, Tile]:
-    """Return the visibility of a tile with its margin, and the position of the tile in it."""
+    """Return the visibility of a tile with its margin, and the slices of the tile within it."""
     rows, columns = (
         slice(max(0, part.start - margin), min(size, part.stop + margin))
         for part, size in zip(tile, surface.frame.shape, strict=True)
@@ -188,7 +191,7 @@ def near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     import cv2
 
     lowest = cv2.erode(is_hidden.view(np.uint8), np.ones((2, 2), dtype=np.uint8), anchor=(0, 0))
-    # A single dilation restores the patches from their upper left cells and adds the margin.
+    # One dilation restores the patches from their upper left cells and adds the margin.
     window = np.ones((2 * reach + 2,) * 2, dtype=np.uint8)
     return np.asarray(cv2.dilate(lowest, window, anchor=(reach + 1,) * 2) > 0, dtype=np.bool_)
 
@@ -265,13 +268,13 @@ def sample(
     """Sample the colours of a tile; cells that are not visible become black.
 
     Args:
-        photo: (height, width, 3), 8 or 16 bits.
-        visible: the tile with its margin, with finite positions.
+        photo: (height, width, 3) uint8 or uint16.
+        visible: visibility of the tile with its margin; all positions are finite.
         inner: rows and columns of the tile in `visible`.
-        bounds: first and last column, first and last row of the pixels needed.
+        bounds: first column, last column, first row and last row of the pixels needed.
         footprint: size of a cell in pixels.
-        params: interpolation and averaging of colours.
-        into: (rows, cols, 3), overwritten.
+        params: sampling of colours.
+        into: (rows, cols, 3) colours of the tile, overwritten.
     """
     import cv2
 
@@ -298,11 +301,11 @@ def sample(
         sample_bilinear(crop, (first_column, first_row), visible, inner, into)
         return
     if is_nearest:
-        # Use the pixel that contains the position, so that OpenCV has nothing to round.
+        # Take the pixel that contains the position, so that OpenCV does not need to round.
         u, v = (np.floor(places[inner]) for places in (visible.u, visible.v))
         u, v = u - np.float32(first_column), v - np.float32(first_row)
     else:
-        # OpenCV counts from the centre of the first pixel.
+        # OpenCV has its origin at the centre of the first pixel.
         u = visible.u[inner] - np.float32(first_column + 0.5)
         v = visible.v[inner] - np.float32(first_row + 0.5)
     flags = {
@@ -323,19 +326,19 @@ def sample_bilinear(
 ) -> None:
     """Sample colours bilinearly; cells that are not visible become black.
 
-    The border of the photo is replicated. `cv2.remap` would round positions to 1/32 pixel and take
-    twice as long.
+    The border of the photo is replicated. `cv2.remap` is not used because it rounds positions to
+    1/32 pixel and takes twice as long.
 
     Args:
         photo: (height, width, 3), a part of the photo.
-        corner: column and row of its first pixel in the whole photo.
-        visible: the tile with its margin, with positions in the whole photo.
+        corner: column and row of the first pixel of this part in the whole photo.
+        visible: visibility of the tile with its margin; positions are those in the whole photo.
         inner: rows and columns of the tile in `visible`.
         colours: (rows, cols, 3) of the tile, overwritten.
     """
     import cv2
 
-    # The kernel reads each pixel as one number and needs at least 2 x 2 pixels.
+    # The kernel reads each pixel as one number, and needs at least 2 x 2 pixels.
     if min(photo.shape[:2]) < 2:
         photo = cv2.copyMakeBorder(photo, 0, 1, 0, 1, cv2.BORDER_REPLICATE)  # type: ignore[assignment]
     four = np.asarray(cv2.cvtColor(photo, cv2.COLOR_RGB2RGBA), dtype=photo.dtype)
@@ -355,14 +358,14 @@ def _mix_pixels(
     first: tuple[int, int],
     mixed: NDArray[np.uint32 | np.uint64],
 ) -> None:
-    """Interpolate between pixels that hold four channels in one number; ignore the fourth.
+    """Interpolate between pixels, each stored as one number with four channels; ignore the fourth.
 
     Each loop has no branches and writes to one array only, so that the compiler can vectorise it,
     except for the loops that fetch pixels.
 
     Args:
         pixels: (rows, cols), at least 2 x 2.
-        centre: column and row of the centre of the first pixel.
+        centre: column and row, in the whole photo, of the centre of the first pixel.
         visible: positions of the cells.
         first: row and column of the first cell in `visible`.
         mixed: (rows, cols) colours of the cells, overwritten.
@@ -409,7 +412,6 @@ def _mix_pixels(
 
 @inlined
 def _mixed(four, across, down, shift, level):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Interpolate one channel between four pixels."""
     f = np.float32
     above, below = f(four[0] >> shift & level), f(four[2] >> shift & level)
     above += (f(four[1] >> shift & level) - above) * across

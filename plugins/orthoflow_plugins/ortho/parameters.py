@@ -9,7 +9,7 @@ from pydantic import Field
 from orthoflow.sdk import MethodParams
 
 Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
-# Points at most this far below the topmost point belong to the same surface.
+# Points at most this far below the topmost point of a cell belong to the same surface.
 LAYER_M: Final = 0.02
 
 Inpainting = Literal["between", "telea", "navier-stokes", "none"]

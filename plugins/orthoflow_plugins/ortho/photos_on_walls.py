@@ -1,4 +1,4 @@
-"""Common parts of the methods that project photos: ports, visibility, photos with cameras."""
+"""Ports, visibility and camera lookup of the methods that project photos."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class PhotosOnWalls(Ports):
 
 
 class LayersOfPhotos(Ports):
-    """A layer for each pair of a wall and a photo that shows it."""
+    """One layer for each pair of a wall and a photo that shows it."""
 
     layers: Layers
 
@@ -86,9 +86,7 @@ class OpenedPhoto:
     """A photo prepared for projection onto walls.
 
     Attributes:
-        name: name of the photo.
-        pixels: (height, width, 3) uint8, or uint16 if any photo has 16 bits.
-        viewer: camera of the photo.
+        pixels: (height, width, 3) uint8, or uint16 if any photo has more than 8 bits.
         buffer: depth buffer of objects in front of the camera.
     """
 
@@ -105,16 +103,16 @@ def project_photos(
     *,
     hides: bool = True,
 ) -> tuple[LayersOfPhotos, dict[str, float]]:
-    """Project all photos onto all walls, and sort the layers by wall.
+    """Project all photos onto all walls.
 
     Args:
         inputs: walls and oriented photos.
         ctx: context of the step.
         project: function that projects a photo onto a wall and adds the layer.
-        hides: whether relief and cloud can hide cells.
+        hides: whether the relief of the wall and points of the cloud can hide cells.
 
     Returns:
-        The layers, and the seconds spent on each part.
+        The layers, sorted by wall, and the seconds spent on each part of the work.
     """
     from orthoflow.geometry.occluders import depth_buffer, nothing_in_the_way
     from orthoflow_plugins.ortho.surfaces import surfaces_of
@@ -127,7 +125,7 @@ def project_photos(
     surfaces = surfaces_of(inputs.walls, ctx, hides=hides)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = ctx.clock_s()
-    # Prepare occluders once for all photos, since the outliers depend on all cameras.
+    # Find occluders once for all photos, since the choice of outliers depends on all cameras.
     viewers = [camera.viewing() for _, camera in oriented]
     occluders = _occluders(inputs, viewers, ctx) if hides else None
     seconds["occluders_s"] = ctx.clock_s() - started
@@ -149,7 +147,7 @@ def project_photos(
         seconds["decoding_s"] += decoded - started
         seconds["occluders_s"] += looked - decoded
         seconds["painting_s"] += ctx.clock_s() - looked
-        # Release this photo before the next one is decoded.
+        # Release this photo before decoding the next one.
         del pixels, free, buffer, opened
     profile = shared_profile(photos, ctx)
     used = {layer.source for layer in stack.painted}
@@ -163,7 +161,6 @@ def project_photos(
 def _occluders(
     inputs: PhotosOnWalls, viewers: Sequence[ViewingCamera], ctx: StepContext
 ) -> Occluders | None:
-    """Find objects in front of the walls; warn and return None if there is no cloud."""
     from orthoflow.geometry.occluders import occluders_before
 
     cloud, walls = inputs.cloud, inputs.walls
@@ -204,9 +201,9 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
-    """Return the numpy type of projected colours: 16 bits if any photo has more than 8.
+    """Return the numpy type of projected colours: uint16 if any photo has more than 8 bits.
 
-    8-bit levels are then multiplied by 257, so that white stays white and no level is lost.
+    Levels of 8-bit photos are multiplied by 257 in this case, so that white stays white.
     """
     plain = [photo.name for photo in photos if (stated_bits(photo.encoded) or 0) <= _PLAIN_BITS]
     if len(plain) == len(photos):
@@ -219,10 +216,10 @@ def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
 
 
 def pixels_of(photo: Photo, camera: Camera, level: Level) -> Colours:
-    """Decode a photo (height, width, 3) to 8 or 16 bits.
+    """Decode a photo into an array (height, width, 3) of 8 or 16 bits.
 
     Raises:
-        MethodError: the image size of the camera differs from that of the photo.
+        MethodError: the photo does not have the image size of its camera.
     """
     deep = level is np.uint16
     pixels = (decode_levels if deep else decode_image)(photo.encoded, photo.name)

@@ -1,7 +1,7 @@
 """Colours of cells from the points of their topmost surface.
 
-skarlatos2012 uses the topmost point, and proposes weighting points by their distance from the
-cell centre as future work; the other rules are variants of that.
+skarlatos2012 uses the topmost point, and proposes as future work to weight points by their distance
+from the cell centre. The other rules are variants of these two.
 """
 
 from __future__ import annotations
@@ -32,21 +32,22 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 
-# Standard deviation of the weight in cells; a point in a corner of its cell has a weight of 1/7.
+# Standard deviation, in cells, of the Gaussian weight; it gives a point in the corner of a cell a
+# weight of 1/7.
 _SIGMA_CELLS: Final = 0.36
 _NO_COLOUR: Final = 999
-# Maximum number of points for the median.
+# Maximum number of points in a cell from which the median is computed.
 _TOP_MOST: Final = 5
 # Maximum number of points sorted at once for the median.
 _POINTS_AT_ONCE: Final = 1 << 24
-# Colours of scans are compared in squares with this side length.
+# Side of the squares in which the colours of scans are compared.
 _PLACE_M: Final = 0.05
-# Minimum number of points of each scan in a square.
+# Minimum number of points that each scan must have in a square.
 _POINTS_LEAST: Final = 4
-# Points with levels outside this range are almost black or clipped.
+# Points with a level below or above these limits are almost black or clipped.
 _DARKEST: Final = 10
 _BRIGHTEST: Final = 245
-# Scans with fewer squares than this are ignored.
+# Scans that share fewer squares than this with other scans are ignored.
 _PLACES_LEAST: Final = 20
 # Maximum share of clipped or almost black points in a square.
 _USELESS_MOST: Final = 0.05
@@ -54,7 +55,7 @@ _USELESS_MOST: Final = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Painters:
-    """The points that colour cells.
+    """The points that give cells their colours.
 
     Attributes:
         cloud: all points.
@@ -69,18 +70,19 @@ class Painters:
 
 @dataclass(frozen=True, kw_only=True)
 class CellColours:
-    """Colours of the cells of a wall, flattened.
+    """The colours of the cells of a wall, as flat arrays.
 
-    A cell is represented by the point that gives its colour, or by the topmost point if several
-    are averaged.
+    The point of a cell is the one that gives the cell its colour, or the topmost point if the
+    colour is an average or a median of several points.
 
     Attributes:
         rgb: (cells, 3) uint8, 0 where void.
         has_point: (cells,) whether the cell contains a point.
-        distance_cells: (cells,) distance of that point from the cell centre; infinite where void.
-        places: (cells, 2) float32 position of that point to the right of and below the centre, in
-            cells; 0 if several points are averaged, NaN where void.
-        depth_m: (cells,) float32 depth of that point; NaN where void.
+        distance_cells: (cells,) distance between the point and the cell centre, infinite where
+            void.
+        places: (cells, 2) float32 offset of the point from the cell centre, to the right and down,
+            in cells; 0 if the colours of several points are averaged, NaN where void.
+        depth_m: (cells,) float32 depth of the point, NaN where void.
     """
 
     rgb: NDArray[np.uint8]
@@ -97,7 +99,7 @@ def colours_of(
 
     Args:
         painters: the points.
-        slab: the wall with its depth range.
+        slab: the frame and the depth range of the wall.
         params: the rule for colours.
         threads: number of threads.
     """
@@ -120,7 +122,7 @@ def colours_of(
         means = totals[:, :-1] / np.maximum(totals[:, -1:], 1e-300)
         rgb[has_point] = np.rint(means[has_point])
     elif colouring == "median":
-        # Process cells with a limited total number of points at once, but at least one cell.
+        # Limit the number of points processed at once, but process at least one cell.
         totals, first, n_before = np.cumsum(winners["n_points"], dtype=np.int64), 0, 0
         while first < totals.size:
             end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
@@ -143,11 +145,11 @@ def colours_of(
 
 
 def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> NDArray[np.float64]:
-    """Find factors on the brightness of scans that remove colour casts, as logarithms (scans, 3).
+    """Compute the channel gains that remove colour casts of scans, as logarithms (scans, 3).
 
     Where two scans overlap, they show the same surface, so differences between their mean colours
     are due to exposure and white balance, except at edges of texture and objects; the L1 norm is
-    robust to these. In a group of overlapping scans, the median scan keeps its colours.
+    robust to these. The median gain of a group of overlapping scans is 1.
 
     Args:
         painters: coloured points with scan numbers.
@@ -155,7 +157,7 @@ def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> ND
         threads: number of threads.
 
     Returns:
-        The logarithms; 0 for scans without overlap.
+        (scans, 3) natural logarithms of the gains, 0 for scans without overlap.
     """
     scans, light = painters.cloud.scan, light_of_levels(255)
     n_scans = 0 if scans is None or not len(scans) else int(scans.max()) + 1
@@ -181,16 +183,17 @@ def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> ND
             shades = np.column_stack([light[values], is_useless, np.ones(len(values))])
             for channel in range(5):
                 sums[:, channel] += np.bincount(key, shades[:, channel], len(sums))
-        # Exclude whole squares, not points; otherwise, the darker scan would lose more points.
+        # Exclude whole squares; excluding single points would remove more points from the darker
+        # scan.
         is_known = (sums[:, 4] >= _POINTS_LEAST) & (sums[:, 3] <= _USELESS_MOST * sums[:, 4])
         known = np.flatnonzero(is_known)
         logs = np.log(sums[known, :3] / sums[known, 4:])
-        # Scans of the same square are adjacent.
+        # Entries of the same square are adjacent.
         first = np.flatnonzero(known[1:] // n_scans == known[:-1] // n_scans)
         pairs.append(np.column_stack([known[first], known[first + 1]]) % n_scans)
         apart.append(logs[first + 1] - logs[first])
     scan_pairs, differences = np.concatenate(pairs), np.concatenate(apart)
-    # Ignore scans with few squares.
+    # Ignore scans that have few squares in common with others.
     counts = np.bincount(scan_pairs.ravel(), minlength=n_scans)
     is_kept = (counts[scan_pairs] >= _PLACES_LEAST).all(axis=1)
     scan_pairs, differences = scan_pairs[is_kept], differences[is_kept]
@@ -212,7 +215,7 @@ def _on_top(
     threads: int,
     cells: slice | None = None,
 ) -> Iterator[Entries]:
-    """Yield the points of the topmost surface, in all cells or in some of them."""
+    """Yield the points of the topmost surface in the given cells, or in all if none are given."""
     cells, width = cells or slice(0, slab.n_cells), slab.frame.width
     rows = slice(cells.start // width, -(-cells.stop // width))
     is_left_out = painters.is_left_out
@@ -230,7 +233,7 @@ def _on_top(
 
 
 def _set_medians(rgb: NDArray[np.uint8], tops: list[Entries], values: NDArray[np.uint8]) -> None:
-    """Set the colours of cells to the median of their highest points, channel by channel."""
+    """Set the colours of cells to the median of their topmost points in each channel."""
     if not tops:
         return
     cells, depths_m, _, points = (np.concatenate(parts) for parts in zip(*tops, strict=True))

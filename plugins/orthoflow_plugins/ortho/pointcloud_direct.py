@@ -1,4 +1,4 @@
-"""`ortho.pointcloud-direct`: colour each cell from the points nearest to the viewer."""
+"""`ortho.pointcloud-direct`: colour each cell of a wall from the points of its topmost surface."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ if TYPE_CHECKING:
 # Larger walls are processed in bands of this many cells; a band needs about 600 MB.
 _BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
-# Pure black points are reported above this share, since real surfaces have hardly any.
+# Pure black points are reported if their share is larger, since real surfaces have hardly any.
 _BLACK_WORTH_WORDS: Final = 0.001
-# Points below this level are almost black.
+# Points darker than this in all channels are almost black.
 _ALMOST_BLACK_GREY: Final = 10
-# Scans that differ by less are not balanced, because a cast of 3 % is hardly visible.
+# Scans are not balanced if their colours differ by less, because a colour cast of 3 % is hardly
+# visible.
 _CAST_LEAST: Final = 0.03
-# If more points are pure black, black is considered a real colour.
+# If the share of pure black points is larger, black is considered a real colour.
 _MOST_SPECKS: Final = 0.1
 
 SPECKS: Final = DiagnosticSpec(
@@ -78,12 +79,12 @@ BLACK_POINTS: Final = DiagnosticSpec(
 
 
 class PointcloudDirect(Method):
-    """Colour each cell of a wall from its topmost point; fill small gaps.
+    """Colour each cell of a wall from its topmost point, and fill small gaps.
 
-    The topmost point is the one nearest to the viewer within the buffer of the wall; if there are
-    several, it is the one nearest to the cell centre, then the one with the lowest index.
-    `colouring` offers other rules. Gaps are void cells with few void cells around them; filled
-    cells are marked as filled.
+    The topmost point of a cell is the point nearest to the viewer within the buffer of the wall. Of
+    points at the same depth, it is the one nearest to the cell centre, then the one with the lowest
+    index. `colouring` offers other rules. A void cell is filled if there are few void cells around
+    it; filled cells are marked as filled.
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
@@ -105,7 +106,7 @@ class PointcloudDirect(Method):
     Params = DirectParams
 
     class In(Ports):
-        """The walls, of which only frames and buffers are used, and the coloured cloud."""
+        """The coloured cloud, and the walls; only the frames and buffers of the walls are used."""
 
         walls: Walls
         cloud: PointCloud
@@ -148,7 +149,7 @@ class PointcloudDirect(Method):
                 projected = ctx.clock_s()
                 _fill(found, layer, band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)
-                # Release this band before the next one is projected.
+                # Release this band before projecting the next one.
                 del found
             layers.append(layer)
             n_filled += int(np.count_nonzero(filled))
@@ -166,7 +167,7 @@ class PointcloudDirect(Method):
 
 
 def _painters(cloud: PointCloud, params: DirectParams, ctx: StepContext) -> Painters:
-    """Return the points with their colours, or their intensity as grey."""
+    """Return the points with their colours, or with their intensity as grey."""
     from orthoflow_plugins.ortho.point_colours import Painters
 
     if cloud.rgb is not None:
@@ -192,7 +193,6 @@ def _painters(cloud: PointCloud, params: DirectParams, ctx: StepContext) -> Pain
 
 
 def _balanced(painters: Painters, slabs: list[Slab], ctx: StepContext) -> Painters:
-    """Return the points with colour casts of single scans removed, if there are any."""
     from orthoflow_plugins.ortho.point_colours import scan_gains
 
     gains, scans = scan_gains(painters, slabs, threads=ctx.cores), painters.cloud.scan
@@ -217,9 +217,9 @@ def _mask(ctx: StepContext, n_points: int) -> NDArray[np.bool_]:
 def _left_out(
     cloud: PointCloud, rgb: NDArray[np.uint8], params: DirectParams, ctx: StepContext
 ) -> NDArray[np.bool_] | None:
-    """Return a mask (n,) of points without a colour or too dark; None if all have a colour.
+    """Return a mask (n,) of points that are too dark or without colour; None if there are none.
 
-    These points contribute depths but no colours. Black points that are used are reported.
+    These points contribute depths but no colours.
     """
     n_points, has_rgb = len(rgb), cloud.has_rgb
     counts = np.zeros(256, dtype=np.int64)
@@ -264,7 +264,7 @@ def _fill(
     *,
     threads: int,
 ) -> None:
-    """Fill the gaps of a band, and write the band into the layer of the wall."""
+    """Fill the gaps of a band, and copy the band into the layer of the wall."""
     from orthoflow.geometry.interpolation import Surroundings
 
     width = layer.frame.width
@@ -286,8 +286,8 @@ def _fill(
             rgb, is_void, is_filled, method=params.inpaint, radius_px=params.inpaint_radius_px
         )
     shown, inner = ~is_void | is_filled, band.inner
-    # The quality falls linearly from 1 for a point at the cell centre to 0.5 in a corner, so that
-    # filled cells have a lower quality than any other.
+    # Quality decreases linearly from 1 for a point at the cell centre to 0.5 for a point in a
+    # corner, and is lower for filled cells.
     distance_cells = found.distance_cells.reshape(-1, width)
     quality = np.where(is_void, np.float32(0.0), 1.0 - distance_cells / np.sqrt(2.0))
     quality[is_filled] = 0.25
@@ -299,7 +299,6 @@ def _fill(
 
 
 def _report(ctx: StepContext, layers: list[Layer], names: Sequence[str], n_filled: int) -> None:
-    """Report the shares of coloured, filled and void cells, and ways to fill more cells."""
     n_cells = sum(layer.mask.size for layer in layers)
     n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
     ctx.metric("painted_share", (sum(n_shown) - n_filled) / n_cells, "1")

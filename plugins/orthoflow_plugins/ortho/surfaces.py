@@ -1,4 +1,4 @@
-"""Walls prepared for visibility tests, and cameras in the axes of a wall."""
+"""Preparation of walls and cameras for visibility tests."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     look_at_cells,
 )
 
-# A surface hides a cell if it is above the cell's ray by more than the first number of standard
-# deviations of depth plus the second number of cells, which allows for detail finer than the
-# raster.
+# A surface blocks a ray if it is above the ray by more than this number of standard deviations of
+# depth plus this number of cells. The second term allows for detail finer than the raster.
 _TOLERANCE_SIGMAS: Final = 3.0
 _TOLERANCE_CELLS: Final = 0.5
-# Quality decreases to 0 at the border of a photo over this share of its shorter side.
+# Width of the border strip of a photo in which quality decreases to 0, relative to the shorter
+# side.
 _BORDER_SHARE: Final = 0.05
 # The occluding surface is computed in bands of this many cells.
 _BAND_CELLS: Final = 1 << 17
-# A cell influences the occluding surface within this number of rows.
+# A cell influences the occluding surface within this distance, in rows.
 _REACH_ROWS: Final = 4
-# A height difference between neighbours of more than this many cells (79 degrees) is an edge.
+# Between neighbouring cells, a height difference of more than this many cells (79 degrees) is an
+# edge.
 _EDGE_CELLS: Final = 5.0
 
 
@@ -48,8 +49,8 @@ class Surface:
     Attributes:
         frame: grid of the cells.
         relief: depths of the cells, and the surface that hides other cells.
-        front_m: largest depth of the relief; the depth buffer contains only points beyond it.
-        tolerance_m: minimum height above a ray at which the surface blocks the ray.
+        front_m: largest depth of the relief; the depth buffer contains only points in front of it.
+        tolerance_m: height above a ray from which the surface blocks the ray.
     """
 
     frame: WallFrame
@@ -59,7 +60,7 @@ class Surface:
 
 
 def surfaces_of(walls: Walls, ctx: StepContext, *, hides: bool = True) -> list[Surface]:
-    """Prepare all walls; if `hides` is false, they do not hide parts of themselves."""
+    """Prepare all walls; if `hides` is false, they cannot hide parts of themselves."""
     return [
         surface_of(walls, index, hides=hides, allocate=_in_file(ctx, index))
         for index in range(len(walls.walls))
@@ -73,7 +74,7 @@ def _in_file(ctx: StepContext, index: int) -> Allocate:
 def surface_of(
     walls: Walls, index: int, *, hides: bool = True, allocate: Allocate = in_memory
 ) -> Surface:
-    """Prepare one wall; `allocate` allocates the occluding surface."""
+    """Prepare one wall; `allocate` returns the array for the occluding surface."""
     wall = walls.walls[index]
     noise_m = depth_noise_m(wall.depth_m) if hides else 0.0
     return Surface(
@@ -85,7 +86,7 @@ def surface_of(
 
 
 def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -> WallView:
-    """Return a camera in the axes of a wall, with full precision at survey coordinates."""
+    """Return a camera in the axes of a wall, with full precision for large world coordinates."""
     frame = surface.frame
     axes = np.column_stack([frame.u_world, frame.v_world, frame.normal_world])
     near = camera.shifted(frame.origin_world)
@@ -108,7 +109,7 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
 def cells_seen(
     view: WallView, relief: Relief, buffer: DepthBuffer, rows: slice, columns: slice
 ) -> TileVisibility:
-    """Find the cells of a part of a wall that a photo sees, and their photo positions."""
+    """Find the cells in a part of a wall that a photo shows, and their positions in the photo."""
     size = (rows.stop - rows.start, columns.stop - columns.start)
     u, v, quality = np.empty((3, *size), dtype=np.float32)
     visible = TileVisibility(u=u, v=v, mask=np.empty(size, dtype=np.uint8), quality=quality)
@@ -127,7 +128,7 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
     Args:
         wall: the wall.
         hides: whether the surface can hide parts of itself.
-        allocate: function that allocates the occluding surface.
+        allocate: function that returns the array for the occluding surface.
     """
     depth = np.asarray(wall.depth_m, dtype=np.float32).view(np.ndarray)[:]
     side = FINE_CELLS if hides else BLOCK_CELLS
@@ -157,10 +158,10 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
 def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
     """Return the occluding surface (rows, cols), without spikes and with complete edges.
 
-    Voids of one cell are closed. Cells higher than all 2 x 2 patches that contain them are lowered,
-    since a single outlier in front of a wall would hide a long strip. The position of an edge
-    within its cell is unknown; next to a step of more than `edge_m`, the lower cell is therefore
-    raised to the height of the higher one.
+    Voids of one cell are closed. A cell that is higher than all 2 x 2 patches that contain it is
+    lowered, since an outlier in front of a wall would otherwise hide a long strip. The position of
+    an edge within its cell is unknown; the lower cell next to a step of more than `edge_m` is
+    therefore raised to the height of the higher one.
     """
     import cv2
 
@@ -182,9 +183,9 @@ def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
 def _of_blocks(
     values: NDArray[np.float32], reduce: np.ufunc, side_cells: int
 ) -> NDArray[np.float32]:
-    """Return the extreme value of each block of cells; the last blocks may be smaller."""
+    """Reduce each block of cells to its extreme value; the last blocks may be smaller."""
     rows, columns = (range(0, size, side_cells) for size in values.shape)
-    # Process bands of rows, since `reduceat` along the first axis is slow on a large array.
+    # Process bands of rows, since `reduceat` is slow along the first axis of a large array.
     bands = [reduce.reduce(values[row : row + side_cells], axis=0) for row in rows]
     reduced = reduce.reduceat(np.array(bands), columns, axis=1)
     return np.asarray(reduced, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Compiled function that finds the cells of a wall that a photo sees, and their positions."""
+"""Compiled function that finds the cells visible in a photo, and their positions in the photo."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# Rays from all cells of a block are traced up to a common height, the bound of the block. Bounds of
-# small blocks are only computed if the bound of the large block does not exclude occlusion.
+# Rays from all cells of a block are traced up to a common height. This height is only computed for
+# small blocks if that of the large block does not exclude occlusion.
 BLOCK_CELLS: Final = 32
 FINE_CELLS: Final = 8
 
 # Cells of a row are projected in float32, in runs of this length and relative to the first cell of
-# the run. Runs begin at multiples of this length, so that results do not depend on the tile.
+# the run. Each run begins at a multiple of this length, so that results do not depend on the tile.
 _RUN_CELLS: Final = 512
 _N_QUANTITIES: Final = 6
 
-# States of a cell, as in `LayerMask`.
+# States of a cell, equal to those in `LayerMask`.
 OUTSIDE: Final = 0
 PAINTED: Final = 1
 OCCLUDED: Final = 2
@@ -34,13 +34,14 @@ class WallView(NamedTuple):
     Attributes:
         camera: (25,) flat camera (see `camera_kernels`) for points (u, v, n) in metres from the
             wall frame's origin.
-        column: column of the projection centre, 0 at the centre of the first cell; row likewise.
+        column: column of the projection centre, 0 at the centre of the first cell; the same applies
+            to `row`.
         height_m: height of the projection centre above the plane.
         gsd_m: side of a cell.
-        front_m: largest depth of the relief; the depth buffer contains only points beyond it.
-        tolerance_m: minimum height above a ray at which the surface blocks the ray.
+        front_m: largest depth of the relief; the depth buffer contains only points in front of it.
+        tolerance_m: height above a ray from which the surface blocks the ray.
         cosine_least: smallest cosine of the angle of incidence of visible cells.
-        border_px: distance from the image border over which quality decreases to 0.
+        border_px: width of the strip along the image border in which quality decreases to 0.
     """
 
     camera: NDArray[np.float64]
@@ -61,10 +62,10 @@ class Relief(NamedTuple):
         depth: (rows, cols) float32 metres, NaN where void.
         occluding: (rows, cols) float32 depth without spikes, minus infinity where void, so that
             voids block no ray; empty if the surface hides nothing.
-        tops: (blocks, blocks) float32 largest `occluding` in a block, or minus infinity.
-        bottoms: (blocks, blocks) float32 smallest depth in a block, infinite if it is void.
-        fine_tops: `tops` for blocks of `FINE_CELLS`, if the surface hides anything; fine_bottoms
-            likewise.
+        tops: (blocks, blocks) float32 largest value of `occluding` in a block.
+        bottoms: (blocks, blocks) float32 smallest depth in a block, infinite if the block is void.
+        fine_tops: `tops` for blocks of `FINE_CELLS` if the surface can hide cells; `fine_bottoms`
+            is the same for `bottoms`.
         highest_m: largest value of `tops`.
     """
 
@@ -78,11 +79,11 @@ class Relief(NamedTuple):
 
 
 class TileVisibility(NamedTuple):
-    """Visibility of a tile of cells in a photo, filled by `look_at_cells`.
+    """Visibility of the cells of a tile in a photo, filled by `look_at_cells`.
 
     Attributes:
         u: (rows, cols) float32 photo column, first pixel centre at 0.5; 0 where not visible.
-        v: (rows, cols) float32 photo row likewise.
+        v: (rows, cols) float32 photo row, with the same convention.
         mask: (rows, cols) uint8 state of the cell.
         quality: (rows, cols) float32 photo pixels per cell, reduced at the border; 0 where not
             visible.
@@ -103,13 +104,13 @@ def look_at_cells(
     first_row: int,
     first_column: int,
 ) -> None:
-    """Project the cells of a tile into a photo and find those that it sees.
+    """Project the cells of a tile into a photo and find those that are visible.
 
     Args:
         view: the camera in the axes of the wall.
         relief: the surface of the whole wall.
         buffer: depth buffer of objects in front of the wall.
-        visible: output, in the shape of the tile.
+        visible: output, with the shape of the tile.
         first_row: first row of the tile on the wall.
         first_column: first column of the tile on the wall.
     """
@@ -154,7 +155,7 @@ def _project_run(
     steps: NDArray[np.float32],
     projected: NDArray[np.float32],
 ) -> None:
-    """Project cells of a row, including void ones, as `camera_kernels.project_point` does.
+    """Project the cells of a row, including void cells, like `camera_kernels.project_point`.
 
     Each loop has no branches and writes to one array only, so that the compiler can vectorise it;
     constants of another type would prevent that.
@@ -162,11 +163,12 @@ def _project_run(
     Args:
         view: the camera in the axes of the wall.
         depths: (n,) depths of the cells.
-        place: row of the cells, and first column of their run.
+        place: row of the cells, and column of the first cell of the run.
         steps: (n,) columns relative to the first one.
-        projected: (_N_QUANTITIES, n or more), overwritten with u, v, inverse distance along the
-            axis, cosine of the angle of incidence, the distance beyond which objects do not hide
-            the cell, and quality; u is -1 behind the camera and beyond the lens model.
+        projected: (_N_QUANTITIES, n or more), overwritten with u, v, the inverse distance along the
+            optical axis, the cosine of the angle of incidence, the distance beyond which objects do
+            not hide the cell, and the quality; u is -1 for cells behind the camera or outside the
+            valid range of the lens model.
     """
     row, first_column = place
     c, gsd_m, f = view.camera, view.gsd_m, np.float32
@@ -185,7 +187,7 @@ def _project_run(
         nears[j] = one / (z0 + zu * steps[j] + zn * depths[j])
     for j in range(depths.size):
         us[j] = (x0 + xu * steps[j] + xn * depths[j]) * nears[j]
-    # Until the other quantities are computed, use their rows for b and the distorted b.
+    # These rows are used as work space until their own quantities are computed.
     bs = cosines
     for j in range(depths.size):
         bs[j] = (y0 + yu * steps[j] + yn * depths[j]) * nears[j]
@@ -232,7 +234,7 @@ def _set_states(
         view: the camera in the axes of the wall.
         buffer: depth buffer of objects in front of the wall.
         depths: (n,) depths of the cells.
-        projected: result of `_project_run`; the inverse distances are overwritten.
+        projected: output of `_project_run`; the row of inverse distances is overwritten.
         places: (n or more,) work array.
         mask: (n,) states, output.
     """
@@ -266,7 +268,6 @@ def _set_states(
 def _keep_painted(
     mask: NDArray[np.uint8], values: NDArray[np.float32], kept: NDArray[np.float32]
 ) -> None:
-    """Copy the values of visible cells; set the others to 0."""
     painted, zero = np.uint8(PAINTED), np.float32(0.0)
     for j in range(mask.size):
         kept[j] = values[j] if mask[j] == painted else zero
@@ -282,16 +283,17 @@ def _hide_low_cells(
     depths: NDArray[np.float32],
     mask: NDArray[np.uint8],
 ) -> None:
-    """Trace the rays from cells of a row not yet hidden towards the camera, up to a height.
+    """Trace the rays from the cells of a row that are not yet hidden towards the camera.
 
-    A ray advances by one row or one column at a time, along the axis on which it is longer.
+    Tracing ends at the height `top`. A ray advances by one row or one column at a time, along the
+    axis on which it is longer.
 
     Args:
         surface: (cells of the wall,) occluding surface, flattened.
         eye: row, column and height of the projection centre.
-        tolerance_m: minimum height above a ray at which the surface blocks the ray.
+        tolerance_m: height above a ray from which the surface blocks the ray.
         top: height above which nothing can hide the cells.
-        place: row and first column of the cells, numbers of rows and columns of the wall.
+        place: row and first column of the cells; number of rows and columns of the wall.
         depths: (n,) depths of the cells.
         mask: (n or more,) states, updated.
     """
@@ -319,8 +321,8 @@ def _hide_low_cells(
         start = here * stride
         for _ in range(n_steps):
             start, at, level = start + step, at + move, level + rise
-            # Interpolate the surface between the two cells on either side of the ray. Rounding
-            # errors must not lead outside the wall.
+            # Interpolate the surface between the two cells on either side of the ray. Indices are
+            # clipped because rounding errors could lead outside the wall.
             first = int(at)
             share, second = np.float32(at - first), min(first + 1, n_beside - 1)
             one = surface[np.uintp(start + first * side)]
@@ -334,7 +336,7 @@ def _hide_low_cells(
 def _bound_rays(
     view: WallView, relief: Relief, row: int, first_column: int, highest: NDArray[np.float64]
 ) -> None:
-    """Bound the height up to which rays from fine blocks must be traced; -inf if none must be.
+    """Compute the heights up to which rays from fine blocks must be traced; -inf if not at all.
 
     Args:
         view: the camera in the axes of the wall.
@@ -369,11 +371,11 @@ def _highest_in_the_way(
     block: tuple[int, int],
     top: float,
 ) -> float:
-    """Bound the height up to which rays from the cells of a block must be traced.
+    """Return an upper bound of the height up to which rays from a block must be traced.
 
-    The rays from a block converge towards the camera, and none is lower than the ray from its
-    lowest cell. A surface can only hide the block where that lowest ray is below the highest
-    surface of the wall; the highest surface along that part gives a tighter bound.
+    The rays from a block converge towards the camera, and none is lower than the ray from the
+    lowest cell. A surface can hide the block only where this lowest ray is below the highest point
+    of the wall. The highest surface along this part of the ray gives a lower bound.
 
     Args:
         view: the camera in the axes of the wall.
@@ -381,11 +383,11 @@ def _highest_in_the_way(
         bottom: smallest depth in the block.
         side_cells: side of a block in cells.
         block: row and column of the block.
-        top: height above which nothing can hide its cells.
+        top: height above which nothing can hide the cells of the block.
     """
     row, column = block
-    # Distance from the middle of a block to the centre of its last cell, in blocks, plus half a
-    # cell, since a ray is tested against the cells on either side of it.
+    # Distance, in blocks, from the middle of a block to the centre of its last cell, plus half a
+    # cell because a ray is tested against the cells on both sides.
     half = 0.5 - 0.5 / side_cells
     bottom += view.tolerance_m
     down = (view.row + 0.5) / side_cells - row - 0.5
