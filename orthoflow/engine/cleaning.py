@@ -21,7 +21,8 @@ class Damage:
 
     Attributes:
         name: path relative to the store's folder.
-        what: the damaged file; for a result, the damaged or missing files it refers to.
+        what: name of the damaged file; for a result, names of the damaged or missing files that it
+            refers to.
     """
 
     name: str
@@ -44,9 +45,9 @@ class Soundness:
 
 
 def check_store(store: Store) -> Soundness:
-    """Check all objects and results; other processes may use the store at the same time.
+    """Check all objects and results. Other processes may use the store at the same time.
 
-    Damaged files are removed, and so are results whose products or figures are missing.
+    Damaged files, and results whose products or figures are missing, are removed.
 
     Raises:
         ArgumentError: the folder is not a store.
@@ -70,7 +71,6 @@ def check_store(store: Store) -> Soundness:
 
 
 def _named_by_digest(folder: Path) -> tuple[str, ...]:
-    """Return the digests that are file names in a folder of the store; ignore other files."""
     names = (path.name.removesuffix(".json") for path in folder.glob("*"))
     return tuple(sorted(name for name in names if re.fullmatch("[0-9a-f]{64}", name)))
 
@@ -97,7 +97,8 @@ def collect_garbage(
 
     Args:
         store: the store; it must not be in use by a run.
-        older_than_days: also remove results that no run used for this many days; 0 removes all.
+        older_than_days: also remove results that no run has used for this many days; 0 removes all
+            results.
         dry_run: only report what would be removed.
 
     Raises:
@@ -126,7 +127,8 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
             kept |= result.objects
     objects = [path for path in _children(store.objects) if path.name not in kept]
     half_written = store.results.glob(".*-*")
-    # Remove results first: if the process is then killed, no result is left without its objects.
+    # Remove the results before their objects: if the process is killed in between, no result lacks
+    # its objects.
     unneeded = (*results, *objects, *_children(store.scratch), *half_written)
     freed_bytes = sum(size_of(path) for path in unneeded)
     for path in () if is_dry else unneeded:

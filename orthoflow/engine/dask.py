@@ -1,10 +1,10 @@
-"""The executor for clusters: runs tasks on Dask workers that share the store's file system.
+"""The executor for clusters, which runs tasks on Dask workers that can access the store.
 
 A worker runs each task in a child process, as on a single machine. Products go to the store; Dask
-transfers only the task and its result. Each attempt has its own folder inside the folder of the
-task, because an abandoned worker may still write to its folder; the number of these folders is the
-number of attempts. Without a scheduler address, the executor creates its own workers, as threads of
-this process.
+transfers only the task and its result. Each attempt at a task has its own folder inside the folder
+of the task, because a worker that was given up may still write to the folder of its attempt. The
+attempts are counted by these folders. Without a scheduler address, the executor starts its own
+workers as threads of this process.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ def look_around(path: str, methods: str) -> tuple[str, str]:
     """Check the environment of a worker; called on each worker before it gets a task.
 
     Returns:
-        The content of the file, or the reason why it cannot be read; and how the methods or
-        libraries of the worker differ from those given, empty if they are the same.
+        The content of the file at `path`, or the reason why it cannot be read; and a description
+        of the first difference between the worker's methods and `methods`, which is empty if they
+        agree.
     """
     try:
         seen = Path(path).read_text(encoding="utf-8")
@@ -64,15 +65,15 @@ def look_around(path: str, methods: str) -> tuple[str, str]:
 
 
 def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -> str:
-    """Run a task in a child process of this worker; return its result as JSON.
+    """Run a task in a child process of this worker, and return the result as JSON.
 
     Args:
         task: what to run.
         name: name of the task in the scheduler.
         topic: topic for progress messages.
-        retries: maximum number of repetitions after the worker is lost.
-        methods: the plan's methods (see `methods_text`); empty for a worker in the process that
-            made the plan.
+        retries: how many times the task is repeated, at most, if its worker is lost.
+        methods: methods of the plan (see `methods_text`); empty if the worker runs in the process
+            that made the plan.
     """
     worker = get_worker()
     home = Path(task.folder)
@@ -117,7 +118,6 @@ def _result(executor: LocalExecutor, worker: Worker, name: str) -> CellResult:
 
 
 def _is_given_up(worker: Worker, name: str) -> bool:
-    """Whether a task is obsolete: its run has ended, or another worker runs it."""
     state = worker.state.tasks.get(name)
     is_closing = worker.status not in WORKER_ANY_RUNNING
     return is_closing or state is None or state.state == "cancelled"
@@ -127,16 +127,17 @@ def _refused(task: Task, error: StepFailedError | PluginError) -> str:
     return result_to_json(failed_result(task, error))
 
 
-# Dask resource of the workers: cores available for steps.
+# Name of the Dask resource by which workers report their number of cores for steps.
 CORES: Final = "cores"
 _PROOF_FILE: Final = "workers-see-this"
 _CONNECT_S: Final = 15.0
-# Time to wait for the first worker, for a lost scheduler, and after all workers are lost.
+# How long to wait for the first worker, for a lost scheduler, and for new workers after all are
+# lost.
 _PATIENCE_S: Final = 60.0
 _WATCH_S: Final = 2.0
 _CLOSE_S: Final = 5.0
-# These settings disable frequent polling: by default, each worker profiles its thread 100 times a
-# second and checks its event loop 50 times a second.
+# Reduce polling: by default, each worker profiles its thread 100 times a second and checks its
+# event loop 50 times a second.
 _QUIET: Final = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
@@ -155,18 +156,19 @@ class DaskExecutor:
         Args:
             plan: the plan; its options contain the scheduler address.
             scratch: folder of the run in the store.
-            capacity: limits of its own workers, if no scheduler is given.
+            capacity: limits of the workers that the executor starts if no scheduler is given.
             listen: called with the address of a task and its message.
 
         Raises:
-            ArgumentError: there is no such scheduler or no worker, or a worker cannot access the
-                store.
-            PluginError: a worker has no orthoflow, or other versions of methods or libraries.
+            ArgumentError: there is no scheduler at the address, the scheduler has no workers, or a
+                worker cannot access the store.
+            PluginError: orthoflow is missing on a worker, or methods or libraries on a worker have
+                other versions.
         """
         self._listen = listen
         self._retries = plan.options.retries
         self._address = plan.options.scheduler
-        # Its own workers run the code that made the plan.
+        # The executor's own workers run in this process, so their methods need no check.
         self._methods = methods_text(plan.methods) if self._address else ""
         self._running: dict[str, tuple[Task, Future[str]]] = {}
         self._messages: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
@@ -231,17 +233,17 @@ class DaskExecutor:
         return ends
 
     def cancel(self) -> None:
-        """End all tasks; the workers notice this within a second, and stop the processes."""
+        """Cancel all tasks; the workers notice this within a second and stop the processes."""
         self._is_cancelled = True
         for _, future in self._running.values():
             with suppress(Exception):
                 future.cancel()
 
     def close(self) -> None:
-        """Release all tasks still running, which the workers then stop by themselves."""
+        """Release all tasks that are still running; the workers then stop them."""
         self.cancel()
         cluster = self._client.cluster
-        # Suppress Dask's messages about lost connections: they are expected here.
+        # Dask may raise errors about lost connections, which are expected here.
         with suppress(Exception):
             self._client.close(timeout=_CLOSE_S)
         if cluster is not None:
@@ -275,14 +277,12 @@ class DaskExecutor:
                 task, StepFailedError(f"{task.who} could not be run on its worker ({reason})")
             )
 
-    # `Any`: the event comes from a worker.
     def _receive(self, event: tuple[float, Any]) -> None:
         with suppress(TypeError, ValueError):
             address, text = event[1]
             self._messages.put((str(address), EVENTS.validate_json(text, strict=True)))
 
     def _watch(self) -> None:
-        """Check every two seconds which workers are connected."""
         now = time.monotonic()
         if now - self._looked < _WATCH_S:
             return
@@ -292,7 +292,8 @@ class DaskExecutor:
         workers = self._workers() if self._client.status == "running" else {}
         if workers:
             self._with_workers = now
-            # Its own workers share the cores of this machine, whatever their number.
+            # The executor's own workers share the cores of this machine, so its capacity does not
+            # depend on their number.
             self._capacity = _capacity(workers) if self._address else self._capacity
         elif self._running and now - self._with_workers > _PATIENCE_S:
             raise self._lost()
@@ -304,9 +305,8 @@ class DaskExecutor:
             "command with the same -o and any executor to continue"
         )
 
-    # `Any`: the scheduler's description of its workers.
     def _workers(self) -> Mapping[str, Any]:
-        """Return address -> properties of the workers that report their cores."""
+        """Return address -> properties, for workers that report their number of cores."""
         try:
             known = self._client.scheduler_info(n_workers=-1)["workers"]
         except Exception:  # noqa: BLE001 - any error means no answer
@@ -349,7 +349,7 @@ class DaskExecutor:
 
 
 def _client(address: str, capacity: Capacity) -> Client:
-    # Dask logs each lost worker with tracebacks; the executor itself reports what matters.
+    # Dask logs a traceback for each lost worker, but the executor reports lost workers itself.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address:
         try:
@@ -364,11 +364,11 @@ def _client(address: str, capacity: Capacity) -> Client:
             n_workers=capacity.n_tasks,
             threads_per_worker=1,
             processes=False,
-            # The scheduler of the run ensures that the tasks together do not exceed the cores.
+            # The scheduler of the run already limits the number of cores used by all tasks.
             resources={CORES: capacity.n_cores},
-            # Steps run in child processes; their memory is monitored by `LocalExecutor`.
+            # Steps run in child processes, whose memory `LocalExecutor` monitors.
             memory_limit=0,
-            # With this address, the dashboard is not accessible from other machines.
+            # Make the dashboard inaccessible from other machines.
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
@@ -376,7 +376,6 @@ def _client(address: str, capacity: Capacity) -> Client:
     return Client(cluster, set_as_default=False)
 
 
-# `Any`: the scheduler's description of its workers.
 def _capacity(workers: Mapping[str, Any]) -> Capacity:
     cores = [int(facts["resources"][CORES]) for facts in workers.values()]
     share = max(1, min(cores))

@@ -1,4 +1,4 @@
-"""Crash-safe writing, JSON with its own digest, and locks between processes."""
+"""Crash-safe writing of files, JSON that contains its own digest, and locks between processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Final
 from orthoflow.errors import StoreError
 from orthoflow.untrusted_text import open_file
 
-# Errors caused by the store's disk, not by a method.
+# These errors are caused by the disk, not by a method.
 _BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.ENXIO})
 
 
@@ -24,7 +24,7 @@ def is_broken(error: OSError, folder: Path) -> bool:
     """Whether an error means that the disk of a folder has failed, rather than that it is full."""
     if error.errno not in _BROKEN:
         return False
-    # Errors of file descriptors contain no path.
+    # An error that concerns a file descriptor contains no path.
     named = isinstance(error.filename, str | bytes)
     return not named or Path(os.fsdecode(error.filename)).is_relative_to(folder)
 
@@ -53,7 +53,7 @@ def writing_to(folder: Path) -> Iterator[None]:
 
 
 def sync(path: Path) -> None:
-    """Make the content of a closed file, or the names in a folder, survive a power cut."""
+    """Flush a closed file, or the names in a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -62,13 +62,13 @@ def sync(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Make everything in a folder survive a power cut, but not the name of the folder itself."""
+    """Flush everything in a folder to the disk, but not the name of the folder itself."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a temporary file and rename it, so that readers see either the old or the new file.
+    """Replace a file atomically, so that readers see either its old or its new content.
 
     Raises:
         StoreError: the disk cannot be written to.
@@ -91,7 +91,8 @@ def place_folder(aside: Path, final: Path) -> bool:
     """Rename a finished folder to its final name.
 
     Returns:
-        False if another process was faster; the new folder then keeps its temporary name.
+        False if another process has already created the final folder; the new folder then keeps
+        its temporary name.
 
     Raises:
         StoreError: the disk cannot be written to.
@@ -111,7 +112,9 @@ def place_folder(aside: Path, final: Path) -> bool:
 
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
-    """Yield the path of a folder to create and fill; it is renamed if the block succeeds.
+    """Yield a path at which the block creates a folder; rename it to `final` at the end.
+
+    If the block fails, no folder exists at `final`.
 
     Raises:
         StoreError: the disk cannot be written to.
@@ -121,8 +124,8 @@ def whole_folder(final: Path) -> Iterator[Path]:
     try:
         with writing_to(final):
             if os.path.lexists(aside):
-                # A leftover that cannot be removed would become part of the new folder; raise the
-                # error instead.
+                # Raise an error if a leftover cannot be removed, because it would become part of
+                # the new folder.
                 shutil.rmtree(aside)
             yield aside
             sync_tree(aside)
@@ -134,7 +137,7 @@ def whole_folder(final: Path) -> Iterator[Path]:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder or file that may be missing or be removed by another process."""
+    """Remove a folder or file; it may be missing, or other processes may be removing it."""
     if folder.is_symlink() or folder.is_file():
         folder.unlink(missing_ok=True)
         return
@@ -144,7 +147,7 @@ def remove_tree(folder: Path) -> None:
 
 
 def folder_size(folder: Path) -> int:
-    """Return the size of all files in a folder and its subfolders, 0 if it is missing."""
+    """Return the size of all files in a folder and its subfolders; 0 if it is missing."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
@@ -168,7 +171,7 @@ def with_digest(text: str) -> str:
 
 
 def is_checked(text: str) -> bool:
-    """Whether a text matches the digest at its beginning; False if there is no digest."""
+    """Whether a JSON text matches the digest at its beginning; False if there is no digest."""
     found = _DIGEST.match(text)
     return found is not None and found[1] == _sha256(f"{{{text[found.end() :]}")
 
@@ -178,7 +181,7 @@ def _sha256(text: str) -> str:
 
 
 def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bool = False) -> bool:
-    """Lock an open file until it is closed or the process ends.
+    """Lock an open file until the file is closed or this process ends.
 
     Args:
         path: path of the file, for the error message.
@@ -208,7 +211,7 @@ def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bo
 
 @contextmanager
 def shared_lock(path: Path) -> Iterator[None]:
-    """Hold a shared lock on a file; wait while another process holds an exclusive lock.
+    """Hold a shared lock on a file; wait until no other process holds an exclusive lock.
 
     Raises:
         StoreError: the lock file cannot be created, or the file system does not support locks.
@@ -227,7 +230,8 @@ def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
         busy: error message if another process holds the lock.
 
     Raises:
-        StoreError: another process holds the lock, or a condition of `shared_lock` applies.
+        StoreError: another process holds the lock, the lock file cannot be created, or the file
+            system does not support locks.
     """
     with _opened_lock(path) as descriptor:
         if not lock_file(path, descriptor):
@@ -236,9 +240,10 @@ def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process holds an exclusive lock; False if the file is missing."""
+    """Whether a running process holds an exclusive lock on a file; False if the file is missing."""
     with suppress(OSError, StoreError), open_file(path) as file:
-        # Use a shared lock, so that two concurrent checks do not mistake each other for the holder.
+        # Use a shared lock, so that two concurrent checks do not each report the other as the
+        # holder.
         return not lock_file(path, file.fileno(), is_shared=True)
     return False
 

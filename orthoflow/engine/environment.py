@@ -1,4 +1,4 @@
-"""Versions, processor and time of a run, without names of users, hosts or folders."""
+"""Software versions, processor and time of a run, without names of users, hosts or folders."""
 
 from __future__ import annotations
 
@@ -42,10 +42,13 @@ def environment(threads: int) -> RecordedEnvironment:
 
 @cache
 def packages() -> dict[str, str]:
-    """Return name -> version of installed distributions; the first one with a name counts."""
+    """Return name -> version of installed distributions.
+
+    If a distribution is installed twice, the first one on the search path counts.
+    """
     found: dict[str, str] = {}
     for distribution in metadata.distributions():
-        # Skip metadata that is not text, or lacks name or version.
+        # Skip metadata that is not valid text, or lacks a name or version.
         with suppress(ValueError, KeyError):
             stated = distribution.metadata
             if stated["Name"] and stated["Version"]:
@@ -66,7 +69,7 @@ def cpu_name() -> str:
 
 @cache
 def git_commit() -> str:
-    """Return the commit of orthoflow's code in a checkout, with `+changes` if modified."""
+    """Return the commit of orthoflow's checkout, followed by `+changes` if the code is modified."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return ""
@@ -95,12 +98,12 @@ def now() -> str:
 
 
 def time_of_file(mtime_s: float) -> str:
-    """Return a file time, in seconds since 1970, as ISO 8601 in UTC, to the second."""
+    """Convert a file time in seconds since 1970 to ISO 8601 in UTC, to the second."""
     return _written(datetime.fromtimestamp(mtime_s, tz=UTC), "seconds")
 
 
 def time_in_a_name() -> str:
-    """Return the current time in UTC as digits in sortable order, for use in file names."""
+    """Return the current time in UTC as digits that sort by time, for use in file names."""
     return f"{datetime.now(UTC):%Y%m%d-%H%M%S}"
 
 

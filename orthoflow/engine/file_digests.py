@@ -1,7 +1,7 @@
-"""SHA-256 of input files, cached as long as the file system reports no change.
+"""SHA-256 digests of input files, cached as long as the file system reports no change.
 
-The paths of files are stored, too: records contain no folders, so replays and exports use these
-paths to find the input files of an earlier run.
+The cache also contains the paths of the files. Replays and exports need these paths to find the
+input files of an earlier run, because records contain no folders.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from orthoflow.errors import InputError
 from orthoflow.geometry.threads import in_order
 from orthoflow.sdk.lines import one_line, text_of_path
 
-# A file that was changed this recently before hashing may change again with the same time stamp.
+# If a file was changed less than this time before it was hashed, another change may not change its
+# time stamp.
 _SETTLED_NS: Final = 2_000_000_000
 
 
@@ -49,7 +50,9 @@ class FileDigests:
         self._is_dirty = False
 
     def digest_all(self, paths: Iterable[Path]) -> tuple[FileRef, ...]:
-        """Return the digests of files, in the order given; large new files are read in parallel.
+        """Return the digests of files, in the order given.
+
+        Large files whose digests are not cached are read in parallel.
 
         Raises:
             InputError: a file cannot be read.
@@ -98,7 +101,7 @@ class FileDigests:
         )
 
     def note_place(self, sha256: str, path: Path) -> None:
-        """Record the path at which a run found a file."""
+        """Record the path of a file with a given digest."""
         place = str(path.absolute())
         self._is_dirty |= self._places.get(sha256) != place
         self._places[sha256] = place
@@ -121,7 +124,7 @@ class FileDigests:
 
 
 def file_identity(path: Path) -> str:
-    """Return file system attributes that do not change unless the file is changed.
+    """Return file system attributes that stay the same as long as the file is not changed.
 
     Raises:
         OSError: the file is not accessible.
@@ -145,7 +148,6 @@ def file_sha256(path: Path) -> str:
 
 
 def _read_memo(memo: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Read the cache file: identity -> digest, and digest -> path."""
     try:
         text = memo.read_text(encoding="utf-8")
         content = json.loads(text) if is_checked(text) else {}

@@ -1,4 +1,4 @@
-"""The run folder: names of its files, the journal, and the events of a run."""
+"""The run folder: the names of its files, the journal, and the events of a run."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class CellFinished:
     Attributes:
         address: address of the cell.
         result: its result, with status ok, failed or skipped.
-        cached: whether the result was in the store, including results that this run stored before
-            an interruption.
+        cached: whether the result was in the store; also true if this run stored it before an
+            interruption.
     """
 
     address: str
@@ -99,11 +99,12 @@ class JournalLine:
         event: `run` in the first line; `resumed`, `interrupted` or `ended` for the run; `started`
             or `finished` for a cell.
         time: ISO 8601, UTC.
-        format: name and version of the file format; only in the first line, as are `run_id` and
-            `workflow`.
+        format: name and version of the file format; like `run_id` and `workflow`, only in the
+            first line.
         run_id: id of the run.
         workflow: name of the workflow.
-        address: address of the cell; this and all further fields are empty for the run.
+        address: address of the cell; in lines about the run, this and all following fields are
+            empty.
         key: cache key of the cell.
         status: ok, failed or skipped.
         cached: whether the result was in the store.
@@ -135,12 +136,12 @@ class Journal:
     """
 
     def __init__(self, folder: Path, name: str, *, run_id: str = "") -> None:
-        """Open or create a run folder.
+        """Open a run folder, or create it.
 
         Args:
             folder: the run folder.
             name: name of the workflow.
-            run_id: id of a new run, generated if empty; a resumed run keeps its own.
+            run_id: id of a new run, generated if empty; a resumed run keeps its id.
 
         Raises:
             ArgumentError: the folder is in use by another run, or contains a finished run, a run of
@@ -186,7 +187,7 @@ class Journal:
         if not lock_file(self._path, self._descriptor):
             raise _is_in_use(self._folder)
         lines = self._read_lines()
-        # The run may have finished since the folder was checked.
+        # The run may have been finished by another process since the folder was checked.
         if (self._folder / RECORD_FILE).exists():
             raise _is_finished(self._folder)
         self.is_resumed = bool(lines)
@@ -209,7 +210,7 @@ class Journal:
             sync(self._folder)
 
     def _read_lines(self) -> list[JournalLine]:
-        """Read all complete lines; an incomplete last line is removed."""
+        """Read all complete lines; truncate the file if the last line is incomplete."""
         content = self._path.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]
         with writing_to(self._folder):
@@ -234,14 +235,14 @@ def _parsed(lines: bytes) -> list[JournalLine]:
 
 
 def require_run_folder(folder: Path, name: str) -> None:
-    """Check a run folder as `Journal` does, but before any input is read.
+    """Check a run folder as `Journal` does, without creating or opening it.
 
     Args:
         folder: the run folder; it may be missing.
         name: name of the workflow.
 
     Raises:
-        ArgumentError: no run of the workflow can start or continue in the folder.
+        ArgumentError: see `Journal`.
     """
     _check_folder(folder)
     if is_running(folder):
@@ -253,7 +254,7 @@ def require_run_folder(folder: Path, name: str) -> None:
 
 @contextmanager
 def kept_from_others(folder: Path) -> Iterator[None]:
-    """Lock a run folder against other runs while results are written to it.
+    """Prevent other runs from using a run folder while the block writes results to it.
 
     Raises:
         ArgumentError: the folder is in use by another run.
@@ -282,7 +283,7 @@ def _check_workflow(folder: Path, first: JournalLine, name: str) -> None:
 
 
 def readable_lines(folder: Path) -> list[JournalLine]:
-    """Return the lines of a journal, even during a run; empty if it is unreadable."""
+    """Return the lines of a journal, even during a run; empty if the journal is unreadable."""
     with suppress(OSError, ValueError):
         return _parsed((folder / JOURNAL).read_bytes())
     return []
@@ -309,7 +310,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def is_running(folder: Path) -> bool:
-    """Whether a live process is executing the run in a folder."""
+    """Whether a running process is executing the run in a folder."""
     return is_locked(folder / JOURNAL)
 
 
@@ -322,7 +323,8 @@ def new_run_folder(name: str, run_id: str) -> Path:
     """Return the default folder of a run: `runs/<name>-<run id>`.
 
     Raises:
-        RecordError: the name, which may come from a record, cannot be a folder name.
+        RecordError: the workflow name, which may come from a record, is not allowed as a folder
+            name.
     """
     try:
         return path_below(Path("runs"), f"{name}-{run_id}")

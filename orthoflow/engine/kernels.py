@@ -1,13 +1,14 @@
-"""Folders for compiled numba kernels: private to the user, and never shared.
+"""Folders for compiled numba kernels, which are private to the user and never shared.
 
-Compiled kernels are pickles, and loading a pickle runs code. They are therefore never written to a
-store or working folder, which several people may share, and never copied from one. The folder
-belongs to the user or root, and nobody else may write to it; if there is no such folder, kernels
-are kept in a temporary folder of this process.
+Compiled kernels are pickles, and loading a pickle runs code. Kernels are therefore never written
+to, or loaded from, a store or working folder, which several people may share. The folder for
+kernels must belong to the user or root, and nobody else may have write permission; if there is no
+such folder, kernels are kept in a temporary folder of this process.
 
 orthoflow's own kernels are identified by their content (see `geometry.compiling`). Kernels of
-plugins are cached by numba itself, which checks only the file of the kernel and not the code that
-it calls in other files; each version of a plugin's code therefore has its own folder.
+plugins are cached by numba itself. Numba checks the file that contains the kernel for changes, but
+not the code in other files that the kernel calls. Each version of a plugin's code therefore has
+its own folder.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ _MAX_STATES: Final = 8
 
 
 def private_folder(name: str) -> Path:
-    """Return a folder of the user's cache that nobody else can write to; create it if missing.
+    """Return a subfolder of the user's cache that nobody else can write to; create it if missing.
 
-    It is `$XDG_CACHE_HOME/orthoflow/<name>` or `~/.cache/orthoflow/<name>`. If this folder cannot
-    be created, or others may write to it, a temporary folder is used, which is removed at exit.
+    The folder is `$XDG_CACHE_HOME/orthoflow/<name>` or `~/.cache/orthoflow/<name>`. If it cannot
+    be created, or others may write to it, the result is a temporary folder, which is removed at
+    exit.
     """
     with suppress(OSError, RuntimeError):
         own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "orthoflow"
@@ -47,8 +49,8 @@ def kernel_folder(state: str) -> Path:
     """Return a folder for compiled kernels (see `all_kernels`).
 
     Args:
-        state: digest of a plugin's code (only the most recent versions are kept); empty for
-            orthoflow's own kernels.
+        state: digest of a plugin's code, or empty for orthoflow's own kernels. Only the folders of
+            the most recent versions are kept.
     """
     root = all_kernels()
     if not state or str(root) == os.environ.get(VARIABLE):
@@ -65,10 +67,10 @@ def kernel_folder(state: str) -> Path:
 
 
 def all_kernels() -> Path:
-    """Return the folder of all kernels of this user.
+    """Return the folder for all kernels of this user.
 
-    The environment variable `NUMBA_CACHE_DIR` sets another folder, which is used without subfolders
-    for plugins if it is private.
+    If the environment variable `NUMBA_CACHE_DIR` names a private folder, this folder is used,
+    without subfolders for plugins.
     """
     named = Path(os.environ.get(VARIABLE, ""))
     if named.is_absolute():
@@ -97,7 +99,7 @@ def _temporary() -> tempfile.TemporaryDirectory[str]:
 
 @contextmanager
 def kernels_in(folder: Path) -> Iterator[None]:
-    """While the block runs, make numba cache the kernels of this process in a folder."""
+    """Make numba cache kernels in a folder while the block runs."""
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = str(folder)
     reload_numba_config()
@@ -112,7 +114,7 @@ def kernels_in(folder: Path) -> Iterator[None]:
 
 
 def reload_numba_config() -> None:
-    """Make numba, if it is loaded, read the environment variables again."""
+    """Make numba read its environment variables again, if numba is loaded."""
     if "numba" in sys.modules:
         from numba.core import config  # noqa: PLC0415 - only where it is loaded anyway
 

@@ -1,6 +1,6 @@
-"""Cache keys: the SHA-256 of everything that determines a cell's result.
+"""Cache keys, which are the SHA-256 of everything that determines the result of a cell.
 
-Paths, step names, cores, timeouts and time stamps are deliberately excluded. The code of each
+Paths, step names, cores, timeouts and time stamps are deliberately excluded. The code of the
 method and the versions of the libraries that it may use are always included.
 """
 
@@ -36,11 +36,11 @@ _WHAT: Final = "orthoflow/cell"
 _CODE: Final = "its code"
 _KEY_VERSION: Final = 1
 _ROOT: Final = Path(__file__).resolve().parents[1]
-# Parts of the framework that can affect the result of a method; the engine and the command line
-# cannot.
+# Only these parts of the framework can affect the result of a method.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
 _CORE: Final = frozenset({"numpy", "numba", "scipy", "opencv-python-headless"})
-# Requirements that do not affect results: command line, records, pages, drawings and metadata.
+# These libraries do not affect results: they serve the command line, records, web pages, drawings
+# and metadata.
 _WITHOUT_EFFECT: Final = frozenset(
     {"click", "ezdxf", "filelock", "h5py", "iiif-prezi3", "jinja2", "libusb-package", "matplotlib"}
     | {"networkx", "pluggy", "prov", "psutil", "pydantic", "pystac", "reportlab", "rich", "rocrate"}
@@ -61,7 +61,7 @@ class MethodFacts(MethodIdentity):
 
     Attributes:
         target: import string of the class.
-        tools: library -> version, for libraries that can affect results.
+        tools: library -> version, for the libraries that can affect results.
         code: digests of the code of the plugin and of the framework.
         inputs: port -> product type.
         outputs: port -> product type.
@@ -94,7 +94,7 @@ class MethodFacts(MethodIdentity):
 
 @dataclass(frozen=True, kw_only=True)
 class CellKey:
-    """Key of a cell, and the text whose SHA-256 it is."""
+    """Key of a cell, and the text of which the key is the SHA-256."""
 
     key: str
     preimage: str
@@ -135,7 +135,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
 
 
 def input_digest(files: Sequence[RecordedFile]) -> str:
-    """Return the digest of an input: file names without folders, sizes and contents, in order."""
+    """Return the digest of the names (without folders), sizes, contents and order of files."""
     listing: JsonValue = [
         {"name": file.name, "size_bytes": file.size_bytes, "sha256": file.sha256} for file in files
     ]
@@ -149,7 +149,7 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
     Args:
         cell: the cell.
         facts: facts of its method.
-        inputs: port -> product.
+        inputs: port -> product connected to it.
     """
     preimage: dict[str, JsonValue] = {
         "what": _WHAT,
@@ -173,7 +173,7 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
 
 
 def read_preimage(text: str) -> Mapping[str, JsonValue]:
-    """Parse the text of a preimage; return an empty mapping if it is invalid."""
+    """Parse the text of a preimage; return an empty mapping if the text is invalid."""
     try:
         content = parse_json(text)
     except ValueError:
@@ -182,7 +182,7 @@ def read_preimage(text: str) -> Mapping[str, JsonValue]:
 
 
 def stated_versions(preimage: Mapping[str, JsonValue], name: str) -> dict[str, str]:
-    """Return `code` or `tools` of a preimage; empty if the entry is not a mapping.
+    """Return the entry `code` or `tools` of a preimage; empty if the entry is not a mapping.
 
     >>> stated_versions({"tools": {"numpy": "2.1"}, "code": [1]}, "tools")
     {'numpy': '2.1'}
@@ -208,9 +208,9 @@ def _tools(cls: type[Method]) -> dict[str, str]:
 def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mapping[str, str]:
     """Return the versions of the libraries that can affect results of a plugin's methods.
 
-    These are the requirements of the plugin's distribution and of orthoflow, and other libraries
-    that the plugin's sources import, as far as they are installed. Libraries that only display or
-    store results are excluded.
+    These are the installed requirements of orthoflow and of the plugin's distribution, and other
+    installed libraries that the plugin's sources import. Libraries that only display or store
+    results are excluded.
 
     Args:
         distribution: distribution of the plugin.
@@ -226,7 +226,6 @@ def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mappi
 
 
 def _imported(sources: Iterable[Path]) -> set[str]:
-    """Return the canonical names of all distributions that Python files import."""
     modules = {
         name
         for path in sources
@@ -236,7 +235,8 @@ def _imported(sources: Iterable[Path]) -> set[str]:
     modules -= {path.stem for path in sources} | {path.parent.name for path in sources} | _OUR_OWN
     if not modules:
         return set()
-    # `metadata.packages_distributions` lists the same, but takes a quarter of a second per command.
+    # `metadata.packages_distributions` returns the same names, but adds a quarter of a second to
+    # each command.
     listed = re.compile(
         rf"^(?:{'|'.join(map(re.escape, sorted(modules)))})(?:[/.]|$)", re.MULTILINE
     )
@@ -257,10 +257,10 @@ def framework_files() -> tuple[Path, ...]:
 
 
 def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
-    """Return the code files of a method, and the data files in the same packages.
+    """Return the code files of a method, together with the data files in the same packages.
 
-    For a built-in method, this is the package of its kind, since no kind imports another; for other
-    methods, all packages of their distribution.
+    For a built-in method, this is the package of its kind, since no kind imports another. For
+    other methods, these are all packages of the distribution.
     """
     files = entry.source_files()
     module = entry.spec.target.partition(":")[0]
@@ -279,7 +279,7 @@ def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
 
 
 def files_digest(files: Iterable[Path]) -> str:
-    """Return the digest of the names and contents of files; cached while they are unchanged."""
+    """Return the digest of the names and contents of files; it is cached until a file changes."""
     return _digest(_states(files))
 
 
@@ -303,12 +303,15 @@ def _digest(files: _States) -> str:
 
 
 def methods_text(methods: Mapping[str, MethodFacts]) -> str:
-    """Return the code digests and library versions of methods as text, for comparison."""
+    """Return the code digests and library versions of methods as JSON, for `misfit`."""
     return json.dumps({name: _facts(facts) for name, facts in methods.items()}, sort_keys=True)
 
 
 def misfit(methods: str) -> str:
-    """Return how the methods installed here differ from those of a plan; empty if they agree."""
+    """Describe how the installed methods differ from those of a plan; empty if they agree.
+
+    Only the first difference is described.
+    """
     catalog = discover_catalog()
     for name, planned in json.loads(methods).items():
         try:

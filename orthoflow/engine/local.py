@@ -56,10 +56,11 @@ _THREAD_VARIABLES: Final = (
     "RAYON_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
-# Environment variables that are read when Python starts or the server loads libraries. A module in
-# the working folder must not replace a standard module. OpenBLAS threads spin for 2**26 clock
-# cycles when they start and after each product, about 0.05 s of processor time; 2**20 cycles take
-# less than 1 ms. Numba would compose coloured error messages for all functions that it tries.
+# These environment variables are read when Python starts or the server loads libraries. They
+# prevent a module in the working folder from replacing a standard module. OpenBLAS threads spin
+# for 2**26 clock cycles (about 0.05 s) when they start and after each matrix product; 2**20 cycles
+# take less than 1 ms. Numba would spend time on colouring the error messages of all functions that
+# it tries.
 _AT_START: Final = {
     "PYTHONSAFEPATH": "1",
     "PYTHONHASHSEED": "0",
@@ -71,12 +72,13 @@ _starting: Final = threading.Lock()
 StepListener = Callable[[str, StepEvent], None]
 EVENTS: Final = TypeAdapter(StepEvent)
 _GRACE_S: Final = 5.0
-# Maximum number of messages per poll: a step that never stops sending must not delay its timeout.
+# Maximum number of messages read per poll, so that a step that keeps sending messages cannot delay
+# its own timeout.
 _MOST_MESSAGES: Final = 256
 _LARGEST_MESSAGE: Final = 64 << 20
 _LONGEST_LAST_LINE: Final = 300
 _FROM_OUTSIDE: Final = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-# A record keeps only the end of a long log, where the errors are.
+# A record contains only this much of the end of a log, where the errors are.
 _KEPT_BYTES: Final = 256 << 10
 _MOST_LINES: Final = 2000
 
@@ -88,8 +90,8 @@ class Capacity:
     Attributes:
         n_tasks: maximum number of tasks.
         n_cores: total number of cores.
-        cores_of_one: maximum number of cores for one task.
-        share: default number of cores for one task.
+        cores_of_one: maximum number of cores per task.
+        share: default number of cores per task.
     """
 
     n_tasks: int
@@ -99,15 +101,16 @@ class Capacity:
 
     @classmethod
     def of_jobs(cls, jobs: int, n_cores: int) -> Capacity:
-        """Return the limits for jobs that share the cores of one machine."""
+        """Return the limits for a number of concurrent jobs that share the cores of one machine."""
         share = max(1, n_cores // jobs)
         return cls(n_tasks=jobs, n_cores=n_cores, cores_of_one=n_cores, share=share)
 
 
 class Executor(Protocol):
-    """Runs tasks; used from one thread.
+    """Runs tasks; called from one thread only.
 
-    Nothing here assumes a single machine: a task is JSON, and its results are in the store.
+    The interface does not assume a single machine, because a task can be sent as JSON and its
+    results are in the store.
     """
 
     @property
@@ -125,18 +128,22 @@ class Executor(Protocol):
         """Wait for tasks to end, up to a time limit; forward messages of running tasks.
 
         Returns:
-            Address -> result of the tasks that have ended: ok or failed, never skipped.
+            Address -> result, for the tasks that have ended; the status is ok or failed, never
+            skipped.
         """
 
     def cancel(self) -> None:
-        """Ask all tasks to stop, by force after a grace period; `poll` returns their results."""
+        """Ask all tasks to stop; kill them after a grace period. `poll` returns their results."""
 
     def close(self) -> None:
-        """Stop all tasks still running, immediately."""
+        """Stop all running tasks immediately."""
 
 
 class InlineExecutor:
-    """Runs tasks one by one in this process, for debugging: no timeout, no crash protection."""
+    """Runs tasks one by one in this process, for debugging.
+
+    There are no timeouts, and a crash ends this process.
+    """
 
     def __init__(
         self, capacity: Capacity, listen: StepListener, is_interrupted: Callable[[], bool]
@@ -155,7 +162,7 @@ class InlineExecutor:
         self._is_cancelled = False
 
     def start(self, task: Task) -> None:
-        """Queue a task."""
+        """Add a task to the queue."""
         self._waiting.append(task)
 
     def poll(self, timeout_s: float) -> dict[str, CellResult]:
@@ -180,7 +187,7 @@ class InlineExecutor:
         return {task.address: dataclasses.replace(result, log=text)}
 
     def cancel(self) -> None:
-        """End the queued tasks without running them; never called while a task runs."""
+        """Cancel the queued tasks; never called while a task runs."""
         self._is_cancelled = True
 
     def close(self) -> None:
@@ -189,7 +196,6 @@ class InlineExecutor:
 
 
 def _log_text(path: Path) -> str:
-    """Return the end of a log without NUL characters, which records do not allow in text."""
     with suppress(OSError), open_file(path) as stream:
         n_before = max(0, os.fstat(stream.fileno()).st_size - _KEPT_BYTES)
         stream.seek(n_before)
@@ -223,7 +229,8 @@ def start_process(
     failure: Exception | None = None
     with _starting, _start_conditions():
         context.set_forkserver_preload(PRELOADED)
-        # If the server was killed, the process does not respond; then start both again.
+        # If the server was killed, starting a process fails once, and the second attempt starts a
+        # new server.
         for _ in range(2):
             process = context.Process(target=target, args=arguments, name=name)
             try:
@@ -242,9 +249,8 @@ def start_process(
 def _start_conditions() -> Iterator[None]:
     """Adjust the state that `multiprocessing` passes on to a new process.
 
-    A script that calls `orthoflow.run` must not run again in each step, where it would be imported
-    as the main module; and Dask workers, which are daemons, must be allowed to start child
-    processes.
+    Without this, `multiprocessing` would run a script that calls `orthoflow.run` again in each
+    step, and Dask workers, which are daemons, could not start child processes.
     """
     variables = {**_AT_START, "MPLCONFIGDIR": str(private_folder("matplotlib"))}
     before = {name: os.environ.get(name) for name in variables}
@@ -268,9 +274,8 @@ def _start_conditions() -> Iterator[None]:
 
 
 def _variables(task: Task) -> Mapping[str, str]:
-    """Return the environment variables for the process of a task."""
     variables = dict(os.environ)
-    # This variable is only useful for debugging kernels, which requires `--executor inline`.
+    # This variable serves only to debug kernels, which requires `--executor inline`.
     variables.pop("NUMBA_DISABLE_JIT", None)
     return variables | {
         **dict.fromkeys(_THREAD_VARIABLES, str(task.cores)),
@@ -283,17 +288,15 @@ def _variables(task: Task) -> Mapping[str, str]:
 
 
 class _Step:
-    """A task and its process, in its own session.
+    """A task and the process that runs it, as the leader of its own session.
 
     Attributes:
-        task: the task.
-        process: the process of the task.
-        pipe: messages of the process, see `worker.run_step`.
+        pipe: receives the messages of the process, see `worker.run_step`.
         clock: start time in seconds of the monotonic clock.
-        reason: reason why the executor stopped the process; None if it did not.
-        is_victim: whether the process was stopped for lack of memory.
+        reason: why the executor stopped the process; None if it did not.
+        is_victim: whether the process was stopped because memory was short.
         kill_at: end of the grace period in seconds of the monotonic clock.
-        peak_bytes: peak memory of the process, measured from outside.
+        peak_bytes: peak memory of the process, measured by the executor.
         result: result that the process sent.
     """
 
@@ -307,7 +310,7 @@ class _Step:
         with writing_to(Path(task.folder).parent):
             task.scratch.mkdir(parents=True, exist_ok=True)
         self.task = task
-        # Truncate an existing log, but do not follow a link in its place.
+        # Truncate an existing log, but do not follow a symbolic link.
         opened = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW
         with writing_to(Path(task.log).parent):
             os.close(os.open(task.log, opened, 0o666))
@@ -331,12 +334,11 @@ class _Step:
 
     @property
     def pid(self) -> int:
-        """Process id."""
         assert self.process.pid is not None  # noqa: S101 - it was started
         return self.process.pid
 
     def stop(self, reason: OrthoflowError) -> None:
-        """Ask the process to stop, once; it is killed after a grace period."""
+        """Ask the process to stop, and start the grace period; later calls have no effect."""
         if self.reason is None:
             self.reason = reason
             self.kill_at = time.monotonic() + _GRACE_S
@@ -344,20 +346,18 @@ class _Step:
                 self.process.terminate()
 
     def kill(self) -> None:
-        """Kill the process and its descendants, even if the process has already ended."""
         self.kill_at = time.monotonic() + _GRACE_S
         _kill(_with_descendants(self.pid))
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Release the resources of the process."""
         self.pipe.close()
         if not self.process.is_alive():
             self.process.close()
 
     def outcome(self) -> CellResult:
-        """Return the result of the process, which must have ended."""
+        """Return the result; the process must have ended."""
         peak_mib, log = round(self.peak_bytes / MIB, 1), _log_text(Path(self.task.log))
         if self.reason is None and self.result is not None:
             peak_mib = max(self.result.peak_rss_mib, peak_mib)
@@ -385,7 +385,8 @@ class _Step:
         return StepFailedError(f"{self.task.who} {how}")
 
 
-# Tasks of all executors in this process by process id; each Dask worker in this process has one.
+# Process id -> task, for all executors in this process; each Dask worker thread has its own
+# executor.
 _all_running: Final[dict[int, _Step]] = {}
 
 
@@ -418,7 +419,7 @@ class LocalExecutor:
         pipes = [step.pipe for step in steps if not step.pipe.closed]
         timeout_s = 0.0 if ends else timeout_s
         wait([*pipes, *(step.process.sentinel for step in steps)], timeout_s)
-        # Determine this before reading the last messages: no process sends a message after its end.
+        # Determine first which processes have ended, so that their last messages are read below.
         ended = [step for step in steps if not step.process.is_alive()]
         for step in steps:
             self._read(step)
@@ -427,7 +428,7 @@ class LocalExecutor:
         return ends
 
     def cancel(self) -> None:
-        """Ask all tasks to stop: SIGTERM, then SIGKILL after 5 s."""
+        """Send SIGTERM to all tasks, and SIGKILL 5 s later to those still running."""
         for step in self._running.values():
             step.stop(CancelledStepError(f"step {step.task.address} was interrupted"))
 
@@ -447,7 +448,7 @@ class LocalExecutor:
                     return
                 message = step.pipe.recv_bytes(_LARGEST_MESSAGE)
             except (EOFError, OSError):
-                # The process has ended or sent an invalid message.
+                # The process has ended, or its message was invalid.
                 step.pipe.close()
                 return
             self._take(step, message)
@@ -476,15 +477,16 @@ class LocalExecutor:
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        """Stop the step that uses the most memory if the machine is running out of memory."""
+        """If the machine is running out of memory, kill the step that uses the most."""
         floor, steps = memory_shortage(), _all_running.copy()
-        # Stop one step at a time, because a killed process does not release its memory immediately.
+        # Kill one step at a time, because a killed process does not release its memory
+        # immediately.
         if not floor or any(step.is_victim for step in steps.values()):
             return
         held = {pid: tree_memory(pid) for pid in steps}
         largest = max(held, key=held.__getitem__, default=0)
-        # Another program may be the cause; stopping a small step would not help. Steps of another
-        # executor are left to that executor.
+        # If even the largest step uses less than the required free memory, killing it would not
+        # help, because another program is the cause. Each executor kills only its own steps.
         if not largest or held[largest] < floor or steps[largest] not in self._running.values():
             return
         step = steps[largest]

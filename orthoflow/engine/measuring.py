@@ -1,4 +1,4 @@
-"""Measurement of time and memory of methods, processes and the machine."""
+"""Measurement of the time and memory used by methods and processes, and of free memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GIB: Final = 1 << 30
 
 
 def process_memory(process_id: int | None = None) -> int:
-    """Return the memory allocated by a process, by default this one; 0 if it has ended.
+    """Return the memory in bytes allocated by a process, by default this one; 0 if it has ended.
 
     Mapped files are not counted, because the system can discard and reread them.
     """
@@ -30,7 +30,7 @@ def process_memory(process_id: int | None = None) -> int:
 
 
 def tree_memory(root: int) -> int:
-    """Return the memory allocated by a process and all its descendants."""
+    """Return the memory in bytes allocated by a process and all its descendants."""
     try:
         children = psutil.Process(root).children(recursive=True)
     except psutil.Error:
@@ -39,9 +39,10 @@ def tree_memory(root: int) -> int:
 
 
 def memory_shortage() -> int:
-    """Return the required free memory in bytes if less than that is available, otherwise 0.
+    """Return the required free memory in bytes if less is available, otherwise 0.
 
-    The minimum is 512 MiB or 3 % of the total; with less, a machine fails unpredictably.
+    The required free memory is 512 MiB, or 3 % of the total if this is more, but at most one
+    eighth of the total. With less, programs fail unpredictably.
     """
     memory = psutil.virtual_memory()
     floor = min(max(512 * MIB, memory.total * 3 // 100), memory.total // 8)
@@ -49,9 +50,9 @@ def memory_shortage() -> int:
 
 
 def is_for_want_of_memory(error: BaseException) -> bool:
-    """Whether an error means lack of memory, even when loading a library or starting a thread.
+    """Whether an error was caused by a lack of memory.
 
-    In these two cases, only the message shows that memory is lacking.
+    If a library cannot be loaded or a thread cannot be started, only the message shows the cause.
     """
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "allocate memory" in str(error)
@@ -60,25 +61,25 @@ def is_for_want_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
 
 
-# Every import calls these functions, even for a module that another thread is still loading. They
-# are private, but public hooks (finders and loaders) are not called at the end of a module's
-# imports.
+# Every import calls these functions, even for a module that another thread is still loading. The
+# public hooks (finders and loaders) are not sufficient, because they are not called when the
+# import of a module ends.
 _BOOTSTRAP: Final = cast("Any", importlib)._bootstrap  # noqa: SLF001
 _IMPORTS: Final = ("_find_and_load", "_lock_unlock_module")
 _NUMBA_EVENTS: Final = "numba.core.event"
-# Event of numba while a kernel is compiled or read from its file.
+# Numba event that lasts while a kernel is compiled or read from its file.
 _COMPILER_LOCK: Final = "numba:compiler_lock"
 
 
 class LoadingMeter:
-    """Measures how long a block spends on loading modules and compiling kernels.
+    """Measures how long a block loads modules and compiles kernels.
 
-    Concurrent loading in several threads is counted once. Loading in a daemon thread does not delay
-    the method, so only its processor time is counted.
+    If several threads load at the same time, the elapsed time is counted once. Loading in a daemon
+    thread does not delay the method, so only its processor time is counted.
     """
 
     def __init__(self) -> None:
-        """Start at zero."""
+        """Create a meter that reads zero."""
         self._lock = threading.RLock()
         self._own = threading.local()
         self._n_open = 0
@@ -104,24 +105,24 @@ class LoadingMeter:
 
     @property
     def total_s(self) -> float:
-        """Elapsed seconds so far."""
+        """Elapsed seconds spent on loading and compiling so far."""
         with self._lock:
             running_s = time.perf_counter() - self._opened_s if self._n_open else 0.0
             return self._total_s + running_s
 
     @property
     def processor_s(self) -> float:
-        """Processor seconds so far, of all threads, without loading still in progress."""
+        """Processor seconds of all threads so far, without loading that is still in progress."""
         with self._lock:
             return self._processor_s
 
     def clock_s(self) -> float:
-        """Return seconds as `time.perf_counter` does, but paused while anything is loaded."""
+        """Return the seconds of a clock that pauses while anything is loaded."""
         with self._lock:
             return time.perf_counter() - self.total_s
 
     def begin(self) -> None:
-        """Record that this thread starts loading; nested loading is part of it."""
+        """Record that this thread starts to load; nested calls are counted once."""
         own = self._own
         own.depth = getattr(own, "depth", 0) + 1
         if own.depth > 1:
@@ -139,7 +140,7 @@ class LoadingMeter:
         own = self._own
         depth = getattr(own, "depth", 0)
         if depth == 0:
-            # The loading started before the measurement.
+            # This loading started before the measurement.
             return
         own.depth = depth - 1
         if own.depth:
@@ -165,7 +166,7 @@ class LoadingMeter:
         return timed
 
     def _listen_to_numba(self) -> None:
-        # Do not load numba here: a method that compiles loads it.
+        # Do not load numba here; a method that compiles kernels loads numba itself.
         events = cast("Any", sys.modules.get(_NUMBA_EVENTS))
         if self._listener is not None or not hasattr(events, "install_listener"):
             return

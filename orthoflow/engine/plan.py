@@ -1,4 +1,4 @@
-"""The immutable plan of a run: which cells are stored, which will run, and why."""
+"""The immutable plan of a run: which cells have stored results, which will run, and why."""
 
 from __future__ import annotations
 
@@ -42,22 +42,23 @@ _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
 _ABSENT: Final = "absent"
 _FORCED: Final = "forced"
-# Files with camera parameters or image positions, which may be the same for several images.
+# These files contain camera parameters or image positions, which may be the same for several
+# images.
 _SIDECARS: Final = frozenset({".aae", ".jgw", ".pgw", ".prj", ".tfw", ".wld", ".xmp"})
-# Time to start a process and to read and store its products.
+# Estimated time to start a process, read its inputs and store its outputs.
 _START_S: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(Selection):
-    """Options of plan and run.
+    """Options for planning and executing a run.
 
     Attributes:
         jobs: number of concurrent cells, which share the cores.
-        executor: `local` (a child process per cell), `inline` (this process, for debugging) or
-            `dask` (a child process per cell, on the workers of a cluster).
+        executor: `local` (each cell in a child process), `inline` (all cells in this process, for
+            debugging) or `dask` (each cell in a child process of a cluster's worker).
         scheduler: address of the Dask scheduler; if empty, `jobs` local workers are created.
-        retries: maximum number of repetitions of a cell after its worker is lost.
+        retries: how many times a cell is repeated, at most, if its Dask worker is lost.
         force: steps to run even if their results are in the store.
     """
 
@@ -85,12 +86,13 @@ class PlannedCell:
     Attributes:
         cell: the cell.
         status: `cached`, `will run`, `skipped`, or `unknown yet` if the inputs are not yet known.
-        reason: reason for the status, such as the changes since the most similar earlier result.
+        reason: why the cell has this status, such as the changes since the most similar earlier
+            result.
         key: cache key; None if its inputs are not known.
         inputs: port -> product, as far as known.
         result: stored result of a cached cell.
-        took_s: expected duration in seconds, from the earlier call with the most similar
-            parameters; 0 for cells that do not run, None if unknown.
+        took_s: expected duration in seconds, taken from the earlier call with the most similar
+            parameters; 0 if the cell will not run, None if unknown.
     """
 
     cell: Cell
@@ -104,10 +106,10 @@ class PlannedCell:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedInput:
-    """A workflow input with the content of its files.
+    """A workflow input, with the digests of its files.
 
     Attributes:
-        ref: digest of the input, as a product of type `files`.
+        ref: reference to the input as a product of type `files`, with its digest.
         files: files of the input, in order.
     """
 
@@ -148,7 +150,7 @@ def plan_run(
     store: Store,
     options: RunOptions | None = None,
 ) -> RunPlan:
-    """Plan a run without running any cell: hash inputs, compute cache keys, and look them up.
+    """Plan a run: hash the inputs, compute cache keys, and look up results; no cell runs.
 
     Raises:
         ArgumentError: an option refers to a step that does not exist.
@@ -182,10 +184,10 @@ def _require_distinct(
     inputs: Mapping[str, PlannedInput | None],
     methods: Mapping[str, MethodFacts],
 ) -> None:
-    """Refuse input files that a step would use twice: copies, or links to the same file.
+    """Reject an input that contains copies of a file, or several links to it.
 
     Raises:
-        InputError: two files of an input have the same content.
+        InputError: two files have the same content.
     """
     for cell in cells:
         for port, source in cell.inputs.items():
@@ -209,7 +211,7 @@ def known_inputs(
     inputs: Mapping[str, PlannedInput | None],
     results: Mapping[str, CellResult],
 ) -> dict[str, ProductRef]:
-    """Return port -> product for the inputs of a cell whose upstream results are known."""
+    """Return port -> product for a cell whose upstream results are known."""
     known: dict[str, ProductRef] = {}
     for port, source in cell.inputs.items():
         if isinstance(source, CellOutput):
@@ -227,8 +229,6 @@ def known_inputs(
 
 @dataclass(kw_only=True)
 class _Planner:
-    """Plans cells one by one, in topological order."""
-
     inputs: Mapping[str, PlannedInput | None]
     methods: Mapping[str, MethodFacts]
     store: Store
@@ -237,14 +237,14 @@ class _Planner:
     _earlier: dict[str, tuple[CellResult, ...]] = field(default_factory=dict)
 
     def add(self, cell: Cell) -> None:
-        """Add the plan of one more cell."""
         planned = self._without_inputs(cell) or self._with_inputs(cell)
         is_run = planned.status in ("will run", "unknown yet")
         took_s = self._took_s(cell) if is_run else 0.0
         if planned.status == "unknown yet" and cell.step in self.force:
             planned = replace(planned, status="will run", reason=_FORCED)
         elif planned.status == "unknown yet" and took_s is None:
-            # If a method has no results in the store, none can be found for any inputs.
+            # If the store contains no results of a method, the cell will run whatever its inputs
+            # are.
             reason = "no result of this method is stored"
             planned = replace(planned, status="will run", reason=reason)
         self.planned[cell.address] = replace(planned, took_s=took_s)
@@ -275,7 +275,6 @@ class _Planner:
         )
 
     def _took_s(self, cell: Cell) -> float | None:
-        """Return the duration of the most similar call; None if there is none."""
         params = {
             f"params.{name}": json.dumps(value, ensure_ascii=False, sort_keys=True)
             for name, value in cell.params.items()
@@ -296,7 +295,7 @@ class _Planner:
 
 
 def remember_places(inputs: Mapping[str, PlannedInput | None], store: Store) -> None:
-    """Record the paths of input files in the store, for replays and exports."""
+    """Record the paths of input files in the store, where replays and exports look them up."""
     digests = store.file_digests()
     for given in inputs.values():
         for file in given.files if given else ():
@@ -318,7 +317,7 @@ def _digest_inputs(
         ref = ProductRef(type_name="files", encoding_version=0, digest=input_digest(refs))
         planned[name] = PlannedInput(ref=ref, files=refs)
     if store.folder.is_dir():
-        # The digests are only a cache: planning must also work on a full or read-only disk.
+        # Planning must also work on a full or read-only disk, and the digests are only a cache.
         with contextlib.suppress(StoreError):
             digests.save()
     return planned
@@ -366,7 +365,7 @@ def explain(key: CellKey, earlier: Sequence[CellResult]) -> str:
 
 @lru_cache(maxsize=1024)
 def _ingredients(text: str) -> Mapping[str, str]:
-    """Flatten a preimage by one level: `params.cell_m`, `inputs.cloud`, ...; values as JSON."""
+    """Flatten a preimage by one level to keys such as `params.cell_m`, with values as JSON."""
     flat: dict[str, str] = {}
     for name, value in read_preimage(text).items():
         prefix, items = (f"{name}.", value) if isinstance(value, dict) else ("", {name: value})

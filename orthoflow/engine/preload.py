@@ -1,4 +1,4 @@
-"""Libraries that every step needs, loaded once in the process from which steps are forked.
+"""Libraries that steps need, loaded once in the process from which steps are forked.
 
 Plugins are never loaded here, so that no third-party code runs in that process.
 """
@@ -32,9 +32,10 @@ _LIBRARIES: Final = (
 
 
 def load_libraries() -> None:
-    """Load the libraries; errors are ignored here and reported by the steps."""
+    """Load the libraries. Errors are ignored here, because the steps report them."""
     if address_space() is not None:
-        # If memory is short, some libraries crash, which would end all steps.
+        # If the limit on the address space is low, some libraries crash, and no step could be
+        # started.
         return
     for name in _LIBRARIES:
         with suppress(Exception):
@@ -46,10 +47,10 @@ def load_libraries() -> None:
 
 
 def _register_compiler() -> None:
-    """Make numba register its types and functions, as it does for the first kernel of a process.
+    """Make numba register its types and functions, as it does for the first kernel.
 
-    This takes longer than loading numba. Numba extensions of third parties are loaded in each step
-    instead.
+    Registration takes longer than importing numba. Third-party numba extensions are not loaded
+    here, but in each step.
     """
     from numba.core import entrypoints  # noqa: PLC0415 - only where numba is there
     from numba.core.registry import cpu_target  # noqa: PLC0415

@@ -26,7 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 from orthoflow.engine.durability import is_checked, with_digest
 from orthoflow.errors import StoreError
 
-# Names from the record format, re-exported for the engine.
+# Some of these names are re-exported from the record format.
 __all__ = [
     "CellOutcome",
     "CellResult",
@@ -68,7 +68,8 @@ class FigureRef(Figure):
     """A figure in the store.
 
     Attributes:
-        sha256: SHA-256 of the bytes as hexadecimal digits, which is also the name of its object.
+        sha256: SHA-256 of the bytes as hexadecimal digits, which is also the name of the object in
+            the store.
     """
 
     sha256: str
@@ -81,7 +82,7 @@ class CellResult(CellOutcome):
     Attributes:
         format: name and version of the JSON format.
         run_id: id of the run that computed the result.
-        environment: environment in which the result was computed; None if it was not computed.
+        environment: environment in which the result was computed; None for a skipped cell.
         inputs: port -> product.
         outputs: port -> product.
         figures: figures drawn by the method.

@@ -1,4 +1,4 @@
-"""Executes a plan: starts cells when their inputs are known, and continues after failures."""
+"""Execution of a plan: starts each cell when its inputs are known, and continues after failures."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class RunOutcome:
         results: address -> result, in the order of the plan.
         cached: address -> id of the run that computed the result, for results of other runs.
         resumed: addresses of cells that this run computed before it was interrupted.
-        inputs: workflow input -> files; None for an optional input that is not given.
+        inputs: workflow input -> files; None for an optional input that was not given.
     """
 
     run_id: str
@@ -92,7 +92,7 @@ class RunOutcome:
 
     @property
     def failed(self) -> Mapping[str, CellResult]:
-        """Return the failed cells, without those that were skipped because of a failure."""
+        """Return the failed cells, without cells skipped because another cell failed."""
         return {
             address: result for address, result in self.results.items() if result.status == "failed"
         }
@@ -104,7 +104,7 @@ class RunOutcome:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 if no cell failed, 2 or 4 if all failures have that exit code, or else 1."""
+        """Return 0 if no cell failed; 2 or 4 if all failed cells have this code; otherwise 1."""
         codes = {result.exit_code for result in self.failed.values()}
         if not codes:
             return 0
@@ -121,7 +121,7 @@ def execute(
 ) -> RunOutcome:
     """Execute a plan.
 
-    A failed cell stops only the cells that depend on it. If the process is killed at any time, the
+    If a cell fails, only the cells that depend on it are skipped. If the process is killed, the
     same call with the same folder resumes the run.
 
     Args:
@@ -129,17 +129,17 @@ def execute(
         run_folder: folder for the journal and the logs; created if missing.
         store: store for products and results.
         listen: called with each event of the run.
-        run_id: id of a new run, generated if empty; a resumed run keeps its own.
+        run_id: id of a new run, generated if empty; a resumed run keeps its id.
 
     Raises:
-        ArgumentError: the run folder contains a finished run or other files, or a path cannot be
-            encoded as text.
-        StoreError: the disk cannot be written to, or the run folder is in use.
-        DamageError: an input of a step was damaged in the store and has been removed; the same call
-            recomputes it.
+        ArgumentError: the run folder is in use by another run or contains a finished run or other
+            files, or a path is not valid UTF-8.
+        StoreError: the disk cannot be written to.
+        DamageError: a product that a step needs was damaged in the store and has been removed; the
+            same call recomputes this product.
         CancelledStepError: the run was interrupted by Ctrl-C or SIGTERM.
         ClusterError: the scheduler was lost or does not respond.
-        PluginError: workers have other versions of a method or library, or Dask is not installed.
+        PluginError: Dask is not installed, or a worker has another version of a method or library.
     """
     folder = Path(run_folder).absolute()
     for what, path in (("run folder", folder), ("store", store.folder)):
@@ -165,8 +165,6 @@ def execute(
 
 
 class _Run:
-    """The state of one run; used from one thread."""
-
     def __init__(
         self,
         plan: RunPlan,
@@ -195,11 +193,6 @@ class _Run:
         self._step_of = step_names((item.cell.step, item.cell.method) for item in self._plan.cells)
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
-        """Run until every cell has a result.
-
-        Raises:
-            CancelledStepError: the run was interrupted.
-        """
         while self._waiting or self._running:
             if interruption.is_asked:
                 self._interrupt(executor)
@@ -207,7 +200,7 @@ class _Run:
             self._poll(executor)
 
     def report(self, address: str, event: StepEvent) -> None:
-        """Pass on an event of a cell, with the names of the steps of this run."""
+        """Pass on an event of a cell, with the step names that this workflow uses."""
         if event.diagnostic is not None:
             named = placed(event.diagnostic, self._settings[address], self._step_of)
             event = dataclasses.replace(event, text=named.text, diagnostic=named)
@@ -219,7 +212,6 @@ class _Run:
             self._take(self._running.pop(address), result)
 
     def outcome(self) -> RunOutcome:
-        """Return the results of the run, in the order of the plan."""
         self._journal.write("ended")
         order = [item.cell.address for item in self._plan.cells]
         return RunOutcome(
@@ -243,7 +235,6 @@ class _Run:
         )
 
     def _advance(self, executor: Executor) -> None:
-        """Finish each cell whose inputs are known, or start it if enough cores are free."""
         for address, planned in list(self._waiting.items()):
             if address not in self._ready:
                 self._prepare(planned.cell)
@@ -252,7 +243,7 @@ class _Run:
             if ready is None or self._is_under_way(ready[0]):
                 continue
             key, refs = ready
-            # A cell of this run with the same key may have ended in the meantime.
+            # Another cell of this run with the same key may have finished in the meantime.
             known = self._known(planned.cell, key) if key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
@@ -261,7 +252,7 @@ class _Run:
                 self._start(planned.cell, key, refs, executor)
 
     def _prepare(self, cell: Cell) -> None:
-        """Once the inputs of a cell are known, use a stored result or mark the cell as ready."""
+        """If the inputs of a cell are known, use its stored result or mark the cell as ready."""
         needed = cell.sources
         if not all(address in self._results for address in needed):
             return
@@ -308,13 +299,12 @@ class _Run:
         return result
 
     def _require_sound(self, cell: Cell, refs: Mapping[str, ProductRef]) -> None:
-        """Check all bytes of the products that a cell uses, and remove damaged products."""
         for port, ref in refs.items():
             if isinstance(cell.inputs[port], CellOutput) and not self._store.is_sound(ref.digest):
                 raise DamageError(f"{cell.inputs[port]}, which {cell.address} uses, was damaged")
 
     def _is_under_way(self, key: CellKey) -> bool:
-        """Whether a cell with the same key is running; both then share its result."""
+        """Whether another cell with the same key is running, whose result this cell will share."""
         return any(task.key == key.key for task in self._running.values())
 
     def _has_room(self, cell: Cell, capacity: Capacity) -> bool:
@@ -370,7 +360,7 @@ class _Run:
         remove_tree(Path(task.folder))
         cell = next(one.cell for one in self._plan.cells if one.cell.address == task.address)
         if result.error_type == DamageError.__name__:
-            # The method is not at fault: its inputs were damaged after they had been checked.
+            # The inputs were damaged after they had been checked, so the method is not at fault.
             self._require_sound(cell, {port: given.ref for port, given in task.inputs.items()})
             raise DamageError(result.error_message)
         if result.status == "ok" and self._plan.methods[cell.method].is_code_unchanged():
@@ -378,8 +368,7 @@ class _Run:
             self._store.put_result(task.key, result)
             self._store.trust(result)
         elif result.status == "ok":
-            # Do not store the result: it would be attributed to the code in its key, which has
-            # changed.
+            # Do not store the result: its key contains the digest of the code before the change.
             changed = _CODE_CHANGED.of("", {})
             self.report(cell.address, _event_of(changed))
             result = _reporting(result, changed)
@@ -387,13 +376,14 @@ class _Run:
 
     def _settle(self, cell: Cell, result: CellResult, *, is_cached: bool = False) -> None:
         self._waiting.pop(cell.address, None)
-        # The result may come from another workflow; use the step names of this one.
+        # A stored result may come from another workflow, so replace its step names by those of
+        # this workflow.
         named = (
             placed(one, self._settings[cell.address], self._step_of) for one in result.diagnostics
         )
         result = _reporting(dataclasses.replace(result, diagnostics=()), *named)
         self._results[cell.address] = result
-        # If a cell of this run with the same key has just computed the result, it counts as new.
+        # A result that another cell of this run has just computed counts as new.
         if is_cached and result.run_id != self._journal.run_id:
             self._cached[cell.address] = result.run_id
         elif is_cached and result.key not in self._made:
@@ -425,14 +415,14 @@ def _cores(cell: Cell, capacity: Capacity) -> int:
 
 @contextmanager
 def _scratch(store: Store, run_id: str) -> Iterator[Path]:
-    """Create a scratch folder; leftovers of killed runs are removed first."""
+    """Create a scratch folder for the block, after removing leftovers of killed runs."""
     with writing_to(store.folder):
         for old in store.scratch.iterdir():
             if old.is_dir() and old.name != "loose" and not is_locked(_lock_of(old)):
                 remove_tree(old)
                 _lock_of(old).unlink(missing_ok=True)
     folder = store.scratch / f"{run_id}-{uuid.uuid4().hex[:6]}"
-    # Lock the folder before it exists, so that no other run mistakes it for a leftover.
+    # Lock the folder before creating it, so that no other run mistakes it for a leftover.
     with exclusive_lock(_lock_of(folder), f"the scratch folder {folder} is in use"):
         with writing_to(store.folder):
             folder.mkdir(parents=True)
@@ -450,17 +440,6 @@ def _lock_of(folder: Path) -> Path:
 def _executor_of(
     plan: RunPlan, scratch: Path, listen: StepListener, is_asked_to_stop: Callable[[], bool]
 ) -> Executor:
-    """Return the executor selected in the options of a run.
-
-    Args:
-        plan: plan of the run.
-        scratch: scratch folder of the run.
-        listen: called with messages of steps.
-        is_asked_to_stop: returns whether the run was interrupted.
-
-    Raises:
-        PluginError: Dask is not installed.
-    """
     options = plan.options
     capacity = Capacity.of_jobs(options.jobs, usable_cores())
     if options.executor == "dask":
@@ -487,7 +466,7 @@ class Interruption:
         self.is_asked = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Record the first signal; end immediately on a second one.
+        """Record the first signal; raise an error on the second.
 
         Raises:
             KeyboardInterrupt: a second signal was received.
@@ -499,7 +478,7 @@ class Interruption:
 
 @contextmanager
 def _watching_interruptions() -> Iterator[Interruption]:
-    """Handle SIGINT and SIGTERM in the block; possible only in the main thread."""
+    """Handle SIGINT and SIGTERM while the block runs, if this is the main thread."""
     interruption = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield interruption

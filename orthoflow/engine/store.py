@@ -1,4 +1,4 @@
-"""The store: products by digest, results by key; the engine's only access to the record format.
+"""The store, which contains products by their digest and results by their cache key.
 
 Layout of the store's folder:
 
@@ -9,10 +9,10 @@ Layout of the store's folder:
     scratch/<run id>/               work in progress; removed at the end of the run
     lock                            shared by runs, exclusive for garbage collection
 
-All files have a digest, which is checked when a run or an export uses them. Damaged files are
+Each file has a digest, which is checked when a run or an export uses the file. Damaged files are
 removed; a new run then recomputes the missing results. The digest of a figure is its name; results
-and descriptions of objects begin with the digest of their remaining text. Digests reveal damage,
-not forgery: anyone who can write to the store can also write digests.
+and descriptions of objects begin with the digest of their remaining text. The digests reveal
+damage but not forgery, because anyone who can write to the store can also write digests.
 """
 
 from __future__ import annotations
@@ -58,17 +58,17 @@ from orthoflow.engine.results import (
 from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
 from orthoflow.products.product import Payload, Product
 
-# Folders created together on first use of a store. Together they identify a store: a git repository
-# also has `objects`, and any folder may have `results`.
+# These folders are created on first use of a store. Only all of them together identify a store: a
+# git repository also has `objects`, and any folder may have `results`.
 _MADE: Final = ("scratch", "objects", "results")
-# Names that may exist before these folders, such as a lock. The root of a disk has `lost+found`,
-# and systems create hidden files everywhere.
+# These names may exist before a store is created: a lock or the digests of input files, and
+# `lost+found` in the root folder of a disk.
 _OURS: Final = frozenset({*_MADE, "digests.json", "lock", "lost+found"})
 PRODUCT: Final = "product.h5"
 PUBLISHED: Final = "files"
 BLOB: Final = "blob"
 DESCRIPTION: Final = "object.json"
-# Shortages of system resources, which do not mean that a file is damaged.
+# These errors mean that system resources are short, not that a file is damaged.
 _SHORTAGES: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
@@ -78,9 +78,9 @@ def is_store(folder: Path) -> bool:
 
 
 def require_store(folder: Path) -> None:
-    """Refuse a folder with other files, because a store is written to and cleaned up.
+    """Raise an error if a folder contains other files, because files in a store may be removed.
 
-    A missing folder, or one with only hidden files and parts of a store, is accepted.
+    A folder is accepted if it is missing, or contains only hidden files and parts of a store.
 
     Raises:
         ArgumentError: the folder contains other files and is not a store.
@@ -100,7 +100,7 @@ def require_store(folder: Path) -> None:
 
 
 def make_store(folder: Path) -> None:
-    """Create the folders of a store, if they are missing.
+    """Create the folders of a store if they are missing.
 
     Raises:
         ArgumentError: the folder contains other files and is not a store.
@@ -146,12 +146,12 @@ class Store:
     """
 
     def __init__(self, folder: Path, *, workspace: Path | None = None) -> None:
-        """Open a store; no folder is created before the first write.
+        """Open a store; its folders are created on the first write.
 
         Args:
             folder: the store's folder.
-            workspace: folder for unfinished objects, on the same file system; by default in the
-                store's scratch folder.
+            workspace: folder for unfinished objects, on the same file system as the store; by
+                default a subfolder of the store's scratch folder.
         """
         self.folder = Path(folder).absolute()
         self.scratch = self.folder / "scratch"
@@ -159,11 +159,11 @@ class Store:
         self.objects = self.folder / "objects"
         self.lock_file = self.folder / "lock"
         self._workspace = workspace or self.scratch / "loose"
-        # Files already checked by this process; they are not read again unless they change.
+        # This process has checked these files and does not read them again unless they change.
         self._sound: set[tuple[Path, int, int, int, int]] = set()
 
     def file_digests(self) -> FileDigests:
-        """Return the cache of input file digests; its `save` must be called at the end."""
+        """Return the cache of input file digests; call its `save` at the end."""
         return FileDigests(self.folder / "digests.json")
 
     @contextlib.contextmanager
@@ -184,15 +184,15 @@ class Store:
         """Store a product and its published files.
 
         Args:
-            product: the product; if the store already contains it with the same published files,
-                the stored one is kept.
-            publisher: function that writes the published files.
+            product: the product; nothing is written if the store already contains it with the same
+                published files.
+            publisher: function that writes the files that the product publishes.
 
         Raises:
             StoreError: the disk is full or fails.
             ProductError: the product has content that cannot be stored.
         """
-        # Imports h5py, which is not needed for planning.
+        # This module imports h5py, which is not needed for planning.
         from orthoflow_provenance.arrays import write_product_file  # noqa: PLC0415
 
         aside = self._new_folder()
@@ -221,8 +221,8 @@ class Store:
         Args:
             digest: digest of the product.
             cls: class of the product.
-            is_checked: whether the bytes are already checked (as the coordinator does for steps),
-                so that the check is skipped.
+            is_checked: whether to skip the check of the bytes; True in steps, whose inputs the
+                coordinator has checked.
 
         Raises:
             DamageError: the product is missing or damaged.
@@ -250,13 +250,13 @@ class Store:
         return (self._object(digest) / PRODUCT).exists()
 
     def product_file(self, digest: str) -> Path | None:
-        """Return the HDF5 file of a product; None if it is missing or damaged."""
+        """Return the path of a product's HDF5 file; None if the product is missing or damaged."""
         return self._object(digest) / PRODUCT if self.is_sound(digest) else None
 
     def published_files(self, digest: str) -> Mapping[Path, str]:
-        """Return the published files of a product, sorted by name, with the expected SHA-256.
+        """Return the published files of a product, sorted by name, with their expected SHA-256.
 
-        The files are not read here: their digests are computed when they are copied.
+        The files are not read here; their digests are checked when they are copied.
 
         Raises:
             DamageError: the product is missing, or its published files are unknown.
@@ -309,14 +309,17 @@ class Store:
         return not self.damage(name)
 
     def damage(self, name: str) -> str:
-        """Return the damaged file of an object, and remove the object; empty if it is intact.
+        """Remove an object if it is damaged.
 
         Args:
             name: name of the object: digest of a product, or SHA-256 of a figure.
 
+        Returns:
+            The damaged file, relative to the folder of the object; empty if the object is intact.
+
         Raises:
             StoreError: the object cannot be removed.
-            OSError: the machine lacks memory or has too many open files.
+            OSError: memory is short, or too many files are open.
         """
         folder = self._object(name)
         found = self._damaged_file(folder)
@@ -334,15 +337,15 @@ class Store:
     # Results ------------------------------------------------------------------------------------
 
     def result(self, key: str) -> CellResult | None:
-        """Return the result with a key; None if it is missing or obviously incomplete."""
+        """Return the result with a key; None if the result is missing or unusable."""
         return self.look_up(key)[0]
 
     def look_up(self, key: str) -> tuple[CellResult | None, str]:
         """Return the result of a key.
 
         Returns:
-            The result, None if it is missing or unusable; and its damaged or missing files, as
-            paths relative to the store's folder.
+            The result, which is None if it is missing or unusable; and the damaged or missing
+            files of an unusable result, as paths relative to the store's folder.
         """
         path = self.results / f"{key}.json"
         try:
@@ -363,7 +366,7 @@ class Store:
         return (None, ", ".join(named)) if named else (result, "")
 
     def take(self, key: str) -> tuple[CellResult | None, str]:
-        """Look up a result for a run, and record its use for garbage collection."""
+        """Look up a result for a run, and record for garbage collection when it was used."""
         result, damage = self.look_up(key)
         if result is not None:
             with contextlib.suppress(OSError):
@@ -382,11 +385,11 @@ class Store:
         return damage
 
     def size_bytes(self, result: CellResult) -> int:
-        """Return the size of a result's products (with published files) and figures."""
+        """Return the total size of a result's products (with published files) and figures."""
         return sum(folder_size(self.objects / name) for name in result.objects)
 
     def put_result(self, key: str, result: CellResult) -> None:
-        """Store the result of a cell, whose objects must already be in the store.
+        """Store the result of a cell; the objects of the result must already be in the store.
 
         Raises:
             StoreError: the disk cannot be written to.
@@ -396,7 +399,7 @@ class Store:
         write_whole(self.results / f"{key}.json", result_to_json(result).encode())
 
     def earlier_results(self, method: str, *, limit: int = 20) -> tuple[CellResult, ...]:
-        """Return the results of a method, complete or not, most recently used first."""
+        """Return the results of a method, including incomplete ones, most recently used first."""
         dated = []
         for path in self.results.glob("*.json"):
             with contextlib.suppress(OSError):
@@ -405,7 +408,7 @@ class Store:
         for _, path in sorted(dated, reverse=True):
             with contextlib.suppress(OSError, UnicodeDecodeError):
                 text = path.read_text(encoding="utf-8")
-                # Most results are of other methods; parsing all of them would be slow.
+                # Most results come from other methods, and parsing all of them would be slow.
                 if f'"method":"{method}"' in text:
                     found.append(result_from_json(text, path.name))
             if len(found) == limit:
@@ -427,9 +430,9 @@ class Store:
         return folder
 
     def _place(self, aside: Path, final: Path, files: Mapping[str, tuple[int, str]]) -> None:
-        """Rename a finished object to its final name, replacing a damaged or different one."""
+        """Rename a finished object to its final name, replacing one that is damaged or differs."""
         if os.path.lexists(final):
-            # Another run may be reading the same object.
+            # Keep an intact object, which another run may be reading.
             if _files_of(final) == files and not self._damaged_file(final):
                 return
             with contextlib.suppress(FileNotFoundError):
@@ -437,7 +440,7 @@ class Store:
         place_folder(aside, final)
 
     def _remove(self, path: Path) -> None:
-        """Remove a file or folder atomically, so that no other process sees a part of it."""
+        """Remove a file or folder atomically, so that nobody sees an incomplete folder."""
         gone = self._workspace / f"removed-{uuid.uuid4().hex}"
         gone.parent.mkdir(parents=True, exist_ok=True)
         path.rename(gone)
@@ -467,12 +470,8 @@ class Store:
         return ""
 
     def _remove_damaged(self, path: Path, damaged: Callable[[], str]) -> None:
-        """Remove a file or folder, if it exists and is still damaged.
-
-        Raises:
-            StoreError: the file or folder cannot be removed.
-        """
-        # Another process may have removed the object in the meantime and stored an intact one.
+        """Remove a file or folder if it exists and is still damaged."""
+        # Another process may have replaced the damaged object in the meantime.
         if not os.path.lexists(path) or not damaged():
             return
         try:
@@ -497,7 +496,6 @@ def _codec() -> TypeAdapter[StoredProduct]:
 
 
 def _describe(folder: Path, name: str, type_name: str) -> Mapping[str, tuple[int, str]]:
-    """Write `object.json` for the files in a folder, and return their size and SHA-256."""
     published = sorted(path for path in (folder / PUBLISHED).rglob("*") if path.is_file())
     files = {
         path.relative_to(folder).as_posix(): (path.stat().st_size, file_sha256(path))
@@ -510,7 +508,7 @@ def _describe(folder: Path, name: str, type_name: str) -> Mapping[str, tuple[int
 
 
 def _read_description(folder: Path) -> StoredProduct | None:
-    """Read `object.json`; None if it is missing, damaged or describes another object."""
+    """Read `object.json`; return None if it is missing or damaged, or describes another object."""
     try:
         text = (folder / DESCRIPTION).read_text(encoding="utf-8")
         found = _codec().validate_json(text, strict=True)
@@ -524,7 +522,10 @@ def _read_description(folder: Path) -> StoredProduct | None:
 
 
 def _files_of(folder: Path) -> Mapping[str, tuple[int, str]]:
-    """Return path -> size (-1 if unknown) and SHA-256 of an object's files, if known."""
+    """Return path -> size (-1 if unknown) and SHA-256 of the files of an object.
+
+    The result is empty if the description of the object is missing or damaged.
+    """
     if folder.is_symlink():
         return {}
     if (folder / BLOB).exists():
@@ -534,12 +535,12 @@ def _files_of(folder: Path) -> Mapping[str, tuple[int, str]]:
 
 
 def stores_at(folder: str | Path) -> tuple[Store, ...]:
-    """Return a tuple with the store in a folder, empty if there is no folder; create nothing."""
+    """Return a tuple with the store in a folder, or an empty tuple if the folder does not exist."""
     return (Store(Path(folder)),) if Path(folder).is_dir() else ()
 
 
 def publish_into(folder: Path, product: Product, publisher: Publisher, digest: str) -> None:
-    """Let a product publish its files in a new folder; only regular files are allowed."""
+    """Write the published files of a product to a new folder; only regular files are allowed."""
     folder.mkdir(parents=True)
     publisher(product, folder, digest)
     for path in folder.rglob("*"):
@@ -551,7 +552,7 @@ def publish_into(folder: Path, product: Product, publisher: Publisher, digest: s
 
 
 def digest_of(product: Product) -> str:
-    """Return the digest of a product's logical content: `sha256:` + 64 hexadecimal digits."""
+    """Return the digest of a product's content: `sha256:` and 64 hexadecimal digits."""
     from orthoflow_provenance.arrays import payload_digest  # noqa: PLC0415 - as above
 
     return payload_digest(product.to_payload())
@@ -582,7 +583,7 @@ class StoredResult:
 
 
 def list_results(store: Store) -> tuple[StoredResult, ...]:
-    """List the results in a store, most recently used first; unreadable ones are omitted."""
+    """List the readable results in a store, most recently used first."""
     found: list[StoredResult] = []
     for path in store.results.glob("*.json"):
         try:

@@ -1,4 +1,4 @@
-"""Execution of one task: reads the inputs, calls the method, stores the outputs.
+"""Execution of one task: reads the inputs, calls the method and stores the outputs.
 
 `run_step` is the main function of a step's process; `run_task` runs a task in any process.
 """
@@ -71,7 +71,8 @@ from orthoflow.untrusted_text import shown
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Publisher
 
-# Limit with room for the method's own message, which is truncated earlier, and the text around it.
+# Maximum length of an error message, which contains the method's own message (truncated earlier)
+# and text around it.
 _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
 _OOM_SCORE: Final = "900"
@@ -85,7 +86,7 @@ class TaskInput:
 
     Attributes:
         ref: reference to the product.
-        target: import string of the product class; empty for files.
+        target: import string of the product class; empty for the files of a workflow input.
         input_name: name of the workflow input; empty for products.
         files: files of the workflow input.
     """
@@ -139,7 +140,7 @@ class Task(MethodIdentity):
 
     @property
     def who(self) -> str:
-        """Method and distribution, for the beginning of a sentence."""
+        """Name of the method and its distribution, for error messages."""
         brought = (
             f" of {self.distribution} {self.distribution_version}" if self.distribution else ""
         )
@@ -154,23 +155,23 @@ class Task(MethodIdentity):
 Listener = Callable[[StepEvent], None]
 
 
-# Messages from the process of a step consist of one of these prefixes, followed by JSON.
+# A message from the process of a step consists of one of these prefixes, followed by JSON.
 EVENT: Final = b"event "
 RESULT: Final = b"result "
 
 
 def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None:
-    """Run a task as the main function of a step's process, and send its messages and result.
+    """Run a task as the main function of a step's process, and send messages and the result.
 
     Args:
-        task: what to run.
+        task: the task.
         pipe: receives `EVENT` and `RESULT` messages.
         variables: all environment variables of the step.
     """
     _move_to(task, variables)
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    # From here on, only the method itself can raise KeyboardInterrupt.
+    # From now on, only the method itself can raise KeyboardInterrupt.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_coordinator, daemon=True).start()
     events = _EventPipe(pipe)
@@ -185,9 +186,8 @@ def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None
 
 
 def _move_to(task: Task, variables: Mapping[str, str]) -> None:
-    """Set up this process for a step: session, log, environment variables, thread limits."""
     os.setsid()
-    # Descendants in other sessions remain descendants of this process when their parents end.
+    # Make descendants whose parents end children of this process, even in other sessions.
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     log = os.open(task.log, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
@@ -220,7 +220,6 @@ def _move_to(task: Task, variables: Mapping[str, str]) -> None:
 
 
 def _end_with_coordinator() -> None:
-    """Wait until the coordinator has ended, then kill this session."""
     coordinator = multiprocessing.parent_process()
     if coordinator is not None:
         coordinator.join()
@@ -236,8 +235,6 @@ def _kill_children() -> None:
 
 
 class _EventPipe:
-    """Sends events to the coordinator; thread-safe."""
-
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
         self._lock = threading.Lock()
@@ -245,9 +242,10 @@ class _EventPipe:
         self._sent = StepEvent(kind="progress", text="", fraction=0.0)
 
     def listen(self, event: StepEvent) -> None:
-        """Send an event: progress at most ten times a second; other events are also logged.
+        """Send an event; events other than progress are also written to the log.
 
-        A progress event with a new text but the same fraction is always sent, as a new activity.
+        Progress is sent at most ten times a second. Only a progress event that starts a new
+        activity, with a new text but no higher fraction, is always sent.
         """
         if event.kind == "progress":
             is_soon = time.monotonic() - self._sent_s < _PROGRESS_EVERY_S
@@ -256,19 +254,19 @@ class _EventPipe:
                 return
             self._sent_s, self._sent = time.monotonic(), event
         else:
-            # The method may have closed or replaced stderr.
+            # The method may have closed or replaced `sys.stderr`.
             with suppress(AttributeError, OSError, ValueError):
                 sys.stderr.write(shown(event.text, keep="\n") + "\n")
         self.send(EVENT + json.dumps(dataclasses.asdict(event)).encode())
 
     def send(self, message: bytes) -> None:
-        """Send a message; ignored if the method has closed the pipe."""
+        """Send a message, unless the method has closed the pipe."""
         with self._lock, suppress(OSError):
             self._pipe.send_bytes(message)
 
 
 def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> CellResult:
-    """Run a task; every failure becomes a failed result, never an exception.
+    """Run a task; a failure is returned as a failed result and never raised as an exception.
 
     Args:
         task: the task; its folder must exist.
@@ -282,13 +280,14 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         with meter, on_compiling(progress.compiling):
             result = call.run()
     except BaseException as error:
-        # If Ctrl-C is ignored, only the method can have raised KeyboardInterrupt.
+        # In a process that ignores Ctrl-C, only the method can have raised KeyboardInterrupt.
         is_users = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
         if isinstance(error, KeyboardInterrupt) and is_users:
             raise
         result = failed_result(task, explain_failure(task, error))
         if not isinstance(error, OrthoflowError):
-            # Write the traceback to the log, and so to the record, for the author of the method.
+            # Write the traceback to the log, which becomes part of the record, for the author of
+            # the method.
             progress.listen(StepEvent(kind="log", text=_trace(error)))
             result = dataclasses.replace(result, is_bug=True)
     return dataclasses.replace(
@@ -303,7 +302,7 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
 
 def failed_result(task: Task, error: OrthoflowError) -> CellResult:
     """Return the result of a cell that failed."""
-    # Errors in input files list all problems, one per line.
+    # The message of an InputError may list several problems, one per line.
     message = "; ".join(str(error).splitlines()) if type(error) is InputError else error
     return dataclasses.replace(
         blank_result(task),
@@ -315,7 +314,7 @@ def failed_result(task: Task, error: OrthoflowError) -> CellResult:
 
 
 def blank_result(task: Task) -> CellResult:
-    """Return a result that contains everything known before the task runs."""
+    """Return a result that contains everything that is known before the task runs."""
     return CellResult(
         status="ok",
         key=task.key,
@@ -329,7 +328,7 @@ def blank_result(task: Task) -> CellResult:
 
 
 def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
-    """Convert any exception raised by a method into an OrthoflowError with one sentence."""
+    """Convert any exception of a method into an OrthoflowError with a one-sentence message."""
     if isinstance(error, OrthoflowError):
         return error
     if is_for_want_of_memory(error):
@@ -349,32 +348,29 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
 
 def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        # Do not return a StoreError: the method needed more than is available, so it counts as
-        # failed.
+        # Do not return a StoreError, which would end the run: the method needed more disk space
+        # than is available.
         return StepFailedError(str(store_error(error, store)))
     return store_error(error, store) if is_broken(error, store) else None
 
 
 class _ProgressWithCompiling:
-    """Forwards messages of a step, and reports which kernel is being compiled."""
-
     def __init__(self, listen: Listener) -> None:
         self._listen = listen
         self._last = StepEvent(kind="progress", text="", fraction=0.0)
 
     def listen(self, event: StepEvent) -> None:
-        """Forward a message of the method."""
         if event.kind == "progress":
             self._last = event
         self._listen(event)
 
     def compiling(self, text: str) -> None:
-        """Report the kernel being compiled, or the previous message once it is compiled."""
+        """Report which kernel is compiled; repeat the previous message at the end."""
         self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 
 class _Call:
-    """One call of a method, with its measurements so far, even if it fails."""
+    """One call of a method; its measurements are available even if the call fails."""
 
     def __init__(
         self,
@@ -405,11 +401,11 @@ class _Call:
         return self._context.diagnostics
 
     def costs(self) -> Costs:
-        """Return the costs of the call so far."""
         return Costs(
             wall_s=self._wall_s,
             cpu_s=self._processor_s,
-            # The executor samples the memory of a step that runs in its own process.
+            # If the step runs in its own process, the executor also samples the memory of this
+            # process.
             peak_rss_mib=round(process_memory() / MIB, 1),
             stored_mib=self._stored_mib,
             compile_s=round(self._meter.total_s, 4),
@@ -424,13 +420,14 @@ class _Call:
             outputs = cast("object", cls().run(cls.In(**inputs), params, self._context))
         finally:
             if os.getpid() != process:
-                # This is a child process forked by the method, whose result does not count.
+                # This process was forked by the method, so it has no result to return.
                 os._exit(1)
             drawing_s, drawing_cpu_s = self._context.drawing_s
             self._wall_s = round(self._meter.clock_s() - wall_s - drawing_s, 4)
-            # Thread clocks can be a few ticks ahead of their process's clock.
+            # The clock of a thread can be a few ticks ahead of the clock of its process.
             self._processor_s = max(0.0, round(self._cpu_s() - cpu_s - drawing_cpu_s, 4))
-        # Do not use `progress`, which checks for cancellation: a finished step has a result.
+        # Do not use `progress`, which would raise an error if the run is cancelled: a finished
+        # step keeps its result.
         self._context.listen(StepEvent(kind="progress", text="storing the results", fraction=1.0))
         for given in self.task.inputs.values():
             for file in given.files:
@@ -445,7 +442,6 @@ class _Call:
         return result
 
     def _cpu_s(self) -> float:
-        """Processor seconds of this process and its children, excluding loading and compilation."""
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         own_s = time.process_time() - self._meter.processor_s
         return own_s + children.ru_utime + children.ru_stime
@@ -511,7 +507,7 @@ class _Call:
 def _check_file(file: FileRef) -> None:
     path = file.path
     try:
-        # A change of name or time stamp does not matter.
+        # A change in the time stamp alone does not matter.
         is_same = file_identity(path) == file.identity or file_sha256(path) == file.sha256
     except OSError as error:
         raise InputError(f"cannot read the input file {path} any more: {error.strerror}") from error
@@ -524,5 +520,5 @@ def _trace(error: BaseException) -> str:
         text = "".join(traceback.format_exception(error))
     except Exception:  # noqa: BLE001 - its own text may raise one
         text = ""
-    # Keep the end, which contains the error.
+    # Keep the end of the traceback, which contains the error.
     return text[-_LONGEST_TRACE:].encode(errors="backslashreplace").decode()
