@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import Cone, Cylinder, WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import (
     Layer,
@@ -16,7 +16,9 @@ from orthoflow.products import (
     Orthoimage,
     OrthoMask,
     Planes,
+    Surface,
     SurfaceMask,
+    Surfaces,
     Ties,
     TieWall,
     Wall,
@@ -159,3 +161,38 @@ def taken(ties: Ties, chosen: NDArray[np.bool_] | NDArray[np.intp] | slice) -> T
     """Some of the ties."""
     arrays = {name: value for name, value in vars(ties).items() if isinstance(value, np.ndarray)}
     return replace(ties, **{name: array[chosen] for name, array in arrays.items()})
+
+
+def surfaces() -> Surfaces:
+    """A vault above the plane z = 2, seen from below, and a tower that becomes narrower."""
+    vault = Cylinder(
+        point_world=np.array([1.0, 2.0, 2.0]), axis_world=NORTH, radius_m=3.0, is_concave=True
+    )
+    tower = Cone(
+        apex_world=np.array([9.0, 0.0, 50.0]),
+        axis_world=DOWN,
+        half_angle_rad=0.1,
+        is_concave=False,
+    )
+    known: dict[str, Any] = {"covariance": 1e-8 * np.eye(7), "n_points": 3, "rms_m": 0.002}
+    return Surfaces(
+        surfaces=(
+            Surface(
+                name="vault 0",
+                shape=vault,
+                zero_world=UP,
+                along_m=(-2.0, 2.0),
+                arc_rad=(-1.3, 1.3),
+                **known,
+            ),
+            Surface(
+                name="cone 1",
+                shape=tower,
+                zero_world=EAST,
+                along_m=(30.0, 50.0),
+                arc_rad=(-np.pi, np.pi),
+                **known,
+            ),
+        ),
+        up=UP,
+    )

@@ -44,7 +44,7 @@ from orthoflow.files.sidecars import (
     write_json,
     write_text,
 )
-from orthoflow.geometry import WallFrame, omega_phi_deg
+from orthoflow.geometry import Cylinder, WallFrame, omega_phi_deg
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.cameras import opencv_matrix, to_opencv
 from orthoflow.geometry.levels import eight_bits
@@ -62,6 +62,7 @@ from orthoflow.products import (
     Planes,
     PointCloud,
     ResidualRow,
+    Surfaces,
     TieRole,
     Ties,
     Wall,
@@ -121,6 +122,43 @@ def publish_planes(product: Planes, folder: Path, digest: str) -> None:
     write_json(
         folder / "planes.json",
         {"planes": planes, "up": numbers(product.up), "product_digest": digest},
+    )
+
+
+def publish_surfaces(product: Surfaces, folder: Path, digest: str) -> None:
+    """Write `surfaces.json`: the curved surfaces in order of support, largest first."""
+    surfaces: list[JsonValue] = []
+    for surface in product.surfaces:
+        shape = surface.shape
+        entry: dict[str, JsonValue] = {
+            "chart": "cylinder" if isinstance(shape, Cylinder) else "cone",
+            "label": surface.name,
+            "axis": numbers(shape.axis_world),
+            "is_concave": shape.is_concave,
+        }
+        if isinstance(shape, Cylinder):
+            entry |= {"point": numbers(shape.point_world), "radius_m": shape.radius_m}
+        else:
+            half_angle_deg = math.degrees(shape.half_angle_rad)
+            entry |= {"apex": numbers(shape.apex_world), "half_angle_deg": half_angle_deg}
+        start_deg, end_deg = map(math.degrees, surface.arc_rad)
+        surfaces.append(
+            entry
+            | {
+                "arc_deg": end_deg - start_deg,
+                "arc_from_deg": start_deg,
+                "zero_direction": numbers(surface.zero_world),
+                "length_m": surface.along_m[1] - surface.along_m[0],
+                "along_from_m": surface.along_m[0],
+                "n_points": surface.n_points,
+                "rms_mm": 1000.0 * surface.rms_m,
+                "sigma_axis_deg": surface.sigma_axis_deg,
+                "sigma_radius_mm": 1000.0 * surface.sigma_radius_m,
+            }
+        )
+    write_json(
+        folder / "surfaces.json",
+        {"surfaces": surfaces, "up": numbers(product.up), "product_digest": digest},
     )
 
 

@@ -13,8 +13,11 @@ from orthoflow.geometry.frames import (
     wall_axes,
 )
 from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry.surfaces import Cone, Cylinder
 
 __all__ = [
+    "Cone",
+    "Cylinder",
     "Plane",
     "UpDirection",
     "WallFrame",

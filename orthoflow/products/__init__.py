@@ -27,6 +27,7 @@ from orthoflow.products.planes import (
     plane_name,
 )
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
+from orthoflow.products.surfaces import Surface, SurfaceKind, Surfaces, surface_kind
 from orthoflow.products.walls import (
     PAINTED_STATES,
     SHOWN_STATES,
@@ -80,7 +81,10 @@ __all__ = [
     "ScanRow",
     "SideSource",
     "Spread",
+    "Surface",
+    "SurfaceKind",
     "SurfaceMask",
+    "Surfaces",
     "TakenPhoto",
     "Thickness",
     "TieRole",
@@ -93,4 +97,5 @@ __all__ = [
     "is_painted",
     "is_shown",
     "plane_name",
+    "surface_kind",
 ]

@@ -14,6 +14,7 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
+from orthoflow.products.surfaces import Surfaces
 
 SideSource = Literal["stations", "photos", "guess", "given"]
 # Kind of a plane, the first part of its name. Planes of the kinds `level` and `slope` are neither
@@ -266,10 +267,11 @@ class Planes(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class PointLabels(Product):
-    """The plane of each point of a cloud.
+    """The plane, or the curved surface, of each point of a cloud.
 
     Attributes:
-        plane_index: (n,) int16 index in `Planes`, -1 if the point is on no plane.
+        plane_index: (n,) int16 index in `Planes`, or in `Surfaces` of the same step; -1 if the
+            point is on none.
     """
 
     type_name: ClassVar[str] = "labels"
@@ -297,11 +299,10 @@ class PointLabels(Product):
                     f"labels.plane_index must have one label for each of {len(product)} points, "
                     f"got {len(self.plane_index)}"
                 )
-            if isinstance(product, Planes) and self.plane_index.size:
+            if isinstance(product, Planes | Surfaces) and self.plane_index.size:
                 low, high = int(self.plane_index.min()), int(self.plane_index.max())
-                n_planes = len(product.offset)
-                if low < -1 or high >= n_planes:
+                if low < -1 or high >= len(product):
                     raise ProductError(
-                        f"labels.plane_index must be -1 or the index of one of {n_planes} planes "
-                        f"(from 0), got {low if low < -1 else high}"
+                        f"labels.plane_index must be -1 or the index of one of {len(product)} "
+                        f"{product.type_name} (from 0), got {low if low < -1 else high}"
                     )

@@ -216,7 +216,7 @@ def _decode(hint: object, stored: JsonValue, name: str, arrays: Mapping[str, Arr
         value = array.tobytes() if stored[_ARRAY] == "bytes" else array
         return _of_kind(hint, value, name)
     for candidate in _alternatives(hint):
-        if dataclasses.is_dataclass(candidate) and isinstance(stored, dict):
+        if _may_be(candidate, stored, hint) and isinstance(stored, dict):
             return _decode_fields(typing.cast("type", candidate), name + "/", stored, arrays)
         if typing.get_origin(candidate) is tuple and isinstance(stored, list):
             items = typing.get_args(candidate)
@@ -233,6 +233,14 @@ def _decode(hint: object, stored: JsonValue, name: str, arrays: Mapping[str, Arr
         if isinstance(candidate, type) and issubclass(candidate, IntEnum) and type(stored) is int:
             return _member(candidate, stored, name)
     return _of_kind(hint, stored, name)
+
+
+def _may_be(candidate: object, stored: JsonValue, hint: object) -> bool:
+    """Return whether a value is of a dataclass; of several, the one with all stored fields."""
+    if not dataclasses.is_dataclass(candidate) or not isinstance(stored, dict):
+        return False
+    is_only = sum(map(dataclasses.is_dataclass, _alternatives(hint))) == 1
+    return is_only or set(stored) <= {field.name for field in dataclasses.fields(candidate)}
 
 
 def _member(kind: type[IntEnum], stored: int, name: str) -> IntEnum:

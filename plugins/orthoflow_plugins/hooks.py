@@ -91,6 +91,12 @@ def orthoflow_kinds() -> list[KindSpec]:
             outputs=_ports("planes labels"),
         ),
         KindSpec(
+            name="surface",
+            summary="find curved walls: vaults, apses, towers, columns",
+            inputs=_ports("cloud labels"),
+            outputs=_ports("surfaces labels"),
+        ),
+        KindSpec(
             name="face",
             summary="determine the fronts of planes",
             inputs=_ports("planes cloud photos"),
@@ -180,6 +186,12 @@ def orthoflow_products() -> list[ProductSpec]:
             publisher="publishing",
         ),
         _product("labels", "planes:PointLabels", "the plane of each point"),
+        _product(
+            "surfaces",
+            "surfaces:Surfaces",
+            "cylinders and cones with their extents and covariances",
+            publisher="publishing",
+        ),
         _product(
             "walls",
             "walls:Walls",

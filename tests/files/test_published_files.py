@@ -73,6 +73,11 @@ def test_planes_are_told_completely(tmp_path: Path, snapshot: SnapshotAssertion)
     assert "part_corners_world" not in (tmp_path / "planes.json").read_text()
 
 
+def test_surfaces_are_published_completely(tmp_path: Path, snapshot: SnapshotAssertion) -> None:
+    publishing.publish_surfaces(samples.surfaces(), tmp_path, DIGEST)
+    assert json_of(tmp_path / "surfaces.json") == snapshot
+
+
 MASK = np.array([[0, 1, 2], [3, 4, 1]], np.uint8)
 RGB = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
 

@@ -63,6 +63,28 @@ def test_impossible_planes_are_refused(changed: dict[str, Any]) -> None:
         replace(PLANES, **changed).check_against(OTHERS)
 
 
+@pytest.mark.parametrize(
+    ("rule", "changed"),
+    [
+        ("covariance", {"covariance": -np.eye(7)}),
+        ("zero_world", {"zero_world": np.array([0.0, 0.6, 0.8])}),
+        ("along_m", {"along_m": (2.0, 1.0)}),
+        ("arc_rad", {"arc_rad": (-1.0, 6.0)}),
+        ("rms_m", {"rms_m": -0.1}),
+        ("n_points", {"n_points": 5}),
+    ],
+)
+def test_impossible_surfaces_are_refused(rule: str, changed: dict[str, Any]) -> None:
+    surfaces = samples.surfaces()
+    surfaces.check_against(OTHERS)
+    labels(-1, 0, 1, -1).check_against({"surfaces": surfaces})
+    with pytest.raises(ProductError, match=r"labels\.plane_index.*2 surfaces.*got 2"):
+        labels(-1, 0, 2, -1).check_against({"surfaces": surfaces})
+    wrong = replace(surfaces.surfaces[0], **changed)
+    with pytest.raises(ProductError, match=rf"surfaces\[0\]\.{rule}"):
+        replace(surfaces, surfaces=(wrong, *surfaces.surfaces[1:])).check_against(OTHERS)
+
+
 def test_a_cloud_without_a_place_is_refused() -> None:
     CLOUD.check_against({})
     for name in ("x", "y", "z", "origin"):

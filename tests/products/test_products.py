@@ -86,7 +86,8 @@ def walls() -> Walls:
 def products() -> tuple[Product, ...]:
     examples = [SURVEYED[name]() for name in ("cloud", "labels")]
     examples += [PHOTOGRAPHED[name]() for name in ("walls", "layers")]
-    return planes(), cameras(), photos(), walls(), *examples, *box_products().values()
+    simple = (planes(), cameras(), photos(), walls(), samples.surfaces())
+    return *simple, *examples, *box_products().values()
 
 
 def assert_equal(first: object, second: object) -> None:

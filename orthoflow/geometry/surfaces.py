@@ -1,0 +1,151 @@
+"""Curved surfaces in the world: circular cylinders and cones, seen from inside or from outside."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.frames import basis_from_up
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder:
+    """A circular cylinder without ends.
+
+    Attributes:
+        point_world: (3,) float64 metres, a point of the axis.
+        axis_world: (3,) float64 unit vector of the axis.
+        radius_m: radius in metres.
+        is_concave: whether it is seen from inside, like a vault or an apse; towers and columns are
+            seen from outside.
+    """
+
+    point_world: NDArray[np.float64]
+    axis_world: NDArray[np.float64]
+    radius_m: float
+    is_concave: bool
+
+    def __post_init__(self) -> None:
+        _require_axis("a cylinder", self.point_world, self.axis_world)
+        if not 0.0 < self.radius_m < math.inf:
+            raise GeometryError(f"a cylinder needs a positive radius, got {self.radius_m}")
+
+    def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return signed distances (n,) of points (n, 3), metres, positive towards the viewer."""
+        _, across = along_and_across(points_world, self.point_world, self.axis_world)
+        outwards = np.linalg.norm(across, axis=1) - self.radius_m
+        return np.asarray(-outwards if self.is_concave else outwards)
+
+    def normals(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return unit normals (n, 3) towards the viewer, at the places nearest to points (n, 3)."""
+        _, across = along_and_across(points_world, self.point_world, self.axis_world)
+        outwards = across / np.linalg.norm(across, axis=1, keepdims=True)
+        return np.asarray(-outwards if self.is_concave else outwards)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cone:
+    """One half of a circular cone, which opens from its apex in the direction of its axis.
+
+    Attributes:
+        apex_world: (3,) float64 metres.
+        axis_world: (3,) float64 unit vector from the apex into the cone.
+        half_angle_rad: angle between the axis and the surface, between 0 and 90 degrees, radians.
+        is_concave: whether it is seen from inside.
+    """
+
+    apex_world: NDArray[np.float64]
+    axis_world: NDArray[np.float64]
+    half_angle_rad: float
+    is_concave: bool
+
+    def __post_init__(self) -> None:
+        _require_axis("a cone", self.apex_world, self.axis_world)
+        if not 0.0 < self.half_angle_rad < 0.5 * math.pi:
+            raise GeometryError(
+                "a cone needs a half angle between 0 and 90 degrees, got "
+                f"{math.degrees(self.half_angle_rad):g}"
+            )
+
+    def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return signed distances (n,) of points (n, 3), metres, positive towards the viewer.
+
+        They are perpendicular to the nearest generatrix, which is extended beyond the apex.
+        """
+        along, across = along_and_across(points_world, self.apex_world, self.axis_world)
+        radius = np.linalg.norm(across, axis=1)
+        outwards = radius * math.cos(self.half_angle_rad) - along * math.sin(self.half_angle_rad)
+        return np.asarray(-outwards if self.is_concave else outwards)
+
+    def normals(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return unit normals (n, 3) towards the viewer, at the places nearest to points (n, 3)."""
+        _, across = along_and_across(points_world, self.apex_world, self.axis_world)
+        radial = across / np.linalg.norm(across, axis=1, keepdims=True)
+        outwards = radial * math.cos(self.half_angle_rad)
+        outwards -= math.sin(self.half_angle_rad) * self.axis_world
+        return np.asarray(-outwards if self.is_concave else outwards)
+
+
+def along_and_across(
+    points_world: NDArray[np.float64],
+    point_world: NDArray[np.float64],
+    axis_world: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split points (n, 3) into positions (n,) along an axis and vectors (n, 3) from the axis.
+
+    Args:
+        points_world: (n, 3) points.
+        point_world: (3,) point of the axis, where positions along it begin.
+        axis_world: (3,) unit vector.
+    """
+    relative = points_world - point_world
+    along = relative @ axis_world
+    return along, relative - along[:, None] * axis_world
+
+
+def zero_direction(axis_world: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit vector (3,) perpendicular to an axis from which angles around it count.
+
+    For axes at most 45 degrees from vertical, it is the horizontal direction e1 of
+    `basis_from_up`, made perpendicular to the axis. For others, it is `up`, made perpendicular, so
+    that angle 0 is the crown of a vault.
+
+    Args:
+        axis_world: (3,) unit vector of the axis.
+        up: (3,) unit vector.
+    """
+    is_steep = abs(float(axis_world @ up)) >= math.sqrt(0.5)
+    start = basis_from_up(up)[0] if is_steep else up
+    perpendicular = start - (start @ axis_world) * axis_world
+    return np.asarray(perpendicular / np.linalg.norm(perpendicular))
+
+
+def angles_around(
+    points_world: NDArray[np.float64],
+    point_world: NDArray[np.float64],
+    axis_world: NDArray[np.float64],
+    zero_world: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return angles (n,) of points (n, 3) around an axis by the right-hand rule, -pi to pi.
+
+    Args:
+        points_world: (n, 3) points.
+        point_world: (3,) point of the axis.
+        axis_world: (3,) unit vector of the axis.
+        zero_world: (3,) unit vector perpendicular to the axis, the direction of angle 0.
+    """
+    relative = points_world - point_world
+    return np.arctan2(relative @ np.cross(axis_world, zero_world), relative @ zero_world)
+
+
+def _require_axis(
+    what: str, point_world: NDArray[np.float64], axis_world: NDArray[np.float64]
+) -> None:
+    if point_world.shape != (3,) or not np.isfinite(point_world).all():
+        raise GeometryError(f"{what} needs a finite point of shape (3,), got {point_world!r}")
+    if axis_world.shape != (3,) or abs(float(np.linalg.norm(axis_world)) - 1.0) > 1e-9:
+        raise GeometryError(f"{what} needs a unit axis of shape (3,), got {axis_world!r}")

@@ -1,0 +1,172 @@
+"""Curved surfaces found in a cloud."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import ProductError
+from orthoflow.geometry.surfaces import Cone, Cylinder
+from orthoflow.products.cloud import PointCloud
+from orthoflow.products.product import JsonValue, Product, Tolerance
+
+# Kind of a surface, the first part of its name.
+SurfaceKind = Literal["vault", "apse", "tower", "column", "cylinder", "cone"]
+
+_VERTICAL_DEG: Final = 20.0
+_COLUMN_MOST_M: Final = 0.75
+_FULL_TURN: Final = 2.0 * math.pi
+
+
+def surface_kind(shape: Cylinder | Cone, up: NDArray[np.float64]) -> SurfaceKind:
+    """Return the kind of a surface by the direction of its axis, its side and its radius.
+
+    A cylinder that is concave is an apse if its axis is vertical to 20 degrees, and a vault if it
+    is horizontal to 20 degrees. A convex and vertical one is a column up to a radius of 0.75 m, and
+    a tower above.
+    """
+    if isinstance(shape, Cone):
+        return "cone"
+    incline_deg = math.degrees(math.asin(min(1.0, abs(float(shape.axis_world @ up)))))
+    if incline_deg >= 90.0 - _VERTICAL_DEG:
+        if shape.is_concave:
+            return "apse"
+        return "column" if shape.radius_m <= _COLUMN_MOST_M else "tower"
+    return "vault" if shape.is_concave and incline_deg <= _VERTICAL_DEG else "cylinder"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """A part of a cylinder or cone.
+
+    Attributes:
+        name: kind (`surface_kind`) and index of the surface, such as `vault 0` or `column 2`.
+        shape: the whole cylinder or cone. The point of a cylinder's axis is at the middle of the
+            surface's points. The axis of a cylinder points upwards if it is at most 45 degrees from
+            vertical, otherwise towards the positive e1 (e2 if it is nearer) of `basis_from_up`.
+        covariance: (7, 7) float64 covariance of (point, axis, radius) or (apex, axis, half angle),
+            metres and radians.
+        n_points: number of points on the surface.
+        rms_m: root mean square distance of these points.
+        zero_world: (3,) unit vector perpendicular to the axis, the direction of angle 0 (see
+            `geometry.surfaces.zero_direction`).
+        along_m: range of the points along the axis, from the cylinder's point or the cone's apex.
+        arc_rad: range of the points' angles around the axis, by the right-hand rule from
+            `zero_world`; it begins between -pi and pi and is at most one turn long.
+    """
+
+    name: str
+    shape: Cylinder | Cone
+    covariance: NDArray[np.float64]
+    n_points: int
+    rms_m: float
+    zero_world: NDArray[np.float64]
+    along_m: tuple[float, float]
+    arc_rad: tuple[float, float]
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether points surround the whole axis; otherwise an arc of it is open or hidden."""
+        return self.arc_rad[1] - self.arc_rad[0] >= _FULL_TURN - 1e-9
+
+    @property
+    def sigma_axis_deg(self) -> float:
+        """Largest standard deviation, over all directions, of the axis's direction."""
+        largest = float(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1])
+        return math.degrees(math.sqrt(max(0.0, largest)))
+
+    @property
+    def sigma_radius_m(self) -> float:
+        """Standard deviation of a cylinder's radius; of a cone, at the middle of its points."""
+        sigma = math.sqrt(max(0.0, float(self.covariance[6, 6])))
+        if isinstance(self.shape, Cylinder):
+            return sigma
+        middle_m = 0.5 * (self.along_m[0] + self.along_m[1])
+        return sigma * middle_m / math.cos(self.shape.half_angle_rad) ** 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surfaces(Product):
+    """Curved surfaces of a scene, in descending order of their numbers of points.
+
+    Attributes:
+        surfaces: the surfaces.
+        up: (3,) float64 unit vector of the cloud.
+        details: further JSON results, for users only.
+    """
+
+    type_name: ClassVar[str] = "surfaces"
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        "point_world": Tolerance(limit=1e-4, unit="m"),
+        "apex_world": Tolerance(limit=1e-3, unit="m"),
+        "axis_world": Tolerance(limit=1e-6, unit="1"),
+        "zero_world": Tolerance(limit=1e-6, unit="1"),
+        "covariance": Tolerance(limit=1e-6, unit="1"),
+        "radius_m": Tolerance(limit=1e-5, unit="m"),
+        "half_angle_rad": Tolerance(limit=1e-6, unit="1"),
+        "along_m": Tolerance(limit=1e-3, unit="m"),
+        "arc_rad": Tolerance(limit=1e-3, unit="1"),
+        "rms_m": Tolerance(limit=1e-5, unit="m"),
+        "n_points": Tolerance(limit=10, unit="1"),
+    }
+
+    surfaces: tuple[Surface, ...]
+    up: NDArray[np.float64]
+    details: dict[str, JsonValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.up.shape != (3,) or not np.isfinite(self.up).all():
+            raise ProductError(f"surfaces.up must be finite and of shape (3,), got {self.up!r}")
+        for index, surface in enumerate(self.surfaces):
+            if not surface.name.endswith(f" {index}"):
+                raise ProductError(
+                    f"surfaces[{index}].name must end in its index, got {surface.name!r}"
+                )
+            if surface.covariance.shape != (7, 7) or surface.zero_world.shape != (3,):
+                raise ProductError(
+                    f"surfaces[{index}] needs a covariance (7, 7) and zero_world (3,), got "
+                    f"{surface.covariance.shape} and {surface.zero_world.shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.surfaces)
+
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """See `Product.check_against`.
+
+        Raises:
+            ProductError: a covariance, direction, range, number of points or deviation is invalid.
+        """
+        n_all = [len(other) for other in others.values() if isinstance(other, PointCloud)]
+        for index, surface in enumerate(self.surfaces):
+            start, end = surface.arc_rad
+            axis, zero = surface.shape.axis_world, surface.zero_world
+            is_perpendicular = abs(float(axis @ zero)) < 1e-9
+            variances = np.diagonal(surface.covariance)
+            rules = {
+                "covariance must be finite, with variances of at least 0": bool(
+                    np.isfinite(surface.covariance).all() and (variances >= 0.0).all()
+                ),
+                "zero_world must be a unit vector perpendicular to the axis": is_perpendicular
+                and abs(float(np.linalg.norm(zero)) - 1.0) < 1e-9,
+                "along_m must be an ascending range": surface.along_m[0] < surface.along_m[1],
+                "along_m of a cone must begin at its apex or beyond": isinstance(
+                    surface.shape, Cylinder
+                )
+                or surface.along_m[0] >= 0.0,
+                "arc_rad must be a range of at most one turn that begins between -pi and pi": (
+                    -math.pi - 1e-9 <= start <= math.pi and start < end <= start + _FULL_TURN + 1e-9
+                ),
+                "rms_m must be finite and at least 0": 0.0 <= surface.rms_m < math.inf,
+                "n_points must be between 0 and the number of points": 0
+                <= surface.n_points
+                <= (n_all[0] if n_all else surface.n_points),
+            }
+            for rule, is_kept in rules.items():
+                if not is_kept:
+                    raise ProductError(f"surfaces[{index}].{rule}, got {surface!r}")
