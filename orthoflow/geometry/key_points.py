@@ -1,8 +1,8 @@
-"""Evenly distributed key points of pictures, and matching of their descriptors.
+"""Evenly distributed key points of images, and matching of their descriptors.
 
 OpenCV's SIFT shifts all key points by a quarter of a pixel to the right and down unless its precise
-upscaling is enabled (opencv issue 23123; with version 5.0, a shift of 0.25 px was measured for key
-points of all sizes). The shift would be a systematic error of an orientation, so it is subtracted
+upscaling is enabled (OpenCV issue 23123; with version 5.0, we measured a shift of 0.25 px for key
+points of all sizes). The shift would cause a systematic error of orientations, so it is subtracted
 if the default upscaling is used.
 """
 
@@ -20,21 +20,23 @@ from orthoflow.geometry.rows import Rows
 
 # OpenCV's default contrast threshold.
 _OPENCV_CONTRAST: Final = 0.04
-# Half of the default, which still gives correct matches.
+# Contrast threshold; half of the default still gives correct matches.
 _MIN_CONTRAST: Final = 0.02
 # OpenCV's default ratio of curvatures.
 _MAX_EDGE_RATIO: Final = 10.0
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
-# SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. Tiles limit the memory.
+# SIFT doubles the size of an image and keeps all scales in memory, which takes 0.23 GB per million
+# pixels. Tiles limit the memory needed.
 _TILE_PX: Final = 2048
 _TILE_OVERLAP_PX: Final = 96
 _SPREAD_CELLS: Final = 12
-# In smaller pictures, no key points are searched for.
+# Images with a shorter side than this are not searched for key points.
 _MIN_SIDE_PX: Final = 16
-# The unit of RootSIFT entries is 1/512. Sums of their products are below 2^24, so float32 products
-# are exact, regardless of the order of summation in a BLAS library.
+# RootSIFT entries are multiples of 1/512. In this unit, the sums of their products are integers
+# below 2^24, so matrix products in float32 are exact, regardless of the order of summation in the
+# BLAS library.
 _QUANTA: Final = 512.0
-# Number of pairs whose descriptors are processed at once (2 x 32 MB).
+# Number of pairs processed at once; their descriptors need 2 x 32 MB.
 _PAIRS_AT_ONCE: Final = 65_536
 # Number of entries in a block of distances; its 12 MB fit into a processor's cache.
 _BLOCK_ENTRIES: Final = 3_000_000
@@ -43,7 +45,7 @@ _BLOCK_ENTRIES: Final = 3_000_000
 def in_turns(
     cell: NDArray[np.intp], keys: Sequence[NDArray[np.floating] | NDArray[np.intp]], n_most: int
 ) -> NDArray[np.intp]:
-    """Return indices (k,) of up to `n_most` of n items, taken in turn from the cells of a grid.
+    """Return the indices (k,) of up to `n_most` items, taken from the cells of a grid in turn.
 
     The selection covers the same area as the items; within a cell, items are taken in sort order.
 
@@ -59,9 +61,9 @@ def in_turns(
 
 
 def root_sift(raw: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return RootSIFT of SIFT descriptors (n, 128) as integers (Arandjelovic & Zisserman 2012).
+    """Convert SIFT descriptors (n, 128) to RootSIFT as integers (Arandjelovic & Zisserman 2012).
 
-    Euclidean distances between the results correspond to Hellinger distances of the originals.
+    Euclidean distances between the results correspond to Hellinger distances between the originals.
     """
     total = np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
     rooted: NDArray[np.float32] = np.rint(np.sqrt(raw / total) * _QUANTA).astype(np.float32)
@@ -70,7 +72,7 @@ def root_sift(raw: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class Features(Rows):
-    """Key points of an image; any first n are the strongest n distributed over the image.
+    """Key points of an image; for any n, the first n are strong and evenly distributed.
 
     Attributes:
         pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
@@ -107,10 +109,10 @@ class Features(Rows):
         return replace(self, pixels=self.pixels * factor, sizes_px=self.sizes_px * factor)
 
     def mirrored(self, width_px: float) -> Features:
-        """Return the key points of the image, which has this width, after mirroring left to right.
+        """Return the key points of the image, of the given width, mirrored left to right.
 
-        In a descriptor, mirroring reverses the order of the rows of the 4 x 4 fields and the sense
-        of rotation of the 8 directions, both relative to the main direction.
+        Mirroring reverses the order of the rows in the 4 x 4 fields of a descriptor and the sense
+        of rotation of its 8 directions, both relative to the main direction.
         """
         fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
         turned = fields[..., (8 - np.arange(8)) % 8]
@@ -129,7 +131,7 @@ def find_features(
     *,
     as_opencv: bool = False,
 ) -> Features:
-    """Find key points, tile by tile, in an order that depends only on the image.
+    """Find key points tile by tile; their order depends only on the image.
 
     Args:
         picture: (rows, cols) grey values.
@@ -153,13 +155,13 @@ def find_features(
     ]
     points = np.vstack([tile[1] for tile in tiles])
     pixels = points[:, :2]
-    # OpenCV's threads return key points in arbitrary order.
+    # OpenCV's threads return key points in arbitrary order, so sort them.
     chosen = np.lexsort(points[:, :4].T)
     if usable is not None:
         most = np.array(usable.shape[::-1]) - 1
         columns, rows = np.clip(pixels[chosen].astype(np.intp), 0, most).T
         chosen = chosen[usable[rows, columns]]
-    # Take the strongest key points in turn from the cells of a coarse grid.
+    # Take the strongest key points from the cells of a coarse grid in turn.
     scale = _SPREAD_CELLS / np.array([picture.shape[1], picture.shape[0]])
     cells = np.minimum((pixels[chosen] * scale).astype(np.intp), _SPREAD_CELLS - 1)
     u, v, strengths = points[chosen][:, [0, 1, 4]].T
@@ -207,10 +209,10 @@ def _in_tile(
 def _described(
     sift: Any, picture: NDArray[np.uint8], tiles: list[_Tile], chosen: NDArray[np.intp]
 ) -> NDArray[np.float32]:
-    """Compute SIFT descriptors (n, 128) of the chosen key points, numbered over all tiles.
+    """Compute SIFT descriptors (n, 128) of the chosen key points, which are numbered across tiles.
 
-    Only chosen key points are described, because in a picture with much texture, only one in ten is
-    kept, and description takes longer than detection.
+    Only chosen key points are described: in an image with much texture, only one in ten is kept,
+    and description takes longer than detection.
     """
     raw = np.empty((len(chosen), 128), dtype=np.float32)
     first = 0
@@ -230,8 +232,8 @@ class Matches(Rows):
     Attributes:
         first: (n,) index into the first set.
         second: (n,) index into the second set.
-        ratio: (n,) ratio of the distances of the best and the second best match in the second set;
-            1 if there is no second best.
+        ratio: (n,) ratio of the descriptor distances of the best and the second best match; 1 if
+            there is no second best.
     """
 
     first: NDArray[np.intp]
@@ -241,18 +243,19 @@ class Matches(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """Limits for possible pairs, from the approximately known geometry.
+    """Limits for possible pairs, if the geometry is approximately known.
 
     Attributes:
-        first: (n, 2) positions of the first set.
-        second: (m, 2) expected positions of the second set in the frame of the first.
-        radius: maximum difference of a pair's coordinates.
-        first_log_size: (n,) float32 log2 of the sizes.
+        first: (n, 2) positions of the key points of the first set.
+        second: (m, 2) expected positions of the key points of the second set in the frame of the
+            first.
+        radius: maximum difference between the coordinates of a pair, along each axis.
+        first_log_size: (n,) float32 log2 of the sizes of the key points.
         second_log_size: (m,) float32 log2 of the expected sizes in the frame of the first.
         first_angle_deg: (n,) float32 angles.
         second_angle_deg: (m,) float32 expected angles in the frame of the first.
-        max_log_size: maximum difference of log2 sizes.
-        max_angle_deg: maximum difference of angles.
+        max_log_size: maximum difference between log2 sizes.
+        max_angle_deg: maximum difference between angles.
     """
 
     first: NDArray[np.float32]
@@ -283,12 +286,13 @@ class Window:
 def mutual_matches(
     first: NDArray[np.float32], second: NDArray[np.float32], *, ratio: float
 ) -> Matches:
-    """Match descriptors that are mutually nearest and distinctly nearer than the second nearest.
+    """Match descriptors that are mutually nearest and pass the ratio test.
 
     Args:
         first: (n, d) integer values, small enough that products are exact in float32.
         second: (m, d) integer values like `first`.
-        ratio: maximum ratio of the distances of the best and the second best match (Lowe 2004).
+        ratio: maximum ratio of the descriptor distances of the best and the second best match (Lowe
+            2004).
     """
     if not (len(first) and len(second)):
         return _no_matches()
@@ -306,8 +310,8 @@ def best_matches(
     Args:
         first: (n, d) integer values, small enough that products are exact in float32.
         second: (m, d) integer values like `first`, m > 0.
-        ratio: maximum ratio of the distances of the best and the second best match (Lowe 2004); 1
-            accepts any.
+        ratio: maximum ratio of the descriptor distances of the best and the second best match (Lowe
+            2004); 1 accepts all matches.
     """
     found = two_nearest(first, second)
     ratios = _ratio(found.best, found.next_best)
@@ -322,13 +326,13 @@ def mutual_matches_within(
     *,
     ratio: float,
 ) -> Matches:
-    """Match descriptors like `mutual_matches`, but consider only the pairs in a window.
+    """Match descriptors like `mutual_matches`, but consider only the pairs that a window allows.
 
     Args:
         first: (n, d) integer values, small enough that products are exact in float32.
         second: (m, d) integer values like `first`.
-        window: the possible pairs, also for the second best match.
-        ratio: maximum ratio of the distances of the best and the second best match.
+        window: limits for all pairs, including the second best match.
+        ratio: maximum ratio of the descriptor distances of the best and the second best match.
     """
     if not (len(first) and len(second)):
         return _no_matches()
@@ -354,7 +358,7 @@ class TwoNearest:
     """The two nearest descriptors of a set for each query descriptor.
 
     Attributes:
-        index: (n,) index of the nearest.
+        index: (n,) index of the nearest descriptor.
         best: (n,) float32 squared distance to the nearest.
         next_best: (n,) float32 squared distance to the second nearest; inf if there is none.
     """
@@ -365,9 +369,9 @@ class TwoNearest:
 
 
 def two_nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> TwoNearest:
-    """Find the two nearest of `among` (m, d), m > 0, for each of `asked` (n, d).
+    """Find the two nearest descriptors in `among` (m, d), m > 0, for each of `asked` (n, d).
 
-    Both have integer values, small enough that products are exact in float32.
+    Both arrays have integer values, small enough that products are exact in float32.
     """
     left, right = _left(asked), _right(among)
     index = np.zeros(len(asked), dtype=np.intp)
@@ -382,7 +386,7 @@ def two_nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> TwoNe
 
 
 def nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Return the index (n,) of the nearest of `among` (m, d), m > 0, for each of `asked` (n, d)."""
+    """Return the index (n,) of the nearest in `among` (m, d), m > 0, for each of `asked` (n, d)."""
     left, right = _left(asked), _right(among)
     parts = [(left[rows] @ right).argmin(axis=1) for rows in _blocks(len(asked), len(among))]
     return np.concatenate([np.empty(0, dtype=np.intp), *parts])
@@ -405,7 +409,8 @@ def _distances(
 
 def _ratio(best: NDArray[np.float32], next_best: NDArray[np.float32]) -> NDArray[np.float64]:
     ratio = np.sqrt(np.maximum(best, 0.0) / np.maximum(next_best, 1e-12)).astype(np.float64)
-    # A single candidate cannot be compared, and neither of two identical candidates is distinct.
+    # A single candidate has no second best match, and of two identical candidates, neither is
+    # distinct.
     ratio[~np.isfinite(next_best) | (next_best <= 0.0)] = 1.0
     return ratio
 
@@ -416,9 +421,9 @@ def _no_matches() -> Matches:
 
 
 def _left(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return rows whose product with `_right` is the squared distance.
+    """Return a matrix whose product with the result of `_right` contains squared distances.
 
-    The product is (-2 a, |a|^2, 1) (b, 1, |b|^2).
+    Each distance is the product of a row (-2 a, |a|^2, 1) and a column (b, 1, |b|^2).
     """
     squares = (descriptors * descriptors).sum(axis=1)
     return np.column_stack([-2.0 * descriptors, squares, np.ones_like(squares)])

@@ -1,6 +1,7 @@
-"""Conversion between colour levels with 8 and 16 bits per channel, in proportion to white.
+"""Conversion between colour levels with 8 and 16 bits per channel.
 
-255 in 8 bits corresponds to 65535 in 16 bits; an 8-bit level times 257 is its 16-bit level.
+White is 255 with 8 bits and 65535 with 16 bits, so multiplying an 8-bit level by 257 gives the
+16-bit level.
 """
 
 from __future__ import annotations
@@ -20,17 +21,18 @@ Level: TypeAlias = type[np.uint8] | type[np.uint16]
 REC_601: Final = np.array([0.299, 0.587, 0.114])
 # 16-bit levels per 8-bit level.
 DEEPER: Final = 257
-# Number of steps of the table from linear light to levels, which is nearly linear within a step.
+# Number of steps in the table from linear light to levels; the relation is nearly linear within a
+# step.
 _STEPS: Final = 1 << 16
-# A picture has a single tone if at least this share of its cells is almost black, almost white, or
-# within one of 256 levels of the median.
+# An image has a single tone if at least this share of its cells is almost black, almost white, or
+# differs from the median by at most one of 256 levels.
 _PLAIN_SHARE: Final = 0.98
-# Cells are almost black or white if they differ from black or white by less than this share of
-# white.
+# Cells are almost black or almost white if they differ from it by less than this share of the
+# brightness of white.
 _DARK: Final = 0.03
 _LEVEL: Final = 0.5 / 255.0
 _TONE_SAMPLE: Final = 40_000
-# Pictures with fewer cells are not checked.
+# Images with fewer cells are not checked.
 _TONE_CELLS_MIN: Final = 2000
 
 
@@ -68,7 +70,7 @@ def light_of_levels(highest: int) -> NDArray[np.float32]:
 
 @cache
 def _share_of_light() -> NDArray[np.float32]:
-    """Return levels, 0 to 1, for equal steps of light, and an additional one for interpolation."""
+    """Return levels, 0 to 1, at equal steps of light, and an extra entry for interpolation."""
     light = np.minimum(np.arange(_STEPS + 1) / (_STEPS - 1.0), 1.0)
     level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     return level.astype(np.float32)
@@ -77,9 +79,9 @@ def _share_of_light() -> NDArray[np.float32]:
 def lit_shares(
     levels: NDArray[np.floating], log_gains: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Multiply the linear light of levels (n, 3), 0 to 1, by exp(log_gains), (n, 3)."""
+    """Multiply the linear light of sRGB levels (n, 3), 0 to 1, by exp(log_gains), (n, 3)."""
     light = np.interp(levels, np.linspace(0.0, 1.0, _STEPS), light_of_levels(_STEPS - 1))
-    # Light is clipped to white, the end of the table.
+    # `interp` clips light to white, the end of the table.
     gained = light * np.exp(log_gains)
     levels = np.interp(gained, np.linspace(0.0, 1.0, _STEPS), _share_of_light()[:_STEPS])
     return np.asarray(levels, dtype=np.float64)
@@ -99,7 +101,7 @@ def lit(colours: Colours, log_gains: NDArray[np.float32]) -> Colours:
 def plain_tone(
     picture: NDArray[np.generic], mask: NDArray[np.uint8], shown: Sequence[int], *, white: float
 ) -> tuple[str, float] | None:
-    """Check whether a picture is almost entirely black, white or uniform.
+    """Check whether an image is almost entirely black, white or of a single colour.
 
     Args:
         picture: (rows, cols) or (rows, cols, 3); NaN is ignored.
@@ -108,8 +110,8 @@ def plain_tone(
         white: the value of maximum brightness.
 
     Returns:
-        `black`, `white` or `one value`, and the share of these cells; None if the picture has
-        several tones or few cells.
+        `black`, `white` or `one value`, and the share of cells with this tone; None if the image
+        has several tones or too few cells.
 
     >>> ramp, mask = np.linspace(0.0, 1.0, 2000)[None], np.ones((1, 2000), dtype=np.uint8)
     >>> plain_tone(0.0 * ramp, mask, (1,), white=1.0), plain_tone(ramp, mask, (1,), white=1.0)

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 
 def narrow_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArray[np.int64]:
-    """Find the void cells in narrow gaps.
+    """Find the void cells that are in narrow gaps.
 
-    A gap is narrow if no disc with the given radius fits into it. The other void cells are the
+    A gap is narrow if no disc with the given radius fits into it. The remaining void cells are the
     morphological opening of all void cells, so the shapes of windows and outlines do not change.
     Cells outside the raster count as void. Each cell found has a measured cell within the radius.
 
@@ -18,7 +18,7 @@ def narrow_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArray[np
         radius_cells: radius of the disc; 0 finds no gaps.
 
     Returns:
-        (k,) flat indices, ascending.
+        (k,) indices of the cells in row order, ascending.
     """
     import cv2
 

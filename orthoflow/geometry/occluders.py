@@ -1,4 +1,4 @@
-"""Points of the whole cloud that hide other points in photos."""
+"""Points of a cloud that hide other points in photos."""
 
 from __future__ import annotations
 
@@ -23,23 +23,26 @@ from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24
-# Side of a voxel, which is small enough to separate the legs of a chair, and large enough to
-# contain several points of a surface.
+# Side of a voxel in point spacings: small enough to separate the legs of a chair, and large enough
+# for several points of a surface.
 _VOXEL_CELLS: Final = 6.0
-# Scanners do not measure at ranges shorter than this. Points there are errors, even if dense.
+# Scanners do not measure shorter ranges, so points at these ranges are errors, even if they are
+# dense.
 _BLIND_M: Final = 0.3
-# A voxel is empty if fewer than one in this many rays of a station end in it. A 1 mm rod stops a
-# larger share of the rays through a 0.2 m cube.
+# A voxel is considered empty if fewer than one in this many rays from a station end in it. A rod of
+# 1 mm stops a larger share of the rays through a cube of 0.2 m.
 _PASSING_RAYS: Final = 200
 _N_ELEVATIONS: Final = 90
-# Half the number of points in 3 x 3 x 3 voxels of a surface scanned with the spacing of the wall.
+# Half the number of points in 3 x 3 x 3 voxels if a surface crosses these with the point spacing of
+# the wall.
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
-# Around the corner of a surface, there are a quarter of these points; at its edge, there are half.
+# Around a corner of a surface, there are a quarter as many points; along its edges, half as many.
 _CORNER_SHARE: Final = 0.25
-# Maximum share of point pairs in the same voxel; closer to 1 in 27 than to 1 in 9.
+# Points are scattered if a smaller share of point pairs is in the same voxel. The limit is closer
+# to 1/27 (scattered points) than to 1/9 (a surface).
 _SPREAD_SHARE: Final = 0.07
 _SAMPLED_MOST: Final = 1 << 20
-# Points with fewer points around them (including themselves) are outliers and hide nothing.
+# Points with fewer points around them (including the point itself) are outliers and hide nothing.
 POINTS_LEAST: Final = 6
 
 
@@ -60,14 +63,14 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Occluders:
-    """A cloud prepared for rendering from the position of any photo.
+    """A cloud prepared for rendering from any position.
 
     Attributes:
         origin: (3,) float64 metres.
         points: float32 offsets from the origin.
-        around: number of points around each point.
-        n_least: points with fewer points in 3 x 3 x 3 voxels around them are outliers.
-        threads: number of threads for one view, which does not affect the result.
+        around: number of points in 3 x 3 x 3 voxels.
+        n_least: points with fewer points in the 3 x 3 x 3 voxels around them are outliers.
+        threads: number of threads per view; does not affect the result.
     """
 
     origin: NDArray[np.float64]
@@ -87,17 +90,18 @@ def occluders_before(
     n_least: int = POINTS_LEAST,
     threads: int,
 ) -> Occluders:
-    """Count points between cameras and walls, to detect outliers and estimate point spacing.
+    """Count the points between cameras and walls, to detect outliers and estimate point spacing.
 
     Args:
         cloud: the whole cloud.
-        slabs: slabs of the walls; only points in the box around them and the cameras can hide them.
+        slabs: slabs of the walls; only points in the bounding box of walls and cameras can hide
+            walls.
         cameras: all cameras.
-        spacing_m: approximate point spacing on a wall. It must not be the size of coarser cells,
-            because larger voxels contain more stray points of a dense scan.
-        stations_world: (s, 3) metres, positions of the scanner, if known.
-        n_least: points with fewer neighbours are outliers; the number is increased in large boxes,
-            whose voxels are larger.
+        spacing_m: approximate point spacing on a wall. Do not pass the size of coarser cells,
+            because in a dense scan, larger voxels contain more stray points.
+        stations_world: (s, 3) metres, positions of the scanner; None if unknown.
+        n_least: points with fewer points around them are outliers. The number is increased for
+            large boxes, whose voxels are larger.
         threads: see `Occluders`.
     """
     places = [camera.centre_world for camera in cameras]
@@ -122,7 +126,7 @@ def occluders_in(
     Args:
         cloud: the whole cloud.
         box: region in which points may hide others.
-        stations_world: (s, 3) metres, positions of the scanner, if known.
+        stations_world: (s, 3) metres, positions of the scanner; None if unknown.
         n_least: see `Occluders`.
         threads: see `Occluders`.
     """
@@ -146,7 +150,7 @@ def occluders_in(
         stations = np.unique(stations_world, axis=0) - cloud.origin
         _forget_passed(grid, points, stations, _CORNER_SHARE * n_few)
         _forget_around(grid, stations)
-    # In larger voxels, the number of points on a linear object increases by this factor.
+    # On a linear object, larger voxels contain more points, by this factor.
     n_asked = math.ceil(n_least * larger)
     return Occluders(
         origin=cloud.origin, points=points, around=grid, n_least=n_asked, threads=threads
@@ -181,7 +185,7 @@ def depth_buffer(occluders: Occluders, camera: ViewingCamera) -> DepthBuffer:
 
 
 def nothing_in_the_way(camera: ViewingCamera) -> DepthBuffer:
-    """Return the depth buffer of an empty scene."""
+    """Return a depth buffer without points, so that nothing is hidden."""
     return DepthBuffer(
         nearest=np.full((1, 1), np.inf, dtype=np.float32),
         reduction=float(max(camera.width, camera.height)),
@@ -191,7 +195,7 @@ def nothing_in_the_way(camera: ViewingCamera) -> DepthBuffer:
 def _closed(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
     """Fill holes of one or two pixels, so that no wall is visible through a nearer surface.
 
-    This is a minimum filter followed by a maximum filter, 3 x 3 pixels each.
+    Apply a minimum filter and then a maximum filter, each with 3 x 3 pixels.
     """
     for choose in (np.minimum, np.maximum):
         for axis in range(2):
@@ -208,14 +212,14 @@ def _part(points: Offsets, piece: slice) -> Offsets:
 
 
 def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_few: float) -> None:
-    """Reject voxels with few points that, unlike a surface, are spread over all 27 voxels.
+    """Set counts to 0 where a few points are spread over all 27 voxels, unlike a surface.
 
-    If points are scattered, one in 27 pairs of points is in the same voxel; on a surface, it is one
-    in 9, and along a line, one in 3.
+    If points are scattered, both points of one in 27 pairs are in the same voxel; on a surface, it
+    is one in 9 pairs, and along a line, one in 3.
 
     Args:
-        counts: numbers of points in 27 voxels, changed in place.
-        squares: squared counts of single voxels, changed in place.
+        counts: numbers of points in 3 x 3 x 3 voxels, changed in place.
+        squares: squared numbers of points in single voxels, changed in place.
         n_few: voxels with more points are not checked.
     """
     _sum_neighbours(squares)
@@ -228,11 +232,11 @@ def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_fe
 def _forget_passed(
     grid: VoxelGrid, points: Offsets, stations: NDArray[np.float64], n_few: float
 ) -> None:
-    """Reject voxels through which nearly all rays from the stations passed.
+    """Set counts to 0 in voxels through which nearly all rays from the stations pass.
 
     Stray points of a dense scan can be as dense as points of a surface, especially near a station,
-    but only a small share of the rays in their direction ends at them. Near a station in a thinned
-    cloud, there are equally few points, but on a surface they are as many as expected.
+    but only a small share of the rays in their direction end at stray points. In a thinned cloud, a
+    surface near a station also has few points, but as many as there are rays in its direction.
     """
     every = slice(None, None, max(1, len(points.x) // _SAMPLED_MOST))
     places = np.column_stack([axis[every] for axis in points]).astype(np.float64)
@@ -241,8 +245,8 @@ def _forget_passed(
     middles = grid.low + grid.side_m * (
         np.array(np.unravel_index(filled, grid.counts.shape)).T + 0.5
     )
-    # It is unknown which station measured a point, so all stations are assumed to have the same
-    # share.
+    # It is unknown which station measured a point, so assume that all stations measured equal
+    # shares.
     rays = np.zeros(len(filled))
     for station in stations:
         per_sr = weight * _points_per_sr(places - station) / len(stations)
@@ -254,7 +258,7 @@ def _forget_passed(
 
 
 def _points_per_sr(ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Count points per direction: (rows, columns) of elevation and azimuth."""
+    """Return point densities per steradian; rows are elevations and columns are azimuths."""
     counts = np.zeros((_N_ELEVATIONS, 2 * _N_ELEVATIONS))
     np.add.at(counts, _directions(ways), 1.0)
     edges = np.sin(np.linspace(-0.5 * math.pi, 0.5 * math.pi, _N_ELEVATIONS + 1))
@@ -262,7 +266,7 @@ def _points_per_sr(ways: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _directions(ways: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the row (elevation) and the column (azimuth) of each direction (n, 3)."""
+    """Return the rows (elevation) and columns (azimuth) of directions (n, 3)."""
     elevation = np.arctan2(ways[:, 2], np.hypot(ways[:, 0], ways[:, 1])) / math.pi + 0.5
     azimuth = np.arctan2(ways[:, 1], ways[:, 0]) / math.pi + 1.0
     rows, columns = ((_N_ELEVATIONS * each).astype(np.intp) for each in (elevation, azimuth))
@@ -270,7 +274,7 @@ def _directions(ways: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np
 
 
 def _forget_around(grid: VoxelGrid, stations: NDArray[np.float64]) -> None:
-    """Reject voxels closer to a station than the minimum range of scanners."""
+    """Set counts to 0 in voxels closer to a station than the minimum range of scanners."""
     for station in stations:
         middle = (station - grid.low) / grid.side_m - 0.5
         reach = _BLIND_M / grid.side_m

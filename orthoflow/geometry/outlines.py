@@ -1,4 +1,4 @@
-"""Intersections of the planes of a room, and its outline in plan and in space."""
+"""Intersections of the planes of a room, and outlines of rooms in plan and in space."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, Plane, basis_from_up
 
-# A rectangle of points may end this far before a corner that furniture hides, or extend this far
-# beyond a corner with a reveal.
+# The rectangle of a plane's points may end this far before a corner that is hidden by furniture, or
+# extend this far beyond a corner with a reveal.
 REACH_M: Final = 0.3
 SHORTEST_M: Final = 0.1
-# The intersection of planes at a smaller angle is poorly determined.
+# The intersection of two planes at a smaller angle is poorly determined.
 _LEAST_ANGLE_DEG: Final = 20.0
 
 Interval = tuple[float, float]
@@ -29,7 +29,7 @@ class Surface:
 
     Attributes:
         plane: the plane.
-        rectangles_world: (m, 4, 3) metres, corners of its connected parts.
+        rectangles_world: (m, 4, 3) metres, corners of the rectangles around its connected parts.
     """
 
     plane: Plane
@@ -42,7 +42,7 @@ class Edge:
 
     Attributes:
         first: index of one plane.
-        second: index of the other, larger plane.
+        second: index of the other plane, which is larger than the first index.
         ends_world: (2, 3) end points in metres.
     """
 
@@ -70,7 +70,7 @@ class Corner:
 
 
 def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the line where two planes intersect: point nearest to the origin, and direction.
+    """Return the intersection of two planes: the point nearest to the origin, and the direction.
 
     The result is None if the planes are nearly parallel.
     """
@@ -98,7 +98,8 @@ def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> t
         line = line_of(first.plane, second.plane)
         if line is None:
             continue
-        # Solve relative to a point near both planes, so that survey coordinates lose no precision.
+        # Use coordinates relative to a point near both planes, because large survey coordinates
+        # reduce the precision.
         point, direction = line
         middle = first.rectangles_world.mean(axis=(0, 1))
         start = point + ((middle - point) @ direction) * direction
@@ -129,7 +130,8 @@ def corners_between(
     normals = np.array([surface.plane.normal for surface in surfaces])[at]
     offsets = np.array([surface.plane.offset_m for surface in surfaces])[at]
     meet = np.abs(np.linalg.det(normals)) >= math.sin(math.radians(_LEAST_ANGLE_DEG)) ** 2
-    # Solve relative to a nearby point, so that survey coordinates lose no precision.
+    # Use coordinates relative to a nearby point, because large survey coordinates reduce the
+    # precision.
     middles = np.array([surface.rectangles_world.mean(axis=(0, 1)) for surface in surfaces])
     near = middles[at[meet, 0]]
     rest = offsets[meet] - np.einsum("nij,nj->ni", normals[meet], near)
@@ -145,12 +147,12 @@ def corners_between(
 def _spans(
     surface: Surface, start: NDArray[np.float64], direction: NDArray[np.float64], reach_m: float
 ) -> list[Interval]:
-    """Return the intervals of a line near a measured surface, disjoint and ascending."""
+    """Return the disjoint, ascending intervals of a line that are near a measured surface."""
     relative = surface.rectangles_world - start
     along = relative @ direction
     aside = relative @ np.cross(surface.plane.normal, direction)
-    # The part of a rectangle within reach is bounded by its corners within reach and by the points
-    # where its sides cross the limit.
+    # The part of a rectangle within the maximum distance ends at corners within this distance and
+    # at points where the sides cross the limit.
     places = [np.where(np.abs(aside) <= reach_m, along, np.nan)]
     over = np.roll(aside, -1, axis=1) - aside
     for limit in (-reach_m, reach_m):
@@ -188,9 +190,9 @@ def _distance(edge: Edge, point: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(point - begin - along * (end - begin)))
 
 
-# Maximum distance between the end of a wall's points and the corner with the next wall.
+# Maximum distance between the end of the points of a wall and the corner with the next wall.
 _JOINED_M: Final = 1.0
-# Parallel walls that are closer to each other than this are one wall with relief.
+# Parallel walls whose distance is smaller than this are one wall with relief.
 _RELIEF_M: Final = 0.5
 
 
@@ -199,14 +201,13 @@ class RoomOutline:
     """The boundary of a room.
 
     Attributes:
-        walls: indices of the bounding planes that meet another one, in the order of the chains.
+        walls: indices of the bounding planes that adjoin another wall, in the order of the chains.
         chains_world: outlines (n, 3) in metres at the height of the floor; consecutive walls share
             a point.
-        closed: whether the last point of each chain joins its first point.
-        faces_world: (w, 4, 3) metres, faces of `walls` from floor to ceiling: top left, bottom
-            left, bottom right, top right for the viewer.
-        floor_m: height of the floor along up, or of the lower edge of the lowest wall if no floor
-            was found.
+        closed: for each chain, whether it is closed, so that the last point is joined to the first.
+        faces_world: (w, 4, 3) metres, corners of the faces of `walls` from floor to ceiling: top
+            left, bottom left, bottom right and top right for the viewer.
+        floor_m: height of the floor, or of the lower edge of the lowest wall if no floor was found.
     """
 
     walls: tuple[int, ...]
@@ -237,7 +238,7 @@ class _Wall:
         return float(np.linalg.norm(self.ends[1] - self.ends[0]))
 
 
-# Index of a wall in the list, and one of its ends: 0 left, 1 right.
+# Index of a wall in the list, and one of its ends (0: left, 1: right).
 _End = tuple[int, int]
 
 
@@ -246,12 +247,13 @@ def room_outline(
 ) -> RoomOutline:
     """Join the walls of a room into its outline.
 
-    Only the first plane of a wall with relief is used. A wall ends at its intersection with the
-    next wall if its points extend to within a metre of this intersection, and otherwise at the end
-    of its points.
+    If a wall with relief has several planes, only the first is used. A wall ends at its
+    intersection with the next wall if its points extend to within a metre of this intersection, and
+    otherwise at the end of its points.
 
     Args:
-        planes: planes with normals into the room, in descending order of their numbers of points.
+        planes: planes whose normals point into the room, in descending order of the number of
+            points.
         corners_world: (k, 4, 3) metres, corners of the rectangles of their points, top left first,
             counter-clockwise for the viewer.
         up: (3,) unit vector.
@@ -280,7 +282,7 @@ def room_outline(
 def _level(
     planes: Sequence[Plane], corners: NDArray[np.float64], up: NDArray[np.float64]
 ) -> int | None:
-    """Return the largest level plane that faces a given direction."""
+    """Return the largest plane whose normal is within 10 degrees of `up`."""
     limit = math.cos(math.radians(LEVEL_LIMIT_DEG))
     areas = {
         k: float(np.linalg.norm(np.cross(quad[1] - quad[0], quad[3] - quad[0])))
@@ -307,14 +309,14 @@ def _bounding(
     ]
     kept: list[_Wall] = []
     for wall in upright:
-        # A rectangle of zero width has no extent along a wall.
+        # A rectangle of zero width has no direction in plan.
         if wall.length_m > 0.0 and not any(_is_relief(wall, larger) for larger in kept):
             kept.append(wall)
     return kept
 
 
 def _is_relief(wall: _Wall, larger: _Wall) -> bool:
-    """Return whether a wall is relief: mostly in front of or behind a larger, parallel one."""
+    """Return whether most of a wall is just in front of or behind a larger, parallel wall."""
     if float(wall.plane.normal @ larger.plane.normal) < math.cos(math.radians(LEVEL_LIMIT_DEG)):
         return False
     middle = wall.corners.mean(axis=0)
@@ -328,7 +330,7 @@ def _is_relief(wall: _Wall, larger: _Wall) -> bool:
 
 
 def _joints(walls: Sequence[_Wall]) -> dict[_End, _End]:
-    """Return pairs of wall ends that meet, the closest first."""
+    """Return the wall ends that meet, as a mapping from each end to the other."""
     candidates: list[tuple[float, _End, _End]] = []
     for (i, first), (j, second) in combinations(enumerate(walls), 2):
         crossing = _crossing(first, second)
@@ -362,7 +364,7 @@ def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
 
 
 def _chains(count: int, joints: dict[_End, _End]) -> list[tuple[list[_End], bool]]:
-    """Return chains of walls, each wall with its first end; and whether chains are closed."""
+    """Return chains of walls, each with its first end, and whether the chains are closed."""
     left = set(range(count))
     chains: list[tuple[list[_End], bool]] = []
     # Begin at free ends, so that open chains are followed from one end to the other.
@@ -410,7 +412,7 @@ def _corner_in_plan(
 def _face(
     walls: Sequence[_Wall], place: int, joints: dict[_End, _End], levels: Sequence[Plane | None]
 ) -> NDArray[np.float64]:
-    """Return the corners (4, 3) of a wall bounded by its neighbours, ceiling and floor."""
+    """Return the corners (4, 3) of a wall that ends at adjoining walls, ceiling and floor."""
     own = walls[place]
     sides = []
     for side, (top, bottom) in enumerate(((0, 1), (3, 2))):
@@ -434,7 +436,7 @@ def _on_line(
     level: Plane | None,
     near: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the point of a line on a plane or, without a plane, its point nearest to `near`."""
+    """Return the point of a line on a plane; without a plane, the point nearest to `near`."""
     point, direction = line
     if level is None:
         return np.asarray(point + (near - point) @ direction / (direction @ direction) * direction)

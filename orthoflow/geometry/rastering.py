@@ -1,9 +1,9 @@
 """Binning of the points of a cloud into the raster of a wall.
 
-The cloud is processed in chunks. `project_points` transforms a chunk; the passes then process the
-points inside the raster, each thread for the cells assigned to it. Thus, the points of each cell
-are processed in order, and results, including sums of floats, do not depend on the number of
-threads.
+The cloud is processed in chunks. `project_points` transforms a chunk. Passes then process the
+points inside the raster; each thread processes the points of the cells assigned to it. The points
+of each cell are therefore processed in order, and results, including sums of floats, do not depend
+on the number of threads.
 
 This module loads numba, so methods import it inside functions.
 """
@@ -22,12 +22,13 @@ from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.slabs import BOXED_POINTS, OffsetPoints, Offsets, Slab, read_only
 from orthoflow.geometry.threads import in_parts, in_threads
 
-# Cells are assigned to threads in runs of 2^17, a few dozen rows. The points of a scan run along
-# columns or rows, and a thread is faster if the points of its cells come in long runs.
+# Cells are assigned to threads in runs of 2^17, a few dozen rows. Consecutive points of a scan are
+# in neighbouring columns or rows, and threads are faster if many consecutive points belong to the
+# same thread.
 _RUN_SHIFT: Final = 17
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
-# One record per cell, because a scan along columns needs a different row of the raster, and thus at
-# least one cache line, for each point.
+# One record per cell, because consecutive points of a scan along columns are in different rows of
+# the raster, so that each point needs at least one cache line.
 WINNER: Final = np.dtype([("depth_m", "f4"), ("square", "f4"), ("point", "u4"), ("n_points", "u4")])
 
 
@@ -35,9 +36,10 @@ class Target(NamedTuple):
     """The raster into which points are binned.
 
     Attributes:
-        wall_from_offset: (3, 4) float64 transform from offsets to column, row and depth in metres.
-        behind_m: smallest depth.
-        front_m: largest depth.
+        wall_from_offset: (3, 4) float64 transform from offsets in metres to (column, row, depth in
+            metres).
+        behind_m: smallest depth, in metres.
+        front_m: largest depth, in metres.
         height: number of rows.
         width: number of columns.
     """
@@ -50,11 +52,11 @@ class Target(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """Points of one chunk inside the raster, in order.
+    """Points of a chunk that are inside the raster, in order.
 
     Attributes:
-        cells: (n,) int32, row * width + column.
-        depths_m: (n,) float32.
+        cells: (n,) int32 cell, row * width + column.
+        depths_m: (n,) float32 depth in metres.
         squares: (n,) float32 squared distance to the centre of the cell, in cells.
         points: (n,) uint32 index in the cloud.
     """
@@ -75,14 +77,14 @@ def project_points(
     first: int,
     end: int,
 ) -> None:
-    """Set the cell, the depth and the distance from the cell's centre of points in a chunk.
+    """Compute the cell, depth and distance from the cell's centre for the points of a chunk.
 
-    Depths at both limits are inside. The left and upper edges of a cell belong to it.
+    Depths equal to a limit are inside. A cell includes its left and upper edges.
 
     Args:
         offsets: offsets of the chunk.
         target: the raster.
-        cells: output, -1 outside the raster or its range of depths.
+        cells: output (see `Entries`); -1 for points outside the raster or the range of depths.
         depths_m: output (see `Entries`).
         squares: output (see `Entries`).
         first: index of the first point.
@@ -94,7 +96,7 @@ def project_points(
     d0, d1, d2, d3 = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
     x, y, z = offsets.x, offsets.y, offsets.z
     for k in range(first, end):
-        # float64 costs no time, because the pass is limited by memory bandwidth.
+        # Computing in float64 takes no extra time, because memory bandwidth limits the pass.
         px, py, pz = np.float64(x[k]), np.float64(y[k]), np.float64(z[k])
         u = u0 * px + u1 * py + u2 * pz + u3
         v = v0 * px + v1 * py + v2 * pz + v3
@@ -116,10 +118,10 @@ def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers
 
 @compiled
 def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
-    """Select each cell's point with the largest depth; if equal, the one nearest to the centre.
+    """Select the point of each cell with the largest depth, or the most central of several.
 
     Args:
-        entries: points of one chunk; the first of equally near points is used.
+        entries: points of one chunk; of equally near points, the first is used.
         winners: (cells,) of `WINNER`, updated; depths are initially minus infinity.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells are processed.
@@ -137,7 +139,7 @@ def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner
 
 @compiled
 def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
-    """Select the point nearest to the centre of each cell; if equal, the first.
+    """Select the point nearest to the centre of each cell, and of equally near ones, the first.
 
     Args:
         entries: points of one chunk.
@@ -156,7 +158,7 @@ def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner
             winner.point = entries.points[k]
 
 
-# The entries of a chunk (16 MB) stay in the cache of the processor between passes.
+# Number of points in a chunk, whose entries (16 MB) stay in the processor's cache between passes.
 _CHUNK: Final = 1 << 20
 
 # Gaps are filled from the nearest cells and from cells at most one cell farther away.
@@ -168,11 +170,11 @@ _Value = TypeVar("_Value", bound=np.generic)
 def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the transform (3, 4) from offsets in metres to (column, row, depth in metres).
 
-    The difference of the two origins is computed in float64, so that survey coordinates of 10^6 m
-    lose no precision.
+    The difference between the two origins is computed in float64, so that no precision is lost with
+    survey coordinates of 10^6 m.
     """
     axes = np.vstack([frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world])
-    # Adding +0.0 converts -0.0, whose bits differ from those of +0.0.
+    # Adding 0.0 converts -0.0, which has different bits, to 0.0.
     return np.column_stack([axes, axes @ (origin - frame.origin_world) + 0.0])
 
 
@@ -184,7 +186,7 @@ def entries_inside(
     rows: slice | None = None,
     is_left_out: NDArray[np.bool_] | None = None,
 ) -> Iterator[Entries]:
-    """Yield the points inside a slab in order, by chunks.
+    """Yield the points inside a slab in order, one chunk at a time.
 
     Blocks of points are not read if their bounding boxes are outside the slab.
 
@@ -192,8 +194,8 @@ def entries_inside(
         points: points of the cloud.
         slab: slab of the wall.
         threads: number of threads.
-        rows: rows of the raster that are needed; points in other rows may be omitted. None for all.
-        is_left_out: (n,) points to ignore; None if all are used.
+        rows: required rows of the raster; points in other rows may be omitted. None for all rows.
+        is_left_out: (n,) True for points to ignore; None to use all points.
     """
     frame = slab.frame
     target = Target(
@@ -219,7 +221,7 @@ def entries_inside(
 
 
 def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[tuple[int, int]]:
-    """Yield the first index and the end index of chunks that may have points inside."""
+    """Yield the first and end indices of chunks that may contain points inside the slab."""
     n_points, boxes_m = points.x.size, points.boxes_m
     if boxes_m is None:
         edges = np.array([[0, n_points]])
@@ -236,14 +238,14 @@ def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[
 def _may_hold_points(
     boxes_m: NDArray[np.float64], target: Target, rows: slice | None
 ) -> NDArray[np.bool_]:
-    """Return a mask of bounding boxes (n, 2, 3) that may intersect a slab, which may be oblique."""
+    """Return a mask of bounding boxes (n, 2, 3) that may intersect a slab of any orientation."""
     axes = target.wall_from_offset[:, :3]
     middles = boxes_m.mean(axis=1) @ axes.T + target.wall_from_offset[:, 3]
     halves = 0.5 * (boxes_m[:, 1] - boxes_m[:, 0]) @ np.abs(axes).T
     first_row, end_row = (0, target.height) if rows is None else (rows.start, rows.stop)
     low = np.array([0.0, first_row, target.behind_m])
     high = np.array([target.width, end_row, target.front_m])
-    # Use a tolerance that is much larger than rounding errors.
+    # Use a tolerance much larger than rounding errors.
     slack = 1e-9 * (np.abs(middles) + halves) + 1e-6
     # Comparisons with NaN are false, so a box with a NaN coordinate is kept.
     is_beside = (middles + halves < low - slack) | (middles - halves > high + slack)
@@ -256,8 +258,8 @@ def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
 
     Args:
         threads: number of threads, rounded down to a power of two.
-        passes: functions of the number of owners and the index of the owner whose cells are
-            processed.
+        passes: functions that are called with the number of threads (`owners`) and the index of the
+            thread (`owner`) whose cells they process.
     """
     owners = 1 << (max(1, threads).bit_length() - 1)
 
@@ -275,16 +277,16 @@ def topmost_points(
     threads: int,
     is_left_out: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.void]:
-    """Return the point of each cell that is nearest to the viewer (skarlatos2012).
+    """Find the point nearest to the viewer in each cell (skarlatos2012).
 
-    If points are equally near, the one nearest to the centre of the cell is used; if these are also
-    equally near, the first one is used.
+    Of equally near points, the one nearest to the centre of the cell is used, and of several such
+    points, the first.
 
     Args:
         points: points of the cloud.
         slab: slab of the wall.
         threads: number of threads.
-        is_left_out: (n,) points to ignore; None if all are used.
+        is_left_out: (n,) True for points to ignore; None to use all points.
 
     Returns:
         (cells,) of `WINNER`; `point` is `NO_POINT` if the cell is void.
@@ -296,7 +298,7 @@ def topmost_points(
 
 
 def empty_winners(n_cells: int) -> NDArray[np.void]:
-    """Return an array of cells without points."""
+    """Return records for cells without points."""
     winners = np.empty(n_cells, dtype=WINNER)
     winners[:] = (-np.inf, np.inf, NO_POINT, 0)
     return winners
@@ -310,7 +312,7 @@ def values_of_winners(
     Args:
         winners: (cells,) of `WINNER`.
         values: (n, channels) values of the points of the cloud.
-        nothing: value of cells without a point.
+        nothing: value for cells without a point.
     """
     taken = np.full((winners.size, values.shape[1]), nothing, dtype=values.dtype)
     has_point = winners["n_points"] > 0
@@ -324,8 +326,8 @@ def places_of_winners(
     """Return the positions of the selected points in cells near gaps.
 
     Returns:
-        (cells, 2) to the right of and below the centre of the cell, in cells; 0 if there is no void
-        cell nearby, NaN if the cell has no point.
+        (cells, 2) distances to the right and downwards from the centre of the cell, in cells; 0 if
+        no void cell is nearby, NaN if the cell has no point.
     """
     from scipy import ndimage  # noqa: PLC0415 - few who load this need it
 

@@ -1,8 +1,8 @@
-"""Resection: the pose of one camera from points in its photo with known world coordinates.
+"""Resection: the pose of a camera from points in its photo with known world coordinates.
 
 The method is a weighted least-squares adjustment (Gauss-Markov model with Levenberg-Marquardt
-damping) with the full lens model. The observations are the pixels; the covariance of each pixel
-includes the uncertainty of its point.
+damping) with the full lens model. The observations are pixel coordinates, whose covariances include
+the uncertainty of the points.
 """
 
 from __future__ import annotations
@@ -33,14 +33,13 @@ from orthoflow.geometry.frames import cross_matrix
 from orthoflow.geometry.rows import Rows
 
 _ITERATIONS: Final = 40
-# Relative change of the sum of squares at convergence. With a few hundred points, a step with this
-# change moves no parameter by more than 1 % of its standard deviation, and the next step is far
-# smaller.
+# Relative change of the sum of squares at convergence. With a few hundred points, such a step
+# changes no parameter by more than 1 % of its standard deviation, and the next step is far smaller.
 _CONVERGED: Final = 1e-7
 _DAMPING_START: Final = 1e-6
 _DAMPING_MOST: Final = 1e8
-# A point is not used if its uncertainty exceeds this share of the image's longer side, since the
-# point would agree with any pixel.
+# Points whose uncertainty in pixels exceeds this share of the image's longer side are not used,
+# since they would agree with any pixel.
 _BLUR_MOST_SHARE: Final = 0.02
 
 
@@ -63,17 +62,17 @@ class SeenPoints(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Resection:
-    """An adjusted camera and its accuracy.
+    """An adjusted camera and its covariance.
 
     Attributes:
         camera: the camera.
-        covariance: (p, p) float64 covariance of rotation vector (left of camera_from_world),
-            translation, and free lens parameters in the order of `LensFreedom.names`; scaled by the
-            residuals.
+        covariance: (p, p) float64 covariance of the rotation vector in radians (its rotation
+            multiplies camera_from_world from the left), the translation in metres, and the free
+            lens parameters in the order of `LensFreedom.names`; scaled by the residuals.
         sigma0: standard deviation of unit weight; 1 if the sigmas of the points are correct.
-        variance_factor: mean ratio, over its axes, of `covariance` to the covariance from the given
-            sigmas. It is sigma0 squared, or more if residuals of neighbouring points are similar,
-            so that the points are not independent.
+        variance_factor: mean ratio of `covariance` to the covariance that the given sigmas predict.
+            It is the square of `sigma0`, or larger if neighbouring points have similar residuals
+            and are therefore not independent.
         lens: the free lens parameters.
     """
 
@@ -89,11 +88,11 @@ class Misfit:
     """The fit of points to a camera.
 
     Attributes:
-        residuals_px: (n, 2) float64 observed minus computed; NaN if the camera cannot see the
-            point.
+        residuals_px: (n, 2) float64 observed minus computed pixel coordinates; NaN if the camera
+            cannot see the point.
         normalised: (n,) float64 length of the residual in units of its expected standard deviation
-            (chi distribution with 2 degrees of freedom); inf if the camera cannot see the point, or
-            if the point is so close that its projection could be anywhere in the image.
+            (chi distribution with 2 degrees of freedom). It is inf if the camera cannot see the
+            point, or if the point is so close that its uncertainty would allow any pixel.
     """
 
     residuals_px: NDArray[np.float64]
@@ -112,14 +111,16 @@ def adjust(
     """Adjust a camera to the points it sees.
 
     Args:
-        seen: the points, at least as many as the unknowns require.
+        seen: the points; their number must suffice for the pose.
         start: initial camera.
         prior: camera whose interior orientation is the prior of the free lens parameters; `start`
             by default.
-        lens: free parameters of the interior orientation; none by default.
-        independent: whether the errors of the points are independent; if false, neighbouring points
-            may have common errors (`geometry.covariances`).
-        soft_limit: residuals beyond this many standard deviations get less weight (Huber).
+        lens: standard deviations of the free parameters of the interior orientation; all fixed by
+            default.
+        independent: whether the errors of the points are independent. If false, neighbouring points
+            may have common errors (see `geometry.covariances`).
+        soft_limit: residuals larger than this number of standard deviations get less weight
+            (Huber).
 
     Raises:
         GeometryError: there are too few points, or they do not determine the pose.
@@ -140,7 +141,7 @@ def stated(
     independent: bool = True,
     soft_limit: float = math.inf,
 ) -> Resection:
-    """Return a camera found by `fitted` with its accuracy; the arguments are those of `adjust`.
+    """Compute the covariance of a camera that `fitted` returned; for the arguments, see `adjust`.
 
     Raises:
         GeometryError: there are too few points, or they do not determine the pose.
@@ -153,7 +154,7 @@ def stated(
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise GeometryError("the points of a photo do not determine its pose") from error
-    # The prior, not the points, determines part of the unknowns.
+    # The prior determines this number of unknowns, so the points determine only the others.
     from_prior = float((np.diag(cofactors)[POSE_PARAMETERS:] / lens.sigmas**2).sum())
     redundancy = 2 * len(seen) - n_free + from_prior
     sigma0 = math.sqrt(float((errors.residuals**2).sum()) / redundancy)
@@ -180,7 +181,7 @@ def fitted(
     lens: LensFreedom | None = None,
     soft_limit: float = math.inf,
 ) -> ViewingCamera:
-    """Return the camera that `adjust` finds, without its accuracy.
+    """Return the camera that `adjust` finds, without its covariance.
 
     Raises:
         GeometryError: there are too few points, or they do not determine the pose.
@@ -190,11 +191,11 @@ def fitted(
 
 
 def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
-    """Compute the fit of points to a camera, relative to the expected deviation of each point."""
+    """Compute the residuals of points, also in units of their expected standard deviations."""
     middle = seen.points_world.mean(axis=0) if len(seen) else np.zeros(3)
     near = camera.shifted(middle)
     linear = linearised(near, seen.points_world - middle, LensFreedom())
-    # There is no pixel beyond the radius at which a lens model folds back.
+    # A lens model has no pixels beyond the radius at which it folds back.
     folds = camera.distortion.any()
     pixels = near.project(seen.points_world - middle)[:, :2] if folds else linear.pixels
     residuals = seen.pixels_photo - pixels
@@ -210,7 +211,7 @@ def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
 def predicted_covariances(
     resection: Resection, points_world: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return covariances (n, 2, 2) in pixels squared of the projections of points (n, 3)."""
+    """Return the covariances (n, 2, 2), in pixels squared, of the projections of points (n, 3)."""
     by_parameters = linearised(resection.camera, points_world, resection.lens).by_parameters
     return by_parameters @ resection.covariance @ by_parameters.transpose(0, 2, 1)
 
@@ -218,7 +219,7 @@ def predicted_covariances(
 def pixels_by_point(
     camera: ViewingCamera, points_world: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return derivatives (n, 2, 3), pixels per metre, of the pixels of world points (n, 3)."""
+    """Return the derivatives (n, 2, 3), pixels per metre, of the pixels of points (n, 3)."""
     linear = linearised(camera, points_world, LensFreedom())
     return linear.by_camera_point @ camera.rotation
 
@@ -226,10 +227,10 @@ def pixels_by_point(
 def moved_origin(
     camera: ViewingCamera, middle: NDArray[np.float64], n_free: int
 ) -> NDArray[np.float64]:
-    """Return derivatives (n_free, n_free) of a camera's parameters by those of a shifted camera.
+    """Return the derivatives of a camera's parameters with respect to those of a shifted camera.
 
-    The coordinates of the shifted camera have their origin at `middle`: t = t_local - R middle, and
-    a rotation w left of R moves R middle by w x (R middle).
+    The coordinates of the shifted camera have their origin at `middle`, so t = t_local - R middle.
+    If a small rotation w multiplies R from the left, R middle changes by w x (R middle).
     """
     derivative = np.eye(n_free)
     derivative[3:6, :3] = cross_matrix(camera.rotation @ middle)
@@ -237,7 +238,7 @@ def moved_origin(
 
 
 def whiten(covariances: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return columns (n, 2, c) whitened by the inverse Cholesky factor."""
+    """Multiply columns (n, 2, c) by the inverse Cholesky factors of covariances (n, 2, 2)."""
     first = np.sqrt(covariances[:, 0, 0])
     mixed = covariances[:, 0, 1] / first
     second = np.sqrt(covariances[:, 1, 1] - mixed**2)
@@ -255,7 +256,7 @@ class _Errors:
 
 
 class _Problem:
-    """The adjustment of one camera, in coordinates with an origin near the points."""
+    """The adjustment of a camera, in coordinates whose origin is near the points."""
 
     def __init__(
         self, seen: SeenPoints, lens: LensFreedom, prior: ViewingCamera, soft_limit: float
@@ -296,7 +297,7 @@ class _Problem:
         return step
 
     def errors(self, camera: ViewingCamera) -> _Errors:
-        """Return whitened residuals and derivatives; large residuals get less weight."""
+        """Return whitened residuals and derivatives, with less weight for large residuals."""
         seen = self._seen
         linear = linearised(camera, seen.points_world, self.lens)
         residuals = seen.pixels_photo - linear.pixels
@@ -318,7 +319,7 @@ class _Problem:
     def adjusted_points(
         self, camera: ViewingCamera, errors: _Errors, cofactors: NDArray[np.float64]
     ) -> AdjustedPoints:
-        """Return the points with the effect of their errors on the camera."""
+        """Return the points, including the effect of their errors on the unknowns."""
         linear = linearised(camera, self._seen.points_world, LensFreedom())
         by_place = whiten(
             _pixel_covariances(linear, self._seen), linear.by_camera_point @ camera.rotation
@@ -338,7 +339,7 @@ class _Problem:
 
     def normal(self, errors: _Errors) -> NDArray[np.float64]:
         along, down = errors.jacobian.transpose(1, 2, 0)
-        # Use einsum, since the order of summation in BLAS depends on the number of threads.
+        # Use einsum, because the order of summation in BLAS depends on the number of threads.
         normal: NDArray[np.float64] = np.einsum("jn,kn->jk", along, along)
         normal += np.einsum("jn,kn->jk", down, down)
         free = np.arange(POSE_PARAMETERS, len(normal))
@@ -353,12 +354,12 @@ class _Problem:
 def _problem(
     seen: SeenPoints, prior: ViewingCamera, lens: LensFreedom | None, soft_limit: float
 ) -> tuple[NDArray[np.float64], _Problem]:
-    """Return the centroid of the points, and the adjustment in coordinates relative to it.
+    """Return the centroid of the points, and the adjustment in coordinates relative to this.
 
     Large survey coordinates would reduce the precision.
     """
     freedom = LensFreedom() if lens is None else lens
-    # The lens parameters have a prior, so the points only need to determine the pose.
+    # The prior determines the lens parameters, so the points only need to determine the pose.
     if 2 * len(seen) < POSE_PARAMETERS + 2:
         raise GeometryError(
             f"a resection with {POSE_PARAMETERS} unknowns got only {len(seen)} points"

@@ -1,4 +1,4 @@
-"""Measures of scatter and solutions that are robust to single outliers."""
+"""Measures of scatter, and solutions of linear systems, that are robust to outliers."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-# Ratio of standard deviation to median absolute deviation of a normal distribution:
-# 1 / Phi^-1(3/4).
+# Ratio of the standard deviation of a normal distribution to its median absolute deviation: 1 /
+# Phi^-1(3/4).
 NMAD_FACTOR: Final = 1.4826
 # Median length of a vector with two standard normal components (Rayleigh distribution).
 MEDIAN_LENGTH: Final = 1.1774
 # Number of iterations for the L1 norm.
 _ROUNDS: Final = 20
-# Below this residual, the weight is constant.
+# Smaller residuals all have the same weight.
 _FLOOR: Final = 0.01
 
 
 def median_deviation(values: NDArray[np.floating], middle: float | None = None) -> float:
-    """Return the NMAD, 1.4826 times the median absolute deviation.
+    """Return the NMAD: 1.4826 times the median absolute deviation.
 
     Args:
         values: at least one value.
-        middle: reference of the deviations; None for the median.
+        middle: value from which deviations are measured; None for the median.
     """
     middle = float(np.median(values)) if middle is None else middle
     return NMAD_FACTOR * float(np.median(np.abs(values - middle)))
@@ -33,7 +33,7 @@ def median_deviation(values: NDArray[np.floating], middle: float | None = None) 
 def least_absolute(
     design: NDArray[np.float64], wanted: NDArray[np.float64], held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Solve design x = wanted in the L1 norm by least squares with weights of 1 / residual.
+    """Solve design @ x = wanted in the L1 norm, by least squares with weights of 1 / residual.
 
     Args:
         design: (n, k) design matrix.
@@ -53,12 +53,12 @@ _SAMPLES: Final = 300_000
 
 
 def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
-    """Estimate the standard deviation of depths from second differences between neighbours.
+    """Estimate the standard deviation of depths from second differences of neighbouring cells.
 
-    Edges do not influence the median of the differences. The result is 0 if no three adjacent cells
-    of the raster (rows, cols) are measured.
+    Edges hardly affect the median of the differences. The result is 0 if the raster (rows, cols)
+    has no three adjacent measured cells.
     """
-    # Half of the samples are horizontal, half vertical.
+    # Half of the differences are horizontal and half are vertical.
     step = max(1, 2 * depth_m.size // _SAMPLES)
     rows, middle = depth_m[::step], depth_m[1:-1:step]
     across = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
@@ -67,7 +67,7 @@ def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
     n_known = int(np.count_nonzero(np.isfinite(bends)))
     if not n_known:
         return 0.0
-    # Take the median; NaN is sorted last.
+    # Take the median of the known values; NaN is sorted last.
     half = n_known // 2
     bends = np.partition(bends, half)
     upper = float(bends[half])

@@ -1,4 +1,4 @@
-"""Selection of rows from dataclasses of arrays with one row per item or per row of a raster."""
+"""Selection of items or raster rows from dataclasses of arrays."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Rows:
         return len(next(iter(_arrays(self).values())))
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
-        """Return the selected items; views if they are selected by a slice."""
+        """Return the selected items; a slice gives views."""
         return replace(self, **{name: array[chosen] for name, array in _arrays(self).items()})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Concatenate items; fields that are not arrays are taken from the first object."""
+        """Concatenate items; fields that are not arrays are copied from the first object."""
         columns = {name: [getattr(part, name) for part in parts] for name in _arrays(parts[0])}
         return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
 
@@ -43,7 +43,7 @@ _AnyRaster = TypeVar("_AnyRaster", bound=_Raster)
 
 
 def raster_rows(raster: _AnyRaster, rows: slice) -> _AnyRaster:
-    """Return a band of rows of a raster: views of its arrays, and the frame of the band."""
+    """Return a band of rows of a raster, with views of its arrays and the frame of the band."""
     frame = raster.frame
     bands = {
         name: array[rows]

@@ -1,13 +1,13 @@
-"""Ray casting in a simulated scene: the surface that a ray hits, and its colour.
+"""Ray casting in a simulated scene: the surface that a ray hits, and the colour of the surface.
 
-Rays are traced through a tree of bounding boxes. The nearest hit is exact, because the tree only
-skips rectangles that a ray cannot hit. If two rectangles are at the same distance, the one with the
-smaller index is returned.
+Rays are traced through a tree of bounding boxes. The nearest hit is exact, because only rectangles
+that a ray cannot hit are skipped. If a ray hits two rectangles at the same distance, the one with
+the smaller index is returned.
 
-A texture is a function of position, without grids or images, so the true orthoimage can be computed
-at any resolution. Stains are value noise on hashed lattices with quintic interpolation. This noise
-is twice continuously differentiable, and its shortest wavelength is about twice the lattice
-spacing. Ornaments have sharp edges.
+Textures are functions of position rather than images, so the true orthoimage can be computed at any
+resolution. Stains are value noise on hashed lattices with quintic interpolation. This noise is
+twice continuously differentiable, and its shortest wavelength is about twice the lattice spacing.
+Ornaments have sharp edges.
 
 This module loads numba, so methods import it inside functions.
 """
@@ -26,7 +26,7 @@ from orthoflow.geometry.scenes import Scene
 
 
 class Shade(NamedTuple):
-    """Colour of a point (red, green, blue, 0..255) and its laser reflectance (0..1)."""
+    """Colour (red, green and blue, 0..255) and laser reflectance (0..1) of a point."""
 
     red: float
     green: float
@@ -52,11 +52,11 @@ class Pattern(NamedTuple):
     """The pattern at a point.
 
     Attributes:
-        light: brightness deviation, about -1..1.
-        warmth: colour deviation, from blue (-1) to red (1).
+        light: deviation of the brightness, about -1..1.
+        warmth: deviation of the colour, from blue (-1) to red (1).
         paint: opacity of a coloured ornament, 0..1.
-        hue: hue of that ornament, 0..1 around the colour circle.
-        other: `light` at the wavelength of the laser.
+        hue: hue of the ornament, 0..1 around the colour circle.
+        other: deviation of the brightness at the wavelength of the laser.
     """
 
     light: float
@@ -77,7 +77,7 @@ def mixed_bits(value: np.uint64) -> np.uint64:
 
 @kernel_part
 def uniform(state: np.uint64, draw: int) -> float:
-    """Return a number in [0, 1) that depends only on the 64-bit state and the index of the draw."""
+    """Return a random number in [0, 1) that depends only on a 64-bit state and an index."""
     bits = mixed_bits(np.uint64(state) + np.uint64(draw + 1) * np.uint64(0x9E3779B97F4A7C15))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
@@ -95,7 +95,7 @@ def cell_state(i: int, j: int, seed: int) -> np.uint64:
 
 @kernel_part
 def _lattice_value(column: np.uint64, j: int) -> float:
-    """Return a random number in [0, 1) for the lattice point j of a column."""
+    """Return a random number in [0, 1) for lattice point j of a column, given by its state."""
     bits = mixed_bits(column ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
@@ -115,7 +115,7 @@ def _value_noise(a: float, b: float, seed: int) -> float:
 
 @kernel_part
 def _stains(a: float, b: float, period: float, seed: int) -> float:
-    """Return three octaves of noise, about -1..1; the finest lattice is a sixth of the period."""
+    """Return noise of three octaves, about -1..1, with lattices down to a sixth of the period."""
     return (
         0.5 * _value_noise(a / period, b / period, seed)
         + 0.3 * _value_noise(2.7 * a / period + 7.3, 2.7 * b / period + 1.9, seed + 1)
@@ -125,7 +125,7 @@ def _stains(a: float, b: float, period: float, seed: int) -> float:
 
 @kernel_part
 def _wear(a: float, b: float, seed: int) -> float:
-    """Return fine detail of a surface: grain on an 11 mm lattice and cracks 2 to 4 mm wide."""
+    """Return fine detail: grain on a lattice with a spacing of 11 mm, and cracks 2 to 4 mm wide."""
     grain = 0.3 * _value_noise(a / 0.011, b / 0.011, seed)
     crack = abs(_value_noise(a / 0.13, b / 0.13, seed + 1))
     return grain - 0.8 * max(0.0, 1.0 - crack / 0.03)
@@ -133,10 +133,10 @@ def _wear(a: float, b: float, seed: int) -> float:
 
 @kernel_part
 def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float]:
-    """Return the ornament of the lattice cell at (a, b): (paint 0 or 1, hue 0..1).
+    """Return the ornament at (a, b) as (paint, 0 or 1; hue, 0..1).
 
-    Each cell contains a different flower, whose number of petals, size, rotation, hue and position
-    are random.
+    Each lattice cell contains a flower with a random number of petals, size, rotation, hue and
+    position.
     """
     i, j = math.floor(a / period), math.floor(b / period)
     state = cell_state(i, j, seed)
@@ -151,7 +151,8 @@ def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float
         return 1.0, (uniform(state, 5) + 0.5) % 1.0
     if radius < outline * (0.72 + 0.28 * wave):
         return 1.0, uniform(state, 5)
-    # A painted ring and lattice lines around the flowers, 1/40 of the period wide.
+    # Around each flower, there are a painted ring and lines along the lattice, 1/40 of the period
+    # wide.
     if abs(radius - 0.42) < 0.0125 and uniform(state, 6) > 0.4:
         return 1.0, uniform(state, 7)
     edge = 0.5 - max(abs(a / period - i - 0.5), abs(b / period - j - 0.5))
@@ -162,7 +163,7 @@ def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float
 
 @kernel_part
 def _motif(a: float, b: float, period: float) -> float:
-    """Return a damask motif, exactly periodic; alternate columns are shifted by half a period."""
+    """Return an exactly periodic damask motif; every other column is shifted by half a period."""
     i = math.floor(a / period)
     x = 2.0 * (a / period - i) - 1.0
     y = b / period + 0.5 * (i % 2)
@@ -208,13 +209,13 @@ def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Patt
     elif kind == 4:
         light = _grain(a, b, period, seed + 40)
         other = 0.5 * light + 0.5 * warmth
-    # Dirt in cracks is also dark at the wavelength of the laser, but less so.
+    # Dirt in cracks is also dark at the wavelength of the laser, but less dark.
     return Pattern(light + wear, warmth, paint, hue, other + 0.5 * wear)
 
 
 @kernel_part
 def colour_at(kind: int, params: NDArray[np.float64], a: float, b: float) -> Shade:
-    """Return colour and reflectance at (a, b) of a texture (`TextureKind` and its parameters)."""
+    """Return the colour and reflectance at (a, b) of a texture, from its kind and parameters."""
     light, warmth, paint, hue, other = _pattern(kind, params, a, b)
     contrast, gap = params[4], params[7]
     gain = 1.0 + contrast * light
@@ -245,10 +246,10 @@ def paint_points(
     points: NDArray[np.float64],
     painted: NDArray[np.float32],
 ) -> None:
-    """Fill `painted` (4, n) with red, green, blue (0..255) and reflectance (0..1) of points (3, n).
+    """Set `painted` (4, n) to red, green, blue (0..255) and reflectance (0..1) of points (3, n).
 
-    Values for rectangle -1 remain unchanged. A point outside the plane of its rectangle gets the
-    colour at its projection onto that plane.
+    Columns of points with rectangle -1 remain unchanged. A point that is not on the plane of its
+    rectangle gets the colour of its projection onto that plane.
     """
     frames = table.frames
     for i in range(rectangle.shape[0]):
@@ -269,21 +270,21 @@ def paint_points(
 
 Index: TypeAlias = int | np.int64
 
-# Minimum distance of a hit, so that a ray does not hit the surface from which it starts.
+# Minimum distance of a hit, so that rays do not hit the surface from which they start.
 _NEAREST: Final = 1e-9
 
 
 class CastTable(NamedTuple):
-    """A scene prepared for ray casting, relative to its origin, in the axes of the boxes.
+    """A scene prepared for ray casting, in coordinates along the axes of the boxes from its origin.
 
     Attributes:
-        axes: (3, 3) float64 rotation from the scene's axes to those of the boxes.
-        rectangles: (r, 18) float64: centre, axis a, axis b, normal (3 each), extent (4), and the
-            first and the last + 1 of its holes.
+        axes: (3, 3) float64 rotation from the scene's axes to the axes of the boxes.
+        rectangles: (r, 18) float64: centre, axis a, axis b and normal (3 numbers each), extent (4),
+            index of its first hole, and index after its last hole.
         holes: (h, 4) float64 extents of the holes.
-        nodes: (m, 9) float64 nodes of the tree: bounds of a box (low, then high); the next node for
-            rays that miss the box; the first and the last + 1 of its rectangles in `order` (an
-            empty range unless the node is a leaf). Parents precede children, and node 0 is the
+        nodes: (m, 9) float64 nodes of the tree: lower and upper corner of the box (3 numbers each);
+            next node for rays that miss the box; first index and end index of its rectangles in
+            `order` (equal unless the node is a leaf). Parents precede children, and node 0 is the
             root.
         order: (r,) int64 rectangles in the order of the leaves.
     """
@@ -296,7 +297,7 @@ class CastTable(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """Start (metres from the scene's origin) and direction, whose length is the distance unit."""
+    """Start in metres from the scene's origin, and direction, whose length is the unit of t."""
 
     x: float
     y: float
@@ -310,8 +311,8 @@ class Ray(NamedTuple):
 def _hit_distance(
     rectangles: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
-    """Return the distance to a rectangle along a ray, in units of its direction, or inf."""
-    # Use scalars, since a row as an array would be reference-counted at each use.
+    """Return the distance along a ray to a rectangle, in units of the ray's direction, or inf."""
+    # Use scalars, because an array for the row would be reference-counted at each use.
     r = rectangles
     facing = r[index, 9] * ray.dx + r[index, 10] * ray.dy + r[index, 11] * ray.dz
     if abs(facing) < 1e-12:
@@ -352,8 +353,8 @@ def _along(axes: NDArray[np.float64], axis: int, x: float, y: float, z: float) -
 
 @kernel_part
 def _inverse(value: float) -> float:
-    # Use a large number instead of infinity, since 0 times infinity is NaN for a ray in the plane
-    # of a slab.
+    # Use a large number instead of infinity: for a ray in a face of a box, 0 times infinity would
+    # be NaN.
     if abs(value) < 1e-30:
         return 1e30 if value >= 0.0 else -1e30
     return 1.0 / value
@@ -371,10 +372,12 @@ def cast_rays(
 
     Args:
         table: the scene.
-        starts: (3, n), or (3, 1) for all rays, metres from the scene's origin, in its axes.
-        ways: (3, n) directions in the scene's axes; their lengths are the units of t.
-        t: (n,) maximum distance; set to the distance of the hit, unchanged if there is none.
-        rectangle: (n,) filled with the rectangle; -1 if there is no hit.
+        starts: (3, n), or (3, 1) if all rays have the same start, in metres from the scene's
+            origin, in its axes.
+        ways: (3, n) directions in the scene's axes; the length of a direction is the unit of its t.
+        t: (n,) maximum distances on input; changed to the distances of hits, and unchanged where
+            there is no hit.
+        rectangle: (n,) output, indices of the rectangles; -1 where there is no hit.
     """
     rectangles, holes, nodes, axes = table.rectangles, table.holes, table.nodes, table.axes
     each = 1 if starts.shape[1] > 1 else 0
@@ -391,8 +394,8 @@ def cast_rays(
         ray = Ray(x, y, z, dx, dy, dz)
         inverse = Ray(x, y, z, _inverse(dx), _inverse(dy), _inverse(dz))
         best_t, best = t[i], np.int64(-1)
-        # First test the rectangle that the previous ray hit, which excludes most boxes without
-        # changing the result.
+        # Start with the rectangle that the previous ray hit. The result is the same, but most boxes
+        # are then too far away to be searched.
         if guess >= 0:
             distance = _hit_distance(rectangles, holes, guess, ray)
             if distance < best_t:
@@ -412,7 +415,7 @@ def cast_rays(
         rectangle[i] = guess = best
 
 
-# Number of rays per batch, for which arrays with one number per ray fit into the processor's cache.
+# Number of rays per batch. Arrays with one number per ray fit into the processor's cache.
 RAYS_AT_ONCE: Final = 1 << 14
 
 
@@ -421,7 +424,8 @@ class Hits:
     """The first hits of rays in a scene.
 
     Attributes:
-        t: (n,) float64 distance in units of the ray's direction; inf if there is no hit.
+        t: (n,) float64 distance in units of the length of the ray's direction; inf if there is no
+            hit.
         rectangle: (n,) int32 row of the scene; -1 if there is no hit.
     """
 
@@ -432,8 +436,8 @@ class Hits:
 class SceneRays:
     """A scene prepared for many rays.
 
-    Starts and points are in metres from the scene's origin. Arrays have one row per coordinate,
-    (3, n), since numpy processes them several times as fast as arrays with one row per point.
+    Starts and points are in metres from the scene's origin. Arrays have one row per coordinate, (3,
+    n), because NumPy processes them several times as fast as arrays with one row per point.
 
     Args:
         scene: the scene.
@@ -457,9 +461,10 @@ class SceneRays:
         """Find the first hit of rays.
 
         Args:
-            starts: (3, n), or (3, 1) for all rays.
-            ways: (3, n) directions; their lengths are the units of distances.
-            within: maximum distance, (n,) or one for all rays.
+            starts: (3, n), or (3, 1) if all rays have the same start.
+            ways: (3, n) directions; the length of a direction is the unit of distances along the
+                ray.
+            within: maximum distances (n,), or one distance for all rays.
         """
         n_rays = ways.shape[1]
         t = np.empty(n_rays)
@@ -478,9 +483,9 @@ class SceneRays:
     def colours(
         self, rectangle: NDArray[np.int32], points: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Return red, green, blue (0..255) and reflectance (0..1), (4, n), of points.
+        """Return (4, n): red, green, blue (0..255) and reflectance (0..1) of points (3, n).
 
-        Values for rectangle -1 are 0.
+        All values are 0 for points with rectangle -1.
         """
         painted = np.zeros((4, len(rectangle)), dtype=np.float32)
         paint_points(
@@ -495,7 +500,7 @@ class SceneRays:
 def points_on(
     starts: NDArray[np.float64], ways: NDArray[np.float64], hits: Hits
 ) -> NDArray[np.float64]:
-    """Return the points (3, n) that rays hit, or the start of a ray that hits nothing."""
+    """Return the points (3, n) that rays hit; for a ray that hits nothing, its start."""
     return starts + np.where(hits.rectangle < 0, 0.0, hits.t) * ways
 
 
@@ -526,10 +531,10 @@ def _cast_table(scene: Scene) -> CastTable:
 
 
 class _BoxTree:
-    """Bounding boxes of rectangles, split where the cost of rays is lowest.
+    """A tree of bounding boxes of rectangles, split so that the expected cost of rays is lowest.
 
-    The boxes are parallel to the rectangle for which they are smallest. In a room, most rectangles
-    are parallel or perpendicular to it, so their boxes are thin.
+    The axes of all boxes are those of the rectangle that makes the boxes smallest. In a room, most
+    rectangles are parallel or perpendicular to this one, so their boxes are thin.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -541,8 +546,8 @@ class _BoxTree:
             return
         self.axes = _tightest_axes(scene)
         corners = scene.corners_m() @ self.axes.T
-        # Add a tolerance of 1 micrometre, so that the boxes of rectangles along the axes are not
-        # empty.
+        # Add a tolerance of 1 micrometre, so that the boxes of rectangles parallel to the axes are
+        # not empty.
         self._low = corners.min(axis=1) - 1e-6
         self._high = corners.max(axis=1) + 1e-6
         self._add(np.arange(len(scene)))
@@ -562,17 +567,17 @@ class _BoxTree:
         self.links[node] = (len(self.boxes), first, first)
 
     def _cheapest_half(self, members: NDArray[np.int64]) -> NDArray[np.bool_] | None:
-        """Choose the members of the first child; None if a leaf is cheaper.
+        """Return a mask of the members of the first child; None if a leaf is cheaper.
 
-        The cost of a child is its number of rectangles times the surface of its box, which is
-        proportional to the probability of a hit (Goldsmith and Salmon 1987); visiting a node costs
-        about one rectangle.
+        The cost of a child is the number of its rectangles times the surface area of its box,
+        because this area is proportional to the probability of a hit (Goldsmith and Salmon 1987).
+        Visiting a node costs about as much as one rectangle.
         """
         if len(members) == 1:
             return None
         low, high = self._low[members], self._high[members]
         whole = float(_surfaces_m2(high.max(axis=0) - low.min(axis=0)))
-        # Process all three axes at once, (n, axis), since most nodes have few members.
+        # Process all three axes at once, because most nodes have few members.
         order = np.argsort(low + high, axis=0, kind="stable")
         heads = _running_surfaces(low[order], high[order])[:-1]
         tails = _running_surfaces(low[order[::-1]], high[order[::-1]])[:-1][::-1]
@@ -587,14 +592,14 @@ class _BoxTree:
 
 
 def _surfaces_m2(sides: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return half the surfaces (...) of boxes with these sides (..., 3)."""
+    """Return half the surface areas (...) of boxes with sides (..., 3)."""
     x, y, z = np.moveaxis(sides, -1, 0)
     surfaces: NDArray[np.float64] = x * y + y * z + z * x
     return surfaces
 
 
 def _running_surfaces(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return surfaces (n, k) of boxes around the first 1, 2, ... members of k orders (n, k, 3)."""
+    """Return half the surface areas (n, k) of boxes around the first 1, 2, ..., n members."""
     return _surfaces_m2(np.maximum.accumulate(high) - np.minimum.accumulate(low))
 
 

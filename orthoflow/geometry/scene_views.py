@@ -18,9 +18,10 @@ from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_
 from orthoflow.geometry.scenes import Scene, Viewers, cell_states, uniforms
 from orthoflow.geometry.threads import in_runs
 
-# A viewer sees a point unless a hit is more than this far in front of it, in metres.
+# A viewer sees a point unless the ray hits a surface more than this distance, in metres, before the
+# point.
 _SEEN_WITHIN_M: Final = 0.0005
-# A camera sees a point unless a hit is more than this share of the distance in front of it.
+# The same for a camera, as a share of its distance from the point.
 _SEEN_WITHIN_SHARE: Final = 2e-4
 
 
@@ -30,13 +31,14 @@ class TrueOrthoimage:
 
     Attributes:
         frame: the frame of the cells.
-        rgb: (rows, cols, 3) float32, 0..255, mean over the cell; NaN if there is no surface or no
-            colour was requested.
-        depth_m: (rows, cols) float32 along the normal at the cell's centre; NaN if there is no
-            surface.
-        rectangle: (rows, cols) int32 row of the scene at the centre; -1 if there is no surface.
-        seen: (rows, cols) bool, whether a viewer sees this surface point; undefined unless
-            requested.
+        rgb: (rows, cols, 3) float32, 0..255, mean colours of the cells; NaN where there is no
+            surface or no colour was requested.
+        depth_m: (rows, cols) float32 depths along the normal at the centres of the cells; NaN where
+            there is no surface.
+        rectangle: (rows, cols) int32 rectangles (rows of the scene) at the centres of the cells; -1
+            where there is no surface.
+        seen: (rows, cols) bool, whether any viewer sees the surface point at the centre; undefined
+            where not requested.
     """
 
     frame: WallFrame
@@ -62,11 +64,11 @@ def render(  # noqa: PLR0913
 
     Args:
         scene: the scene.
-        frame: the frame of the cells; it may deviate from a true wall.
-        front_m: distance in front of the plane beyond which surfaces are ignored.
-        behind_m: distance behind the plane beyond which surfaces are ignored.
-        viewers: positions from which the surface is seen; if None, no cell is seen.
-        supersample: colours are the mean of supersample^2 rays per cell.
+        frame: the frame of the cells; its plane may deviate from a true wall.
+        front_m: surfaces farther than this in front of the plane are ignored.
+        behind_m: surfaces farther than this behind the plane are ignored.
+        viewers: positions from which `seen` is computed; if None, no cell is seen.
+        supersample: the colour of a cell is the mean colour of supersample^2 rays.
         coloured: (rows, cols) bool, cells whose colour is requested; None for all cells.
         judged: (rows, cols) bool, cells whose `seen` is requested; None for all cells.
         cores: number of threads; does not change the result.
@@ -96,11 +98,11 @@ def render(  # noqa: PLR0913
 
 @dataclass(frozen=True, kw_only=True)
 class SeenPoints:
-    """The surface points that pixels show.
+    """Surface points that are visible at pixels.
 
     Attributes:
         points: (n, 3) float64 metres from the scene's origin; NaN if there is no hit.
-        rectangle: (n,) int32 row of the scene; -1 if there is no hit.
+        rectangle: (n,) int32 rectangle (row of the scene); -1 if there is no hit.
     """
 
     points: NDArray[np.float64]
@@ -125,8 +127,8 @@ class SceneCameras:
     ) -> NDArray[np.float32]:
         """Render a photo (rows, columns, 3) with values 0..255, without noise.
 
-        Colours are means of supersample^2 rays per pixel, at random positions that depend on the
-        seed.
+        The colour of a pixel is the mean colour of supersample^2 rays at random positions, which
+        depend on the seed.
         """
         image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
         near = camera.shifted(self._origin)
@@ -139,7 +141,7 @@ class SceneCameras:
         return image
 
     def trace(self, camera: ViewingCamera, pixels_photo: NDArray[np.float64]) -> SeenPoints:
-        """Find the surface points of pixels (n, 2), which may be outside the image or NaN."""
+        """Find the surface points at pixels (n, 2), which may be outside the image or NaN."""
         pixels = np.asarray(pixels_photo, dtype=np.float64)
         points = np.full((len(pixels), 3), np.nan)
         rectangle = np.full(len(pixels), -1, dtype=np.int32)
@@ -160,9 +162,8 @@ class SceneCameras:
     def sees(self, camera: ViewingCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return a mask (n,) of the surface points (n, 3) that a camera sees.
 
-        Points are in metres from the scene's origin.
-
-        A point counts as seen unless a surface is more than 0.02 % of the distance in front of it.
+        Points are in metres from the scene's origin. A point counts as seen unless the ray from the
+        camera hits a surface before the point, by more than 0.02 % of the distance.
         """
         shifted = camera.shifted(self._origin)
         inside = shifted.sees(shifted.project(np.nan_to_num(points, nan=np.inf))[:, :2])
@@ -177,7 +178,7 @@ class SceneCameras:
 
         Args:
             starts: (n, 3) or (3,) metres from the scene's origin.
-            directions: (n, 3); their lengths are the units of the hits' distances.
+            directions: (n, 3); the length of a direction is the unit of the distance along the ray.
         """
         n_rays = len(directions)
         starts = np.broadcast_to(starts, (n_rays, 3))
@@ -196,7 +197,7 @@ class SceneCameras:
 def pixel_directions(
     camera: ViewingCamera, u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return ray directions (3, n) of pixels, in world axes, whose depth component is 1."""
+    """Return the directions (3, n), in world axes, of rays through pixels; their depth is 1."""
     found = undistorted(*camera.bent_rays(np.stack([u, v])), camera.distortion)
     rotation = camera.rotation
     ways = np.empty((3, len(u)))
@@ -206,7 +207,7 @@ def pixel_directions(
 
 
 class _Renderer:
-    """Computes a true orthoimage; cells are numbered row by row."""
+    """Renders a true orthoimage; cells are numbered row by row."""
 
     def __init__(
         self,
@@ -222,7 +223,7 @@ class _Renderer:
         self._viewers = viewers
         self._front_m = front_m
         self._reach_m = front_m + behind_m
-        # Flat views share the memory of the arrays.
+        # These one-dimensional views share the memory of the arrays.
         self._rgb = truth.rgb.reshape(-1, 3)
         self._depth_m = truth.depth_m.reshape(-1)
         self._rectangle = truth.rectangle.reshape(-1)
@@ -247,18 +248,18 @@ class _Renderer:
     def shows_something(
         self, cells: NDArray[np.int64], wanted: NDArray[np.bool_] | None
     ) -> NDArray[np.bool_]:
-        """Return a mask (n,) of cells that show a surface and are requested."""
+        """Return a mask (n,) of the requested cells that show a surface."""
         shows: NDArray[np.bool_] = self._rectangle[cells] >= 0
         return shows if wanted is None else shows & wanted.reshape(-1)[cells]
 
     def look_from(
         self, position: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
     ) -> None:
-        """Mark the cells (n,) whose surface points (3, n) are seen from a position."""
+        """Mark the cells (n,) whose surface points (3, n) are visible from a position."""
         viewers = self._viewers
         if viewers is None:
             return
-        # Subtract a small tolerance, since the sine of straight up may be rounded to more than 1.
+        # Use a small tolerance, because rounding may make the sine of the elevation larger than 1.
         lowest = math.sin(math.radians(viewers.lowest_elevation_deg)) - 1e-12
         highest = math.sin(math.radians(viewers.highest_elevation_deg)) + 1e-12
         ways = points - position[:, None]
@@ -270,12 +271,12 @@ class _Renderer:
         self._seen[cells[hits.rectangle < 0]] = True
 
     def colour(self, cells: NDArray[np.int64], n_sub: int) -> None:
-        """Set the mean colours of cells whose centre shows a surface, from n_sub^2 rays each."""
+        """Set the mean colours of cells, each from n_sub^2 rays."""
         sums, n_hits = np.zeros((3, len(cells)), dtype=np.float32), np.zeros(len(cells))
         ways = np.broadcast_to(-self._normal, (3, len(cells)))
         for sub in range(n_sub * n_sub):
-            # A sheared grid has n^2 different positions along each axis, so edges along rows or
-            # columns, which are frequent on walls, are not rendered in steps of 1/n of a cell.
+            # A sheared grid has n^2 different positions along each axis, so that edges along rows
+            # or columns, which are frequent on walls, are not rendered in steps of 1/n of a cell.
             i, j = sub % n_sub, sub // n_sub
             starts = self._starts(
                 cells, (i + (j + 0.5) / n_sub) / n_sub, (j + (n_sub - i - 0.5) / n_sub) / n_sub
@@ -287,7 +288,7 @@ class _Renderer:
         self._rgb[cells[shown]] = (sums[:, shown] / n_hits[shown]).T
 
     def _starts(self, cells: NDArray[np.int64], right: float, down: float) -> NDArray[np.float64]:
-        """Return the starts (3, n) of rays, in front of the plane, for positions in cells."""
+        """Return the starts (3, n) of rays through a position (right, down) in each cell."""
         rows, columns = np.divmod(cells, self._width)
         return self._corner + (columns + right) * self._step_u + (rows + down) * self._step_v
 
@@ -295,7 +296,7 @@ class _Renderer:
 def _exposed(
     rays: SceneRays, camera: ViewingCamera, rows: tuple[int, int], n_sub: int, seed: int
 ) -> NDArray[np.float32]:
-    """Return the mean colours (rows, columns, 3) of the rays of some pixel rows."""
+    """Return the colours (rows, columns, 3) of rows of pixels, means of n_sub^2 rays each."""
     first, last = rows
     shape = (last - first, camera.width)
     columns, lines = np.arange(camera.width), np.arange(first, last)
@@ -313,11 +314,11 @@ def _exposed(
 
 
 def _pixel_ways(camera: ViewingCamera, first: int, last: int) -> tuple[NDArray[np.float64], ...]:
-    """Return the direction of the first corner of each pixel, and its change inside the pixel.
+    """Return ray directions at the top-left corners of pixels, and their changes inside the pixels.
 
-    A ray at (s, t) of a pixel has the direction base + s right + t down + s t twist, each (3, rows,
-    columns). The directions of the corners are exact; between them, the lens deviates by less than
-    1e-5 of a pixel.
+    A ray at (s, t) in a pixel has the direction base + s right + t down + s t twist, where each
+    term is (3, rows, columns). The directions of the corners are exact; between the corners, errors
+    of the interpolation are below 1e-5 of a pixel.
     """
     u, v = np.meshgrid(
         np.arange(camera.width + 1, dtype=np.float64), np.arange(first, last + 1, dtype=np.float64)

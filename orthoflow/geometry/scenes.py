@@ -1,8 +1,8 @@
-"""Simulated scenes of textured rectangles, independent of the position of the world's origin.
+"""Simulated scenes that consist of textured rectangles.
 
-Random numbers are functions of a lattice cell, a seed and the index of the draw, so they do not
-depend on the order of computation or the number of threads. The formulas are those of `scene_rays`,
-for arrays.
+Random numbers are functions of a lattice cell, a seed and an index (`draw`), so they do not depend
+on the order of computation or the number of threads. The formulas are those of `scene_rays`,
+applied to arrays.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ N_TEXTURE_PARAMS = 8
 
 
 class SurfaceRole(IntEnum):
-    """The role of a rectangle in the room."""
+    """Role of a rectangle in a room."""
 
     WALL = 0
     RELIEF = 1
@@ -29,12 +29,12 @@ class SurfaceRole(IntEnum):
 
 
 class TextureKind(IntEnum):
-    """The pattern of a rectangle; its parameters are in `texture_params`.
+    """Pattern of a rectangle; its parameters are in `texture_params`.
 
     A pattern is a function of the position (a, b) in the rectangle, so it can be evaluated exactly
-    at any position, and of 8 numbers: red, green, blue (0..255), laser reflectance (0..1), contrast
-    (0..1), period in metres, seed, spectral gap. The gap is 0 if the laser measures the visible
-    pattern, and 1 if it measures a different one.
+    at any position. Its 8 parameters are red, green, blue (0..255), laser reflectance (0..1),
+    contrast (0..1), period in metres, seed and spectral gap. The gap is 0 if the laser measures the
+    visible pattern, and 1 if it measures a different one.
 
     Attributes:
         PLAIN: a single colour with smooth stains.
@@ -51,27 +51,27 @@ class TextureKind(IntEnum):
     WOOD = 4
 
 
-# Fields of a scene with one row per rectangle.
+# Fields of a scene that have one row per rectangle.
 _PER_RECTANGLE: Final = "centre axis_a axis_b extent plane_index role texture texture_params"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Rectangles with holes and procedural textures; one row per rectangle.
+    """Rectangles with holes and procedural textures.
 
     Attributes:
-        origin: (3,) float64 metres, world coordinates; all positions of the scene are relative to
-            it, so a shift of the world changes nothing else.
-        centre: (r, 3) float64 metres from `origin`, world axes; the position of a = b = 0.
+        origin: (3,) float64 metres, world coordinates; all positions in the scene are relative to
+            it, so a different origin of the world changes only this field.
+        centre: (r, 3) float64 position of a = b = 0, in metres from `origin`, world axes.
         axis_a: (r, 3) float64 unit vector in the rectangle, world axes.
         axis_b: (r, 3) float64 unit vector in the rectangle perpendicular to `axis_a`, world axes.
-        extent: (r, 4) float64 metres: a_min, a_max, b_min, b_max from the centre.
-        plane_index: (r,) int16 index of the rectangle's true plane, -1 for none.
+        extent: (r, 4) float64 a_min, a_max, b_min and b_max, in metres from the centre.
+        plane_index: (r,) int16 index of the rectangle's true plane; -1 if it belongs to none.
         role: (r,) uint8 `SurfaceRole`.
         texture: (r,) int32 `TextureKind`.
         texture_params: (r, 8) float64 (see `TextureKind`).
         hole_rectangle: (h,) int32 index of the rectangle that contains the hole, ascending.
-        hole_extent: (h, 4) float64 metres, as in `extent`; the rim of a hole belongs to the
+        hole_extent: (h, 4) float64 metres, as in `extent`; the edge of a hole belongs to the
             rectangle.
     """
 
@@ -116,7 +116,7 @@ class Scene:
         return np.cross(self.axis_a, self.axis_b)
 
     def corners_m(self) -> NDArray[np.float64]:
-        """Return the corners (r, 4, 3) of the rectangles in order, in metres from `origin`."""
+        """Return the corners (r, 4, 3) of the rectangles in cyclic order, metres from `origin`."""
         a = self.extent[:, [0, 1, 1, 0], None] * self.axis_a[:, None, :]
         b = self.extent[:, [2, 2, 3, 3], None] * self.axis_b[:, None, :]
         return self.centre[:, None, :] + a + b
@@ -133,12 +133,12 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Viewers:
-    """Positions from which a scene is seen in all directions within a range of elevations.
+    """Positions from which a scene is viewed, in all directions within a range of elevations.
 
     Attributes:
         positions_world: (s, 3) float64 metres.
         up: (3,) float64 unit vector.
-        lowest_elevation_deg: lowest visible elevation, positive above the horizon.
+        lowest_elevation_deg: lowest visible elevation; positive above the horizon.
         highest_elevation_deg: highest visible elevation.
     """
 
@@ -160,20 +160,20 @@ _TURN: Final = 2.0 * np.pi
 def cell_states(
     columns: NDArray[np.int64], rows: NDArray[np.int64], seed: int
 ) -> NDArray[np.uint64]:
-    """Return random 64-bit states of lattice cells; columns and rows are broadcast."""
+    """Return random 64-bit states of lattice cells; `columns` and `rows` are broadcast."""
     state = mixed_bits(columns.astype(np.uint64) * _COLUMN + np.uint64(seed % _WORD))
     return mixed_bits(state ^ (rows.astype(np.uint64) * _ROW))
 
 
 def uniforms(states: NDArray[np.uint64], draw: int) -> NDArray[np.float64]:
-    """Return one number in [0, 1) per state; each draw gives different numbers."""
+    """Return a random number in [0, 1) for each state; it also depends on the index `draw`."""
     bits = mixed_bits(states + np.uint64((draw + 1) * _GOLDEN % _WORD))
     bits >>= np.uint64(11)
     return np.multiply(bits, 1.0 / 9007199254740992.0, dtype=np.float64)
 
 
 def normals(states: NDArray[np.uint64], draw: int) -> NDArray[np.float64]:
-    """Return one standard normal number per state (Box and Muller); `draw` must be even."""
+    """Return a standard normal number for each state (Box and Muller); `draw` must be even."""
     lengths = np.sqrt(-2.0 * np.log1p(-uniforms(states, draw)))
     return np.asarray(lengths * np.cos(_TURN * uniforms(states, draw + 1)), dtype=np.float64)
 

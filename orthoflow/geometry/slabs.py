@@ -1,4 +1,4 @@
-"""Blocks of the points of a cloud, and the slab around the plane of a wall."""
+"""Blocks of the points of a cloud, and slabs around the planes of walls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthoflow.geometry.threads import in_parts
 
 
 class Offsets(NamedTuple):
-    """Offsets of points from the origin of their cloud, (n,) float32 metres each."""
+    """Offsets of points from the origin of their cloud along each axis, (n,) float32 metres."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -21,23 +21,23 @@ class Offsets(NamedTuple):
 
 
 def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> Offsets:
-    """Return offsets in the form for which kernels are compiled; arrays may be memory-mapped."""
+    """Return read-only offsets, as kernels expect them; the arrays may be memory-mapped."""
     views = [np.asarray(values).view(np.ndarray) for values in (x, y, z)]
     for view in views:
         view.flags.writeable = False
     return Offsets(*views)
 
 
-# Two threads saturate the bandwidth of memory or of the disk.
+# Two threads use the entire bandwidth of the memory or the disk.
 _BOXING_THREADS: Final = 2
 
 
 class OffsetPoints(Protocol):
-    """The attributes of a `PointCloud` that raster passes use."""
+    """The attributes of a `PointCloud` that are needed to compute rasters."""
 
     @property
     def origin(self) -> NDArray[np.float64]:
-        """(3,) metres."""
+        """Origin (3,) in metres."""
 
     @property
     def x(self) -> NDArray[np.float32]:
@@ -56,12 +56,12 @@ class OffsetPoints(Protocol):
         """Result of `block_boxes_m` for these points; None if there are few points."""
 
 
-# Number of points per box; small enough for the processor's cache.
+# Number of points per box. Their coordinates fit into the processor's cache.
 BOXED_POINTS: Final = 1 << 16
 
 
 def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
-    """Return bounding boxes (blocks, 2, 3) of `BOXED_POINTS` points each, metres.
+    """Return the bounding boxes (blocks, 2, 3), in metres, of blocks of `BOXED_POINTS` points.
 
     Consecutive points of a scan are close together, so a pass over one wall can skip the blocks of
     other walls.
@@ -81,7 +81,7 @@ def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class Slab:
-    """The raster of a wall, and the range of depths in front of and behind its plane.
+    """The raster of a wall, and a range of depths in front of and behind its plane.
 
     Attributes:
         frame: raster on the plane.
@@ -95,9 +95,9 @@ class Slab:
 
     @property
     def n_cells(self) -> int:
-        """Number of cells."""
+        """Number of cells in the raster."""
         return self.frame.width * self.frame.height
 
     def over(self, rows: slice) -> Slab:
-        """Return the slab of the given rows of the raster."""
+        """Return the slab for the given rows of the raster."""
         return replace(self, frame=self.frame.of_rows(rows))

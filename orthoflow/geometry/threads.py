@@ -1,7 +1,7 @@
-"""Division of work among threads, with results in order.
+"""Division of work among threads.
 
-Results are identical for any number of threads, because the division into parts either does not
-depend on this number or does not affect the result. Compiled kernels release the interpreter lock.
+Results are identical for any number of threads, because either the division into parts does not
+depend on this number, or it does not affect the result. Compiled kernels release the GIL.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def usable_cores() -> int:
 
 
 def address_space() -> int | None:
-    """Return the bytes that this process may still allocate (`ulimit -v`); None if unlimited."""
+    """Return the limit of the address space in bytes (`ulimit -v`); None if unlimited."""
     import resource  # noqa: PLC0415 - only of Unix, where steps run
 
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -35,13 +35,13 @@ def address_space() -> int | None:
 
 
 def has_room_for_threads() -> bool:
-    """Return whether threads can be started; without free memory, a start would block forever."""
+    """Return whether memory suffices for threads; otherwise, starting one would block forever."""
     limit = address_space()
     return limit is None or limit >= _ROOM_FOR_THREADS
 
 
 def start_beside(work: Callable[[], object]) -> Thread | None:
-    """Start a task in a thread; return None if no thread can be started."""
+    """Start a task in a thread; return None if the thread cannot be started."""
     if not has_room_for_threads():
         return None
     thread = Thread(target=work, daemon=True)
@@ -50,11 +50,11 @@ def start_beside(work: Callable[[], object]) -> Thread | None:
 
 
 def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = None) -> None:
-    """Run tasks concurrently.
+    """Run tasks in threads.
 
     Args:
         tasks: functions to run.
-        threads: maximum number of tasks that run at the same time; None for all tasks.
+        threads: maximum number of tasks that run at the same time; None for no limit.
     """
     if len(tasks) == 1 or not has_room_for_threads():
         for task in tasks:
@@ -68,7 +68,7 @@ def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = Non
 def in_order(
     function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int | None = None
 ) -> Iterator[_Result]:
-    """Yield the results of a function, computed in threads (None: one per processor)."""
+    """Yield the results of a function in order, computed in threads (None: one per processor)."""
     if not has_room_for_threads():
         yield from map(function, items)
         return
@@ -77,12 +77,12 @@ def in_order(
 
 
 def even_parts(n_items: int, n_parts: int, *, multiple: int = 1) -> list[slice]:
-    """Divide a range into parts of similar length; some may be empty.
+    """Divide a range into parts of similar length; parts may be empty.
 
     Args:
         n_items: length of the range.
         n_parts: number of parts.
-        multiple: parts begin at multiples of this number.
+        multiple: each part begins at a multiple of this number.
     """
     n_units = -(-n_items // multiple)
     edges = [part * n_units // n_parts * multiple for part in range(n_parts)] + [n_items]
@@ -90,7 +90,7 @@ def even_parts(n_items: int, n_parts: int, *, multiple: int = 1) -> list[slice]:
 
 
 def in_parts(work: Callable[[int, int], None], n_items: int, *, threads: int) -> None:
-    """Call `work(first, end)` for one part of a range per thread."""
+    """Divide a range into one part per thread, and call `work(first, end)` for each part."""
     parts = even_parts(n_items, threads)
     in_threads([partial(work, part.start, part.stop) for part in parts])
 
@@ -98,7 +98,7 @@ def in_parts(work: Callable[[int, int], None], n_items: int, *, threads: int) ->
 def in_runs(
     work: Callable[[int, int], None], n_items: int, *, n_per_run: int, threads: int
 ) -> None:
-    """Call `work(first, end)` for parts of a range with the same length."""
+    """Divide a range into parts of equal length, and call `work(first, end)` for each part."""
     starts = range(0, n_items, n_per_run)
     in_threads(
         [partial(work, first, min(n_items, first + n_per_run)) for first in starts],
