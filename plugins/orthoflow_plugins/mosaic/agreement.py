@@ -1,4 +1,4 @@
-"""Agreement of the sources of a wall: positions in overlaps, and colours along seams."""
+"""Agreement between the sources of a wall: displacements in overlaps, and colour steps at seams."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 PATCH_CELLS: Final = 64
 _PATCHES_MOST: Final = 200
-# Patches with less contrast than this show no displacement.
+# Displacements cannot be measured in patches with less contrast than this.
 _CONTRAST_LEAST_GREY: Final = 3.0
-# Correlation peaks lower than this are due to chance.
+# Correlation peaks lower than this may be due to chance.
 _RESPONSE_LEAST: Final = 0.15
 _ROWS_AT_ONCE: Final = 1024
 
@@ -32,7 +32,8 @@ class Overlaps:
     """Displacements between pairs of photos that show the same part of a wall.
 
     Attributes:
-        shifts_cells: (n, 2) displacements (u, v) of the second photo relative to the first.
+        shifts_cells: (n, 2) displacements (u, v), in cells, of the second photo relative to the
+            first.
         centres: (n, 2) column and row of the centre of each patch.
         photos: names of the two photos of each patch.
     """
@@ -45,13 +46,13 @@ class Overlaps:
 def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overlaps:
     """Measure the displacements between layers in patches of a wall.
 
-    Patches of 64 x 64 cells that both layers show completely are compared by phase correlation,
-    which is accurate to about a tenth of a cell.
+    Phase correlation, which is accurate to about a tenth of a cell, compares the layers in patches
+    of 64 x 64 cells that both layers show completely.
 
     Args:
         layers: photos of one wall.
-        of_all_pairs: whether to compare all pairs of layers that show a patch, not only the best
-            two.
+        of_all_pairs: whether to compare all pairs of layers that show a patch; otherwise, only the
+            two best layers are compared.
     """
     import cv2
 
@@ -77,7 +78,7 @@ def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overl
 
 
 def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, int, int, int]]:
-    """Yield row and column of a patch, and two layers that show it completely."""
+    """Return the first row and column of a patch with two layers that show it, for all pairs."""
     n_rows, n_columns = (side // PATCH_CELLS for side in layers[0].frame.shape)
     if len(layers) < 2 or not n_rows or not n_columns:
         return []
@@ -92,7 +93,7 @@ def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, in
 
 
 def _patch_qualities(layer: Layer, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the mean quality of each patch; 0 if the layer does not show the whole patch."""
+    """Return the mean quality of each patch, 0 if the layer does not show the whole patch."""
     qualities: list[NDArray[np.float64]] = []
     columns = shape[1] * PATCH_CELLS
     for rows in row_bands((shape[0] * PATCH_CELLS, columns), multiple=PATCH_CELLS):
@@ -111,16 +112,18 @@ def _grey(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 def seam_steps(
     source: NDArray[np.int16], layers: Sequence[Layer], balance: Balance | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compare the two sources of a seam, in cells to the left of or above it that both show.
+    """Compare the colours of the two sources along seams.
+
+    They are compared in the cells to the left of or above the seam, if both sources show the cell.
 
     Args:
         source: (rows, cols) index of the layer of each cell, -1 if none.
-        layers: the layers to which the index refers.
+        layers: the layers to which `source` refers.
         balance: the colour balance, or None.
 
     Returns:
-        (n,) differences in luminance between the two sources in seam cells, and distances between
-        their colours in CIE L*a*b* (1976).
+        (n,) luminance differences between the two sources in these cells, and (n,) colour distances
+        in CIE L*a*b* (1976).
     """
 
     def shown(index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -151,7 +154,7 @@ def seam_steps(
 def _before_seams(
     source: NDArray[np.int16], axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Yield, strip by strip, rows and columns of cells above (axis 0) or to the left of seams."""
+    """Return the rows and columns of the cells above (axis 0) or to the left of (axis 1) seams."""
     found: list[NDArray[np.int64]] = []
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
         strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
@@ -164,10 +167,10 @@ def _before_seams(
 
 
 def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
-    """Count all seam cells, and those on depth edges, a few rows at a time."""
+    """Count all seam cells, and those on depth edges."""
     n_seam = n_edge_seam = 0
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
-        # Whether the last row has a seam depends on the row below it.
+        # The row below the last row determines whether the last row contains seam cells.
         rows = slice(first, first + _ROWS_AT_ONCE + 1)
         seam = is_seam(source[rows])[:_ROWS_AT_ONCE]
         n_seam += int(np.count_nonzero(seam))

@@ -1,11 +1,11 @@
 """Colour balance of layers by smooth corrections of their brightness.
 
-Corrections are smooth over blocks of cells, and layers are never mixed. Detail therefore always
-comes from one photo, and there are no double contours even if some parallax remains.
+Each cell keeps the detail of one photo, since layers are not blended and corrections are smooth
+over blocks of cells. Double contours therefore do not occur, even if some parallax remains.
 
-The model consists of an exposure per photo, the vignetting of its lens, and a smooth field per
+The model consists of an exposure per photo, the vignetting of each lens, and a smooth field per
 photo. All of these are logarithms, so that factors become sums. Where two photos show the same
-blocks of a wall, the difference between their corrections must equal the observed difference in
+blocks of a wall, the difference between their corrections should cancel the observed difference in
 brightness.
 """
 
@@ -44,25 +44,26 @@ if TYPE_CHECKING:
 _BLOCK_CELLS_MOST: Final = 16
 # Approximate number of blocks on a small wall.
 _BLOCKS_LEAST: Final = 4_000
-# Photos are left unchanged if all their corrections, which are logarithms, are below this.
+# Photos are left unchanged if all corrections, as logarithms, are smaller than this.
 _ALIKE: Final = 0.02
-# Smoothing radius of differences, in blocks.
+# Standard deviation of the smoothing of differences, in blocks.
 _SMOOTH_BLOCKS: Final = 1.5
-# Regularisation where few blocks are known.
+# Regularisation for areas in which differences are known in few blocks.
 _KNOWN_LEAST: Final = 0.02
-# Larger differences between balanced photos are due to different objects, not to lighting.
+# Larger differences between balanced photos are due to different objects rather than lighting.
 _SAME_THING: Final = 0.15
-# Logarithms of the focal lengths of one lens differ by less than about this.
+# Photos may have the same lens if the logarithms of their focal lengths differ by less than about
+# this value.
 _SAME_ZOOM: Final = 0.1
 # Overlaps with fewer blocks than this are ignored.
 _LEAST_BLOCKS: Final = 4
 # Overlaps with more blocks than this are sampled.
 _BLOCKS_MOST: Final = 200
-# An overlap counts as at most this many independent blocks.
+# Maximum number of independent blocks that an overlap counts for.
 _INDEPENDENT: Final = 50.0
-# Smallest standard deviation of the difference between two photos in a block.
+# Minimum standard deviation of the brightness difference between two photos in a block.
 _SPREAD_LEAST: Final = 0.01
-# Prior standard deviations of exposures, lens terms and nodes of fields, in logarithms.
+# Prior standard deviations of exposures, lens terms and nodes of fields, as logarithms.
 _EXPOSURE_PRIOR: Final = 1.0
 _LENS_PRIOR: Final = 0.5
 _FIELD_PRIOR: Final = 0.05
@@ -81,8 +82,8 @@ class Balance:
     Attributes:
         blocks: blocks of the wall.
         lights: uncorrected brightness of each layer.
-        logs: (rows, cols, 3) float32 corrections in the blocks of each layer, to be interpolated
-            bilinearly between block centres.
+        logs: (rows, cols, 3) float32 corrections of each layer, per block and channel; values
+            between block centres are interpolated bilinearly.
         exposures: parameters from which the corrections were computed.
     """
 
@@ -94,13 +95,13 @@ class Balance:
     def shown(
         self, index: int, colours: Colours, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> Colours:
-        """Return balanced colours (n, 3) of a layer at rows and columns (n,)."""
+        """Return the colours (n, 3) of a layer at rows and columns (n,) after balancing."""
         return lit(colours, self.log_gains(index, rows, columns))
 
     def log_gains(
         self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Return the corrections (n, 3) of a layer at rows and columns (n,)."""
+        """Return the logarithmic corrections (n, 3) of a layer at rows and columns (n,)."""
         logs, box = self.logs[index], self.lights[index].box
         row, down = _between(rows, self.blocks.rows, box[0])
         column, right = _between(columns, self.blocks.columns, box[1])
@@ -119,10 +120,13 @@ class Balance:
 def _between(
     cells: NDArray[np.int64], edges: NDArray[np.int64], part: slice
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the first of the two blocks around each cell (n,), and the weight of the second."""
+    """Return the first of the two blocks between whose centres each cell (n,) lies.
+
+    Also return the interpolation weight (n,) of the second block.
+    """
     n_blocks = part.stop - part.start
     middles = 0.5 * (edges[part] + edges[part.start + 1 : part.stop + 1])
-    # Interpolate once for each row or column, not for each cell.
+    # Interpolate once per row or column instead of once per cell.
     at = np.interp(np.arange(edges[-1]) + 0.5, middles, np.arange(n_blocks))
     first = np.minimum(at.astype(np.int64), max(0, n_blocks - 2))
     return first[cells], (at - first).astype(np.float32)[cells][:, None]
@@ -133,10 +137,10 @@ def balance_of(
     wall: Wall | None,
     cameras: Sequence[Camera | None],
 ) -> Balance | None:
-    """Find corrections that equalise the layers of a wall; None if the layers already agree.
+    """Estimate corrections that equalise the layers of a wall; None if they already agree.
 
     Args:
-        layers: layers with coloured cells, at least one.
+        layers: at least one layer; each has coloured cells.
         wall: the wall, or None.
         cameras: camera of each layer, or None if unknown.
     """
@@ -155,7 +159,6 @@ def balance_of(
 
 
 def _block_cells(shape: tuple[int, int]) -> int:
-    """Return the side of the blocks of a wall in cells."""
     return int(np.clip(np.sqrt(shape[0] * shape[1] / _BLOCKS_LEAST), 2, _BLOCK_CELLS_MOST))
 
 
@@ -166,7 +169,7 @@ def _radii(
     blocks: Blocks,
     lights: Sequence[BlockLight],
 ) -> list[Radii | None]:
-    """Return the distances of the blocks of each layer from the centre of its photo."""
+    """Return the distances between the blocks of each layer and the centre of its photo."""
     lenses: dict[tuple[int, int, int], int] = {}
     found: list[Radii | None] = []
     down, right = blocks.centres()
@@ -175,8 +178,8 @@ def _radii(
             found.append(None)
             continue
         lens = camera.intrinsics
-        # If photos are oriented separately, estimated focal lengths of the same lens differ
-        # slightly.
+        # Estimated focal lengths of the same lens differ slightly if photos are oriented
+        # separately.
         key = (lens.width, lens.height, round(math.log(lens.fx) / _SAME_ZOOM))
         rows, columns = down[light.box[0]], right[light.box[1]]
         middles = np.stack(np.broadcast_arrays(columns, rows[:, None]), axis=-1).reshape(-1, 2)
@@ -184,7 +187,8 @@ def _radii(
         pixels = camera.viewing().project(frame.world_from_wall(middles, depths_m))[:, :2]
         half = np.array([0.5 * lens.width, 0.5 * lens.height])
         radii = np.linalg.norm(pixels - half, axis=1) / np.linalg.norm(half)
-        # Coloured cells are inside the photo; all others, and NaN, get the radius of the corner.
+        # Coloured cells are inside the photo. All other cells, including those at NaN, get the
+        # radius of the corner.
         radii = np.fmin(radii, 1.0).astype(np.float32)
         values = radii.reshape(len(rows), len(columns))
         found.append(Radii(values=values, lens=lenses.setdefault(key, len(lenses))))
@@ -200,9 +204,10 @@ def _depths_at(wall: Wall, middles: NDArray[np.float64]) -> NDArray[np.float64]:
 def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -> Balance:
     """Add corrections that blend the remaining differences between layers near their seams.
 
-    Towards a seam, each layer changes to the mean of the layers on both sides, weighted by their
-    shares of the neighbourhood. Blocks with depth edges, and blocks where two layers show different
-    objects, do not contribute; where no difference is known, the correction fades to zero.
+    Near a seam, each layer is shifted towards the mean of the layers on both sides, weighted by
+    their shares of the nearby cells. Blocks with depth edges, and blocks in which two layers show
+    different objects, do not contribute. Where no difference is known, the correction fades to
+    zero.
 
     Args:
         balance: the colour balance of the layers.
@@ -219,7 +224,7 @@ def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -
         says[edges > 0.0] = 0.0
     logs = [values.copy() for values in balance.logs]
     for i, j, shared in pairs(balance.lights):
-        # One of the two layers may end at the seam, so extend the difference beyond it.
+        # Extend the difference beyond the seam, because one of the two layers may end there.
         around = _grown(shared, _reach(_SMOOTH_BLOCKS), blocks.shape)
         apart = _apart(balance, (i, j), shared, around, says)
         if apart is None:
@@ -238,14 +243,14 @@ def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -
 def _apart(
     balance: Balance, pair: tuple[int, int], shared: Box, around: Box, says: NDArray[np.float32]
 ) -> NDArray[np.float32] | None:
-    """Return the smooth difference (rows, cols, 3) between two balanced layers (second - first).
+    """Return the smooth difference (rows, cols, 3), second minus first, between balanced layers.
 
     Args:
         balance: the colour balance of all layers.
         pair: indices of the two layers.
         shared: blocks in the boxes of both layers.
-        around: the shared blocks with a margin, for which the difference is returned.
-        says: (rows, cols) 1 in blocks of the wall that may be used, 0 in all others.
+        around: the shared blocks with a margin; the difference is returned for these.
+        says: (rows, cols) weight of each block of the wall: 1 if it may be used, otherwise 0.
     """
     parts = [inside(shared, balance.lights[k].box) for k in pair]
     first, second = (
@@ -266,12 +271,12 @@ def _apart(
 
 @dataclass(frozen=True, kw_only=True)
 class _Shares:
-    """Share of each layer in the cells around a block.
+    """Share of the cells around each block that are taken from each layer.
 
     Attributes:
         boxes: box of each layer, with a margin.
-        values: (rows, cols) float32 smoothed share of each layer, within its box.
-        total: (rows, cols) float32 sum over all layers, for the whole wall.
+        values: (rows, cols) float32 smoothed share of each layer in the blocks of its box.
+        total: (rows, cols) float32 sum of the shares of all layers, for all blocks of the wall.
     """
 
     boxes: tuple[Box, ...]
@@ -280,7 +285,7 @@ class _Shares:
 
     @classmethod
     def of(cls, balance: Balance, source: NDArray[np.int16], spread: float) -> _Shares:
-        """Spread the cells of each layer over neighbouring blocks."""
+        """Compute the share of each layer per block, smoothed over `spread` blocks."""
         blocks = balance.blocks
         reach = _reach(spread)
         boxes, values = [], []
@@ -299,7 +304,7 @@ class _Shares:
         return cls(boxes=tuple(boxes), values=tuple(values), total=total)
 
     def within(self, index: int, part: Box) -> NDArray[np.float32]:
-        """Return the relative share of a layer in a part of its box."""
+        """Return the share of a layer, relative to all layers, in a part of its box."""
         value = self.values[index][inside(part, self.boxes[index])]
         return np.asarray(value / np.maximum(self.total[part], np.float32(1e-6)), np.float32)
 
@@ -330,11 +335,11 @@ def _grown(box: Box, reach: int, shape: tuple[int, int]) -> Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Radii:
-    """Distance of the blocks of a layer from the centre of its photo.
+    """Distances between the blocks of a layer and the centre of its photo.
 
     Attributes:
         values: (rows, cols) float32, 1 in the corners of the photo.
-        lens: number of the lens; photos with the same lens have the same vignetting.
+        lens: number of the lens; photos taken with the same lens have the same vignetting.
     """
 
     values: NDArray[np.float32]
@@ -346,9 +351,10 @@ class Exposures:
     """Parameters of the corrections of all layers.
 
     Attributes:
-        exposures: (k, 3) logarithm per layer and channel.
+        exposures: (k, 3) logarithmic exposure correction per layer and channel.
         lenses: (lenses, 2) coefficients of r^2 and r^4, where r is 1 in the corners of a photo.
-        nodes: (k, 4, 4, 3) nodes of the smooth fields, bilinear over the box of each layer.
+        nodes: (k, 4, 4, 3) values at the nodes of the smooth fields, which are interpolated
+            bilinearly over the box of each layer.
     """
 
     exposures: NDArray[np.float64]
@@ -356,7 +362,7 @@ class Exposures:
     nodes: NDArray[np.float64]
 
     def logs(self, index: int, light: BlockLight, radii: Radii | None) -> NDArray[np.float64]:
-        """Return the corrections (rows, cols, 3) in the blocks of a layer."""
+        """Return the logarithmic corrections (rows, cols, 3) in the blocks of a layer."""
         rows, columns = (_hats(np.arange(size), size) for size in light.log_light.shape[:2])
         logs: NDArray[np.float64] = self.exposures[index] + np.einsum(
             "ri,cj,ijk->rck", rows, columns, self.nodes[index], optimize=True
@@ -368,11 +374,12 @@ class Exposures:
 
 @dataclass(frozen=True, kw_only=True)
 class _Overlap:
-    """Blocks that two layers show.
+    """Blocks that are in both of two layers.
 
     Attributes:
         layers: indices of the two layers.
-        places: (n, 2) row and column of each block in the box of the first and of the second layer.
+        places: two arrays (n, 2): row and column of each block in the box of the first layer, and
+            in the box of the second layer.
         apart: (n, 3) logarithm of the brightness of the second layer minus that of the first.
     """
 
@@ -384,13 +391,13 @@ class _Overlap:
 def estimate(lights: Sequence[BlockLight], radii: Sequence[Radii | None]) -> Exposures:
     """Estimate the corrections that equalise overlaps, robust against moved objects and glare.
 
-    Exposures and vignetting are first estimated from the mean of the channels; the remaining
-    differences are then modelled by exposures per channel and by smooth fields, which are kept
-    small.
+    Exposures and vignetting are first estimated from the mean of the channels. The remaining
+    differences are modelled by exposures per channel and by smooth fields, which are kept small.
 
     Args:
         lights: brightness of the layers of a wall.
-        radii: radii of the same layers; None if the camera of a layer is unknown.
+        radii: distances from the photo centre for the same layers; None if the camera of a layer is
+            unknown.
     """
     count = len(lights)
     n_lenses = 1 + max((item.lens for item in radii if item is not None), default=-1)
@@ -445,7 +452,7 @@ def _corner(part: Box) -> NDArray[np.int64]:
 
 
 def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
-    """Return the design matrix's exposure columns: 1 for the first layer, -1 for the second."""
+    """Return the exposure columns of the design matrix: 1 for first, -1 for second layers."""
     from scipy.sparse import csr_array
 
     layers = np.repeat(
@@ -460,7 +467,7 @@ def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
 def _lens_columns(
     overlaps: Sequence[_Overlap], radii: Sequence[Radii | None], n_lenses: int
 ) -> csr_array:
-    """Return the design matrix's lens columns, two per lens."""
+    """Return the lens columns of the design matrix, two per lens."""
     from scipy.sparse import csr_array
 
     columns = np.zeros((sum(len(item.apart) for item in overlaps), 2 * n_lenses))
@@ -477,7 +484,7 @@ def _lens_columns(
 
 
 def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -> csr_array:
-    """Return the design matrix's columns of the fields, one per node and layer."""
+    """Return the field columns of the design matrix, one per node and layer."""
     from scipy.sparse import csr_array
 
     n_nodes = _NODES**2
@@ -497,7 +504,7 @@ def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -
 
 
 def _hats(places: NDArray[np.int64], size: int) -> NDArray[np.float64]:
-    """Return weights (n, nodes) for linear interpolation between the nodes along a side."""
+    """Return the weights (n, nodes) for linear interpolation between nodes along one side."""
     at = (places + 0.5) / size * (_NODES - 1)
     return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(_NODES)))
 
@@ -513,7 +520,7 @@ def _solved(
     priors: NDArray[np.float64],
     overlaps: Sequence[_Overlap],
 ) -> NDArray[np.float64]:
-    """Solve a robust least squares problem (unknowns, channels) with zero-mean priors.
+    """Solve a robust least-squares problem with zero-mean priors for unknowns (unknowns, channels).
 
     Cauchy weights are used, scaled by the scatter of the residuals of each pair of layers.
     """
@@ -530,7 +537,8 @@ def _solved(
         for part in np.split(np.arange(len(apart)), ends[:-1]):
             spread = max(_SPREAD_LEAST, median_deviation(residuals[part], 0.0))
             counted = min(1.0, _INDEPENDENT / len(part)) / spread**2
-            # In the first iteration, exposures are unknown, so large differences are not outliers.
+            # Exposures are unknown in the first iteration, so large differences are not yet
+            # outliers.
             limit = np.inf if sweep == 0 else _OUTLIER * spread
             weights[part] = counted / (1.0 + (residuals[part] / limit) ** 2)
         weighted = matrix.T @ diags_array(weights)

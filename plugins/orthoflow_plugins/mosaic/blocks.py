@@ -1,4 +1,4 @@
-"""Blocks of cells over which colours, brightness and depths are averaged."""
+"""Blocks of cells over which colour, brightness and depth are averaged."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import Colours, light_of_levels
 from orthoflow.products import Layer, LayerMask
 
-# Levels outside this range are almost black or clipped.
+# Levels below or above these limits are almost black or clipped.
 _DARKEST: Final = 10.0 / 255.0
 _BRIGHTEST: Final = 245.0 / 255.0
-# Minimum share of pixels within this range of levels, in blocks whose brightness is measured.
+# Minimum share of levels within these limits in blocks whose brightness is measured.
 _SAYING_LEAST: Final = 0.95
-# Minimum height of depth edges, at which photos differ because of parallax.
+# Minimum height of a depth edge, where photos differ because of parallax.
 _DEPTH_EDGE_M: Final = 0.03
 
 # Rows and columns of blocks.
@@ -31,7 +31,7 @@ class Blocks:
     """A symmetric division of a raster into blocks with about the same number of cells.
 
     Attributes:
-        rows: first row of each row of blocks, and the number of rows.
+        rows: first row of cells of each row of blocks, followed by the number of rows of cells.
         columns: the same for columns.
     """
 
@@ -46,11 +46,11 @@ class Blocks:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Numbers of rows and columns of blocks."""
+        """The number of rows and the number of columns of blocks."""
         return len(self.rows) - 1, len(self.columns) - 1
 
     def cells(self, box: Box) -> tuple[slice, slice]:
-        """Return the rows and columns of cells in a box of blocks."""
+        """Return the rows and columns of the cells in a box of blocks."""
         rows, columns = box
         return (
             slice(int(self.rows[rows.start]), int(self.rows[rows.stop])),
@@ -58,13 +58,13 @@ class Blocks:
         )
 
     def within(self, box: Box) -> Blocks:
-        """Return the blocks of a box, relative to its first cell."""
+        """Return the blocks of a box as a division of their own; rows and columns start at 0."""
         rows = self.rows[box[0].start : box[0].stop + 1]
         columns = self.columns[box[1].start : box[1].stop + 1]
         return Blocks(rows=rows - rows[0], columns=columns - columns[0])
 
     def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the centres of the rows and columns of blocks, in cells."""
+        """Return the centres of the rows of blocks, and of the columns of blocks, in cells."""
         rows, columns = (
             np.asarray(0.5 * (edges[1:] + edges[:-1]), np.float64)
             for edges in (self.rows, self.columns)
@@ -74,7 +74,7 @@ class Blocks:
 
 def _symmetric_edges(length: int, part: int) -> NDArray[np.int64]:
     n_parts = -(-length // part)
-    # A middle cell that belongs to neither half is a block of its own.
+    # If a middle cell belongs to neither half, make it a block of its own.
     n_parts += length % 2 * (1 - n_parts % 2)
     half = np.arange(n_parts // 2 + 1) * length // n_parts
     return np.concatenate([half, (length - half[::-1])[1 - n_parts % 2 :]])
@@ -88,10 +88,10 @@ def raster_means(raster: Colours | NDArray[np.float32], blocks: Blocks) -> NDArr
 def block_means(
     values: Callable[[slice], NDArray[np.generic]], blocks: Blocks
 ) -> NDArray[np.float64]:
-    """Return the mean (rows, cols) of each block; `values` returns the cells of given rows."""
+    """Return the mean (rows, cols) of each block; `values` is called with a slice of rows."""
     rows, columns = blocks.rows, blocks.columns
     means = np.empty((len(rows) - 1, len(columns) - 1))
-    # Process rows of blocks together, with about as many cells as a band.
+    # Process several rows of blocks at once, with about as many cells as a band.
     for some in row_bands((len(means), int(columns[-1] * np.diff(rows).max()))):
         first, last = rows[some.start], rows[some.stop]
         known = values(slice(int(first), int(last))).astype(np.float64)
@@ -110,7 +110,7 @@ def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool_]:
-    """Return a mask of the cells of some rows on either side of a depth edge."""
+    """Return a mask of the cells in some rows that are on either side of a depth edge."""
     first = max(0, rows.start - 1)
     around = depth_m[first : rows.stop + 1]
     beside = depth_edges(around) | depth_edges(around[::-1, ::-1])[::-1, ::-1]
@@ -119,12 +119,12 @@ def depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool
 
 @dataclass(frozen=True, kw_only=True)
 class BlockLight:
-    """Mean brightness of the blocks that a layer shows completely, in the box around its cells.
+    """Mean brightness of the blocks that a layer covers completely, in a box around its cells.
 
     Attributes:
         box: rows and columns of blocks.
-        log_light: (rows, cols, 3) float32 natural logarithm of the mean brightness; NaN if the
-            layer does not show all of a block, or too much of it is black or white.
+        log_light: (rows, cols, 3) float32 natural logarithm of the mean brightness; NaN for blocks
+            that the layer does not cover completely, or that are largely black or clipped.
     """
 
     box: Box
@@ -137,7 +137,7 @@ class BlockLight:
 
 
 def block_light(layer: Layer, blocks: Blocks) -> BlockLight:
-    """Measure the brightness of the blocks of a layer that has coloured cells."""
+    """Measure the brightness of the blocks of a layer, which must have coloured cells."""
     painted = block_means(lambda rows: layer.mask[rows] == LayerMask.PAINTED, blocks)
     down, right = (np.flatnonzero((painted > 0.0).any(axis=axis)) for axis in (1, 0))
     box = slice(int(down[0]), int(down[-1]) + 1), slice(int(right[0]), int(right[-1]) + 1)
@@ -175,7 +175,7 @@ def common(one: Box, other: Box) -> Box | None:
 
 
 def inside(part: Box, box: Box) -> Box:
-    """Return the slices of a part of a box in arrays over that box."""
+    """Return the slices that select a part of a box from an array over this box."""
     rows, columns = (
         slice(inner.start - outer.start, inner.stop - outer.start)
         for inner, outer in zip(part, box, strict=True)
@@ -186,7 +186,7 @@ def inside(part: Box, box: Box) -> Box:
 def pairs(
     lights: Sequence[BlockLight],
 ) -> list[tuple[int, int, Box]]:
-    """Return the pairs of layers (lower index first) with overlapping boxes, and the overlap."""
+    """Return all pairs of layers with overlapping boxes, lower index first, and the overlaps."""
     found = []
     for i, one in enumerate(lights):
         for j in range(i + 1, len(lights)):

@@ -1,10 +1,10 @@
-"""Replacement of people and vehicles by the colours of photos that contradict them.
+"""Removal of people and vehicles from photos that are contradicted by other photos or the scan.
 
-Photos of the same area, and the colours of the scan, are independent observations of brightness,
-which are compared in blocks of a few centimetres after smooth differences (lighting, exposure) have
-been removed. A photo is not used in a region where it contradicts another photo that more
-observations confirm. Reflections also cause contradictions. In all cases, colours are only replaced
-by those of another photo.
+Photos of the same area, and the colours of the scan, are independent observations of brightness.
+They are compared in blocks of a few centimetres, after smooth differences (lighting, exposure) have
+been removed. In a region where two photos contradict each other, the one that fewer observations
+confirm is not used. Reflections also cause contradictions. Colours are only replaced by those of
+another photo.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means, common, in
 if TYPE_CHECKING:
     from orthoflow.geometry.levels import Colours
 
-# Side of a block: larger than the displacements between photos, narrower than a limb.
+# Side of a block, which must exceed the displacements between photos but not the width of a limb.
 _BLOCK_M: Final = 0.025
 _BLOCK_CELLS: Final = (4, 32)
 _LEAST_PAINTED: Final = 0.5
-# This is added to brightness, so that noise in almost black cells is not taken for a difference.
+# This is added to brightness, so that noise in almost black cells does not count as a difference.
 _DARK: Final = 0.02
 # Two observations contradict each other if the logarithms of their brightness differ by at least
-# the first value and, up to twice this value, by at least the second value times the standard
-# deviation over all blocks.
+# the first value. If the second value times the standard deviation over all blocks is greater, it
+# is the limit, but the limit is at most twice the first value.
 _APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
-# In the core of a region of contradiction, the difference must exceed the limit by this factor.
+# In the core of a contradicted region, differences exceed the limit by at least this factor.
 _CORE_TIMES: Final = 2.0
 _LEAST_CORE_BLOCKS: Final = 6
-# Differences that are smooth over this many blocks are attributed to lighting.
+# Differences that vary only over distances longer than this, in blocks, are attributed to lighting.
 _SMOOTH_BLOCKS: Final = 40.0
-# Regions that are thinner than this are misaligned edges.
+# Regions thinner than this are due to misaligned edges.
 _OPENING_BLOCKS: Final = 2
 # Gaps of up to this many blocks in a region are closed.
 _CLOSING_BLOCKS: Final = 9
 # Regions are extended by this many blocks.
 _GROWTH_BLOCKS: Final = 2
-# The laser intensity is used if its correlation with the grey of the photos is at least this.
+# The laser intensity is used if its correlation with the brightness of the photos is at least this.
 _LEAST_CORRELATION: Final = 0.6
 _LEAST_BLOCKS: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Witness:
-    """Logarithm of the brightness (r, c, 3) of the blocks in a box; NaN if not observed."""
+    """Logarithmic brightness (r, c, 3) of the blocks in a box, NaN where not observed."""
 
     box: Box
     log_light: NDArray[np.float64]
@@ -66,17 +66,17 @@ class _Witness:
 def consensus(
     layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate
 ) -> tuple[list[Layer], int, NDArray[np.bool_] | None]:
-    """Exclude from each photo the regions where better confirmed photos contradict it.
+    """Exclude from each photo the regions in which it is contradicted by better-confirmed photos.
 
     Args:
-        layers: photos of one wall, not modified; each shows some cells.
+        layers: layers of one wall, each with coloured cells; they are not modified.
         wall: the scanned wall; None if unknown.
-        allocate: function that creates the masks of changed layers, given a name.
+        allocate: function that allocates the masks of changed layers.
 
     Returns:
-        The layers, with excluded cells marked as hidden; the number of cells in which an excluded
-        photo differs from the one used instead; and the cells (rows, cols) that only one photo
-        shows and that contradict the scan, None if the scan has no colours.
+        The layers, with excluded cells marked as hidden; the number of excluded cells, summed over
+        the layers; and a mask (rows, cols) of the cells that only one photo shows and in which that
+        photo contradicts the scan, or None if the scan has neither colours nor a usable intensity.
     """
     shape, gsd_m = layers[0].frame.shape, layers[0].frame.gsd_m
     side = int(np.clip(math.ceil(_BLOCK_M / gsd_m), *_BLOCK_CELLS))
@@ -84,8 +84,8 @@ def consensus(
     witnesses = [_witness(layer.rgb, layer.mask == LayerMask.PAINTED, blocks) for layer in layers]
     scan = None if wall is None else _scan(wall, blocks, witnesses)
     if scan is not None:
-        # Passers-by affect this comparison less than a comparison of two photos, because a photo
-        # and the scan have more cells in common.
+        # Remove lighting differences between each photo and the scan first. People affect this
+        # comparison less than a comparison of two photos, which have fewer cells in common.
         witnesses = [_in_light_of(scan, item) for item in witnesses]
     everyone = [*witnesses, *([] if scan is None else [scan])]
     supports, apart = _compared(everyone, len(layers), blocks)
@@ -108,6 +108,10 @@ def _compared(
         everyone: the photos, followed by the scan if it is used.
         n_photos: number of photos.
         blocks: blocks of the wall.
+
+    Returns:
+        (photos, rows, cols) counts, and for each pair the difference in each block relative to the
+        limit for a contradiction.
     """
     supports = np.zeros((n_photos, *blocks.shape), dtype=np.int8)
     apart: dict[tuple[int, int], NDArray[np.float64]] = {}
@@ -122,7 +126,8 @@ def _compared(
                 supports[i] += agrees
                 supports[j] += agrees
             else:
-                # A person may look the same in two photos, but not in a photo and in the scan.
+                # The scan counts more than all photos together, since two photos may show the same
+                # person at the same place.
                 supports[i] += agrees * np.int8(1 if everyone[j].is_grey else n_photos)
     return supports, apart
 
@@ -133,7 +138,7 @@ def _contradicted(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.float64]:
-    """Return each block's difference between a photo and better-confirmed ones; 0 if none."""
+    """Return the largest difference in each block between a photo and better-confirmed photos."""
     worst = np.zeros(blocks.shape)
     for other in range(len(supports)):
         ratio = apart.get((min(photo, other), max(photo, other)))
@@ -148,7 +153,7 @@ def _alone(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.bool_]:
-    """Return a mask of blocks that only one photo shows and that contradict the scan."""
+    """Return a mask of the blocks in which the only photo that shows them contradicts the scan."""
     shown = np.array([_known(item, blocks) for item in photos])
     is_alone = shown.sum(axis=0) == 1
     found = np.zeros(blocks.shape, dtype=np.bool_)
@@ -161,7 +166,6 @@ def _alone(
 
 
 def _of_cells(region: NDArray[np.bool_], blocks: Blocks) -> NDArray[np.bool_]:
-    """Return a mask (rows, cols) of the cells of some blocks."""
     by_row = np.repeat(region, np.diff(blocks.rows), axis=0)
     return np.repeat(by_row, np.diff(blocks.columns), axis=1)
 
@@ -188,7 +192,7 @@ def _witness(rgb: Colours, is_painted: NDArray[np.bool_], blocks: Blocks) -> _Wi
 
 
 def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | None:
-    """Return the colours of the scan, or its intensity if it correlates with the photos."""
+    """Return the colours of the scan, or its intensity if that correlates with the photos."""
     if wall.rgb is not None and wall.rgb_mask is not None:
         return _witness(wall.rgb, wall.rgb_mask > 0, blocks)
     if wall.intensity is None:
@@ -204,7 +208,7 @@ def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | 
 
 
 def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
-    """Return the intensity scaled to the brightness of the photos; None if uncorrelated."""
+    """Return the intensity scaled to the brightness of the photos, or None if uncorrelated."""
     given, shown = [np.empty(0)], [np.empty(0)]
     for photo in photos:
         box = common(grey.box, photo.box)
@@ -217,7 +221,7 @@ def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
         return None
     x, y = x[known] - x[known].mean(), y[known]
     slope = float(x @ (y - y.mean()) / (x @ x))
-    # Passers-by must not influence the scale.
+    # Exclude people and vehicles from the estimate of the scale.
     near = np.abs(y - np.median(y) - slope * x) <= _CORE_TIMES * _APART
     if near.sum() < _LEAST_BLOCKS or np.corrcoef(x[near], y[near])[0, 1] < _LEAST_CORRELATION:
         return None
@@ -226,7 +230,7 @@ def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
 
 
 def _in_light_of(scan: _Witness, photo: _Witness) -> _Witness:
-    """Return a photo without its smooth difference in brightness from the scan."""
+    """Remove from a photo its smooth difference in brightness from the scan."""
     box = common(scan.box, photo.box)
     if box is None:
         return photo
@@ -246,7 +250,10 @@ def _known(witness: _Witness, blocks: Blocks) -> NDArray[np.bool_]:
 def _difference(
     one: _Witness, other: _Witness, box: Box
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the difference between two observations (grey if one is) and a mask of both."""
+    """Return the difference between two observations, and a mask of the blocks that both have.
+
+    The difference is that of the channel means if one observation is grey.
+    """
     difference = one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
     if one.is_grey or other.is_grey:
         difference = np.repeat(difference.mean(axis=2, keepdims=True), 3, axis=2)
@@ -254,7 +261,7 @@ def _difference(
 
 
 def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the smooth part (r, c, 3) of a difference between observations; NaN if unknown."""
+    """Return the smooth part (r, c, 3) of a difference that is NaN where unknown."""
     known = np.asarray(np.isfinite(difference).all(axis=2), dtype=np.bool_)
     if not known.any():
         return np.zeros(difference.shape)
@@ -267,10 +274,10 @@ def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
-    """Return the difference between two observations in each block, in units of the threshold.
+    """Return the difference between two observations in each block, relative to the limit.
 
-    The difference is NaN where an observation is missing; None is returned if the observations
-    have no block in common.
+    The difference is NaN where an observation is missing. The result is None if no block is
+    observed twice.
     """
     box = common(one.box, other.box)
     if box is None:
@@ -288,7 +295,7 @@ def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64
 
 
 def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the mean (r, c, 3) of the used values around each block."""
+    """Return the weighted mean (r, c, 3) of the used values around each block."""
     import cv2
 
     weights = cv2.GaussianBlur(is_used.astype(np.float64), (0, 0), _SMOOTH_BLOCKS)
@@ -297,7 +304,7 @@ def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[
 
 
 def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the regions of contradiction that contain a core."""
+    """Return a mask of the contradicted regions that contain a core."""
     import cv2
 
     square = cv2.getStructuringElement(cv2.MORPH_RECT, (_OPENING_BLOCKS, _OPENING_BLOCKS))
@@ -312,7 +319,7 @@ def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a region extended by its border, where its colours mix with the background."""
+    """Extend a region by its border, where colours mix with the background."""
     import cv2
 
     side = 2 * _GROWTH_BLOCKS + 1
@@ -323,7 +330,7 @@ def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _any_left(
     painted: Sequence[NDArray[np.bool_]], is_out: Sequence[NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Return a mask of the cells that any layer shows without being excluded there."""
+    """Return a mask of the cells that at least one layer shows and is not excluded from."""
     left = [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
     return np.asarray(np.logical_or.reduce(left), dtype=np.bool_)
 
@@ -334,7 +341,7 @@ def _without(
     blocks: Blocks,
     allocate: Allocate,
 ) -> tuple[list[Layer], int]:
-    """Exclude outvoted blocks where another layer remains; return layers and cell count."""
+    """Exclude outvoted blocks that another layer shows; return the layers and the cell count."""
     changed = [index for index, region in enumerate(outvoted) if region.any()]
     if not changed:
         return list(layers), 0
@@ -352,7 +359,8 @@ def _without(
         painted = [layer.mask[rows] == LayerMask.PAINTED for layer in layers]
         is_out = [region[at] & shows for region, shows in zip(grown, painted, strict=True)]
         stays = _any_left(painted, is_out)
-        # Between two people, use the border of one of them rather than the other person.
+        # Where photos show two people next to each other, keep the border of one region rather than
+        # the other person.
         is_out = [out & (stays | region[at]) for out, region in zip(is_out, outvoted, strict=True)]
         stays = _any_left(painted, is_out)
         for index in changed:

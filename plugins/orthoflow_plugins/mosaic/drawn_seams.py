@@ -1,4 +1,4 @@
-"""Areas assigned to photos by hand, which override the rule for seams."""
+"""Areas that users assign to photos by hand; they override the rule for seams."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from orthoflow.products import InputFiles
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnSeams:
-    """Polygons of one wall, each assigned to a layer; where they overlap, the last one is used.
+    """Polygons of one wall, each assigned to a layer; where polygons overlap, the last one is used.
 
     Attributes:
-        rings: (n, 2) corners of each polygon as (column, row).
+        rings: corners (n, 2) of each polygon as (column, row).
         layers: index of the layer of each polygon.
         n_columns: number of columns of the wall.
     """
@@ -29,7 +29,7 @@ class DrawnSeams:
     n_columns: int
 
     def chosen(self, rows: slice) -> NDArray[np.int16]:
-        """Return the assigned layer (rows, cols) in the given rows; -1 if none is assigned."""
+        """Return the assigned layer (rows, cols) of the cells in the given rows; -1 if none."""
         chosen = np.full((rows.stop - rows.start, self.n_columns), -1, dtype=np.int16)
         for rings, layer in zip(self.rings, self.layers, strict=True):
             moved = tuple(ring - [0.0, rows.start] for ring in rings)
@@ -41,10 +41,10 @@ class DrawnSeams:
 
 
 def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[NamedPolygon]:
-    """Read the polygons of all walls, with the properties `photo` and `wall` (a number).
+    """Read the polygons of all walls; their properties are `photo` and the number `wall`.
 
     Raises:
-        InputError: a file has a different format, or refers to a photo that is not a layer.
+        InputError: a file has a different format, or refers to a photo without a layer.
     """
     if files is None:
         return []
@@ -77,7 +77,7 @@ def seams_of(
         polygons: polygons of all walls, in the coordinates of their GeoTIFFs (metres).
         number: number of the wall.
         frame: frame of the wall.
-        sources: sources of the layers of the wall, in order.
+        sources: source of each layer of the wall.
     """
     mine = [
         polygon

@@ -1,10 +1,11 @@
-"""Expected error of a point measured in an orthoimage, per cell.
+"""Expected error, per cell, of the position of a point measured in an orthoimage.
 
-Three independent causes displace the content of a cell along the wall: errors of the pose of the
-photo (its covariance, propagated to the wall), errors of the depth of the cell (times the tangent
-of the viewing angle), and displacements between overlapping photos that neither of these errors
-explains. Overlaps separate the last two, because a depth error displaces photos taken from
-different sides in different directions.
+Three independent causes displace the content of a cell along the wall. The first is the error of
+the pose of the photo (its covariance, propagated to the wall). The second is the error of the depth
+of the cell, times the tangent of the viewing angle. The third is estimated from displacements
+between overlapping photos that the first two do not explain. Overlaps separate depth errors from
+the third cause, because depth errors displace photos taken from different sides in different
+directions.
 """
 
 from __future__ import annotations
@@ -23,29 +24,30 @@ from orthoflow_plugins.mosaic.agreement import Overlaps
 if TYPE_CHECKING:
     from orthoflow.geometry import WallFrame
 
-# Pose errors vary smoothly, so they are computed at this many nodes per side and interpolated
-# linearly.
+# Pose errors vary smoothly, so they are computed at this many nodes per side, and interpolated
+# linearly between the nodes.
 _NODES: Final = 48
-# Noise of phase correlation. Measurements in a simulated room with pose errors of 0.01 cells gave
-# 0.06 and 0.07 cells.
+# Noise of phase correlation: 0.06 and 0.07 cells were measured in a simulated room with pose errors
+# of 0.01 cells.
 _PARALLAX_NOISE_CELLS: Final = 0.065
 _LEAST_OVERLAPS: Final = 10
-# No cell is viewed at more than 84 degrees from the normal.
+# Tangent of the maximum viewing angle, 84 degrees.
 _MOST_TANGENT: Final = 10.0
-# Interpolated depths have larger errors than measured ones, by this factor (`docs/accuracy.md`).
+# The errors of interpolated depths are larger than those of measured depths by this factor
+# (`docs/accuracy.md`).
 _RECOVERED_TIMES: Final = 2.0
-# The spread of a few points is uncertain, so it is only used if it exceeds that of the whole raster
-# by this factor, as it does at edges.
+# The standard deviation of a few points is uncertain, so it is used only if it exceeds that of the
+# whole raster by this factor, which is typical of edges.
 _SPREAD_TIMES: Final = 2.0
-# Clouds from photos have depth errors that are correlated over this distance.
+# Depth errors of clouds from photos are correlated over this distance.
 _PATCH_M: Final = 0.05
-# Errors count as correlated if differences between depths at this distance exceed those between
-# neighbouring depths by this factor. The relief of rooms explains a factor of up to 1.35
-# (neighbouring and distant cells differ by 0.98 and 1.3 mm in the simulated room, 1.2 and 2.4 mm in
-# a stuccoed hall, 1.7 and 5.2 mm in a stereo cloud of a fountain).
+# Depth errors count as correlated if depth differences over this distance exceed those between
+# neighbouring cells by this factor. Relief of rooms explains a factor of up to 1.35, except in a
+# stereo cloud: neighbouring and distant cells differ by 0.98 and 1.3 mm in the simulated room, by
+# 1.2 and 2.4 mm in a stuccoed hall, and by 1.7 and 5.2 mm in a stereo cloud of a fountain.
 _PATCHY_TIMES: Final = 1.5
-# Overlaps reveal depth errors if the tangents of the viewing angles differ by at least the first
-# value in at least the second number of patches.
+# Depth errors can be estimated from overlaps if the tangents of the two viewing angles differ by at
+# least the first value in at least the second number of patches.
 _LEAST_TANGENTS: Final = 0.3
 _LEAST_SLANTED: Final = 20
 # Displacements of more than this many standard deviations are false matches.
@@ -57,7 +59,7 @@ def ties_on(cameras: Cameras | None, number: int) -> tuple[int, int]:
     """Count the control and check points of the photos on a wall.
 
     Args:
-        cameras: orientations with the ties on which they are based.
+        cameras: orientations, including the ties from which they were computed.
         number: number of the wall.
     """
     ties = None if cameras is None else cameras.ties
@@ -82,15 +84,15 @@ def expected_errors_m(
     *,
     allocate: Allocate,
 ) -> NDArray[np.float32]:
-    """Predict the errors of cells: standard deviations of u and v, in metres.
+    """Predict the error of each cell: the standard deviation of u, and of v, in metres.
 
     Args:
         wall: surface of the wall.
         source: (rows, cols) index of the photo used for each cell, -1 if none.
         sources: names of the photos.
-        cameras: oriented photos by name; a photo without a covariance has no expected error.
+        cameras: camera of each oriented photo by name; without a covariance, the error is unknown.
         overlaps: displacements between overlapping photos.
-        allocate: function that creates the array.
+        allocate: function that allocates the result.
 
     Returns:
         (rows, cols), NaN where no photo is used or the error of the photo is unknown.
@@ -110,7 +112,7 @@ def expected_errors_m(
     excess = _excess_of_overlaps(wall, cameras, overlaps)
     position_m, depth_m = (0.0, None) if excess is None else excess
     if depth_m is not None:
-        # Within five centimetres, relief looks like correlated errors, but overlaps distinguish the
+        # Within 5 cm, relief looks like correlated errors, but overlaps distinguish between the
         # two.
         patchy_m = depth_m
     for index, name in enumerate(sources):
@@ -134,7 +136,7 @@ def expected_errors_m(
 
 
 def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
-    """Return the columns and rows (r, c, 2) of the nodes, which are centres of blocks."""
+    """Return the columns and rows (r, c, 2) of the nodes, which are at the centres of blocks."""
     rows, columns = ((np.arange(-(-size // step)) + 0.5) * step for size in frame.shape)
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
@@ -142,15 +144,15 @@ def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
 def _pose_variances(
     camera: Camera, frame: WallFrame, nodes: NDArray[np.float64], depths_m: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Return variances (r, c) of a wall coordinate due to the orientation of a photo, in m²."""
+    """Return the variances (r, c) of a wall coordinate due to the pose of a photo, in m²."""
     from orthoflow.geometry.cameras import LensFreedom, linearised
     from orthoflow.geometry.resection import moved_origin, pixels_by_point
 
     if camera.covariance is None:
         return None
     viewing, middle = camera.viewing(), frame.origin_world
-    # Use coordinates relative to the wall, because in survey coordinates, effects of rotations and
-    # shifts would almost cancel out, and precision would be lost.
+    # Use coordinates relative to the wall. In survey coordinates, effects of rotations and shifts
+    # almost cancel out, which loses precision.
     to_local = np.linalg.inv(moved_origin(viewing, middle, 6))
     covariance = to_local @ camera.covariance @ to_local.T
     near = viewing.shifted(middle)
@@ -168,7 +170,8 @@ def _pose_variances(
     variances[shown] = 0.5 * np.einsum("nij,jk,nik->n", by_pose, covariance, by_pose)
     inside = near.sees(pixels) & shown
     if camera.sigma_wall_m is not None and inside.any():
-        # The covariance includes the parameters of a lens that was estimated with the pose.
+        # If a lens was estimated with the pose, the covariance includes the parameters of that
+        # lens.
         stated = camera.sigma_wall_m**2 / float(np.median(variances[inside]))
         variances *= max(1.0, stated)
     known = np.isfinite(variances)
@@ -179,7 +182,7 @@ def _pose_variances(
 def _between(
     values: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp], step: int
 ) -> NDArray[np.float64]:
-    """Interpolate values (n,) at cells linearly between nodes; constant beyond the outer nodes."""
+    """Interpolate values at cells (n,) linearly between nodes; constant beyond the outer nodes."""
     places, shares = [], []
     for cells, size in zip((rows, columns), values.shape, strict=True):
         place = np.clip((cells + 0.5) / step - 0.5, 0.0, size - 1.0)
@@ -194,7 +197,7 @@ def _between(
 
 
 def _depth_noises_m(wall: Wall) -> tuple[float, float]:
-    """Return the noise of single depths, and the error shared by neighbours (0 if none)."""
+    """Return the noise of single depths, and the error that neighbours share (0 if none)."""
     noise_m = depth_noise_m(wall.depth_m)
     step = max(1, round(_PATCH_M / wall.frame.gsd_m))
     apart_m = depth_noise_m(wall.depth_m[::step, ::step])
@@ -210,9 +213,10 @@ def _depth_variances(
     centre: NDArray[np.float64],
     noises_m: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return variances (n,) of a coordinate due to depth errors, viewed from a centre (3,).
+    """Return variances (n,), in m², of a wall coordinate due to depth errors.
 
-    The first noise is that of single cells, the second is shared by neighbouring cells.
+    The viewer is at `centre` (3,) in the axes of the wall. The first noise is that of single cells;
+    the second is shared by neighbouring cells.
     """
     noise_m, patchy_m = noises_m
     gsd_m = wall.frame.gsd_m
@@ -231,16 +235,16 @@ def _depth_variances(
 def _excess_of_overlaps(
     wall: Wall, cameras: Mapping[str, Camera], overlaps: Overlaps
 ) -> tuple[float, float | None] | None:
-    """Separate errors of poses and depths by means of displacements; None if these are too few.
+    """Separate pose errors from depth errors by means of displacements; None if there are too few.
 
     The expected squared displacement is the sum of the variances of both poses, twice the
     additional variance of a pose, and the depth variance times the squared difference between the
-    tangents of the two viewing angles. The two unknown variances are estimated by weighted least
-    squares, without outliers and with the constraint that they are not negative.
+    tangents of the two viewing angles. The two unknown variances are estimated by weighted
+    non-negative least squares, without outliers.
 
     Returns:
         The additional standard deviation of a coordinate in one photo, and the standard deviation
-        of depths over a patch, which is None if the views differ too little.
+        of depths over a patch; the latter is None if the viewing directions differ too little.
     """
     from scipy.optimize import nnls
 
@@ -270,7 +274,7 @@ def _excess_of_overlaps(
         columns.append((apart**2).ravel())
     matrix, wanted = np.column_stack(columns), squares.ravel()
     known_part = np.broadcast_to(fixed, squares.shape).ravel()
-    # Half of all displacements are below 0.67 standard deviations.
+    # Half of all normally distributed displacements are below 0.67 standard deviations.
     predicted = np.full(len(wanted), max(float(np.median(wanted)) * NMAD_FACTOR**2, 1e-12))
     found = np.zeros(len(columns))
     for _ in range(_ROUNDS):
@@ -287,7 +291,7 @@ def _excess_of_overlaps(
 def _views_of(
     wall: Wall, camera: Camera, centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return variances (n,) due to a pose, and tangents (n, 2) of viewing angles, at positions."""
+    """Return the variances (n,) due to a pose, and the tangents (n, 2) of the viewing angles."""
     frame = wall.frame
     depths_m = np.nan_to_num(
         wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)

@@ -1,4 +1,4 @@
-"""Seams by graph cuts, where two photos look similar and away from depth edges."""
+"""Seams by graph cuts, placed where two photos look similar and away from depth edges."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from orthoflow_plugins.mosaic.blocks import Blocks, block_means, depth_edges_in,
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
 
-# Cuts are computed at a reduced scale with about this many cells.
+# Graph cuts are computed at a reduced scale, with about this many cells.
 _CELLS_MOST: Final = 30_000
 _SWEEPS_MOST: Final = 2
-# A seam on a depth edge costs as much as one between black and white.
+# Additional cost of a seam at a depth edge, equal to that of a seam between black and white.
 _DEPTH_EDGE_COST: Final = 1.0
-# Even where layers are identical, a long seam costs more than a short one.
+# Cost per cell of a seam, so that short seams are preferred where layers are identical.
 _LENGTH_COST: Final = 0.01
 _VIEW_WEIGHT: Final = 0.1
 # Cost of assigning a cell to a layer that does not show it.
@@ -33,9 +33,10 @@ _UNITS: Final = 1000.0
 
 @dataclass(frozen=True, kw_only=True)
 class _Scene:
-    """The reduced layers: colours (k, rows, cols, 3) 0..1, views (k, rows, cols), edges.
+    """Layers at reduced scale: colours (k, rows, cols, 3) in 0..1, views (k, rows, cols), edges.
 
-    `views` is the cost of a layer in a cell, `edges` the additional cost of a seam in the cell.
+    `views` is the cost of a layer in each cell; `edges` (rows, cols) is the additional cost of a
+    seam in each cell.
     """
 
     colours: NDArray[np.float32]
@@ -49,14 +50,14 @@ class CutLabels:
 
     Attributes:
         small: (rows, cols) int16 layer of each block, -1 if no layer shows it.
-        blocks: the cells of each block.
+        blocks: division of the wall into blocks.
     """
 
     small: NDArray[np.int16]
     blocks: Blocks
 
     def in_rows(self, rows: slice) -> NDArray[np.int16]:
-        """Return the layers (rows, cols) of the cells in the given rows of the wall."""
+        """Return the layer (rows, cols) of each cell in the given rows of the wall."""
         first_rows, first_columns = self.blocks.rows, self.blocks.columns
         wanted = np.arange(*rows.indices(int(first_rows[-1])))
         blocks = np.searchsorted(first_rows, wanted, side="right") - 1
@@ -68,14 +69,15 @@ def cut_labels(
 ) -> CutLabels:
     """Assign a layer to each cell by a graph cut; -1 if no layer shows the cell.
 
-    Boykov, Veksler and Zabih 2001: each layer in turn takes over cells of the others if this lowers
-    the sum of view costs and seam costs (colour differences between the two layers on both sides of
-    a seam, Kwatra et al. 2003, plus depth edges). The cut is computed at a reduced scale.
+    Each layer in turn takes over cells of other layers if this lowers the sum of view costs and
+    seam costs (Boykov, Veksler and Zabih 2001). The cost of a seam is the colour difference between
+    the two layers on both sides of the seam (Kwatra et al. 2003), plus the cost of depth edges. The
+    cut is computed at a reduced scale.
 
     Args:
         layers: layers of one wall.
-        wall: surface of the wall, for depth edges, or None.
-        balance: colour balance applied to the layers before they are compared, or None.
+        wall: the wall, or None if depth edges are unknown.
+        balance: colour balance applied to the layers before their comparison, or None.
     """
     shape = layers[0].frame.shape
     factor = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS_MOST)))
@@ -125,7 +127,7 @@ def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
 
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
-    """Let one layer take over cells; a minimum cut finds the optimal move."""
+    """Reassign cells to the layer `alpha` where a minimum cut finds this optimal."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -133,8 +135,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     source, sink = count, count + 1
     flat = labels.ravel()
     cells = np.arange(count)
-    # Unary costs of keeping the label (0) and of changing to alpha (1). They are integers, so that
-    # sums are exact and the order of two neighbours does not matter.
+    # Unary costs of keeping the label (0) and of changing it to alpha (1). Integers make sums
+    # exact, so that results do not depend on the order of neighbours.
     views = np.rint(_UNITS * scene.views)
     keep = views.reshape(len(views), -1)[flat, cells]
     take = views[alpha].ravel().copy()
@@ -144,8 +146,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
         p, q = one.ravel(), other.ravel()
         right = _seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
         left = _seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
-        # The triangle inequality must hold, that is, a seam costs at most as much as both seams
-        # with alpha.
+        # Enforce the triangle inequality: a seam costs at most as much as both seams with alpha
+        # together.
         kept = np.minimum(_seam_cost(scene, p, q, flat[p], flat[q]), right + left)
         # Kolmogorov and Zabih 2004: A + (C - A) p - C q + (B + C - A) (1 - p) q.
         np.add.at(take, p, left - kept)
@@ -156,7 +158,7 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     low = np.minimum(keep, take)
     starts += [np.full(count, source), cells]
     ends += [cells, np.full(count, sink)]
-    # A cell on the side of the sink changes to alpha, which cuts its edge from the source.
+    # A cell on the sink side of the cut changes to alpha, which cuts the edge from the source.
     between += [take - low, keep - low]
     # An edge from p to q is cut where p keeps its label (source side) and q changes.
     capacity = np.minimum(np.concatenate(between), 4.0 * _FORBIDDEN * _UNITS)
@@ -185,14 +187,14 @@ def _seam_cost(
     label_p: NDArray[np.int64],
     label_q: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return the integer seam cost (n,) of neighbours with these labels; 0 if they are equal."""
+    """Return the integer seam cost (n,) between neighbours with these labels; 0 if equal."""
     colours = scene.colours.reshape(len(scene.colours), -1, 3)
     views = scene.views.reshape(len(scene.views), -1)
     edges = scene.edges.ravel()
     cost = _LENGTH_COST + edges[p] + edges[q]
     for cell in (p, q):
         apart = np.abs(colours[label_p, cell] - colours[label_q, cell]).mean(axis=1)
-        # Where only one layer shows the cells, there is nothing to compare and no visible step.
+        # If only one layer shows a cell, the colours cannot be compared and no step is visible.
         both = (views[label_p, cell] < _FORBIDDEN) & (views[label_q, cell] < _FORBIDDEN)
         cost = cost + np.where(both, apart, 0.0)
     return np.where(label_p == label_q, 0.0, np.rint(_UNITS * cost))

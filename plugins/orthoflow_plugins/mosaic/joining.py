@@ -1,4 +1,4 @@
-"""Selection of the layer for each cell of a wall, by a rule and without small patches."""
+"""Selection of a layer for each cell of a wall by a rule, and removal of small patches."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
     from orthoflow_plugins.mosaic.drawn_seams import DrawnSeams
 
-# Preference (rows, cols) of a layer in some rows of the wall. Preferences are computed band by
-# band, because those of a large wall would not fit into memory.
+# Function that returns the preference (rows, cols) of a layer in the given rows of a wall.
+# Preferences are computed in bands, because those of a large wall would not fit into memory.
 Preference = Callable[[slice], NDArray[np.float32]]
 
 NOBODY: Final = -1
@@ -31,8 +31,8 @@ NOBODY: Final = -1
 _BAND_CELLS: Final = 1 << 25
 # Balancing colours temporarily takes more than a hundred bytes per cell.
 _BALANCED_AT_ONCE: Final = 1 << 20
-# States in ascending order; a cell takes the highest state of any layer. It is occluded if at least
-# one source faces it, but none shows it.
+# States in ascending order; a cell takes the highest state that it has in any layer. It is occluded
+# if at least one source faces it but none shows it.
 _RANKED: Final = (
     OrthoMask.NONE,
     OrthoMask.NO_SURFACE,
@@ -54,13 +54,14 @@ def preferences(
     wall: Wall | None = None,
     balance: Balance | None = None,
 ) -> list[Preference]:
-    """Return functions that compute each layer's preference by a rule; the highest is used.
+    """Return functions that compute the preference of each layer by the given rule.
 
-    `best-view` is the quality of the layers: angle of incidence, resolution and distance from the
-    border of the photo. `voronoi` prefers the layer whose area ends farthest away, so that seams
-    are in the middle of overlaps. `priority` takes photos in the given order, followed by all
-    others by quality. `graph-cut` puts seams where the layers look similar and away from depth
-    edges of the wall.
+    A cell is taken from the layer with the highest preference. `best-view` is the quality of the
+    layer, which depends on the angle of incidence, the resolution and the distance from the border
+    of the photo. `voronoi` prefers the layer whose border is farthest away, so that seams are in
+    the middle of overlaps. `priority` takes photos in the given order, followed by all others by
+    quality. `graph-cut` puts seams where the layers look similar, away from depth edges of the
+    wall.
     """
     if params.seams == "voronoi":
         return [_depth_inside(layer) for layer in layers]
@@ -90,7 +91,7 @@ def _cut_off(
 def _depth_inside(layer: Layer) -> Preference:
     """Return the distance in cells to the nearest cell without a colour, or to the border.
 
-    On a large wall, distances are computed for every n-th cell and interpolated linearly.
+    For a large wall, distances are computed for every n-th cell and interpolated linearly.
     """
     import cv2
 
@@ -103,7 +104,7 @@ def _depth_inside(layer: Layer) -> Preference:
         return lambda rows: inside[1:-1, 1:-1][rows]
 
     def preference(rows: slice) -> NDArray[np.float32]:
-        # The first sampled cell is the second cell of the padded picture.
+        # Because of the padding, the first sampled cell is the second cell of the image.
         row, column = (
             (np.arange(*part.indices(size)) - step // 2) / step + 1.0
             for part, size in zip((rows, slice(None)), shape, strict=True)
@@ -117,7 +118,7 @@ def _depth_inside(layer: Layer) -> Preference:
 
 
 def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
-    """Refuse names in `priority` that are not names of layers.
+    """Check that all names in `priority` are sources of layers.
 
     Raises:
         MethodError: a name is unknown.
@@ -132,10 +133,10 @@ def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
 
 
 def require_one_raster(layers: Sequence[Layer], name: str) -> None:
-    """Refuse layers of a wall that do not share one frame.
+    """Check that all layers of a wall have the same frame.
 
     Raises:
-        MethodError: they differ.
+        MethodError: the frames differ.
     """
     first = layers[0]
     for layer in layers[1:]:
@@ -156,20 +157,20 @@ def joined(
     balance: Balance | None,
     allocate: Allocate,
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """Determine the state and the layer of each cell of a wall, band by band if it is large.
+    """Determine the state and the layer of each cell of a wall, in bands if the wall is large.
 
     Args:
         painters: layers of the wall with coloured cells.
         others: layers without coloured cells; their masks show which cells are occluded.
         params: the rule for seams.
-        drawn: areas assigned to photos by hand, which override the rule where the photo shows
-            them.
+        drawn: areas assigned to photos by hand; they override the rule where the photo shows them.
         wall: the surface, to keep seams away from its depth edges, or None.
         balance: the colour balance of `painters`, or None.
-        allocate: function that creates the arrays of the orthoimage, given a name.
+        allocate: function that allocates the arrays of the orthoimage.
 
     Returns:
-        (rows, cols) `OrthoMask`, and the index of the layer of each cell, `NOBODY` if it has none.
+        (rows, cols) `OrthoMask`, and (rows, cols) index of the layer of each cell, `NOBODY` if
+        none.
     """
     preferred: list[Preference] = []
     if painters:
@@ -177,7 +178,7 @@ def joined(
     shape = [*painters, *others][0].frame.shape
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
-    # Cells influence each other if they are at most this many rows apart.
+    # A cell can influence another one only if they are at most this many rows apart.
     cells_min = params.island_cells_min
     reach = cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
@@ -208,13 +209,13 @@ def coloured(
     *,
     allocate: Allocate,
 ) -> Colours:
-    """Return the colours (rows, cols, 3) of cells from their layers, in bands if there are many.
+    """Return the colours (rows, cols, 3) of the cells from the layers assigned to them.
 
     Args:
         painters: layers of the wall with coloured cells.
         source: (rows, cols) index of the layer of each cell, `NOBODY` if it has none.
         balance: colour balance of the layers; None leaves colours unchanged.
-        allocate: function that creates the array.
+        allocate: function that allocates the result.
     """
     is_deep = any(layer.rgb.dtype == np.uint16 for layer in painters)
     level: Level = np.uint16 if is_deep else np.uint8
@@ -235,10 +236,11 @@ def coloured(
 def best_views(
     layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """Assign each cell to the layer with the highest preference, or to the first of several.
+    """Assign each cell to the layer with the highest preference, or to the first of equal layers.
 
     Returns:
-        (rows, cols) rank of the state of each cell, and its layer, `NOBODY` if it has none.
+        (rows, cols) rank of the state of each cell, and (rows, cols) its layer, `NOBODY` if it has
+        none.
     """
     shape = layers[0].frame.shape
     best = np.zeros(shape, dtype=np.float32)
@@ -257,10 +259,10 @@ def best_views(
 def without_islands(
     rank: NDArray[np.uint8], owner: NDArray[np.int16], layers: Sequence[Layer], cells_min: int
 ) -> NDArray[np.int16]:
-    """Reassign small patches to the source that surrounds them, if it also shows them.
+    """Reassign small patches to a source that surrounds them and also shows them.
 
-    Cells of a patch are connected by their sides. A cell takes the source of most surrounding
-    cells; it remains unchanged if no source of a larger patch shows it.
+    Cells of a patch are connected by their sides. A cell takes the source that most of the
+    surrounding cells have. It is unchanged if no source of a larger patch shows it.
     """
     import cv2
 

@@ -10,7 +10,7 @@ from orthoflow.sdk import MethodParams
 
 
 class SeamsParams(MethodParams):
-    """Choice of a cell's layer, and balancing of colours."""
+    """Rule for the layer of each cell, and balancing of colours."""
 
     seams: Literal["best-view", "voronoi", "graph-cut", "priority"] = Field(
         "best-view",

@@ -62,9 +62,9 @@ _LONGEST_PX: Final = 900
 _NAMED_MOST: Final = 24
 # The legend has two columns instead of three if a name has at least this many characters.
 _LONG_NAME: Final = 16
-# Weight of the source colours over the grey image.
+# Weight of the source colours when they are blended with the grey image.
 _TINT: Final = 0.45
-# Minimum shares of empty cells, of contradicted cells and of cells with one cause for a report.
+# Shares from which empty cells, contradicted cells and a single cause of empty cells are reported.
 _EMPTY_WORTH_WORDS: Final = 0.1
 _CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01
@@ -106,26 +106,27 @@ EMPTY_CELLS: Final = DiagnosticSpec(
 
 
 class MosaicSeams(Method):
-    """Take each cell from the layer that shows it best; balance photos where they differ.
+    """Take each cell from the layer that shows it best, and balance photos where they differ.
 
-    A single layer is used unchanged. If there are several, each cell is taken from the layer that
-    the rule `seams` prefers, or from the first of equal layers. Filled cells are used only where no
-    layer has a measured colour. Small patches are assigned to the source around them if that source
-    shows them, too.
+    If there is only one layer, it is used unchanged. If there are several, each cell is taken from
+    the layer that the rule `seams` prefers, or from the first of equal layers. Filled cells are
+    used only where no layer has a measured colour. Small patches are assigned to the source around
+    them if that source also shows them.
 
-    `best-view` decides cell by cell, by angle of incidence, resolution and distance from the border
-    of the photo; `voronoi` puts seams in the middle of overlaps; `graph-cut` puts them where photos
-    look similar and, if the walls are connected, away from depth edges; `priority` uses a given
-    order of photos. Displacements between overlapping photos and colour differences along seams are
-    reported.
+    `best-view` selects each cell by the angle of incidence, the resolution and the distance from
+    the border of the photo. `voronoi` puts seams in the middle of overlaps. `graph-cut` puts seams
+    where photos look similar and, if the walls are connected, away from depth edges. `priority`
+    uses a given order of photos. Displacements between overlapping photos and colour differences
+    along seams are reported.
 
-    If photos contradict each other over a region, the photo confirmed by other photos and by the
-    colours of the scan is used (`robust`), so that people who pass by in one photo disappear.
+    If photos contradict each other in a region, the photo that other photos and the colours of the
+    scan confirm is used (`robust`). People who appear in one photo only are removed in this way.
 
-    Colours are balanced unless `gains` is none: by the exposure of each photo, the vignetting of
-    its lens (if the cameras are connected), a smooth field per photo, and blending of the remaining
-    differences near seams. These corrections are smooth, and each cell is taken from one photo
-    only, so photos are never mixed. Photos that agree within 2 % are unchanged.
+    Colours are balanced unless `gains` is none. The corrections consist of the exposure of each
+    photo, the vignetting of its lens (if the cameras are connected), a smooth field per photo, and
+    a blend of the remaining differences near seams. Corrections are smooth and each cell is taken
+    from one photo, so the details of photos are never blended. Photos that agree within 2 % are
+    unchanged.
     """
 
     id: ClassVar[str] = "mosaic.seams"
@@ -166,7 +167,6 @@ class MosaicSeams(Method):
         MetricSpec(
             "contradicted_share", label="cells from a single photo that contradicts the scan"
         ),
-        # Reported for all walls with a known accuracy.
         MetricSpec(
             "expected_mm_median",
             label="expected error of a point measured in the orthoimages, median",
@@ -184,7 +184,7 @@ class MosaicSeams(Method):
     Params = SeamsParams
 
     class In(Ports):
-        """The layers; optionally walls, cameras (for lenses) and hand-drawn seams."""
+        """The layers; optionally also walls, cameras (for lenses) and hand-drawn seams."""
 
         layers: Layers
         walls: Walls | None = None
@@ -197,7 +197,7 @@ class MosaicSeams(Method):
         orthoimages: Orthoimages
 
     def run(self, inputs: In, params: SeamsParams, ctx: StepContext) -> Out:
-        """Join wall by wall."""
+        """Join the layers of each wall."""
         layers = sorted(inputs.layers.layers, key=lambda layer: layer.wall)
         if not layers:
             raise MethodError("there are no layers, but at least one is needed for an orthoimage")
@@ -233,17 +233,18 @@ class MosaicSeams(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Joined:
-    """The orthoimage of one wall, and the agreement of its sources.
+    """The orthoimage of one wall, and the agreement between its sources.
 
     Attributes:
         image: the orthoimage.
-        shifts_cells: (n, 2) displacements between the two best photos at sampled positions.
-        steps: differences in luminance and in colour along seams.
-        n_seam: number of cells on seams.
-        n_edge_seam: number of these on depth edges; None if the surface is unknown.
+        shifts_cells: (n, 2) displacements, in cells, between the two best photos in sampled
+            patches.
+        steps: luminance differences and colour distances along seams.
+        n_seam: number of seam cells.
+        n_edge_seam: number of seam cells on depth edges; None if the surface is unknown.
         untouched: `steps` before colour balancing.
         balance: the colour balance; None if colours are unchanged.
-        n_outvoted: number of cells where another photo disagreed with the one used.
+        n_outvoted: number of cells excluded from photos because other photos contradict them.
     """
 
     image: Orthoimage
@@ -270,28 +271,19 @@ def _join(
     ctx: StepContext,
     allocate: Allocate,
 ) -> _Joined:
-    """Join the layers of one wall.
-
-    Args:
-        inputs: inputs of the step.
-        group: layers of the wall.
-        params: parameters of the step.
-        polygons: hand-drawn areas of all walls.
-        ctx: context of the step.
-        allocate: function that allocates the arrays of the orthoimage by name.
-    """
+    """Join the layers of one wall; `polygons` are the hand-drawn areas of all walls."""
     frame, index = group[0].frame, group[0].wall
     name, number = inputs.layers.name(index), inputs.layers.number(index)
     walls = () if inputs.walls is None else inputs.walls.walls
     wall = walls[index] if index < len(walls) else None
     cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
     require_one_raster(group, name)
-    # A layer without coloured cells is not a source, but shows which cells are hidden.
+    # A layer without coloured cells is not a source, but it shows which cells are hidden.
     painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in group if all(layer is not painter for painter in painters)]
     n_outvoted, contradicted = 0, None
     if params.robust and painters:
-        # Remove passers-by before colours are balanced.
+        # Remove people and vehicles before colours are balanced.
         painters, n_outvoted, contradicted = consensus(painters, wall, allocate=allocate)
     sources = [layer.source for layer in painters]
     balance = None
@@ -321,7 +313,7 @@ def _join(
         overlaps = overlaps_of(group, of_all_pairs=True)
         error_m = expected_errors_m(wall, source, sources, cameras, overlaps, allocate=allocate)
     elif wall is not None and cameras:
-        # Without ties on the wall, its accuracy is unknown.
+        # If no ties are on the wall, its accuracy is unknown.
         error_m = np.asarray(allocate("error_m", frame.shape, np.float32), np.float32)
         error_m[...] = np.nan
         ctx.report(UNCHECKED, subject=name)
@@ -369,7 +361,6 @@ def _show(ctx: StepContext, image: Orthoimage) -> None:
 
 
 def _report_empty(ctx: StepContext, image: Orthoimage) -> None:
-    """Report the causes of empty cells, unless all of them lack a surface."""
     words = {
         OrthoMask.NONE: "are in no oriented photo (check why photos were refused, or take another)",
         OrthoMask.OCCLUDED: "are hidden in all photos, or seen too obliquely (take a "
@@ -401,7 +392,7 @@ def _source_map(image: Orthoimage) -> bytes:
     grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, keepdims=True)
     picture = np.where(source[..., None] >= 0, _TINT * tint + (1.0 - _TINT) * grey, 0.0)
     picture[is_seam(source)] = 255.0
-    # List the photos with the most cells.
+    # List the photos that have the most cells.
     counts = np.bincount(source[source >= 0], minlength=len(image.sources))
     named = sorted(np.argsort(-counts, kind="stable")[:_NAMED_MOST].tolist())
     handles = [Patch(color=colours[k], label=image.sources[k]) for k in named if counts[k]]
@@ -441,7 +432,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     shifts_cells = np.concatenate([item.shifts_cells for item in verdicts])
     ctx.metric("n_overlap_patches", len(shifts_cells), "1")
     if len(shifts_cells):
-        # Millimetres allow runs with different cell sizes to be compared.
+        # In millimetres, runs with different cell sizes can be compared.
         shifts_mm = np.concatenate(
             [1e3 * item.image.frame.gsd_m * item.shifts_cells for item in verdicts]
         )
