@@ -1,1 +1,1 @@
-"""Methods of the kind `match`: matching points of photos with points on the walls."""
+"""Methods of the kind `match`, which match points of photos with points on the walls."""

@@ -1,10 +1,10 @@
-"""Channels: features of a picture that look the same in other spectral bands, and their texture.
+"""Image channels that look the same in different spectral bands, and measures of their texture.
 
-The main channels are dense oriented gradients (after Ye et al. 2019, CFOG): the gradient strength
-in several directions, smoothed and normalised locally. A light joint on dark stone and a dark joint
-on light stone have the same channels. Where the spectral bands are similar, grey values are more
-accurate. Where they differ, a combination of a photo's colours, estimated for each patch, may
-resemble the laser intensity.
+The main channels are dense oriented gradients (similar to CFOG, Ye et al. 2019): the gradient
+strength in several directions, smoothed and normalised locally. A light joint on dark stone has the
+same channels as a dark joint on light stone. If the spectral bands are similar, grey values are
+more accurate. If they differ, a combination of the colours of a photo, estimated for each patch,
+may resemble the laser intensity.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
-# As in rasters, gaps between joined cells are filled if no disc of this radius fits into them.
+# As in rasters, gaps between joined cells are filled if they are too narrow for a disc of this
+# radius.
 _GAP_CELLS: Final = 2
-# Number of cells joined at once; they need about 100 MB of memory.
+# Number of cells joined at once, which needs about 100 MB of memory.
 _CELLS_AT_ONCE: Final = 1 << 22
 
 
@@ -39,8 +40,9 @@ def in_cells_of_points(wall: Wall) -> Wall:
         wall: the wall, with or without intensity.
 
     Returns:
-        The same wall if it has no intensity or its cells are not much finer than its point spacing;
-        otherwise a wall of joined cells with depths, spreads, counts and intensity, but no colours.
+        The same wall if it has no intensity, or if its cells are not much finer than its point
+        spacing; otherwise, a wall of joined cells with depths, spreads, counts and intensity, but
+        without colours.
     """
     gsd_m = wall.frame.gsd_m
     factor = math.floor(scan_step_m(wall.count, gsd_m=gsd_m) / gsd_m)
@@ -82,7 +84,7 @@ def _join(
         wall: the wall.
         factor: number of cells along the side of a joined cell.
         joined: the wall whose rows are filled.
-        places: (rows, cols, 2) centroids as in `Surroundings`, filled as well.
+        places: (rows, cols, 2) centroids as in `Surroundings`; the same rows are filled.
         which: the rows, and the depth difference beyond which points are on different surfaces.
     """
     rows, layer_m = which
@@ -92,7 +94,8 @@ def _join(
     measured = blocks.of(wall.mask) == SurfaceMask.MEASURED
     depths_m = np.where(measured, blocks.of(wall.depth_m), np.float32(np.nan))
     n_known = np.isfinite(depths_m).sum(axis=2)
-    # The lower median is a measured depth and never between two surfaces; NaN is sorted last.
+    # The lower median is always a measured depth, never one between two surfaces. NaN is sorted
+    # last.
     middle = np.maximum(n_known - 1, 0) // 2
     depth_m = np.take_along_axis(np.sort(depths_m, axis=2), middle[:, :, None], axis=2)
     on_surface = np.abs(depths_m - depth_m) <= layer_m
@@ -128,7 +131,7 @@ class _Blocks:
         self._rows, self._factor, self._width = rows, factor, width
 
     def of(self, raster: NDArray[np.generic]) -> NDArray[np.generic]:
-        """Return the values (rows, cols, factor^2) of a raster's cells; 0 beyond its border."""
+        """Return the cell values (rows, cols, factor^2) of a raster; 0 beyond its border."""
         factor, height = self._factor, self._rows.stop - self._rows.start
         part = raster[self._rows.start * factor : self._rows.stop * factor]
         framed = np.zeros((height * factor, self._width * factor), dtype=raster.dtype)
@@ -138,7 +141,7 @@ class _Blocks:
 
 
 def _complete(joined: Wall, around: Surroundings) -> None:
-    """Fill narrow gaps, and interpolate intensity from centroids of points to cell centres."""
+    """Fill narrow gaps, and interpolate intensity from the centroids of points to cell centres."""
     assert joined.intensity is not None  # noqa: S101 - checked before
     depth_m, intensity = joined.depth_m.reshape(-1), joined.intensity.reshape(-1)
     known = np.isfinite(joined.depth_m)
@@ -158,17 +161,17 @@ _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
-# The depths around a cell form a relief step if they differ by more than this many cell sizes and
-# by more than this many point spreads. The nine depths around a cell of a smooth surface differ by
-# about three spreads, and rarely by five.
+# The nine depths around a cell form a relief step if their range exceeds both this many cell sizes
+# and this many point spreads. On a smooth surface, their range is about three spreads and rarely
+# five.
 _STEP_CELLS: Final = 1.0
 _STEP_SPREADS: Final = 6.0
-# A surface consists mainly of relief if, in a window of this many cells along each side, more than
-# this share of the known cells is next to steps. The share is 0.06 to 0.11 in rooms with mouldings
-# and 0.21 on a carved fountain.
+# The surface around a cell consists mainly of relief if more than this share of the known cells is
+# next to steps, in a window with sides of this many cells. The share is 0.06 to 0.11 in rooms with
+# mouldings and 0.21 on a carved fountain.
 _RELIEF_CELLS: Final = 121
 _RELIEF_SHARE: Final = 0.16
-# Minimum distance between textured positions; these are taken in turn from the cells of a grid.
+# Minimum distance between textured positions. They are selected in turn from the fields of a grid.
 _APART_CELLS: Final = 5
 HALF_PATCH_CELLS: Final = 10
 """Compared patches are (2 h + 1) cells wide."""
@@ -176,7 +179,7 @@ _GRID: Final = 16
 
 
 class Channels(NamedTuple):
-    """A picture to be matched, in the form required by compiled kernels.
+    """The channels of a picture to be matched, in the form that compiled kernels require.
 
     Attributes:
         values: (rows, cols, c) float32, 0 where unknown.
@@ -195,7 +198,7 @@ class Channels(NamedTuple):
 
 
 def gradient_channels(grey: NDArray[np.float32]) -> Channels:
-    """Return the oriented gradients of a picture; unknown values are NaN."""
+    """Return the oriented gradients of a picture in which unknown values are NaN."""
     import cv2
 
     gradient, known = _gradient(grey)
@@ -213,12 +216,12 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
 
 
 def grey_channels(grey: NDArray[np.float32]) -> Channels:
-    """Return normalised grey values minus their local mean, for similar spectral bands."""
+    """Return normalised grey values minus their local mean, for matching similar spectral bands."""
     return colour_channels(grey[:, :, None])
 
 
 def colour_channels(colours: NDArray[np.float32]) -> Channels:
-    """Return colours (rows, cols, c) minus their local means, normalised jointly."""
+    """Return the colours (rows, cols, c) minus their local means, normalised jointly."""
     import cv2
 
     known = _safe(np.asarray(np.isfinite(colours).all(axis=2)))
@@ -232,7 +235,7 @@ def colour_channels(colours: NDArray[np.float32]) -> Channels:
 
 @dataclass(frozen=True)
 class WallTarget:
-    """A wall with which photos are matched; gradients and grey values are computed when needed.
+    """A wall with which photos are matched; gradients and grey values are computed on demand.
 
     Attributes:
         wall: the wall.
@@ -254,7 +257,7 @@ class WallTarget:
 
     @cached_property
     def grain(self) -> NDArray[np.float32]:
-        """Result of `grain_of`."""
+        """Number of cells per measured cell, as returned by `grain_of`."""
         return grain_of(self.wall)
 
     @property
@@ -266,12 +269,12 @@ class WallTarget:
 
 
 def _at_steps(wall: Wall) -> NDArray[np.bool_]:
-    """Find the cells (rows, cols) next to a relief step.
+    """Return a mask (rows, cols) of the cells next to a relief step.
 
-    The position of the edge within a cell is unknown, and the cell contains points from both sides,
+    These cells contain points from both sides of the edge, at an unknown position within the cell,
     so the edge in the picture is displaced by part of a cell. An oblique photo shows the face of
-    the step or misses the area behind it. Steep slopes are not steps. Where steps are everywhere,
-    as on carved stone, their cells are not excluded, since too few would be left to compare.
+    the step, or does not show the area behind it. Steep slopes are not steps. Where steps are
+    everywhere, as on carved stone, no cells are masked, since too few would be left to compare.
     """
     import cv2
 
@@ -281,10 +284,10 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
     low = cv2.erode(np.where(known, wall.depth_m, inf), kernel)
     bent = np.zeros(wall.frame.shape, dtype=np.bool_)
     for depth_m, found in ((wall.depth_m, bent), (wall.depth_m.T, bent.T)):
-        # Deviation from the line between the two neighbours; NaN next to void cells.
+        # Deviation of a depth from the line between its two neighbours; NaN next to void cells.
         off_m = np.abs(depth_m[:-2] - 2.0 * depth_m[1:-1] + depth_m[2:])
         found[1:-1] |= off_m > 0.5 * step_m
-    # Where there is no depth nearby, the highest and lowest depths are infinite.
+    # Without known depths nearby, the highest and the lowest depth are infinite.
     with np.errstate(over="ignore"):
         beside = known & bent & (high - low > step_m)
     n_beside, n_known = (
@@ -302,7 +305,7 @@ def least_step_m(wall: Wall) -> float:
 def grain_of(wall: Wall) -> NDArray[np.float32]:
     """Return the number of cells per measured cell around each cell (rows, cols); at least 1.
 
-    Filled cells are interpolated from measured ones and share their errors, so they add no
+    Filled cells are interpolated from measured cells and share their errors, so they add no
     information.
     """
     import cv2
@@ -337,7 +340,7 @@ def textured_places(
 ) -> NDArray[np.intp]:
     """Select cells (n, 2) = (column, row) with the most texture.
 
-    The best cells are taken in turn from the fields of a grid, so that they cover the usable area
+    The best cells of each field of a grid are taken in turn, so that they cover the usable area
     evenly.
 
     Args:
@@ -369,7 +372,7 @@ def _gradient(
 
 
 def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Select cells away from void areas, since filling void areas may create edges."""
+    """Exclude cells next to void areas, since interpolation of void areas may create edges."""
     import cv2
 
     kernel = np.ones((2 * _MARGIN_CELLS + 1, 2 * _MARGIN_CELLS + 1), dtype=np.uint8)
@@ -377,7 +380,7 @@ def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 
 def _evened(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Divide by the local strength, so that weak and strong edges have the same weight."""
+    """Divide by the local strength, so that weak and strong edges have equal weights."""
     strength = np.einsum("ijk,ijk->ij", values, values) * known
     local = np.sqrt(_broadly(strength) / np.maximum(_broadly(known), 1e-3))
     floor = 0.1 * float(np.median(local[known > 0.0])) if (known > 0.0).any() else 1.0
@@ -388,7 +391,8 @@ def _evened(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[
 def _broadly(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Blur with a wide Gaussian, at a quarter of the resolution.
 
-    This takes a tenth of the time needed at full resolution; the result differs by less than 1 %.
+    Compared with a blur at full resolution, this takes a tenth of the time, and the result differs
+    by less than 1 %.
     """
     import cv2
 

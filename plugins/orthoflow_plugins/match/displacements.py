@@ -19,14 +19,14 @@ from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.threads import even_parts, in_threads
 from orthoflow_plugins.match.channels import HALF_PATCH_CELLS, Channels
 
-# Patches are smooth, so every second cell is enough to find the whole-cell shift.
+# Patches are smooth, so correlating every second cell is enough to find the whole-cell shift.
 _STRIDE: Final = 2
 _ITERATIONS: Final = 12
 _CONVERGED_CELLS: Final = 0.002
 _MAX_STEP_CELLS: Final = 0.7
 _MIN_KNOWN_SHARE: Final = 0.3
 _RIDGE: Final = 1e-3
-# In a search, neighbouring cells are correlated, so this many count as one independent cell.
+# In a search, neighbouring cells are correlated; this many cells count as one independent cell.
 _INDEPENDENT: Final = 1.5
 
 
@@ -41,17 +41,18 @@ def search_shifts(
     """Find, for each patch, the whole-cell shift with the highest correlation.
 
     If the first picture has one channel and the second three, each patch is compared with the
-    combination of the second's channels that fits it best.
+    combination of the three channels that fits it best.
 
     Args:
         first: (rows, cols, c) float32.
         second: (rows, cols, c) float32, or (rows, cols, 3) for combinations.
-        places: (n, 2) int64 (column, row), at least half + radius cells from the border.
-        reach: half and radius; patches are 2 half + 1 cells wide, and shifts up to the radius are
-            tried.
-        found: (n, 4) float64, filled with the shift (across, down), its correlation, and the lead
-            of this correlation over the highest one away from it (-1 at the border of the search
-            area); for combinations (n, 7), also filled with the gains of the three channels.
+        places: (n, 2) int64 (column, row), whose distance from the border is at least the sum of
+            both values of `reach`.
+        reach: half width of a patch without its middle cell, and search radius, in cells.
+        found: (n, 4) float64, filled with the shift (across, down), the correlation at this shift,
+            and its lead over the highest correlation at shifts more than two cells away (-1 at the
+            border of the search area); for combinations (n, 7), also filled with the gains of the
+            three channels.
     """
     side, is_mixed = 2 * reach[1] + 1, found.shape[1] == 7
     scores, gains = np.empty(side * side), np.empty(3)
@@ -73,7 +74,7 @@ def search_shifts(
 
 @kernel_part
 def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
-    """Fill in the shift with the highest of the side^2 scores, this score, and its lead."""
+    """Write the shift with the highest of the side^2 scores, its score and its lead to `found`."""
     side = round(math.sqrt(scores.shape[0]))
     top = 0
     for k in range(side * side):
@@ -85,7 +86,7 @@ def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
     found[2] = scores[top]
     found[3] = -1.0
     if 0 < down < side - 1 and 0 < across < side - 1:
-        # If there are no other shifts, the lead is relative to the lowest possible correlation.
+        # Without other shifts, the lead is relative to the lowest possible correlation.
         elsewhere = -1.0
         for k in range(side * side):
             if max(abs(k // side - down), abs(k % side - across)) > 2:
@@ -100,7 +101,10 @@ def _mixed(
     where: tuple[tuple[int, int], tuple[int, int], int],
     gains: NDArray[np.float64],
 ) -> float:
-    """Correlate a patch with the best combination of three channels, and fill in its gains."""
+    """Return the correlation of a patch with the best combination of three channels.
+
+    The gains of the three channels are written to `gains`.
+    """
     at, to, half = where
     n, sa, sb, sc, sd = 0, 0.0, 0.0, 0.0, 0.0
     saa, sab, sac, sad = 0.0, 0.0, 0.0, 0.0
@@ -119,7 +123,7 @@ def _mixed(
     saa, sab, sac, sad = saa - sa * sa / n, sab - sa * sb / n, sac - sa * sc / n, sad - sa * sd / n
     sbc, sbd, scd = sbc - sb * sc / n, sbd - sb * sd / n, scd - sc * sd / n
     sbb, scc, sdd = sbb - sb * sb / n, scc - sc * sc / n, sdd - sd * sd / n
-    # The channels of one material are nearly collinear, so ridge regression keeps their small
+    # The channels of one material are nearly collinear, so ridge regression prevents their small
     # differences from dominating.
     ridge = _RIDGE * (sbb + scc + sdd) + 1e-12
     sbb, scc, sdd = sbb + ridge, scc + ridge, sdd + ridge
@@ -131,7 +135,7 @@ def _mixed(
     gains[1] = (kbc * sab + kcc * sac + kcd * sad) / determinant
     gains[2] = (kbd * sab + kcd * sac + kdd * sad) / determinant
     explained = gains[0] * sab + gains[1] * sac + gains[2] * sad
-    # Adjust for the degrees of freedom, since three gains also fit some of the noise.
+    # Correct for the degrees of freedom, since three gains also fit some of the noise.
     free = n / _INDEPENDENT
     share = explained / max(saa, 1e-20)
     return math.sqrt(max(0.0, 1.0 - (1.0 - share) * (free - 1.0) / max(free - 4.0, 1.0)))
@@ -179,8 +183,8 @@ def match_patches(
     Args:
         first: the first picture.
         second: the second picture.
-        places: (n, 2) int64 (column, row) of the patches' centres in the first picture.
-        window: (p, p) float64 weights of a patch's cells.
+        places: (n, 2) int64 (column, row) of the patch centres in the first picture.
+        window: (p, p) float64 weights of the cells of a patch.
         patch: scratch arrays (p, p), (p + 3, p, c) and (p, p, c), float64.
         found: (n, 4) float64: the shift (across, down), refined in place; the standard deviation of
             a coordinate, assuming independent cells (inf if undetermined); and the correlation.
@@ -219,7 +223,7 @@ def _sample(
     shift: tuple[float, float],
     patch: tuple[NDArray[np.float64], ...],
 ) -> float:
-    """Resample the second picture around a shifted position; return the sum of the weights."""
+    """Resample the second picture around a shifted position, and return the sum of the weights."""
     window, weight, lines, moved = patch
     rows, columns, n_channels = second.values.shape
     side = len(window)
@@ -267,7 +271,7 @@ def _sample(
 
 @kernel_part
 def _cubic(t: float) -> tuple[float, float, float, float]:
-    """Return weights for four neighbours at fraction t (cubic convolution, Keys 1981, a = -1/2)."""
+    """Return weights of four neighbours at fraction t (cubic convolution, Keys 1981, a = -1/2)."""
     return (
         ((-0.5 * t + 1.0) * t - 0.5) * t,
         (1.5 * t - 2.5) * t * t + 1.0,
@@ -287,7 +291,7 @@ def _improvement(
     """Return a Gauss-Newton step (down, across), its standard deviation, and the correlation."""
     side, n_channels = len(weight), values.shape[2]
     top, left = place[0] - side // 2, place[1] - side // 2
-    # Sums of products; a: reference, b: moved patch, x and y: slopes across and down.
+    # Sums of products; a: reference patch, b: moved patch, x and y: gradients across and down.
     saa, sab, sbb, nxx, nxy, nyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     sax, say, sbx, sby = 0.0, 0.0, 0.0, 0.0
     for k in range(n_channels):
@@ -314,7 +318,7 @@ def _improvement(
     gain = sab / sbb
     across, down = gain * sbx - sax, gain * sby - say
     noise = max(saa - gain * sab, 0.0) / (total * n_channels)
-    # In the inverse compositional algorithm, the slopes are those of the reference picture.
+    # In the inverse compositional algorithm, the gradients are those of the reference picture.
     return (
         (nxx * down - nxy * across) / determinant,
         (nyy * across - nxy * down) / determinant,
@@ -323,13 +327,13 @@ def _improvement(
     )
 
 
-# Patches with a smaller share of known cells than this are not measured.
+# Patches in which a smaller share of the cells is known are not measured.
 _MIN_KNOWN: Final = 0.6
 CORRELATION_AREA_CELLS: Final = 6.0
 """Residuals of smoothed pictures are correlated: there is one independent cell per this many."""
 _MAX_DRIFT_CELLS: Final = 1.5
 _MAX_DISAGREEMENT_CELLS: Final = 0.5
-# Margin of cut-out patches, for their drift and for the neighbours used in interpolation.
+# Margin of cut-out patches, for the drift of a patch and for the neighbours used in interpolation.
 _CUT_MARGIN_CELLS: Final = 6
 
 
@@ -339,8 +343,8 @@ class Displacements(Rows):
 
     Attributes:
         places: (n, 2) intp (column, row) cells of the first picture.
-        shift_cells: (n, 2) float64 shift from a cell to the corresponding position in the second
-            picture.
+        shift_cells: (n, 2) float64 shift (across, down) from a cell to the corresponding position
+            in the second picture.
         score: (n,) correlation.
         sigma_cells: (n,) float64 standard deviation of a coordinate of the shift.
     """
@@ -363,18 +367,18 @@ def measure(
 ) -> Displacements:
     """Measure displacements from the first picture to the second at cells (n, 2) of the first.
 
-    If the first has one channel and the second three, each patch of the first is compared with the
-    combination of the second's channels that fits it best.
+    If the first picture has one channel and the second three, each patch of the first is compared
+    with the combination of the three channels that fits it best.
 
     Args:
         first: the first picture.
         second: the second picture.
         places: (column, row) cells of the first picture.
-        radius_cells: search radius.
+        radius_cells: search radius, in cells.
         min_score: minimum correlation. The default of 0.35 is half the usual correlation at correct
             positions; a lower value is possible if many patches are checked against their
             neighbours.
-        min_distinct: minimum difference between the best correlation and the next peak.
+        min_distinct: minimum difference between the correlations of the best and the next peak.
         threads: number of threads.
     """
     places = _well_known(first, second, places, radius_cells)
@@ -400,7 +404,7 @@ def _mixed_and_refined(
     min_score: float,
     threads: int,
 ) -> Displacements:
-    """Refine each patch in its own combination of channels, with patches cut out and stacked."""
+    """Refine each patch in its own combination of channels; patches are cut out and stacked."""
     begun = found[:, :2].astype(np.intp)
     reach = HALF_PATCH_CELLS + _CUT_MARGIN_CELLS
     one = _cut_out(first, places, reach, np.ones((len(places), 1), dtype=np.float32))
@@ -437,7 +441,7 @@ def _cut_out(
 def _well_known(
     first: Channels, second: Channels, places: NDArray[np.intp], radius_cells: int
 ) -> NDArray[np.intp]:
-    """Select positions whose search area is inside the pictures and whose patch is mostly known."""
+    """Select positions with a search area inside both pictures and a mostly known patch."""
     import cv2
 
     reach = radius_cells + HALF_PATCH_CELLS + 2
@@ -459,8 +463,8 @@ def _refined(
 ) -> Displacements:
     begun = found[:, :2]
     forth, sigma_forth, score = _matched(first, second, places, begun, threads)
-    # Use half the difference between the forward and backward shifts, so that effects of
-    # interpolation cancel out.
+    # Use half the difference between the forward and backward shifts, so that interpolation errors
+    # cancel out.
     middle = np.rint(forth).astype(np.intp)
     back, sigma_back, _ = _matched(second, first, places + middle, -forth, threads)
     shifts = 0.5 * (forth - back)
@@ -488,7 +492,7 @@ def _matched(
     places = np.ascontiguousarray(places)
     found = np.zeros((len(places), 4))
     found[:, :2] = begun
-    # Gaussian weights, so that the border of a patch has little influence.
+    # With Gaussian weights, the border of a patch has little influence.
     steps = np.arange(-HALF_PATCH_CELLS, HALF_PATCH_CELLS + 1) / (0.6 * HALF_PATCH_CELLS)
     bell = np.exp(-0.5 * steps**2)
     window = np.outer(bell, bell)

@@ -1,4 +1,4 @@
-"""`match.guided`: match photos with approximate poses near their expected wall positions."""
+"""`match.guided`: match photos with walls, starting from approximate poses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace
     from orthoflow_plugins.match.warping import Before
 
-# As in `ortho`, points of the cloud with fewer neighbours than this are outliers and hide nothing.
+# As in `ortho`, points of the cloud with fewer neighbours than this are outliers and do not hide
+# walls.
 _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
@@ -44,16 +45,17 @@ NOTHING_AGREES: Final = DiagnosticSpec(
 
 
 class MatchGuided(Method):
-    """Project each photo onto the walls with its pose and measure its displacements there.
+    """Project each photo onto the walls with its pose, and measure the remaining displacements.
 
     Only the visible part of a wall is searched, within a small radius (an extension of the mask of
-    markiewicz2015). Oriented gradients, grey values and combinations of the photo's colours are
-    compared, since laser and camera have different wavelengths; for each photo, the channels used
-    are those whose ties have the smallest held-out error in relation to their number and spread.
-    Cells finer than the point spacing are joined. Patches at relief steps are excluded and, if the
-    cloud is connected, those hidden by objects in front of the walls. The pose is estimated again
-    and the photo projected again until held-out ties no longer improve. Photos without a pose are
-    first matched with the other photos, projected onto the walls; if that fails, they get no ties.
+    markiewicz2015). Since laser and camera have different wavelengths, oriented gradients, grey
+    values and combinations of the colours of the photo are compared. For each photo, the channels
+    are selected whose ties have the smallest held-out error in relation to their number and spread.
+    Cells finer than the point spacing are joined. Patches at relief steps are excluded, as are
+    patches hidden by objects in front of the walls if the cloud is connected. The pose is estimated
+    and the photo projected repeatedly, until held-out ties no longer improve. Photos without a pose
+    are first matched with the other photos, projected onto the walls; if that fails, they get no
+    ties.
     """
 
     id: ClassVar[str] = "match.guided"
@@ -93,7 +95,7 @@ class MatchGuided(Method):
     )
 
     class Params(MethodParams):
-        """The preset, the limit of the ratio test, and the number of ties."""
+        """The preset, the limit of the ratio test, and the maximum number of ties."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
@@ -129,7 +131,7 @@ class MatchGuided(Method):
         ties: Ties
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Match the oriented photos with the walls, then the photos without a pose."""
+        """Match the oriented photos with the walls, followed by the photos without a pose."""
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         if inputs.cloud is not None:
@@ -164,7 +166,7 @@ def _traced(
     params: MatchGuided.Params,
     ctx: StepContext,
 ) -> dict[str, Trace]:
-    """Match oriented photos with the walls, then the others; return results by name."""
+    """Match oriented photos with the walls, followed by the others; return results by name."""
     from orthoflow_plugins.match.channels import WallTarget, in_cells_of_points
     from orthoflow_plugins.match.tracing import (
         Setup,
@@ -204,7 +206,7 @@ def _traced(
 
 
 def _oriented(cameras: Cameras) -> dict[str, Camera]:
-    """Return the cameras of oriented photos by name.
+    """Return the cameras of oriented photos by photo name.
 
     Raises:
         MethodError: no photo is oriented.
@@ -220,7 +222,7 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
 
 
 def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
-    """Return the points in front of the walls; None if no cloud is connected."""
+    """Return the points in front of the walls, or None if no cloud is connected."""
     from orthoflow.geometry.occluders import occluders_before
     from orthoflow_plugins.match.warping import Before
 
@@ -235,7 +237,7 @@ def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
         spacing_m=walls.points_apart_m(),
         stations_world=cloud.stations,
         n_least=_MIN_POINTS,
-        # Photos are processed in parallel already.
+        # Several photos are processed in parallel.
         threads=1,
     )
     return Before(occluders=occluders, front_m=tuple(slab.front_m for slab in slabs))

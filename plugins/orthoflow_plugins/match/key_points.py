@@ -1,4 +1,4 @@
-"""Matching of photos with walls by key points, including mirrored photos and colour mixtures."""
+"""Matching of photos with walls by key points, with mirrored photos and mixtures of colours."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from orthoflow.products import Photo, Wall
 from orthoflow.sdk import MethodParams
 from orthoflow_plugins.match.pictures import CLIP_LIMIT, equalised, wall_picture
 
-# A photo is first matched at this size, which is then doubled until a wall is recognised.
+# A photo is first matched at this size, which is doubled until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
-# These numbers of key points in a photo and on each wall are enough to recognise the walls.
+# This many key points in a photo, and this many on each wall, are enough to recognise the walls.
 _FIRST_IN_PHOTO: Final = 3000
 _FIRST_ON_WALL: Final = 4000
-# Tolerance relative to the photo's diagonal, since a homography is approximate on relief.
+# Tolerance relative to the diagonal of the photo, since a homography is only approximate on relief.
 _LOOSE_SHARE: Final = 0.02
-# Scale-invariant key points tolerate a factor of 1.4 between the sizes of pixels and cells.
+# Scale-invariant key points tolerate a ratio of 1.4 between the sizes of pixels and cells.
 _LOG_SCALE_APART: Final = 0.35
-# Tolerances of a key point's size (log2) and direction in the guided match.
+# Tolerances in the guided match for the size (log2) and the direction of a key point.
 _MAX_LOG_SIZE: Final = 0.7
 _MAX_ANGLE_DEG: Final = 30.0
 _VOID_MARGIN_CELLS: Final = 3
@@ -44,9 +44,10 @@ _MAX_RATIO: Final = 0.85
 # Several matches within a square of this side length count as one.
 _PLACE_PX: Final = 2.0
 
-# Descriptors are invariant to the strength of contrast, but not to its sign. If the brightness of
-# materials differs between laser and photo, half of the edges may be inverted; a combination of the
-# photo's colours may restore most of the signs. The combination with the most matches is used.
+# Descriptors do not depend on the strength of the contrast, but on its sign. If the relative
+# brightness of materials differs between laser and photo, half of the edges may be inverted, and a
+# mixture of the colours of the photo may restore most of the signs. The mixture with the most
+# matches is used.
 MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
     "green less red": (-1.0, 1.0, 0.0),
     "red as dark": (-1.0, 0.0, 0.0),
@@ -57,9 +58,9 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
 """Weights of red, green and blue by name, in the order in which they are tried."""
 
 # In rooms with inverted contrast, up to 15 matches agreed on a wrong position, and 19 in one case.
-# A mixture needs more than 15 matches, since several are tried.
+# A mixture needs more than 15 matches, since several mixtures are tried.
 LEAST: Final = 16
-# With this many matches, neither other mixtures nor matching by structure are tried.
+# If there are this many matches, neither other mixtures nor matching by structure is tried.
 CLEARLY: Final = 24
 # Mixtures are only used to find the approximate position, so a reduced resolution is enough.
 _LONGEST_SIDE_PX: Final = 2000
@@ -102,9 +103,9 @@ class Pair:
 
     Attributes:
         wall: index of the wall.
-        matches: matched key points; `first` are those of the photo, `second` those of the wall.
+        matches: matched key points, `first` in the photo and `second` on the wall.
         agreeing: (n,) bool, inliers of an approximate homography.
-        is_shown: whether enough matches agree and the wall is not seen from behind.
+        is_shown: whether enough matches agree and the photo shows the front of the wall.
         homography: (3, 3) approximate homography, photo pixels from wall pixels; None if the wall
             is not shown.
     """
@@ -123,12 +124,12 @@ class PhotoPairs:
     Attributes:
         features: key points of the photo, in pixels of the full image.
         scale: factor by which the photo was reduced.
-        pairs: one per wall with matches.
-        radius_px: radius of the guided matching; if the homography is wrong, matches are evenly
-            distributed within it.
+        pairs: one pair for each wall that has matches.
+        radius_px: search radius of the guided matching; if a homography is wrong, the matches are
+            evenly distributed within this radius.
         is_mirrored: whether the mirrored photo matches better; if so, no wall counts as shown.
         n_recognised: number of inliers before the guided matching.
-        picture: "grey" or name of the mixture.
+        picture: "grey" or the name of the mixture.
     """
 
     features: Features
@@ -141,12 +142,12 @@ class PhotoPairs:
 
     @property
     def n_verified(self) -> int:
-        """Number of inliers on all walls shown."""
+        """Number of inliers on all walls that are shown."""
         return sum(int(pair.agreeing.sum()) for pair in self.pairs if pair.is_shown)
 
 
 def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> Features | None:
-    """Find key points in a wall's intensity; None if the wall has no intensity.
+    """Find key points in the intensity of a wall; None if the wall has no intensity.
 
     Args:
         wall: the wall.
@@ -166,11 +167,11 @@ def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> 
 def pair_photo(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Recognise walls in a photo from coarse to fine, then match it at their resolution.
+    """Recognise walls in a photo from coarse to fine, then match the photo at their resolution.
 
-    If a photo is much finer than the raster, its key points have no counterpart there and lead to
-    many false matches. At one cell per pixel, both show the same detail, which gives 2 to 5 times
-    as many tie points.
+    If the photo is much finer than the raster, most of its key points have no counterpart in the
+    raster and cause false matches. At one cell per pixel, both show the same detail, which gives 2
+    to 5 times as many tie points.
 
     Args:
         grey: (height, width) grey values of the photo.
@@ -213,7 +214,7 @@ def pair_in_colours(
         params: parameters of the matching.
 
     Returns:
-        The matches in grey or, if it has more inliers, in a mixture.
+        The matches in grey, or in a mixture if that has more inliers.
     """
     best = pair_photo(photo_grey(photo), walls, params)
     if best.n_recognised >= CLEARLY:
@@ -233,7 +234,7 @@ def pair_in_colours(
 
 
 def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
-    """Combine a photo's colours, stretched to all grey levels; None if there is no contrast.
+    """Mix the colours of a photo, stretched to all grey levels; None if there is no contrast.
 
     Args:
         rgb: (height, width, 3).
@@ -250,9 +251,9 @@ def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
 def side_matches(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> NDArray[np.intp]:
-    """Count a photo's inliers on walls seen from the front and from behind.
+    """Count the inliers of a photo on each wall, as seen from the front and from behind.
 
-    A wall whose normal points away from the viewer is a mirror image of the photo.
+    The raster of a wall whose normal points away from the viewer is a mirror image of the photo.
 
     Args:
         grey: (height, width) grey values of the photo.
@@ -260,13 +261,14 @@ def side_matches(
         params: parameters of the matching.
 
     Returns:
-        (walls, 2) counts from the front and from behind; 0 if below `MIN_AGREEING`.
+        (walls, 2) counts from the front and from behind; counts below `MIN_AGREEING` are set to 0.
     """
     seeker = _Seeker(grey=grey, params=params)
     counts = np.zeros((len(walls), 2), dtype=np.intp)
     scale = min(seeker.finest, _FIRST_SIDE_PX / max(grey.shape))
     while True:
-        # Use all key points, since a coarse raster contains few of the strongest ones.
+        # Use all key points, since a coarse raster contains few of the strongest key points of a
+        # photo.
         features = seeker.key_points(scale)
         for side, seen in enumerate((features, features.mirrored(grey.shape[1]))):
             for pair in seeker.pairs(seen, scale, walls).pairs:
@@ -288,15 +290,15 @@ def rematched(
 ) -> Matches:
     """Add matches near their expected position, size and direction (guided matching).
 
-    The ratio test ignores repetitions of a motif outside the radius, which gives several times as
-    many matches.
+    Since the ratio test ignores repetitions of a motif outside the radius, this gives several times
+    as many matches.
 
     Args:
         matches: the matches so far, which are kept.
         sets: key points of the photo and of the wall.
-        expected: (m, 2) expected photo pixels of the wall's key points.
+        expected: (m, 2) expected photo pixels of the key points of the wall.
         agreeing: (n,) bool, inliers among the matches so far.
-        radius_px: search radius.
+        radius_px: search radius in the photo.
         ratio: maximum ratio between the distances of the best and the second-best descriptor within
             the radius.
     """
@@ -337,16 +339,15 @@ class _Seeker:
 
     @property
     def finest(self) -> float:
-        """Largest scale at which the photo is matched."""
         return min(1.0, self.params.max_side_px / float(max(self.grey.shape)))
 
     def key_points(self, scale: float) -> Features:
-        """Find key points in the photo reduced by `scale`; return them in full-photo pixels."""
+        """Find key points in the photo reduced by `scale`; positions refer to the full photo."""
         small = equalised(reduced(self.grey, scale), CLIP_LIMIT)
         return find_features(small, self.params.max_features).scaled(1.0 / scale)
 
     def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, Features]:
-        """Recognise walls at increasing scales, first by the strongest key points, then by all.
+        """Recognise walls at increasing scales, by the strongest key points first, then by all.
 
         Returns:
             The best matches, and all key points at the scale of these matches.
@@ -381,7 +382,7 @@ class _Seeker:
         return PhotoPairs(features=features, scale=scale, pairs=tuple(pairs), radius_px=radius_px)
 
     def n_verified_mirrored(self, first: PhotoPairs, walls: Sequence[Features | None]) -> int:
-        """Count the inliers of the mirrored photo on the walls shown.
+        """Count the inliers of the mirrored photo on the walls that are shown.
 
         A symmetric facade partly matches its own mirror image, with a plausible pose.
         """
@@ -396,7 +397,6 @@ def _strongest(walls: Sequence[Features | None]) -> list[Features | None]:
 
 
 def _shown(pairs: PhotoPairs, walls: Sequence[Features | None]) -> list[Features | None]:
-    """Keep only the walls that a photo shows."""
     shown = {pair.wall for pair in pairs.pairs if pair.is_shown}
     return [wall if index in shown else None for index, wall in enumerate(walls)]
 
@@ -404,11 +404,11 @@ def _shown(pairs: PhotoPairs, walls: Sequence[Features | None]) -> list[Features
 def verified(
     index: int, matches: Matches, sets: tuple[Features, Features], loose_px: float
 ) -> Pair:
-    """Find the inliers of an approximate homography of a wall.
+    """Estimate a homography between a photo and a wall, and find its inliers.
 
     Args:
         index: index of the wall.
-        matches: matches between key points of the photo and of the wall.
+        matches: matched key points of the photo and of the wall.
         sets: these key points.
         loose_px: maximum distance of an inlier in the photo.
     """
@@ -421,15 +421,15 @@ def verified(
     if homography is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             agreeing = np.hypot(*(mapped(homography, source) - target).T) < loose_px
-    # Many key points of a texture may match a single position in the other image, so count
-    # positions.
+    # Count distinct positions, since many key points of a texture may match a single position in
+    # the other image.
     n_places = min(
         len(np.unique(np.floor(pixels[agreeing] / _PLACE_PX), axis=0))
         for pixels in (source, target)
     )
     is_shown = homography is not None and n_places >= MIN_AGREEING
     if homography is not None and is_shown:
-        # If the wall is seen from behind, the sense of rotation is reversed.
+        # Seen from behind, the wall has the opposite sense of rotation.
         middle = source[agreeing].mean(axis=0)
         here, *there = mapped(homography, middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
         is_shown = bool(np.linalg.det(np.array(there) - here) > 0.0)
@@ -445,7 +445,7 @@ def verified(
 def _completed(
     pairs: PhotoPairs, walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Add matches near the positions expected by the homographies."""
+    """Add matches near the positions expected from the homographies."""
     completed = []
     for pair in pairs.pairs:
         wall = walls[pair.wall]
@@ -488,7 +488,7 @@ def _homography(
 
 
 def sampling(threshold_px: float, *, trials: int) -> Any:
-    """Return parameters for OpenCV's robust sampling: MSAC with local optimisation and a seed."""
+    """Return OpenCV parameters for robust sampling: MSAC, local optimisation and a fixed seed."""
     import cv2
 
     params: Any = cv2.UsacParams()

@@ -1,4 +1,4 @@
-"""Pictures for matching: photos and wall rasters with equalised contrast, and wall points."""
+"""Pictures for matching: photos and wall rasters with equalised contrast, and points on walls."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photos, Wall, Walls
 
-# Maximum number of threads; each needs up to a gigabyte of memory for its picture.
+# Maximum number of threads; each picture needs up to a gigabyte of memory.
 _MAX_AT_ONCE: Final = 4
 CLIP_LIMIT: Final = 3.0
 """Limit of local contrast equalisation (CLAHE)."""
 _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
-# The depths around a point form a relief edge if they differ by more than this many cell sizes.
+# The depths around a point form a relief edge if their range exceeds this many cell sizes.
 _SMOOTH_CELLS: Final = 1.0
 # Maximum and minimum number of smooth cells from which the typical point spread is estimated.
 _MAX_SPREADS: Final = 100_000
 _MIN_SPREADS: Final = 100
-# Standard deviation of the depth if it cannot be estimated, in cells.
+# Standard deviation of depths, in cells, if it cannot be estimated.
 _UNKNOWN_SIGMA_CELLS: Final = 0.5
 
 
 def require_photos(photos: Photos) -> None:
-    """Refuse an empty set of photos.
+    """Check that there are photos.
 
     Raises:
         MethodError: there are no photos.
@@ -38,7 +38,7 @@ def require_photos(photos: Photos) -> None:
 
 
 def require_intensity(walls: Walls) -> None:
-    """Refuse walls without intensity.
+    """Check that at least one wall has intensity or colour.
 
     Raises:
         MethodError: there are no walls, or none has intensity or colour.
@@ -55,11 +55,11 @@ def require_intensity(walls: Walls) -> None:
 def wall_picture(
     wall: Wall, *, clip_limit: float, void_margin_cells: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]] | None:
-    """Return a wall's intensity as a picture without gaps; None if the wall has no intensity.
+    """Return the intensity of a wall as a picture without gaps; None if it has no intensity.
 
     Args:
         wall: the wall.
-        clip_limit: limit of the local equalisation; 0 only stretches the grey levels.
+        clip_limit: clip limit of the local equalisation; 0 only stretches the grey levels.
         void_margin_cells: half the side of the neighbourhood that must be mostly measured.
 
     Returns:
@@ -76,7 +76,7 @@ def wall_picture(
     low, high = np.percentile(wall.intensity[known], (0.5, 99.5))
     scaled = (wall.intensity - low) / max(float(high - low), 1e-9)
     filled = filled_smoothly(np.where(known, np.clip(scaled, 0.0, 1.0), np.nan))
-    # Cells contain single scan points, so speckle would hide the texture.
+    # Each cell contains only a few scan points, whose speckle would hide the texture.
     grey = np.asarray(cv2.medianBlur(np.rint(filled * 255.0).astype(np.uint8), 3), dtype=np.uint8)
     side = 2 * void_margin_cells + 1
     share = cv2.blur(known.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE)
@@ -84,7 +84,7 @@ def wall_picture(
 
 
 def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Interpolate NaN values, more coarsely the farther they are from known ones (push-pull)."""
+    """Interpolate NaN values by push-pull: the farther from known values, the more coarsely."""
     import cv2
 
     known = np.isfinite(values)
@@ -103,7 +103,7 @@ def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
-    """Equalise contrast locally (CLAHE); a limit of 0 leaves the picture unchanged."""
+    """Equalise contrast locally (CLAHE); a limit of 0 returns the picture unchanged."""
     import cv2
 
     if clip_limit == 0.0 or min(grey.shape) < 2 * _TILES:
@@ -115,19 +115,19 @@ def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
 def points_on_wall(
     wall: Wall, pixels_wall: NDArray[np.float64], *, usual_m: float | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the surface points at positions (n, 2) = (column, row) of a wall's raster.
+    """Return the surface points at positions (n, 2) = (column, row) in the raster of a wall.
 
     The depth is interpolated where the surface is smooth. At a relief edge, the depth is that of
-    the nearest cell, and its standard deviation includes the step.
+    the nearest cell, and its standard deviation includes the height of the step.
 
     Args:
         wall: the wall.
         pixels_wall: the positions.
-        usual_m: result of `usual_spread_m` for the wall, computed if None.
+        usual_m: result of `usual_spread_m` for the wall; computed if None.
 
     Returns:
-        World points (n, 3) in metres, their standard deviations (n,) in metres, and a mask (n,) of
-        the positions with a known depth; points without a depth are NaN.
+        World points (n, 3) in metres, NaN where the depth is unknown; the standard deviations (n,)
+        of the depths in metres; and a mask (n,) of positions with a known depth.
     """
     columns, rows = pixels_wall[:, 0] - 0.5, pixels_wall[:, 1] - 0.5
     height, width = wall.frame.shape
@@ -151,10 +151,10 @@ def points_on_wall(
 
 
 def usual_spread_m(wall: Wall) -> float:
-    """Return the median depth spread of the points in a cell, over cells on a smooth surface.
+    """Return the median, over cells on smooth surfaces, of the depth spread of points in a cell.
 
-    If the point spacing exceeds the cell size, most cells with several points are at relief steps,
-    and their spread is the height of the step.
+    Cells at relief steps are excluded. If the point spacing exceeds the cell size, most cells with
+    several points are at such steps, and the spread would be the height of the step.
     """
     gsd_m = wall.frame.gsd_m
     rows, columns = np.nonzero(np.isfinite(wall.sigma_m))
@@ -169,7 +169,7 @@ def usual_spread_m(wall: Wall) -> float:
 def _spread_about(
     wall: Wall, rows: NDArray[np.intp], columns: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """Return the range (n,) of the depths in the 3 x 3 cells around each cell."""
+    """Return the range (n,) of depths in the 3 x 3 cells around each cell."""
     height, width = wall.frame.shape
     nearest = wall.depth_m[rows, columns].astype(np.float64)
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
@@ -203,10 +203,10 @@ _Result = TypeVar("_Result")
 def one_by_one(
     function: Callable[[_Item], _Result], items: Sequence[_Item], cores: int
 ) -> Iterator[_Result]:
-    """Yield a function's results in order, computed by several threads.
+    """Yield the results of a function in order, computed by several threads.
 
-    OpenCV's own threads gain little with pictures of this size, so the cores are used for several
-    pictures at once.
+    Several pictures are processed at once, since the threads of OpenCV have little effect on
+    pictures of this size.
     """
     import cv2
 

@@ -1,13 +1,14 @@
-"""Coarse poses of photos from structure, if key points do not match the photos with a wall.
+"""Coarse poses from structure, for photos that cannot be matched with a wall by key points.
 
-A high correlation of the structure in nine parts of a photo does not prove its position, since a
-repeating motif also correlates elsewhere. Therefore, overlapping patches are matched independently
-at the most likely positions; a position is probably correct if most of the patches fit one pose.
+A high correlation of the structure in nine parts of a photo does not prove the position of the
+photo, since repeating motifs also correlate elsewhere. Therefore, overlapping patches are matched
+independently at the most likely positions. A position is probably correct if most of the patches
+fit one pose.
 
-A repeating motif, or another wall with the same tiles, may still fit best. Photos share many more
-key points with each other than with the laser intensity. Therefore, a position is accepted if
-another photo, at its own position, shows the same key points at the same positions on the wall,
-because two wrong positions would both have to be wrong in the same way.
+A repetition of the motif, or another wall with the same tiles, may still fit best. Photos share
+many more key points with each other than with the laser intensity. A position is therefore accepted
+if another photo, at its own position, shows the same key points at the same places on the wall.
+This only fails if both positions are wrong by the same displacement.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ from orthoflow_plugins.match.ties import TiePiece, piece_on_wall
 from orthoflow_plugins.match.tracing import agrees_around, fitted_pose
 from orthoflow_plugins.match.warping import project_walls, warp_photo
 
-# Number of positions of a photo, on all walls together, that are examined patch by patch.
+# Number of positions of a photo, over all walls, that are examined patch by patch.
 _PLACES: Final = 4
-# Number of candidates from each wall at each rotation.
+# Number of candidate positions on each wall at each rotation of the photo.
 _PLACES_EACH: Final = 4
 # Search radius of each round, in coarse cells.
 _RADII: Final = (6, 4, 3, 3)
@@ -53,40 +54,41 @@ _SIDE_PX: Final = 1200
 _APART_CELLS: Final = 5
 _MIN_SCORE: Final = 0.3
 _MIN_DISTINCT: Final = 0.03
-# Minimum number of tie points in a round to determine a pose.
+# Minimum number of tie points in a round from which a pose is computed.
 _MIN_FIT: Final = 8
-# A position is dropped if it has fewer tie points, or a smaller share of agreeing patches, than
-# this.
+# A position is dropped if it has fewer tie points than this, or a smaller share of agreeing
+# patches.
 _TIES_FEW: Final = 20
 _SHARE_FEW: Final = 0.05
 # In simulated rooms, wrong positions had leads of up to 6.1 with 15 % of the patches agreeing.
-# Correct positions had leads of at least 6.2, or of at least 5.5 with 30 % of the patches agreeing.
+# Correct positions had leads of at least 6.2, or at least 5.5 with 30 % of the patches agreeing.
 _MIN_LEAD: Final = 6.5
 _MIN_LEAD_OF_MANY: Final = 5.5
 _MANY_SHARE: Final = 0.25
 _MIN_TIES: Final = 40
 _MIN_SHARE: Final = 0.08
 _OVER_NEXT: Final = 1.5
-# Standard deviation of a matched patch, in coarse cells.
+# Standard deviation of the position of a matched patch, in coarse cells.
 _SIGMA_CELLS: Final = 0.5
 # Anticlockwise quarter turns that make a photo upright, by EXIF orientation.
 _QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
-# Two poses count as the same position if they shift the wall in the photo by less than this share
-# of the photo's longer side.
+# Two poses count as the same position if they displace the wall in the photo by less than this
+# share of the longer side of the photo.
 _SAME_SHARE: Final = 0.1
 _LONGEST_SIDE_PX: Final = 1600
 _PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)
-# Minimum number of common key points, because fewer may be a repeated motif.
+# Minimum number of common key points, since fewer may come from a repeated motif.
 _MIN_SHARED: Final = 24
-# Maximum distance, in coarse cells, between the positions of a common key point on the wall
-# according to two photos.
+# Maximum distance, in coarse cells, between the positions on the wall that two photos give for a
+# common key point.
 _CONFIRMED_CELLS: Final = 3.0
-# The same for photos that have only a homography, which ignores relief.
+# The same limit for photos that only have a homography, which ignores relief.
 _APART_ROUGHLY_CELLS: Final = 6.0
 _MIN_AGREEING: Final = 0.6
 # Minimum number of coarse cells that overlapping photos have in common.
 _OVERLAP_CELLS: Final = 200
-# Agreeing photos are accepted if there are this many, or if one of them is clear by itself.
+# A group of agreeing photos is accepted if it has at least this many photos, or if the position of
+# one of them is clear by itself.
 _MANY: Final = 3
 
 
@@ -95,12 +97,12 @@ class Placed:
     """A possible position of a photo on a wall.
 
     Attributes:
-        piece: its tie points.
+        piece: tie points of this position.
         camera: the pose from the tie points.
-        lead: lead of the position, as in `Place`, before patches were matched.
-        share: share of the patches in the overlap that agree with the pose.
-        radius_px: search radius of the patches, photo pixels.
-        is_clear: whether it is far better than all other positions.
+        lead: lead of the position before patches were matched, as in `Place`.
+        share: share of patches, among those in the overlap, that agree with the pose.
+        radius_px: search radius of the patches, in photo pixels.
+        is_clear: whether this position is far better than all others.
     """
 
     piece: TiePiece
@@ -114,10 +116,10 @@ class Placed:
 def places_of(
     index: int, photo: Photo, structures: Sequence[WallStructure | None], cores: int = 1
 ) -> list[Placed]:
-    """Return the possible positions of a photo on the walls, the best first.
+    """Return the possible positions of a photo on the walls, starting with the best.
 
-    Only the first may be clear. A photo without an EXIF orientation is tried in all four
-    orientations.
+    Only the first position may be clear. All four orientations are tried if EXIF does not give the
+    orientation of the photo.
 
     Args:
         index: index of the photo.
@@ -129,7 +131,7 @@ def places_of(
     small = reduced(rgb, min(1.0, _SIDE_PX / longest))
     tiny = reduced(rgb, min(1.0, PHOTO_SIDE_PX / longest))
     lens, freedom = photo.lens_prior()
-    # Coarse tie points do not determine other lens parameters.
+    # Coarse tie points do not determine lens parameters other than the focal length.
     freedom = LensFreedom(focal_sigma=freedom.focal_sigma)
     upright = _QUARTERS.get(photo.exif_orientation, 0)
     has_exif = photo.exif_orientation != 1 or photo.exif_focal_px is not None
@@ -162,7 +164,7 @@ def places_of(
 
 
 def _judged(found: Sequence[Placed]) -> list[Placed]:
-    """Sort positions, drop poor ones and duplicates, and decide whether the best is clear."""
+    """Sort positions, drop poor and duplicate ones, and determine whether the best is clear."""
     best_first = sorted(found, key=lambda each: -each.share)
     kept = [
         replace(each, lead=max(other.lead for other in best_first if _is_same(each, other)))
@@ -186,7 +188,7 @@ def _judged(found: Sequence[Placed]) -> list[Placed]:
 def _camera_at(
     place: Place, structure: WallStructure, lens: ViewingCamera, quarters: int
 ) -> ViewingCamera | None:
-    """Return the pose from the positions of a photo's parts; iterate from a perpendicular view.
+    """Compute the pose from the positions of the parts of a photo, starting perpendicular.
 
     Args:
         place: position of the photo rotated by `np.rot90`.
@@ -195,12 +197,12 @@ def _camera_at(
         quarters: anticlockwise quarter turns of the rotated photo.
     """
     wall, frame = structure.wall, structure.wall.frame
-    # Transforms the axes of the rotated photo to those of the stored photo.
+    # This transforms the axes of the rotated photo to those of the stored photo.
     axes = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters % 4)
     stored_px = np.array([lens.width, lens.height])
     rotated_px = np.abs(axes) @ stored_px
     pixels = ((place.parts_photo - 0.5) * rotated_px) @ axes.T + 0.5 * stored_px
-    # Right, down and into the wall.
+    # The axes point right, down and into the wall.
     rotation = np.array([*(axes @ [frame.u_world, frame.v_world]), -frame.normal_world])
     px_per_m = rotated_px[0] / place.width_m
     # Use an origin near the wall, since large survey coordinates would reduce the precision.
@@ -233,7 +235,7 @@ def _tied(
     start: tuple[ViewingCamera, LensFreedom],
     structure: WallStructure,
 ) -> Placed | None:
-    """Match patches of a reduced photo with a wall and refine its pose, round by round.
+    """Match patches of a reduced photo with a wall and refine the pose, in several rounds.
 
     Returns:
         The position, or None if too few patches match.
@@ -288,7 +290,7 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
     border = radius + HALF_PATCH_CELLS + 2
 
     def framed(channels: Channels) -> Channels:
-        # Patches at the photo's border are used if they are mostly known.
+        # Patches at the border of the photo are used if they are mostly known.
         margin = ((border, border), (border, border))
         return Channels(
             values=np.pad(channels.values, (*margin, (0, 0))), known=np.pad(channels.known, margin)
@@ -311,7 +313,7 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
 
 
 def _is_same(first: Placed, second: Placed) -> bool:
-    """Return whether two poses project the tie points of one of them to the same pixels."""
+    """Return whether two poses project the tie points of one of them to about the same pixels."""
     if first.piece.wall != second.piece.wall:
         return False
     camera, pixels = second.camera, first.piece.pixels_photo
@@ -321,14 +323,14 @@ def _is_same(first: Placed, second: Placed) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _Footprint:
-    """The part of a wall that a photo shows, from a possible position or matched key points.
+    """The part of a wall that a photo shows, according to a possible position or to key points.
 
     Attributes:
         photo: index of the photo.
         wall: index of the wall.
-        pixels: (rows, cols, 2) float64 pixels of the wall's coarse cells, NaN outside the photo.
-        cell_px: width of a coarse cell in the photo.
-        tolerance_cells: tolerance of the position.
+        pixels: (rows, cols, 2) float64 photo pixels of the coarse cells, NaN outside the photo.
+        cell_px: width of a coarse cell in photo pixels.
+        tolerance_cells: tolerance of the position, in coarse cells.
         placed: the possible position; None for a photo with matched key points.
     """
 
@@ -341,7 +343,7 @@ class _Footprint:
 
     @property
     def shown(self) -> NDArray[np.bool_]:
-        """Mask of the coarse cells (rows, cols) in the photo."""
+        """Mask (rows, cols) of the coarse cells that are in the photo."""
         return np.isfinite(self.pixels[:, :, 0])
 
 
@@ -352,19 +354,19 @@ def confirmed(
     on: tuple[Sequence[Wall], Sequence[WallStructure | None]],
     cores: int = 1,
 ) -> dict[int, Placed]:
-    """Choose those positions of photos that confirm each other.
+    """Select the positions of photos that confirm each other.
 
     Args:
         photos: all photos.
         places: possible positions of photos without clear matches, by index.
-        recognised: key point matches of photos with walls, by index; may include photos in
+        recognised: key point matches of photos with walls, by index. These photos may also be in
             `places`, since key points may agree by chance.
         on: all walls, and their structures.
         cores: number of threads.
 
     Returns:
-        The confirmed positions by index of the photo, except for photos whose key points are
-        confirmed.
+        The confirmed position of each photo, by its index; photos with confirmed key points are
+        omitted.
     """
     if not any(places.values()):
         return {}
@@ -452,7 +454,7 @@ def _footprints_by_homography(
 def _shared(
     photos: Photos, wanted: Sequence[tuple[int, int]], cores: int
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Match key points of photo pairs; return pixels (n, 2, 2) in the first and second photo."""
+    """Match key points of photo pairs; return their pixels (n, 2, 2) in both photos."""
     asked = sorted({index for pair in wanted for index in pair})
 
     def look(index: int) -> tuple[NDArray[np.uint8], Features, float]:
@@ -479,7 +481,7 @@ def _shared(
 
 
 def _agree(one: _Footprint, other: _Footprint, shared: NDArray[np.float64]) -> bool:
-    """Return whether two photos show the same key points at the same positions of the wall."""
+    """Return whether two photos show the same key points at the same places on the wall."""
     from scipy.spatial import cKDTree
 
     both = one.shown & other.shown
@@ -497,7 +499,7 @@ def _agree(one: _Footprint, other: _Footprint, shared: NDArray[np.float64]) -> b
 def _chosen(
     footprints: Sequence[_Footprint], agreeing: Sequence[tuple[int, int]]
 ) -> dict[int, Placed]:
-    """Choose the positions of the groups that agree best, one per photo."""
+    """Select the positions of the groups that agree best, one per photo."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -512,7 +514,7 @@ def _chosen(
     ]
 
     def rank(members: list[int]) -> float:
-        """Rank a group by whether it has photos with matched key points, then by patch shares."""
+        """Rank groups with matched key points first, other groups by the sum of patch shares."""
         is_anchored = any(footprints[member].placed is None for member in members)
         return 1e3 * is_anchored + sum(one.share for m in members if (one := footprints[m].placed))
 
@@ -527,13 +529,13 @@ def _chosen(
         }
         for member in members:
             placed = footprints[member].placed
-            # A photo with confirmed key points does not need structure.
+            # A photo with confirmed key points does not need a position from structure.
             if placed is None or footprints[member].photo in recognised:
                 continue
             rival = by_photo.get(footprints[member].photo)
             if rival is None or placed.share > rival.share:
                 by_photo[footprints[member].photo] = placed
-        # A group that contradicts a higher-ranking one is wrong as a whole.
+        # If a group contradicts a higher-ranking group, all of its positions are wrong.
         if not any(photo in chosen for photo in by_photo):
             chosen.update(by_photo)
     return chosen

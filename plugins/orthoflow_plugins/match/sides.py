@@ -1,4 +1,4 @@
-"""`face.photos`: find the visible side of walls from photos if scanner stations are unknown."""
+"""`face.photos`: find the visible side of walls from photos if the scanner stations are unknown."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ _SPACINGS_PER_CELL: Final = 0.6
 _FILLED_CELLS: Final = 2
 _MAX_CELLS: Final = 4_000_000
 _MIN_POINTS: Final = 3
-# Minimum number of inliers in all photos for a decision on the side.
+# Minimum number of inliers, summed over all photos, to decide the side of a plane.
 _MIN_AGREEING: Final = 16
-# Minimum ratio of these inliers to those of the other side, since a symmetric facade partly matches
+# Minimum ratio of these inliers to the inliers on the other side. A symmetric facade partly matches
 # its mirror image.
 _MIN_MARGIN_RATIO: Final = 2.0
-# A plane faces the other way if its normal is within 45 degrees of the opposite direction.
+# A plane faces the opposite way if its normal is within 45 degrees of the opposite direction.
 _OPPOSITE_COSINE: Final = -math.sqrt(0.5)
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-guessed",
@@ -69,10 +69,10 @@ class FaceByPhotos(Method):
 
     A wall seen from behind is a mirror image of its photos. If no scanner station determines the
     side of a plane, the cloud is projected onto a coarse raster in the plane, and the photos are
-    matched both with this picture and with its mirror image. If grey values decide the side of no
-    plane, mixtures of the photos' colours are used. The side with clearly more inliers is used. If
-    the photos do not decide the side of a plane, it is turned if it is between two planes with
-    known sides that both face the other way. Planes with a known side, floors and ceilings remain
+    matched with this picture and with its mirror image. The side with clearly more inliers is used.
+    If the side of every plane is unclear in grey, mixtures of the colours of the photos are used. A
+    plane whose side the photos do not determine is turned if it is between two planes with known
+    sides that both face the opposite way. Planes with a known side, floors and ceilings are
     unchanged.
     """
 
@@ -98,12 +98,12 @@ class FaceByPhotos(Method):
         photos: Photos
 
     class Out(Ports):
-        """The planes, some of which have been turned."""
+        """The planes, some of them turned."""
 
         planes: Planes
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Decide the side of each plane whose side was guessed."""
+        """Determine the side of each plane whose side was guessed."""
         del params
         planes, cloud = inputs.planes, inputs.cloud
         require_photos(inputs.photos)
@@ -155,10 +155,10 @@ class FaceByPhotos(Method):
         pictures: Sequence[Features | None],
         ctx: StepContext,
     ) -> NDArray[np.intp]:
-        """Count the inliers (planes, 2) on the front and on the other side of each plane.
+        """Count the inliers (planes, 2) on the front and on the back of each plane.
 
-        The photos are matched in grey or, if this decides no plane, in the first mixture of colours
-        that decides one.
+        The photos are matched in grey. If this determines no plane, the first mixture of colours
+        that does is used.
         """
         counts = np.zeros((len(pictures), 2), dtype=np.intp)
 
@@ -187,17 +187,16 @@ class FaceByPhotos(Method):
 
 
 def _is_decided(front: int, behind: int) -> bool:
-    """Return whether the numbers of inliers decide the side of a plane."""
+    """Return whether the numbers of inliers determine the side of a plane."""
     least = max(_MIN_AGREEING, _MIN_MARGIN_RATIO * min(front, behind))
     return max(front, behind) >= least
 
 
 def _is_turned_away(planes: Planes, index: int, sources: Sequence[SideSource]) -> bool:
-    """Return whether a plane is between planes with known sides that both face the other way.
+    """Return whether a plane is between planes with known sides that both face the opposite way.
 
-    For example, the step of a fountain in front of a facade is seen from the same side as the
-    facade, although most points of the cloud, those of the facade, are on the other side of the
-    step.
+    An example is a step of a fountain in front of a facade. Both are seen from the same side, but
+    most points of the cloud, those of the facade, are behind the step.
     """
     known = np.array([source != "guess" for source in sources])
     opposite = known & (planes.normal @ planes.normal[index] < _OPPOSITE_COSINE)
@@ -207,7 +206,6 @@ def _is_turned_away(planes: Planes, index: int, sources: Sequence[SideSource]) -
 
 
 def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepContext) -> None:
-    """Report the planes whose side remains a guess."""
     named = sources or [planes.side_source(index) for index in range(len(planes))]
     guessed = [name for name, source in zip(planes.names, named, strict=True) if source == "guess"]
     if guessed:
@@ -215,7 +213,7 @@ def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepCon
 
 
 def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Features | None:
-    """Find key points in a raster of the cloud on a plane; None if there are none."""
+    """Find key points in a raster of the cloud on a plane, or None if there are none."""
     corners = planes.corners[index]
     area_m2 = float(
         np.linalg.norm(corners[3] - corners[0]) * np.linalg.norm(corners[1] - corners[0])

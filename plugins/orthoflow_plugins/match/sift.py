@@ -53,12 +53,12 @@ NO_WALL: Final = DiagnosticSpec(
 
 
 class MatchSift(Method):
-    """Match photos with the intensity rasters of the walls (RootSIFT, mutual, ratio test).
+    """Match photos with the intensity rasters of the walls (RootSIFT, mutual matches, ratio test).
 
-    Each photo is matched with each wall, first by its strongest key points, then by all of them on
-    the recognised walls. If no wall is clearly recognised in grey, mixtures of the photo's colours
-    are tried. If these fail, too, edges are compared regardless of which of their sides is
-    brighter; another photo must confirm the resulting position. Matches that do not fit a
+    The strongest key points of a photo are matched with all walls, then all of its key points are
+    matched with the recognised walls. If no wall is clearly recognised in grey, mixtures of the
+    colours of the photo are tried. If these also fail, edges are compared regardless of which side
+    is brighter; another photo must confirm the resulting position. Matches that do not fit a
     homography of the wall are kept as rejected ties. Ties include the depth of the surface.
     """
 
@@ -145,7 +145,7 @@ def _matched(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> tuple[list[TiePiece], dict[str, JsonValue], list[float]]:
-    """Match photos with the walls by key points or, if the result is unclear, by structure.
+    """Match photos with the walls by key points, and by structure if the result is unclear.
 
     Returns:
         Ties, details of each photo, and the search radius of each photo.
@@ -177,7 +177,7 @@ def _placed(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> dict[int, Placed]:
-    """Use structure to find positions of photos without clear key point matches, by index."""
+    """Find the positions of photos without clear key point matches from structure, by index."""
     from orthoflow_plugins.match.placing import confirmed, places_of
     from orthoflow_plugins.match.structures import wall_structure
 

@@ -1,11 +1,12 @@
 """Structure of photos and walls: position and direction of edges, regardless of their sign.
 
 Laser and camera use different wavelengths, so contrast may be weaker, missing or inverted,
-depending on the material. Edges keep their position and orientation (modulo 180 degrees); relief
-steps are also edges of the wall. A photo is compared with the wall at many scales. Nine overlapping
-parts of the photo are correlated with the whole wall, and may shift slightly relative to each other
-because of perspective. The scale with the largest lead is chosen; the lead is the difference
-between the best sum of correlations and the sums at all other positions, relative to their spread.
+depending on the material. Edges keep their position and their orientation (modulo 180 degrees).
+Relief steps are also edges of the wall. A photo is compared with the wall at many scales. Nine
+overlapping parts of the photo are correlated with the whole wall, and may be displaced slightly
+relative to each other because of perspective. The score of a position is the sum of their
+correlations. The lead of a scale is the difference between its best score and the median score of
+all positions, relative to the spread of the scores. The scale with the largest lead is selected.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _SIZES: Final = (0.2, 1.6)
 _STEP: Final = 1.1
 _MAX_PART_CELLS: Final = 250
 _MIN_PART_CELLS: Final = 16
-# Maximum shift of a part, relative to the photo's width.
+# Maximum shift of a part, relative to the width of the photo.
 _SLIP_SHARE: Final = 0.03
 # A relief step of this height has the same weight as a step from black to white.
 _STEP_M: Final = 0.5
@@ -41,15 +42,15 @@ _EVEN_SIGMA_CELLS: Final = 12.0
 _POOL_SIGMA_CELLS: Final = 1.5
 _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
-# This prevents high scores for parts that hardly overlap the wall.
+# This energy limit prevents high scores for parts that hardly overlap the wall.
 _MIN_ENERGY: Final = 0.25
-# Two positions are distinct if they differ by at least this distance, relative to the photo's
-# width, or if the logarithms of their scales differ by at least this.
+# Two positions are distinct if they differ by at least the first value, relative to the width of
+# the photo, or if the logarithms of their scales differ by at least the second value.
 _ELSEWHERE: Final = (0.25, 0.25)
-# Maximum number of cells along a photo's longer side; larger photos are compared in cells that are
-# two or four times as wide.
+# Maximum number of cells along the longer side of a photo; larger photos are compared in cells that
+# are two or four times as wide.
 _PHOTO_CELLS: Final = 250
-# Channels are smoothed so much that every second cell is enough.
+# Channels are so smooth that every second cell is enough.
 _SAMPLE_CELLS: Final = 2
 _LEVELS: Final = 3
 PHOTO_SIDE_PX: Final = 2 * _MAX_PART_CELLS
@@ -61,10 +62,10 @@ class WallStructure:
     """The structure of a wall, prepared for correlation.
 
     Attributes:
-        wall: the wall in coarse cells.
-        channels: its structure.
-        levels: spectra of the structure in cells of one, two and four times the size.
-        usual_spread_m: as returned by the function `usual_spread_m`.
+        wall: the wall with coarse cells.
+        channels: structure of the wall.
+        levels: spectra of the structure at one, two and four times the cell size.
+        usual_spread_m: result of the function `usual_spread_m` for the wall.
     """
 
     wall: Wall
@@ -79,10 +80,9 @@ class Spectra:
 
     Attributes:
         layers: (c, ...) complex64 conjugate transforms of the channels.
-        energy: complex64 transform of the sum of their squares.
-        shape: rows and columns of samples.
-        padded: rows and columns with padding, so that a part leaves the wall before it wraps
-            around.
+        energy: complex64 transform of the sum of the squared channels.
+        shape: number of rows and columns of samples.
+        padded: number of rows and columns including the padding that prevents wraparound.
         sample_m: width of a sample in metres.
     """
 
@@ -98,11 +98,13 @@ class Place:
     """A possible position of a photo on a wall.
 
     Attributes:
-        centre_m: (2,) float64 metres right and down from the corner of the wall's raster.
+        centre_m: (2,) float64 centre of the photo, in metres to the right and down from the corner
+            of the raster.
         width_m: approximate width of the photo on the wall.
         lead: score of the position minus the median score of all positions at this scale, in robust
             standard deviations.
-        parts_photo: (9, 2) float64 centres of the photo's parts, relative to its width and height.
+        parts_photo: (9, 2) float64 centres of the nine parts of the photo, relative to its width
+            and height.
         parts_m: (9, 2) float64 positions of the parts on the wall, as in `centre_m`.
     """
 
@@ -125,7 +127,7 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     levels = [(channels, coarse.frame.gsd_m)]
     intensity, depth_m = coarse.intensity, coarse.depth_m
     for _ in range(1, _LEVELS):
-        # Use the mean of four intensities, and the first of four depths if most of them are known.
+        # Use the mean of four intensities; use the first of four depths if most of them are known.
         known = _halved(np.isfinite(depth_m)) >= _MIN_KNOWN
         rows, columns = known.shape
         depth_m = np.where(known, depth_m[: 2 * rows : 2, : 2 * columns : 2], np.float32(np.nan))
@@ -146,7 +148,7 @@ def _wall_channels(intensity: NDArray[np.float32], depth_m: NDArray[np.float32])
 
 
 def _halved(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return means of 2 x 2 values (rows, cols, ...); an odd last row or column is dropped."""
+    """Return the means (rows, cols, ...) of 2 x 2 values; an odd last row or column is dropped."""
     import cv2
 
     rows, columns = (length // 2 for length in values.shape[:2])
@@ -198,7 +200,7 @@ def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Chann
 
 
 def _coarser(wall: Wall, factor: int) -> Wall:
-    """Join factor x factor cells of a wall; take the mean intensity (0..1) and one depth."""
+    """Join factor x factor cells of a wall; use their mean intensity (0..1) and one depth."""
     import cv2
 
     assert wall.intensity is not None  # noqa: S101 - checked before
@@ -207,7 +209,7 @@ def _coarser(wall: Wall, factor: int) -> Wall:
     low, high = np.percentile(wall.intensity[np.isfinite(wall.intensity)], (1.0, 99.0))
     scaled = np.clip((wall.intensity - low) / max(float(high - low), 1e-9), 0.0, 1.0)
     grey = np.rint(255.0 * filled_smoothly(np.where(known, scaled, np.nan))).astype(np.uint8)
-    # Cells contain single scan points, and their speckle is not structure.
+    # Each cell contains only a few scan points, and their speckle is not structure.
     grey = np.asarray(cv2.medianBlur(grey, 3), dtype=np.uint8)
     cells = (slice(0, height * factor), slice(0, width * factor))
 
@@ -235,7 +237,7 @@ def _coarser(wall: Wall, factor: int) -> Wall:
 
 
 def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -> list[Place]:
-    """Return possible positions of a photo on a wall, the most likely first.
+    """Return possible positions of a photo on a wall, starting with the most likely.
 
     Args:
         rgb: (height, width, 3) colours of the photo, upright to within about 9 degrees.
@@ -255,7 +257,6 @@ def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -
 
 
 def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
-    """Return the photo widths to try, in cells."""
     height, width = photo[0], photo[1]
     least = _SIZES[0] * min(wall) * width / max(height, width)
     # Each part is half as wide and high as the photo.
@@ -269,11 +270,11 @@ def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
 
 
 def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place:
-    """Return the best position of a photo at a given width in cells."""
+    """Return the best position of a photo with a given width in cells."""
     import cv2
     from scipy import fft
 
-    # Round the size to multiples of a sample.
+    # Round the size to a multiple of the sample size.
     width, height = (
         max(2, round(length / _SAMPLE_CELLS))
         for length in (width_cells, width_cells * rgb.shape[0] / rgb.shape[1])
@@ -289,15 +290,15 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
-    # Energy of the wall under a part at each position of its corner (wrapped); the same for all
-    # parts.
+    # Energy of the wall under a part for each (wrapped) position of its corner. It is the same for
+    # all parts.
     box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
     under = np.asarray(fft.irfft2(wall.energy * np.conj(box), wall.padded), dtype=np.float32)
     maps = [
         _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
         for top, left in corners
     ]
-    # Corner positions of the photo for which its centre is on the wall.
+    # Corner positions for which the centre of the photo is on the wall.
     rows, columns = (
         np.arange(n) - m // 2 for n, m in zip(wall.shape, (height, width), strict=True)
     )
@@ -330,7 +331,7 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
 def _part_map(
     part: NDArray[np.float32], under: NDArray[np.float32], wall: Spectra
 ) -> NDArray[np.float32]:
-    """Correlate a part of a photo with the wall at each position of its corner (wrapped)."""
+    """Correlate a part of a photo with the wall at each (wrapped) position of its corner."""
     from scipy import fft
 
     own = float(np.einsum("cij,cij->", part, part))
@@ -350,7 +351,7 @@ def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[n
 
 
 def _slipped(part: NDArray[np.float32], at: tuple[int, int], slip: int) -> NDArray[np.float64]:
-    """Return the best (column, row) of a part's corner within `slip` of a position."""
+    """Return the best position (column, row) of the corner of a part within `slip` of `at`."""
     steps = np.arange(-slip, slip + 1)
     rows, columns = at[0] + steps, at[1] + steps
     near = part[np.ix_(rows % part.shape[0], columns % part.shape[1])]
@@ -369,10 +370,11 @@ def _is_elsewhere(place: Place, other: Place) -> bool:
 def _channels(
     layers: Sequence[NDArray[np.float32]], known: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return channels (5, rows, cols) of the orientation of edges, for all layers together.
+    """Return channels (5, rows, cols) that describe the orientation of edges in all layers.
 
-    The channels consist of the double and fourfold angle of the gradient and its strength,
-    normalised locally; they are the first terms of a histogram of orientations modulo 180 degrees.
+    The channels are the strength of the gradient, and the cosine and sine of twice and four times
+    its angle, weighted by the strength and normalised locally. They are the first terms of the
+    Fourier series of a histogram of orientations modulo 180 degrees.
     """
     import cv2
 

@@ -1,10 +1,10 @@
-"""Ties between photos and walls: from key points or measured by hand, without duplicates.
+"""Ties between photos and walls, from key points or measured by hand.
 
 `preset: paper` matches as in markiewicz2015 (3.5, 3.6, 4.3): with OpenCV's default SIFT, and with
-matches chosen as in openMVG, reference [36] of the paper. The match of a key point of the wall is
-the nearest descriptor in the photo, provided that the ratio of the distances to the nearest and the
-second nearest is below a limit (0.8 in openMVG's documentation). Without poses, all key points of a
-wall are matched; with poses, those in the part that the photo shows.
+matches selected as in openMVG, reference [36] of the paper. The match of a key point on the wall is
+the nearest descriptor in the photo if the ratio of the distances to the nearest and to the second
+nearest descriptor is below a limit (0.8 in the documentation of openMVG). Without poses, all key
+points of a wall are matched; with poses, those in the part that the photo shows.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from orthoflow_plugins.match.warping import Projection, project_walls
 if TYPE_CHECKING:
     from orthoflow.sdk import StepContext
 
-# Standard deviation of a SIFT key point, in pixels of its image: the minimum, and the ratio to the
-# size of the key point.
+# Standard deviation of the position of a SIFT key point: the minimum, in pixels of the image, and
+# the ratio to the size of the key point.
 _MIN_SIGMA_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
-# Key points whose depths have a larger standard deviation than this, as at relief edges, are
-# dropped.
+# Key points are dropped if the standard deviation of the depth is larger than this, as it is at
+# relief edges.
 _MAX_SIGMA_CELLS: Final = 3.0
-# The ratio in openMVG's documentation.
+# The ratio in the documentation of openMVG.
 _PAPER_RATIO: Final = 0.8
 # Maximum number of key points in a picture.
 _PAPER_FEATURES: Final = 50_000
@@ -82,13 +82,14 @@ def piece_on_wall(
     usual_m: float | None = None,
     role: TieRole = TieRole.CONTROL,
 ) -> TiePiece:
-    """Return ties of one photo with one wall; drop those without a finite pixel or depth.
+    """Return the ties of one photo with one wall, except those without a finite pixel or depth.
 
     Args:
         at: index of the photo and of the wall.
         wall: the wall.
         pixels_photo: (n, 2) pixels of the photo.
-        cells: (n, 2) (column, row) of the wall's raster, first cell centre at (0.5, 0.5).
+        cells: (n, 2) (column, row) in the raster of the wall, with the first cell centre at (0.5,
+            0.5).
         sigma_px: (n,) standard deviation of a pixel coordinate.
         usual_m: as in `points_on_wall`.
         role: role of the ties.
@@ -114,7 +115,7 @@ def key_point_ties(
     scale: float = 1.0,
     role: TieRole = TieRole.CONTROL,
 ) -> TiePiece:
-    """Return ties of one photo with one wall; drop those with an unknown or uncertain depth.
+    """Return the ties of one photo with one wall, except those whose depth is uncertain or unknown.
 
     Args:
         at: index of the photo and of the wall.
@@ -145,14 +146,14 @@ def paper_ties(
     Args:
         photos: the photos.
         walls: the walls.
-        cameras: cameras by photo name; photos without a pose and key points outside the photo are
-            not matched. None matches all photos and key points.
-        ratio: maximum ratio between the distances of the best and the second-best match; None for
-            that of openMVG.
+        cameras: cameras by photo name. Photos without a pose are not matched, nor are key points of
+            a wall outside the photo. If None, all photos and key points are matched.
+        ratio: maximum ratio between the distances of the best and the second-best match; if None,
+            the ratio of openMVG is used.
         ctx: context for progress.
 
     Returns:
-        Ties, and key points of each wall, None for walls without intensity.
+        The ties, and the key points of each wall, which are None for walls without intensity.
     """
 
     def look(wall: Wall) -> Features | None:
@@ -183,7 +184,7 @@ def paper_ties(
 
 
 def _within(features: Features, shown: Projection | None, wall: Wall) -> Features | None:
-    """Select the key points of a wall in the part that a photo shows."""
+    """Select the key points in the part of a wall that a photo shows."""
     if shown is None:
         return None
     mask = np.zeros(wall.frame.shape, dtype=np.bool_)
@@ -200,7 +201,7 @@ def ties_of(
     *,
     search_radius_px: tuple[float | None, ...] = (),
 ) -> Ties:
-    """Join pieces into one product, in their order; drop ties in masked parts of photos.
+    """Join pieces into one product, in their order, and drop ties in masked parts of photos.
 
     Args:
         pieces: the ties.
@@ -238,21 +239,21 @@ def ties_of(
 
 
 def joined(pieces: Sequence[TiePiece]) -> SeenPoints:
-    """Return the ties of all pieces together."""
+    """Join the ties of all pieces."""
     return TiePiece.joined([_NOTHING, *pieces])
 
 
 def parted(pieces: Sequence[TiePiece], kept: NDArray[np.bool_]) -> list[TiePiece]:
-    """Select ties by a mask (n,) over all pieces; return the pieces."""
+    """Select ties of all pieces by one mask (n,) over the joined ties."""
     parts = np.split(kept, np.cumsum([len(piece) for piece in pieces])[:-1])
     return [piece.take(part) for piece, part in zip(pieces, parts, strict=True)]
 
 
 def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
-    """Drop duplicate ties of a key point with the same surface on overlapping walls.
+    """Drop duplicate ties between a key point and the same surface in overlapping walls.
 
-    Rasters of neighbouring planes may contain the same surface, so its ties would count twice in
-    the orientation. The tie with the smallest `sigma_m` is kept.
+    Rasters of neighbouring planes may contain the same surface, whose ties would count twice in the
+    orientation. The tie with the smallest `sigma_m` is kept.
     """
     if len(pieces) < 2:
         return list(pieces)
@@ -297,7 +298,7 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
         ties: ties of all photos, with their walls.
         hand: ties measured by hand in photos with the same names, or None.
         walls: the walls of `ties`.
-        ctx: context in which their number is reported.
+        ctx: context in which the number of ties measured by hand is reported.
     """
     if hand is None or not len(hand.photo):
         return ties
@@ -306,7 +307,7 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
     kept = np.flatnonzero(known[hand.photo] >= 0)
     ctx.metric("n_by_hand", len(kept), "1")
     own_walls = walls.nearest(hand.points_world[kept])
-    # Any, since the product's arrays of various types are collected by name.
+    # The arrays of the product are collected by name and have various types.
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(ties, name), getattr(hand, name)[kept]])
         for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m", "role")

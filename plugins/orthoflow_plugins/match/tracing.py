@@ -1,9 +1,9 @@
-"""Match one photo with all walls, starting from its pose: measure, reject, refit, and repeat.
+"""Matching of one photo with all walls, starting from its pose: measure, reject, refit, repeat.
 
 A photo may share too few key points with the laser intensity of a wall for a first pose, but
-hundreds with another photo of the wall. Therefore, oriented photos are projected onto the walls,
-and a photo without a pose is first matched with these pictures. It is then matched with the scan
-like any other photo, so that its ties depend only on the scan.
+hundreds with another photo of that wall. For a photo without a pose, a first pose is therefore
+computed from matches with the oriented photos, projected onto the walls. The photo is then matched
+with the scan like any other photo, so that its ties depend only on the scan.
 """
 
 from __future__ import annotations
@@ -60,16 +60,16 @@ _MAX_SIGMA_CELLS: Final = 2.0
 # Standard deviation due to the interpolation of the raster.
 _SIGMA_FLOOR_CELLS: Final = 0.1
 _OCCUPIED_CELLS: Final = 5.0
-# Search radius of the first round, halved in each further round down to the minimum.
+# Search radius of the first round; it is halved in each further round, down to the minimum.
 _FIRST_RADIUS_CELLS: Final = 8
 _MIN_RADIUS: Final = 2
 _MAX_ROUNDS: Final = 4
-# A pose is final if its last change moves the photo by less than this on the walls.
+# A pose is final if its last change displaced the photo by less than this on the walls.
 _SETTLED_CELLS: Final = 0.3
 # Relative decrease of the held-out error required for another round.
 _MIN_GAIN: Final = 0.03
-# Channels to compare, in the order in which they are tried; colours are only tried if the others do
-# not give clearly good results.
+# Channels to compare, in the order in which they are tried. Colours are only tried if the results
+# of the others are not clearly good.
 _CONTENTS: Final = ("gradients", "grey", "colours")
 _FEW_SHARE: Final = 0.25
 
@@ -79,8 +79,8 @@ _MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
 _PARAMS: Final = PairingParams()
-# A lens may belong to the same camera if its focal length deviates from the EXIF value by less than
-# this share.
+# A lens may belong to the camera of a photo if its focal length differs from the EXIF value of the
+# photo by less than this share.
 _NEAR_FOCAL: Final = 0.1
 
 
@@ -89,9 +89,10 @@ class Setup:
     """The walls with which photos are matched, and parameters of the matching.
 
     Attributes:
-        targets: all walls; they may hide one another.
-        before: points in front of the walls, None if unknown; cells that they hide are not matched.
-        max_ties: positions measured per photo.
+        targets: all walls, which may hide one another.
+        before: points in front of the walls, None if unknown; cells hidden by these points are not
+            matched.
+        max_ties: maximum number of positions measured per photo.
         threads: number of threads per photo.
     """
 
@@ -163,26 +164,26 @@ def trace_photo(
     setup: Setup,
     lens: LensFreedom | None = None,
 ) -> Trace:
-    """Match a photo with the walls it shows, until held-out ties no longer improve.
+    """Match a photo with the walls that it shows, until held-out ties no longer improve.
 
     Args:
         index: index of the photo.
         photo: the photo.
-        camera: its pose, accurate to a few cells on the walls.
+        camera: the initial pose, accurate to a few cells on the walls.
         setup: the walls, and parameters of the matching.
-        lens: uncertainty of an estimated lens; if the lens were fixed, correct ties that contradict
-            the first estimate would be rejected.
+        lens: uncertainty of an estimated lens; with a fixed lens, correct ties that contradict its
+            first estimate would be rejected.
     """
     view = view_of(index, photo, camera, setup.walls, setup.before)
     found: tuple[Trace, View] | None = None
     for content in _CONTENTS:
         if content == "colours" and found is not None:
-            # If laser and camera differ, grey values match worse than edges, or at only a few
+            # If laser and camera differ, grey values match worse than edges or match at only a few
             # positions.
             is_little = found[0].n_ties < _FEW_SHARE * setup.max_ties
             if found[0].content == "grey" and not is_little:
                 continue
-        # The pose from one set of channels is the initial pose for the next.
+        # The pose computed with one set of channels is the initial pose for the next set.
         start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
         tried = _traced(start, setup, content, lens)
         if found is None or _rank(tried[0]) < _rank(found[0]):
@@ -195,7 +196,7 @@ def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None
     """Return the uncertainty of a lens estimated in a first orientation.
 
     Returns:
-        The standard deviations, or None if the lens was calibrated or given.
+        The standard deviations, or None if the lens was calibrated or given by the user.
     """
     if photo.intrinsics is not None or found is None or found.source != "estimated":
         return None
@@ -203,7 +204,7 @@ def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None
 
 
 def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]:
-    """Return the camera adjusted to a photo's own ties, and the standard deviation of ln f.
+    """Return the camera adjusted to the ties of a photo, and the standard deviation of ln f.
 
     Args:
         trace: matching result of the photo.
@@ -217,7 +218,7 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
 
 
 def _rank(trace: Trace) -> tuple[float, int]:
-    """Return the held-out error, divided by the ties' spread and the root of their number."""
+    """Return the held-out error, divided by the spread of the ties and the root of their number."""
     pixels, error = joined(trace.pieces).pixels_photo, math.inf
     if len(pixels) >= _LEAST and trace.held_out_px:
         spread_px = math.sqrt(math.sqrt(max(float(np.linalg.det(np.cov(pixels.T))), 1.0)))
@@ -231,7 +232,7 @@ def _traced(
     content: str,
     lens: LensFreedom | None = None,
 ) -> tuple[Trace, View]:
-    """Match a photo in one set of channels; return the result and its final projection."""
+    """Match a photo in one set of channels; return the result and the final projection."""
     view, radius = start
     known = None if lens is None else (lens, view.camera)
     best: _Round | None = None
@@ -269,7 +270,7 @@ def _traced(
 
 
 def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) -> float:
-    """Return the RMS displacement of the ties, in cells, between the two poses."""
+    """Return the RMS displacement of the ties, in cells, that is due to refitting the pose."""
     squares = []
     for piece in pieces:
         projection = view.projections[piece.wall]
@@ -292,7 +293,7 @@ def _measured(view: View, setup: Setup, radius: int, content: str) -> _Round:
     occupied: set[tuple[int, int]] = set()
     pieces: list[TiePiece] = []
     n_measured = 0
-    # Largest wall first, since planes close to each other contain the same surface.
+    # Start with the largest wall, since planes close to each other contain the same surface.
     for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
         projection, target = view.projections[index], targets[index]
         if projection is None or target.wall.intensity is None or sizes[index] == 0:
@@ -328,8 +329,9 @@ def _piece(
 ) -> TiePiece:
     """Return the ties of one photo with one wall.
 
-    Residuals are correlated within the cells that fill a gap and, independently of this, within the
-    smoothing kernel, so the two correlation areas add up.
+    Residuals are correlated for two reasons: filled cells share the error of a measured cell, and
+    the smoothing kernel covers several cells. These are independent, so the two correlation areas
+    are added.
     """
     moved, projection = found
     alone = grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64)
@@ -348,9 +350,9 @@ def _piece(
 def _refitted(
     seen: SeenPoints, camera: ViewingCamera, known: _Known | None = None
 ) -> _Refitted | None:
-    """Return the pose from 3/4 of the ties, and its misfit at the others; None for too few ties.
+    """Return the pose from 3/4 of the ties, and the misfit of the others; None for too few ties.
 
-    The lens is adjusted as well if that reduces the misfit at the held-out ties.
+    The lens is also adjusted if that reduces the misfit of the held-out ties.
     """
     if len(seen) < _LEAST:
         return None
@@ -365,7 +367,7 @@ def _refitted(
             continue
         residuals = misfit(seen.take(held_out), fitted).residuals_px
         lengths = np.linalg.norm(residuals, axis=1)
-        # Remaining outliers must not influence whether to continue.
+        # Whether matching continues must not depend on remaining outliers.
         kept = residuals[lengths <= 3.0 * float(np.median(lengths))]
         held_out_px = float(np.sqrt(np.mean(kept**2)))
         if best is None or held_out_px < (1.0 - _MIN_GAIN) * best[1]:
@@ -378,12 +380,12 @@ def fitted_pose(
     camera: ViewingCamera,
     lens: _Known | None = None,
 ) -> ViewingCamera:
-    """Adjust a pose to points and reject outliers, alternately.
+    """Alternately adjust a pose to points and reject outliers.
 
     Args:
         seen: the points.
         camera: initial camera.
-        lens: free parameters of the lens, and a camera with its prior values.
+        lens: free parameters of the lens, and a camera with the prior values of these parameters.
 
     Raises:
         GeometryError: the points do not determine a pose.
@@ -404,7 +406,7 @@ def _without_misfits(
 ) -> list[TiePiece]:
     """Reject ties that do not fit the pose.
 
-    This removes groups of wrong ties, which the comparison with neighbours does not detect.
+    This removes groups of wrong ties, which a comparison with neighbours does not detect.
     """
     seen = joined(pieces)
     if len(seen) < _LEAST:
@@ -421,7 +423,7 @@ def _limit(lengths: NDArray[np.float64]) -> float:
 
 
 def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
-    """Return a mask of displacements that agree with the median of their neighbours."""
+    """Return a mask of the displacements that agree with the median of their neighbours."""
     from scipy.spatial import cKDTree
 
     count = len(moved.places)
@@ -434,7 +436,7 @@ def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
     median = np.median(shifts, axis=1)
     spread = NMAD_FACTOR * np.median(np.abs(shifts - median[:, None]), axis=1)
     tolerance = np.maximum(_MEDIAN_TOLERANCE_CELLS, 3.0 * spread)
-    # Neighbours that disagree with each other may agree with any displacement by chance.
+    # If neighbours contradict each other, any displacement may agree with them by chance.
     agrees = (np.abs(moved.shift_cells - median) <= tolerance) & (spread < 2.0)
     return np.asarray(agrees.all(axis=1))
 
@@ -442,7 +444,7 @@ def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
 def _unoccupied(
     places: NDArray[np.intp], projection: Projection, occupied: set[tuple[int, int]]
 ) -> NDArray[np.intp]:
-    """Select positions in parts of the photo that no other wall uses, and mark them as used."""
+    """Select positions in parts of the photo that no other wall uses; mark these as used."""
     side = _OCCUPIED_CELLS * max(projection.pixels_per_cell, 1e-6)
     u = projection.u[places[:, 1], places[:, 0]]
     v = projection.v[places[:, 1], places[:, 0]]
@@ -458,7 +460,7 @@ def recovered_traces(
     setup: Setup,
     traces: Sequence[Trace],
 ) -> dict[str, Trace]:
-    """Match photos without a pose, starting from poses found with the matched photos.
+    """Match photos without a pose, starting from poses computed with the matched photos.
 
     Args:
         photos: all photos.
@@ -498,7 +500,7 @@ def recovered_traces(
 def _settled(
     photos: Photos, oriented: Mapping[str, Camera], traces: Sequence[Trace]
 ) -> dict[str, Camera]:
-    """Return cameras of matched photos by name, starting with the most precise focal length.
+    """Return the cameras of matched photos by name, starting with the most precise focal length.
 
     Estimated lenses are adjusted to the new ties.
     """
@@ -517,14 +519,14 @@ def _settled(
 
 
 def _view(trace: Trace, photos: Photos, setup: Setup) -> View:
-    """Project a photo onto the walls with its final pose and the occlusions of its first pose."""
+    """Project a photo with its final pose, hiding the cells that were hidden at its first pose."""
     photo = photos.photos[trace.photo]
     first = view_of(trace.photo, photo, trace.camera, setup.walls, setup.before)
     return first.posed(trace.settled, setup.walls)
 
 
 def painted_walls(views: Sequence[View], walls: Sequence[Wall]) -> list[_Painted]:
-    """Project oriented photos onto the walls; each cell uses the photo of highest resolution."""
+    """Project oriented photos onto the walls; the photo with the highest resolution is used."""
     painted = []
     for index, wall in enumerate(walls):
         grey = np.full(wall.frame.shape, np.nan, dtype=np.float32)
@@ -547,7 +549,7 @@ def recovered_pose(
     painted: Sequence[_Painted],
     lens: ViewingCamera,
 ) -> ViewingCamera | None:
-    """Find the pose of a photo from matches with projected photos; None for too few matches.
+    """Compute the pose of a photo from matches with projected photos; None for too few matches.
 
     Args:
         grey: (height, width) grey values of the photo.
@@ -571,9 +573,10 @@ def recovered_pose(
 
 
 def lens_of(photo: Photo, oriented: Mapping[str, Camera], photos: Photos) -> Intrinsics | None:
-    """Return a photo's lens: calibrated, or estimated for another photo by the same camera.
+    """Return the lens of a photo: calibrated, or estimated for another photo by the same camera.
 
-    The estimate is preferred to EXIF values, which may be wrong for all photos of a lens.
+    The estimate is preferred to EXIF values, which may be wrong for all photos taken with the same
+    lens.
 
     Returns:
         The lens, or None if it is neither calibrated nor estimated.
@@ -599,7 +602,7 @@ def pose_of_most(
     lens: ViewingCamera,
     limit_px: float,
 ) -> ViewingCamera | None:
-    """Return the pose with the most inliers, as an initial pose; None if there are too few."""
+    """Return the pose with the most inliers, or None if there are too few."""
     import cv2
 
     params = sampling(limit_px, trials=_POSE_TRIALS)

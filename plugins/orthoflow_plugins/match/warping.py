@@ -17,33 +17,34 @@ from orthoflow.products import Photo, Wall
 if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Occluders
 
-# Minimum cosine of the angle of incidence at which parts of a wall are matched.
+# Parts of a wall are matched if the cosine of the angle of incidence is at least this.
 _GRAZING_COSINE: Final = 0.15
-# Cell size of the depth buffer, in wall cells, so that projected surfaces have no gaps.
+# Cell size of the depth buffer, in wall cells; it is large enough to avoid gaps in projected
+# surfaces.
 _BUFFER_CELLS: Final = 2.0
 # A surface is hidden if it is more than this many wall cells behind the nearest one.
 _HIDDEN_CELLS: Final = 6.0
 _ROWS_AT_ONCE: Final = 256
-# Cells this close to hidden cells may be hidden as well, since objects in front of a wall were
-# scanned from other positions and the pose is only accurate to a few cells.
+# Cells this close to hidden cells may also be hidden: objects in front of a wall were scanned from
+# other positions, and the pose is only accurate to a few cells.
 _BESIDE_CELLS: Final = 3
 # Step, in cells, of the first search for the part of a wall that a photo shows.
 _COARSE: Final = 8
 _MIN_CELLS: Final = 100
-# Pixel at which OpenCV samples cells outside the photo; the sampled value is not used.
+# Photo coordinate at which OpenCV samples cells outside the photo; the result is not used.
 _OUTSIDE_PX: Final = -10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Projection:
-    """Positions of a wall's cells in a photo, for the part of the wall that the photo shows.
+    """Positions in a photo of the cells of a wall, for the part of the wall that the photo shows.
 
     Attributes:
-        part: rows and columns of the wall's raster covered by the arrays.
+        part: rows and columns of the raster that the arrays cover.
         u: (rows, cols) float32 photo column, NaN where the cell is not in the photo.
         v: (rows, cols) float32 photo row, NaN where the cell is not in the photo.
-        distance: (rows, cols) float32 metres along the camera's axis.
-        pixels_per_cell: median cell size in pixels over the cells in the photo.
+        distance: (rows, cols) float32 distance from the camera along the optical axis, in metres.
+        pixels_per_cell: median size of the cells in the photo, in pixels.
     """
 
     part: tuple[slice, slice]
@@ -54,11 +55,11 @@ class Projection:
 
     @property
     def corner(self) -> NDArray[np.intp]:
-        """First (column, row) of the part."""
+        """The first column and row of the part."""
         return np.array([self.part[1].start, self.part[0].start], dtype=np.intp)
 
     def pixels_at(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pixels (n, 2) at fractional cells (n, 2) = (column, row); NaN near void cells."""
+        """Return photo pixels (n, 2) at fractional cells (n, 2); NaN near void cells."""
         return np.column_stack([between(self.u, at), between(self.v, at)])
 
     def hide(self, mask: NDArray[np.bool_]) -> None:
@@ -73,7 +74,8 @@ class Before:
 
     Attributes:
         occluders: the points.
-        front_m: distance in front of each wall's plane up to which points belong to its raster.
+        front_m: for each wall, the distance in front of its plane up to which points belong to its
+            raster.
     """
 
     occluders: Occluders
@@ -87,12 +89,12 @@ class View:
     Attributes:
         index: index of the photo.
         grey: (height, width) grey values of the photo.
-        colours: function that returns the colours (height, width, 3) of the photo, which only few
-            photos need.
+        colours: function that returns the colours (height, width, 3) of the photo; they are only
+            needed for some photos.
         camera: the pose.
         projections: projection of each wall, None if the photo does not show it.
         hidden: cells of each wall that are hidden by points in front of it; empty if unknown.
-        warped: grey values in the raster of each wall, computed when needed.
+        warped: grey values of the photo in the raster of each wall, computed on demand.
     """
 
     index: int
@@ -104,13 +106,13 @@ class View:
     warped: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
     def on_wall(self, index: int, projection: Projection) -> NDArray[np.float32]:
-        """Return the photo's grey values in the raster of a wall."""
+        """Return the grey values of the photo in the raster of a wall."""
         if index not in self.warped:
             self.warped[index] = warp_photo(self.grey, projection)
         return self.warped[index]
 
     def colours_on_wall(self, projection: Projection) -> NDArray[np.float32]:
-        """Return the photo's colours (rows, cols, 3) in the raster of a wall."""
+        """Return the colours (rows, cols, 3) of the photo in the raster of a wall."""
         return warp_photo(self.colours(), projection)
 
     def posed(self, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
@@ -140,7 +142,7 @@ def view_of(
     return View(
         index=index,
         grey=photo_grey(photo),
-        # Decode the colours once for all rounds and walls.
+        # Decode the colours only once for all rounds and walls.
         colours=cache(partial(photo_rgb, photo)),
         camera=camera,
         projections=_bared(projections, hidden),
@@ -166,15 +168,15 @@ def _hidden(
         mask = np.zeros(wall.frame.shape, dtype=np.uint8)
         if projection is not None:
             seen = np.isfinite(projection.u)
-            # After rounding to single precision, a pixel may be exactly on the right or lower
-            # border.
+            # Rounding to single precision may move a pixel exactly onto the right or lower border.
             rows, columns = (
                 np.minimum((pixels[seen] / buffer.reduction).astype(np.intp), length - 1)
                 for pixels, length in zip(
                     (projection.v, projection.u), buffer.nearest.shape, strict=True
                 )
             )
-            # Position of the nearest point on the ray from the camera to the cell, 0 to 1.
+            # Position of the nearest point on the ray from the camera to the cell, 0 at the camera,
+            # 1 at the cell.
             along = np.minimum(buffer.nearest[rows, columns] / projection.distance[seen], 1.0)
             frame = wall.frame
             camera_m = float((camera.centre_world - frame.origin_world) @ frame.normal_world)
@@ -188,7 +190,7 @@ def _hidden(
 def _bared(
     projections: Sequence[Projection | None], hidden: Sequence[NDArray[np.bool_]]
 ) -> Sequence[Projection | None]:
-    """Mark hidden cells in the projections."""
+    """Set hidden cells to NaN in the projections."""
     for projection, mask in zip(projections, hidden, strict=bool(hidden)):
         if projection is not None:
             projection.hide(mask[projection.part])
@@ -196,9 +198,9 @@ def _bared(
 
 
 def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projection | None]:
-    """Project the surfaces of all walls into a photo; None for walls outside the photo.
+    """Project the surfaces of all walls into a photo; the result is None for walls outside it.
 
-    Cells hidden by another surface, of the same or another wall, are NaN.
+    Cells hidden by a surface of the same wall or of another wall are NaN.
     """
     seen = [_in_photo(camera, wall) for wall in walls]
     shown = [(wall, item) for wall, item in zip(walls, seen, strict=True) if item is not None]
@@ -222,7 +224,7 @@ def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projecti
 
 
 def warp_photo(picture: NDArray[np.uint8], projection: Projection) -> NDArray[np.float32]:
-    """Resample a photo at the cells of a wall, after reduction to their resolution.
+    """Resample a photo at the cells of a wall, after reducing the photo to their resolution.
 
     Args:
         picture: (height, width) or (height, width, c).
@@ -277,7 +279,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
 
 
 def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[slice, slice] | None:
-    """Return the rows and columns of coarse cells in the photo, with a margin of one cell."""
+    """Return the rows and columns of the coarse cells in the photo, with a margin of one cell."""
     if not seen.any():
         return None
     spans = []
@@ -291,7 +293,7 @@ def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[sli
 def _project_cells(
     near: ViewingCamera, wall: Wall, part: tuple[slice, slice], step: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return u, v and distance of every step-th cell; `near` has the origin of the wall."""
+    """Return u, v and the distance of every step-th cell; the origin of `near` is on the wall."""
     frame = wall.frame
     rows = np.arange(part[0].start, part[0].stop, step)
     columns = np.arange(part[1].start, part[1].stop, step)
@@ -311,7 +313,7 @@ def _project_cells(
 
 
 def between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Interpolate values (n,) at fractional cells (n, 2) = (column, row); NaN near unknown ones."""
+    """Interpolate values at fractional cells (n, 2) = (column, row); NaN near unknown cells."""
     height, width = raster.shape
     inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
     left = np.where(inside, at[:, 0], 0.0).astype(np.intp)
