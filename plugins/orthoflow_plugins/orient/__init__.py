@@ -1,1 +1,1 @@
-"""Methods of the kind `orient`: exterior orientation of the photos."""
+"""Methods of the kind `orient`, which compute the exterior orientation of photos."""

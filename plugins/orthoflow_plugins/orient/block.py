@@ -1,7 +1,7 @@
-"""Bundle adjustment of a block of photos that share lenses and points, with its covariance.
+"""Bundle adjustment of a block of photos that share lenses and points, and its covariance.
 
 The adjustment uses COLMAP's cost functions and the Ceres solver. The covariance of the unknowns
-takes correlated errors of the observations into account.
+allows for correlated errors of the observations.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ _CONVERGED: Final = 1e-8
 _MODEL: Final = "FULL_OPENCV"
 _N_VALUES: Final = 12
 _COLUMNS: Final = {"cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7}
-# COLMAP estimates fx and fy separately, so this prior keeps their ratio fixed.
+# COLMAP estimates fx and fy separately; this prior keeps their ratio fixed.
 _TIED_ASPECT: Final = 1e-5
-# Pixel coordinate of dummy observations, far outside the photo.
+# Pixel coordinate of dummy observations, which is far outside the photo.
 _FAR_PX: Final = -1e6
-# Scale of a robust loss with which dummy observations have no weight.
+# Scale of a robust loss at which dummy observations have no weight.
 _NOTHING: Final = 1e-9
 LENS_CONFUSED: Final = DiagnosticSpec(
     code="lens-correlated-with-pose",
@@ -70,7 +70,7 @@ class Observations(Rows):
         photo: (m,) index of the camera.
         point: (m,) index of the point.
         pixels: (m, 2) measured pixels.
-        sigma_px: (m,) standard deviation of each coordinate.
+        sigma_px: (m,) standard deviation of each pixel coordinate.
     """
 
     photo: NDArray[np.intp]
@@ -81,13 +81,14 @@ class Observations(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Points(Rows):
-    """Points of a block.
+    """The points of a block.
 
     Attributes:
-        now: (k, 3) metres, adjusted positions.
-        known: (k, 3) metres, positions in the scan; arbitrary for points that are not in the scan.
-        sigma_m: (k,) standard deviation of each coordinate of `known`; inf for points that are not
-            in the scan.
+        now: (k, 3) adjusted positions in metres.
+        known: (k, 3) positions in the scan in metres; arbitrary for points that are not in the
+            scan.
+        sigma_m: (k,) standard deviation of each coordinate of `known`, infinite for points that are
+            not in the scan.
     """
 
     now: NDArray[np.float64]
@@ -97,11 +98,11 @@ class Points(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """Cameras, lenses, points and observations, in coordinates with a nearby origin.
+    """Cameras, lenses, points and observations, in coordinates whose origin is near the points.
 
     Attributes:
-        cameras: one per photo.
-        lens_of: index of each camera's lens.
+        cameras: camera of each photo.
+        lens_of: index of the lens of each camera.
         lenses: the lenses.
         points: the points.
         seen: the observations.
@@ -115,36 +116,36 @@ class Block:
 
     @property
     def is_joint(self) -> NDArray[np.bool_]:
-        """Mask (k,) of the points seen more than once; only these are adjusted.
+        """Mask (k,) of the points that several photos see; only these points are adjusted.
 
-        The uncertainty of all other points is added to that of their pixels.
+        The uncertainty of each other point is added to that of its pixel.
         """
         return np.bincount(self.seen.point, minlength=len(self.points)) > 1
 
     @property
     def lens_starts(self) -> NDArray[np.intp]:
-        """First column of each lens in the normal matrix, and the total number of columns."""
+        """First column of each lens in the normal matrix, followed by the number of columns."""
         sizes = [lens.freedom.sigmas.size for lens in self.lenses]
         return POSE_PARAMETERS * len(self.cameras) + np.cumsum([0, *sizes], dtype=np.intp)
 
     def columns(self, photo: int) -> NDArray[np.intp]:
-        """Return the columns of a photo's pose and lens in the normal matrix."""
+        """Return the columns of the normal matrix that belong to the pose and lens of a photo."""
         first, last = self.lens_starts[self.lens_of[photo] :][:2]
         pose = POSE_PARAMETERS * photo + np.arange(POSE_PARAMETERS)
         return np.concatenate([pose, np.arange(first, last)])
 
     def photos_of(self, lens: int) -> list[int]:
-        """Return the photos that share a lens."""
+        """Return the indices of the photos that share a lens."""
         return [photo for photo, of in enumerate(self.lens_of) if of == lens]
 
 
 @dataclass(frozen=True, kw_only=True)
 class BlockCovariance:
-    """The covariance of a block.
+    """The covariance of the poses and lenses of a block.
 
     Attributes:
-        matrix: (p, p), columns as in `Block.columns`.
-        cofactors: (p, p) the same covariance, computed with the a priori standard deviations.
+        matrix: (p, p) covariance, with columns as in `Block.columns`.
+        cofactors: (p, p) the same covariance, computed from the a priori standard deviations.
         sigma0: standard deviation of unit weight.
         redundancy: number of observations minus the number of unknowns that they determine.
     """
@@ -156,11 +157,11 @@ class BlockCovariance:
 
 
 def solve(block: Block, *, soft_limit: float) -> Block:
-    """Adjust all cameras, lenses and points seen more than once.
+    """Adjust all cameras and lenses, and all points that several photos see.
 
     Args:
-        block: initial values.
-        soft_limit: residuals beyond this many standard deviations get less weight (Huber).
+        block: the block with its initial values.
+        soft_limit: residuals of more than this many standard deviations get less weight (Huber).
 
     Raises:
         GeometryError: the block has no solution.
@@ -169,7 +170,7 @@ def solve(block: Block, *, soft_limit: float) -> Block:
 
     ceres: Any = pyceres
     # The solver changes poses, lenses and points in place. COLMAP's adjuster must outlive the
-    # solver, and a single reference to the problem keeps its costs and losses alive.
+    # solver, and one reference to the problem must be kept so that its costs and losses stay alive.
     scene, adjuster = _set_up(block)
     problem = adjuster.problem
     images = [scene.images[index + 1] for index in range(len(block.cameras))]
@@ -182,7 +183,7 @@ def solve(block: Block, *, soft_limit: float) -> Block:
     options = ceres.SolverOptions()
     options.max_num_iterations = _ITERATIONS
     options.function_tolerance = _CONVERGED
-    # The order of summation is not reproducible with several threads.
+    # With several threads, the order of summation is not reproducible.
     options.num_threads = 1
     kinds = ceres.LinearSolverType
     options.linear_solver_type = kinds.DENSE_SCHUR if joint else kinds.DENSE_NORMAL_CHOLESKY
@@ -215,11 +216,11 @@ def solve(block: Block, *, soft_limit: float) -> Block:
 def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float64]:
     """Return the covariances (m, 2, 2) of the pixels.
 
-    The covariances include the uncertainty of points that are seen only once.
+    The covariances include the uncertainty of points that only one photo sees.
 
     Args:
         block: the block.
-        alone: whether to include the uncertainty of points seen more than once, too.
+        alone: whether to include also the uncertainty of points that several photos see.
     """
     seen = block.seen
     covariances = (seen.sigma_px**2)[:, None, None] * np.eye(2)
@@ -238,7 +239,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
 
     Args:
         block: the adjusted block.
-        soft_limit: residuals beyond this many standard deviations get less weight (Huber).
+        soft_limit: residuals of more than this many standard deviations get less weight (Huber).
 
     Raises:
         GeometryError: the observations do not determine the block.
@@ -251,7 +252,8 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     normal = np.diag(prior)
     squares, n_rows = 0.0, 0
     for columns, jacobian, residuals in rows:
-        # Use einsum, since the order of summation in BLAS depends on the number of threads.
+        # The order of summation of einsum, unlike that of BLAS, does not depend on the number of
+        # threads.
         normal[np.ix_(columns, columns)] += np.einsum("ij,ik->jk", jacobian, jacobian)
         squares += float((residuals**2).sum())
         n_rows += len(residuals)
@@ -270,7 +272,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
 def lenses_json(
     block: Block, photos: Sequence[Photo], covariance: NDArray[np.float64]
 ) -> JsonValue:
-    """Return the adjusted lenses with the standard deviations of their free parameters."""
+    """Return the adjusted lenses and the standard deviations of their free parameters."""
     entries: list[JsonValue] = []
     sigmas = np.sqrt(np.diag(covariance))
     for index, lens in enumerate(block.lenses):
@@ -292,7 +294,7 @@ def lenses_json(
 
 
 def lens_statistics(block: Block) -> JsonValue:
-    """Return mean and SD of the free parameters for each image size and set of free parameters."""
+    """Return the mean and SD of free parameters for each image size and set of free parameters."""
     kinds: dict[tuple[int, int, tuple[str, ...]], list[NDArray[np.float64]]] = {}
     for index, lens in enumerate(block.lenses):
         camera, names = block.cameras[block.lens_of.index(index)], lens.freedom.names
@@ -318,9 +320,13 @@ def lens_statistics(block: Block) -> JsonValue:
 def correlation_notes(
     block: Block, photos: Sequence[Photo], cofactors: NDArray[np.float64]
 ) -> list[tuple[str, Note]]:
-    """Return notes on lens parameters correlated with poses, with the first photo of each lens."""
+    """Return a note for each lens parameter that is correlated with the poses.
+
+    Each note names the first photo of the lens.
+    """
     notes: list[tuple[str, Note]] = []
-    # Each lens is only determined by its own photos, even if the same camera took all photos.
+    # Without sharing, each lens is determined only by its own photos, even if the same camera took
+    # all photos.
     shared = ", or set intrinsics: shared if one camera took all photos at the same zoom"
     also = shared if len(block.lenses) > 1 else ""
     scale = np.sqrt(np.diag(cofactors))
@@ -329,7 +335,8 @@ def correlation_notes(
         members = block.photos_of(index)
         for column, name in enumerate(lens.freedom.names, block.lens_starts[index]):
             of_poses = correlations[: POSE_PARAMETERS * len(block.cameras), column]
-            # A parameter is undetermined only if it is correlated in all photos of the lens.
+            # A parameter is undetermined only if it is correlated with the poses of all photos of
+            # the lens.
             confused = of_poses.reshape(-1, POSE_PARAMETERS)[members].min(axis=0)
             worst = int(confused.argmax())
             if confused[worst] > _CORRELATED:
@@ -350,7 +357,7 @@ def _adjusted_points(
 ) -> AdjustedPoints:
     """Return the scan points with their residuals in the photos."""
     known = np.isfinite(block.points.sigma_m[block.seen.point])
-    # Points seen by several photos are compared with the scan, too.
+    # Compare points that several photos see with the scan, too.
     at_scan = replace(block.points, now=block.points.known)
     block = replace(block, points=at_scan, seen=block.seen.take(known))
     seen, n_known = block.seen, len(block.seen)
@@ -364,7 +371,7 @@ def _adjusted_points(
         by_camera, by_point, off = _seen_by(block, photo, mine, with_places[mine], soft_limit)
         residuals[mine], by_place[mine] = off, by_point
         jacobian[mine[:, None, None], [[0], [1]], own] = by_camera
-        # The error of a point has the same sign and size in all photos that see it.
+        # The error of a point is the same in all photos that see the point.
         by_camera, by_point, _ = _seen_by(block, photo, mine, of_pixels[mine], math.inf)
         pulls[mine[:, None, None], [[0], [1], [2]], own] = np.einsum(
             "nip,nid->ndp", by_camera, by_point
@@ -387,7 +394,7 @@ def _adjusted_points(
 
 
 def _rows(block: Block, soft_limit: float) -> list[_Rows]:
-    """Return the equations of the remaining unknowns after elimination of all points."""
+    """Return the equations of the remaining unknowns after eliminating all points."""
     seen = block.seen
     joint = block.is_joint[seen.point]
     covariances = pixel_covariances(block)
@@ -411,11 +418,11 @@ def _seen_by(
     covariances: NDArray[np.float64],
     soft_limit: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the equations of a photo's m observations, whitened and robustly weighted.
+    """Return the whitened and robustly weighted equations of the m observations in a photo.
 
     Returns:
-        Derivatives with respect to pose and lens (m, 2, c) and to the points (m, 2, 3), and
-        residuals (m, 2).
+        Derivatives with respect to pose and lens (m, 2, c), derivatives with respect to the points
+        (m, 2, 3), and residuals (m, 2).
     """
     camera, seen = block.cameras[photo], block.seen
     points = seen.point[mine]
@@ -435,7 +442,7 @@ def _seen_by(
 def _without_point(
     block: Block, point: int, parts: list[tuple[_Rows, NDArray[np.float64]]]
 ) -> _Rows:
-    """Eliminate a point seen by several photos."""
+    """Eliminate a point that several photos see from the equations of these photos."""
     columns = np.unique(np.concatenate([one[0] for one, _ in parts]))
     sigma_m = float(block.points.sigma_m[point])
     n_known = 3 if math.isfinite(sigma_m) else 0
@@ -456,10 +463,11 @@ def _without_point(
 
 
 def _set_up(block: Block) -> tuple[Any, Any]:
-    """Set up poses and lenses as COLMAP's scene and adjuster.
+    """Build COLMAP's scene and adjuster from the poses and lenses.
 
-    Only COLMAP's adjuster provides the manifold of a pose, and it requires observations. Each photo
-    therefore gets two observations whose residuals are so large that they have no weight.
+    The manifold of a pose is only available from COLMAP's adjuster, which requires observations.
+    Each photo therefore gets two dummy observations, whose residuals are so large that the robust
+    loss gives them no weight.
     """
     import pycolmap
 
@@ -498,7 +506,10 @@ def _add_observations(
     joint: dict[int, NDArray[np.float64]],
     soft_limit: float,
 ) -> None:
-    """Add the observations; those of a point seen only once include the covariance of the point."""
+    """Add the observations to the problem.
+
+    If only one photo sees a point, the observation includes the covariance of the point.
+    """
     import pyceres
     import pycolmap
     from pycolmap import cost_functions
@@ -537,7 +548,7 @@ def _values(camera: ViewingCamera) -> NDArray[np.float64]:
 
 
 def _limit_lens(problem: Any, lens: Lens, values: NDArray[np.float64]) -> None:
-    """Keep the fixed parameters of a lens, and constrain the free ones by their priors."""
+    """Fix the parameters of a lens that are not free, and constrain the others by priors."""
     import pyceres
 
     ceres: Any = pyceres

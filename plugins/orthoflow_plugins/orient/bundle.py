@@ -77,27 +77,28 @@ from orthoflow_plugins.orient.report import Oriented, hand_over
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7
-# Two photos are matched if each shows at least this share of the wall points of the other.
+# Two photos are matched if each of them shows at least this share of the wall points of the other.
 _MIN_OVERLAP: Final = 0.2
 # More tie points only increase the computing time.
 _MAX_PHOTO_POINTS: Final = 1000
-# The sharing mode in which the photos of a lens are tested for consistency.
+# The sharing mode in which the photos of a lens are tested for a common focal length.
 _TESTED: Final = "focal-group"
 _ROUNDS: Final = 5
 _TIE_SIGMA_START_PX: Final = 0.5
 _TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
-# Scan points of different photos within this distance are the same point.
+# Points of different photos at most this far apart are the same scan point.
 _SAME_PLACE_M: Final = 1e-6
 # Photos without EXIF may or may not share a lens. A series is usually taken with one lens, and many
-# photos determine a lens far better than a single one does. However, the photographer may have
-# zoomed, and a photo may have been rotated or cropped. Therefore, the focal length from each
-# photo's own ties is compared with the shared one. Zooming changes it by more than this share, but
-# correlated scan errors by less (up to 0.7 % for photogrammetric clouds with 10 to 30 mm of noise).
+# photos determine a lens far better than one photo does. However, the photographer may have zoomed,
+# and a photo may have been rotated or cropped. Therefore, the focal length computed from the ties
+# of each photo is compared with the shared one. They differ by more than this share if the
+# photographer zoomed, but by less if only scan errors are correlated (up to 0.7 % for
+# photogrammetric clouds with 10 to 30 mm of noise).
 _MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
-# The photo with the largest contradiction distorts the shared lens, so that other photos contradict
-# it as well. Therefore, photos whose contradiction exceeds this share of the largest are separated
-# first.
+# The photo with the largest difference distorts the shared lens, so that other photos contradict
+# that lens as well. Therefore, only photos whose difference exceeds this share of the largest are
+# separated at first.
 _SHARE_OF_WORST: Final = 0.5
 NO_BLOCK: Final = DiagnosticSpec(
     code="bundle-without-result",
@@ -107,15 +108,15 @@ NO_BLOCK: Final = DiagnosticSpec(
 
 
 class OrientColmapBundle(Method):
-    """Orient all photos at once: bundle adjustment with the scan as control.
+    """Orient all photos together by a bundle adjustment with the scan as control.
 
-    Each photo is first oriented separately; photos whose ties agree with their pose no better than
-    by chance are excluded. Key points are then matched between overlapping photos. COLMAP's cost
-    functions and the Ceres solver adjust poses, lenses and points together. Ties to walls are
-    weighted by the standard deviations from the matching step, and ties between photos by that of
-    their residuals. Uncalibrated lenses start from EXIF and are refined. Photos with the same focal
-    length in EXIF share a lens; so do photos without EXIF unless their ties contradict this. The
-    gates and withheld ties are those of `orient.pnp`.
+    Each photo is first oriented separately. Photos are excluded if their ties do not agree with the
+    pose better than by chance. Key points are then matched between overlapping photos. COLMAP's
+    cost functions and the Ceres solver adjust poses, lenses and points together. Ties to walls are
+    weighted by the standard deviations from the matching step, and ties between photos by the
+    standard deviation of their residuals. The initial values of uncalibrated lenses are taken from
+    EXIF. Photos with the same focal length in EXIF share a lens, and so do photos without EXIF
+    unless their ties contradict this. Gates and withheld ties are the same as in `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
@@ -195,7 +196,7 @@ class OrientColmapBundle(Method):
 def _by_itself(
     tied: TiedPhoto, ties: Ties, params: OrientColmapBundle.Params
 ) -> Trusted | Oriented:
-    """Orient a photo by its own ties; refuse it if the ties agree only by chance."""
+    """Orient a photo from its own ties; reject it if the ties agree only by chance."""
     found = by_itself(tied, ties, params, estimate_pose)
     if isinstance(found, Oriented):
         return found
@@ -209,7 +210,7 @@ def _by_itself(
 def _adjusted(
     block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
 ) -> Adjusted | None:
-    """Adjust photos with shared lenses; repeat with separate lenses where ties contradict them."""
+    """Adjust photos with shared lenses; repeat with separate lenses if ties contradict these."""
     photos = [item.tied.photo for item in block]
     cameras = [item.estimate.resection.camera for item in block]
     between = _photo_ties(block, params, ctx)
@@ -252,7 +253,6 @@ def _photo_ties(
 def _report_block(
     ctx: StepContext, adjusted: Adjusted, photos: Sequence[Photo]
 ) -> dict[str, JsonValue]:
-    """Report metrics and diagnostics of the block as a whole."""
     block, covariance = adjusted.block, adjusted.covariance
     for photo, (note, values) in correlation_notes(block, photos, covariance.cofactors):
         ctx.report(note, subject=photo, **values)
@@ -281,12 +281,12 @@ class Adjusted:
     """A block after its adjustment.
 
     Attributes:
-        block: cameras, lenses and points, in coordinates with a nearby origin.
+        block: cameras, lenses and points, in coordinates whose origin is near the points.
         covariance: covariance of all unknowns.
-        estimates: one per photo, in world coordinates.
-        tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
-            (reduced) picture in which the key point was found.
-        ties_px: (m,) lengths of the residuals of these ties, in photo pixels.
+        estimates: the pose of each photo, in world coordinates.
+        tie_sigma_px: standard deviation of a pixel coordinate of a tie between photos, in pixels of
+            the (possibly reduced) image in which the key point was found.
+        ties_px: (m,) lengths of the residuals of ties between photos, in photo pixels.
         n_tie_points: number of points that are not in the scan.
     """
 
@@ -303,12 +303,12 @@ class _Weights:
     """Inliers and weights of an adjustment.
 
     Attributes:
-        agreeing: per photo, (n,) bool, inliers among its scan ties.
-        units: standard deviation of unit weight of each photo's scan ties.
-        limits: rejection limit of each photo's scan ties, in standard deviations.
-        tie_active: (m,) bool, inliers among the ties between photos.
-        tie_sigma: standard deviation of these ties, in pixels of the (reduced) picture in which
-            the key points were found.
+        agreeing: for each photo, (n,) bool, the inliers among its scan ties.
+        units: for each photo, the standard deviation of unit weight of its scan ties.
+        limits: for each photo, the rejection limit of its scan ties, in standard deviations.
+        tie_active: (m,) bool, the inliers among the ties between photos.
+        tie_sigma: standard deviation of these ties, in pixels of the (possibly reduced) image in
+            which the key points were found.
     """
 
     agreeing: list[NDArray[np.bool_]]
@@ -324,13 +324,13 @@ def adjust_block(
     groups: tuple[tuple[int, ...], tuple[Lens, ...]],
     params: OrientParams,
 ) -> Adjusted:
-    """Adjust photos and lenses together; reject and reweight until the inliers do not change.
+    """Adjust photos and lenses together; reject and reweight ties until the inliers do not change.
 
     Args:
-        photos: the photos.
+        photos: the photos with their separate orientations.
         ties: ties between the photos, in world coordinates.
-        groups: index of each photo's lens, and the lenses.
-        params: parameters of the rejection.
+        groups: index of the lens of each photo, and the lenses.
+        params: parameters for the rejection of ties.
 
     Raises:
         GeometryError: the ties do not determine the block.
@@ -388,7 +388,7 @@ def adjust_block(
 
 
 def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
-    """Find photos whose own focal length contradicts a lens shared only because of the image size.
+    """Find photos whose separate focal length contradicts a lens shared because of image size only.
 
     Args:
         photos: photos of the block.
@@ -417,7 +417,7 @@ def _start(
     groups: tuple[tuple[int, ...], tuple[Lens, ...]],
     middle: NDArray[np.float64],
 ) -> tuple[ViewingCamera, ...]:
-    """Return the initial cameras, in coordinates with the origin at `middle`."""
+    """Return the initial cameras, in coordinates whose origin is `middle`."""
     alone = [item.estimate.resection.camera for item in photos]
     cameras: list[ViewingCamera] = []
     lens_of, lenses = groups
@@ -427,10 +427,10 @@ def _start(
         if not lens.freedom.sigmas.size:
             own = posed(lens.prior, own)
         elif lens.source == UNKNOWN:
-            # Start from the photo whose own ties determine the focal length best.
+            # Use the lens of the photo whose ties determine the focal length best.
             best = min(members, key=lambda k: focal_sigma(photos[k].estimate.resection))
             if best != at:
-                # The position depends on the focal length.
+                # The position of a camera depends on the focal length.
                 own = posed(alone[best], own)
                 with suppress(GeometryError):
                     own = fitted(item.tied.control(item.estimate.agreeing), own)
@@ -447,7 +447,7 @@ def _block(
     state: tuple[tuple[ViewingCamera, ...], NDArray[np.float64], NDArray[np.float64]],
     weights: _Weights,
 ) -> Block:
-    """Build the block from scan ties, ties between photos, and the current cameras and points."""
+    """Return the block of scan ties, ties between photos, and the current cameras and points."""
     cameras, positions, middle = state
     seen = [
         item.tied.seen.take(chosen) for item, chosen in zip(photos, weights.agreeing, strict=True)
@@ -486,7 +486,7 @@ def _block(
 def _weighed(
     photos: Sequence[Trusted], fits: Sequence[Misfit], used: _Weights, rejection_sigma: float
 ) -> _Weights:
-    """Reject outliers among the scan ties and estimate the standard deviation of the inliers."""
+    """Reject outliers among the scan ties, and estimate the standard deviation of the inliers."""
     agreeing, units, limits = [], [], []
     for item, fit, some in zip(photos, fits, used.agreeing, strict=True):
         is_check = item.tied.is_check
@@ -501,19 +501,19 @@ def _weighed(
 def _weigh_between(
     ties: PhotoTies, lengths: NDArray[np.float64], weights: _Weights, rejection_sigma: float
 ) -> None:
-    """Reject outliers among ties between photos; estimate the inliers' standard deviation.
+    """Reject outliers among ties between photos, and estimate the standard deviation of inliers.
 
     Args:
         ties: ties between photos.
-        lengths: (m,) lengths of their residuals, in pixels of the reduced pictures.
+        lengths: (m,) lengths of their residuals, in pixels of the reduced images.
         weights: current inliers and weights, updated in place.
         rejection_sigma: limit in standard deviations.
     """
     from scipy.special import chdtri  # importing scipy.stats would take seconds
 
     active = weights.tie_active
-    # m observations have 2 m coordinates, 3 of which determine the point, so the sum of squares has
-    # a chi-square distribution with 2 m - 3 degrees of freedom.
+    # The m observations of a point have 2 m coordinates, 3 of which determine the point, so the sum
+    # of squares has a chi-square distribution with 2 m - 3 degrees of freedom.
     squares = np.bincount(ties.point[active], lengths[active] ** 2)
     n_seeing = np.bincount(ties.point[active])
     is_tied = n_seeing > 1
@@ -521,7 +521,7 @@ def _weigh_between(
     sigma = math.sqrt(float(np.median(squares[is_tied] / usual)))
     weights.tie_sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
     near = lengths <= rejection_sigma * weights.tie_sigma
-    # A point needs inliers in at least two photos.
+    # Keep only points with inliers in at least two photos.
     counts = np.bincount(ties.point[near], minlength=len(ties.points_world))
     weights.tie_active = near & (counts[ties.point] > 1)
 

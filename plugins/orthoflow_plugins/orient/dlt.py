@@ -1,7 +1,7 @@
 """`orient.dlt`: direct linear transform of single photos (markiewicz2015, 3.6 and 4.3).
 
-The eleven parameters, estimated without prior knowledge, are the initial values of an adjustment.
-The predicted error includes lens distortion that the model omits.
+The eleven parameters are estimated without prior knowledge and used as initial values of an
+adjustment. The predicted error includes the distortion of the lens that the model omits.
 """
 
 from __future__ import annotations
@@ -47,11 +47,13 @@ from orthoflow_plugins.orient.report import hand_over
 
 Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
 
-# Practically free, since control points with relief determine a lens far better.
+# This prior has practically no effect, since control points with relief determine a lens far
+# better.
 _FREE: Final = {"focal_sigma": 1.0, "aspect_sigma": 0.5}
 _CENTRE_SHARE: Final = 0.5
 _SKEW_SHARE: Final = 0.5
-# Decentring distortion and principal point are correlated unless the relief is deep.
+# Unless the relief is deep, decentring distortion is correlated with the principal point, which
+# therefore gets this tighter prior.
 _PINNED_CENTRE_SHARE: Final = 0.05
 _FULL: Final = "k1 k2 p1 p2"
 _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
@@ -60,12 +62,12 @@ _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
     _FULL: LensFreedom(**_FREE, k1_sigma=0.5, k2_sigma=0.5, tangential_sigma=0.01),
 }
 _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
-# Relief smaller than this many standard deviations of the points is mostly noise.
+# Relief of less than this many standard deviations of the points is mostly noise.
 _RELIEF_SIGMAS: Final = 10.0
-# If control points are closer to a plane, rounding errors of coordinates affect the eleven
-# parameters.
+# With a larger condition number, control points are so close to a plane that rounding errors of the
+# coordinates affect the eleven parameters.
 _MAX_CONDITION: Final = 5000.0
-# The lens model is insufficient if the standard deviation of unit weight exceeds this.
+# With a larger standard deviation of unit weight, the lens model is insufficient.
 _MAX_SIGMA0: Final = 1.5
 # Lens models are compared on a grid with this many points per side of the photo.
 _FRAME: Final = 12
@@ -81,13 +83,13 @@ DLT_MISFIT: Final = DiagnosticSpec(
 
 
 class OrientDlt(Method):
-    """Orient each photo by eleven parameters, or more with distortion, using only its ties.
+    """Orient each photo from its ties only, by eleven parameters or more with distortion.
 
     Calibration and EXIF are used only to reject wrong ties; `prior: none` does not use them at all.
-    The linear solution is the start of a weighted adjustment of pose, fx, fy, principal point and,
-    if requested, distortion. The skew is recorded, but used only if requested, since modern cameras
-    have none. Photos with nearly coplanar control points are refused, since such points do not
-    determine the parameters. The gates are those of `orient.pnp`.
+    The linear solution gives the initial values of a weighted adjustment of pose, fx, fy, principal
+    point and, if requested, distortion. The skew is recorded, but only used if requested, since
+    modern cameras have no skew. Photos with nearly coplanar control points are rejected, since such
+    points do not determine the parameters. The gates are the same as in `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.dlt"
@@ -123,7 +125,7 @@ class OrientDlt(Method):
     Out = OrientOut
 
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
-        """Orient the photos one by one."""
+        """Orient each photo separately."""
 
         def estimator(tied: TiedPhoto, _: OrientParams) -> Estimate | str:
             return estimate_dlt(tied, params)
@@ -141,7 +143,8 @@ def relief(points: NDArray[np.float64]) -> tuple[float, float]:
     """Measure the relief of points (n, 3) about their best-fitting plane.
 
     Returns:
-        RMS distance from the plane, and standard deviation along the longest axis, in metres.
+        RMS distance from the plane in metres, and standard deviation along the longest axis in
+        metres.
     """
     centred = points - points.mean(axis=0)
     variances = np.linalg.eigvalsh(np.einsum("ni,nj->ij", centred, centred) / len(points))
@@ -155,12 +158,12 @@ def direct_linear(
     """Solve for the eleven parameters (Abdel-Aziz & Karara 1971, normalised after Hartley 1997).
 
     Args:
-        pixels: (n, 2), at least six.
-        points_world: (n, 3) metres.
+        pixels: (n, 2) pixels of at least six points.
+        points_world: (n, 3) coordinates in metres.
         size_px: width and height of the photo.
 
     Returns:
-        The camera, without distortion and with skew; and the ratio of the largest to the second
+        The camera, with skew but without distortion; and the ratio of the largest to the second
         smallest singular value of the normalised equations, which tends to infinity for coplanar
         points.
 
@@ -176,8 +179,9 @@ def direct_linear(
     rows = np.zeros((len(pixels), 2, 12))
     rows[:, 0, :4], rows[:, 0, 8:] = xyz, -uv[:, :1] * xyz
     rows[:, 1, 4:8], rows[:, 1, 8:] = xyz, -uv[:, 1:] * xyz
-    # Use normal equations with a fixed order of summation, since a singular value decomposition
-    # depends on the number of threads. The subsequent adjustment recovers the lost precision.
+    # Solve normal equations with a fixed order of summation, since the result of a singular value
+    # decomposition depends on the number of threads. The subsequent adjustment restores the lost
+    # precision.
     values, vectors = np.linalg.eigh(np.einsum("nij,nik->jk", rows, rows))
     matrix = vectors[:, 0].reshape(3, 4)
     inverse_px = np.array(
@@ -229,7 +233,7 @@ def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
 
 
 def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[np.float64], float]:
-    """Return the shift and scale that centre the points and set their mean distance to `length`."""
+    """Return the shift and scale that centre points and set their mean distance to `length`."""
     shift = values.mean(axis=0)
     mean = float(np.linalg.norm(values - shift, axis=1).mean())
     if not mean > 0.0:
@@ -243,7 +247,7 @@ def _decomposed(
     """Decompose a projection matrix (3, 4) into lens and pose."""
     if np.linalg.det(matrix[:, :3]) < 0.0:
         matrix = -matrix
-    # RQ decomposition, from QR with rows and columns reversed.
+    # Compute the RQ decomposition by a QR decomposition with rows and columns reversed.
     q, r = np.linalg.qr(matrix[::-1, :3].T)
     upper, rotation = r.T[::-1, ::-1], q.T[::-1]
     signs = np.sign(np.diag(upper))
@@ -278,7 +282,7 @@ def _freedom(distortion: Distortion, size_px: tuple[int, int], *, keeps_skew: bo
 
 
 def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
-    """Return the reason why the control points do not suffice for a DLT; empty if they do."""
+    """Return why the control points do not suffice for a DLT; empty if they do."""
     if len(control) < least:
         return (
             f"only {len(control)} control ties agree with one pose; a DLT with distortion "
@@ -300,16 +304,16 @@ def _with_what_is_missing(
 ) -> Estimate:
     """Add the systematic error of an incomplete lens model to the covariance.
 
-    Residuals contain less than a tenth of the missing distortion, because the other parameters
-    absorb most of it and distort the photo between and beyond the ties. Therefore, the error is
-    that of the complete model plus the difference between the models. Otherwise, for a typical lens
-    with unknown distortion, the predicted error of eleven parameters would be a ninth of the actual
-    error.
+    Residuals show less than a tenth of the missing distortion, because the other parameters absorb
+    most of it, which causes errors between and beyond the ties. Therefore, the covariance is that
+    of the complete model plus the squared difference between the models. Without this term, the
+    predicted error with eleven parameters would be a ninth of the actual error for a typical lens
+    with unknown distortion.
 
     Args:
         estimate: estimate with the incomplete model.
-        control: its control points.
-        start: initial values of its adjustment.
+        control: the control points.
+        start: initial values of the adjustment.
         freedom: free lens parameters of the complete model.
     """
     model = estimate.resection
@@ -325,7 +329,8 @@ def _with_what_is_missing(
     except GeometryError:
         return estimate
     points = control.points_world
-    # Mean square per coordinate, without the part explained by the complete model's own variance.
+    # Mean squared difference per coordinate, minus the part that the variance of the complete model
+    # explains.
     moved_px = _moved_px(model.camera, full.camera, points)
     missing = 0.5 * float((moved_px**2).sum(axis=1).mean()) - _variance_px2(full, points)
     if missing <= 0.0:
@@ -334,7 +339,7 @@ def _with_what_is_missing(
     wider = replace(model, covariance=full.covariance + np.outer(bias, bias), lens=full.lens)
     factor = _variance_px2(wider, points) / _variance_px2(model, points)
     wider = replace(wider, variance_factor=factor * model.variance_factor)
-    # The variance factor already includes the misfit of the lens that neighbouring ties share.
+    # The variance factor already includes the error of the lens model that neighbouring ties share.
     beyond_noise = factor * model.variance_factor / model.sigma0**2
     notes: tuple[Note, ...] = ()
     if model.sigma0 > _MAX_SIGMA0 or beyond_noise > _MAX_SIGMA0**2:
@@ -354,8 +359,8 @@ def _flat(control: SeenPoints, why: str) -> str:
 def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArray[np.float64]:
     """Return the parameter change (p,) that best reproduces the complete model in the photo.
 
-    The plain difference of the parameters is unsuitable, because large changes of focal length and
-    distance compensate each other, but not in the linearised model.
+    The difference of the parameters is unsuitable: large changes of focal length and distance
+    compensate each other, but not in the linearised model.
     """
     middle = control.points_world.mean(axis=0)
     points = _frame_points(camera, control) - middle
@@ -370,7 +375,10 @@ def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArra
 
 
 def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.float64]:
-    """Return points (n, 3) on a grid over the photo, at the range of the nearest control point."""
+    """Return points (n, 3) on rays through a grid of pixels, at the range of control points.
+
+    Each point has the range of the control point nearest to it in the photo.
+    """
     across, down = ((np.arange(_FRAME) + 0.5) / _FRAME for _ in range(2))
     pixels = np.stack(np.meshgrid(across * camera.width, down * camera.height), axis=-1)
     pixels = pixels.reshape(-1, 2)
@@ -387,11 +395,11 @@ def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.floa
 def _moved_px(
     camera: ViewingCamera, other: ViewingCamera, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the differences (n, 2) in pixels between the projections by two cameras."""
+    """Return the differences (n, 2), in pixels, between the projections by two cameras."""
     return other.project(points)[:, :2] - camera.project(points)[:, :2]
 
 
 def _variance_px2(resection: Resection, points: NDArray[np.float64]) -> float:
-    """Return the mean predicted variance of a pixel coordinate of points (n, 3)."""
+    """Return the predicted variance of a pixel coordinate, averaged over points (n, 3)."""
     covariances = predicted_covariances(resection, points)
     return 0.5 * float(np.trace(covariances, axis1=1, axis2=2).mean())

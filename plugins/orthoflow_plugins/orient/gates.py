@@ -1,6 +1,6 @@
 """Gates: the criteria that an orientation must meet.
 
-Each gate declares a value of the orientation, a limit, and the reason to give for a refusal.
+Each gate declares a value of the orientation, a limit, and the reason for a rejection.
 """
 
 from __future__ import annotations
@@ -33,19 +33,21 @@ from orthoflow_plugins.orient.pose import (
 )
 
 _GRID_SIDE: Final = 15
-# Minimum cosine of the angle of incidence; more oblique photos are not used for orthoimages.
+# Minimum cosine of the angle of incidence; photos at more oblique angles are not used for
+# orthoimages.
 _GRAZING_COSINE: Final = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class KnownWall:
-    """A wall as described by ties.
+    """A wall as described in `Ties` or by its tie points.
 
     Attributes:
         index: index of the wall.
         number: number of its plane in `planes.json`, for messages.
         name: name of the wall, for messages.
-        corners_world: (4, 3) metres: top-left, then counter-clockwise as seen by the viewer.
+        corners_world: (4, 3) corners in metres, counter-clockwise from the top left as seen by the
+            viewer.
         normal: (3,) unit vector towards the viewer.
         gsd_m: cell size of its raster, or None if unknown.
         has_side: whether the normal is known to point to the viewer.
@@ -65,12 +67,14 @@ class WallError:
     """Predicted error of a photo on its walls.
 
     Attributes:
-        rms_m: standard deviation of a coordinate in the wall's plane, RMS over the footprint.
+        rms_m: standard deviation of a coordinate in the plane of the wall, as RMS over the
+            footprint.
         worst_m: largest standard deviation in the footprint and at the image corners.
-        corners_m: (4,) standard deviations at the image corners: top-left, top-right, bottom-left,
-            bottom-right; NaN where a corner shows none of the walls.
-        footprint_px: (n, 2) pixels of the grid points in the footprint.
-        sigmas_m: (n,) standard deviation of a coordinate in the wall's plane at these points.
+        corners_m: (4,) standard deviations at the top-left, top-right, bottom-left and bottom-right
+            image corners; NaN if a corner shows none of the walls.
+        footprint_px: (n, 2) photo pixels of the grid points on the walls that are visible in the
+            photo.
+        sigmas_m: (n,) standard deviation of a coordinate in the plane of the wall at these points.
     """
 
     rms_m: float
@@ -81,7 +85,7 @@ class WallError:
 
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
-    """Describe the walls of the chosen ties as in `ties.walls` or, if missing, by their points."""
+    """Return the walls of the chosen ties, from `ties.walls` or from the points of the ties."""
     known = []
     for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]).tolist():
         has_side = index < len(ties.walls)
@@ -104,7 +108,7 @@ def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
 
 
 def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | None:
-    """Predict the error on the walls from the covariance; None if the photo shows none of them."""
+    """Predict the error on the walls from the covariance; None if the photo shows no wall."""
     parts = [_variances(resection, wall, _grid(wall, (_GRID_SIDE, _GRID_SIDE))) for wall in walls]
     variances = np.concatenate([np.empty(0), *(part[0] for part in parts)])
     shown = np.isfinite(variances)
@@ -123,19 +127,19 @@ def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | 
 def sigmas_on_wall(
     resection: Resection, wall: KnownWall, shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Predict the standard deviation of a coordinate in a wall's plane, on a grid over the wall.
+    """Predict the standard deviation of a coordinate in the plane of a wall, on a grid.
 
     Returns:
-        (rows, cols) metres, first row at the top; NaN where the photo does not show the wall.
+        (rows, cols) standard deviations in metres, first row at the top; NaN where the photo does
+        not show the wall.
     """
     variances, _ = _variances(resection, wall, _grid(wall, shape))
     return np.sqrt(variances).reshape(shape)
 
 
 def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
-    """Return variances (4,) at the image corners, each the largest on any wall shown there."""
+    """Return variances (4,) at the image corners, each the largest on the walls shown there."""
     camera, worst = resection.camera, np.full(4, np.nan)
-    # Centres of the pixels in the corners.
     corners_px = np.array(
         [[u, v] for v in (0.5, camera.height - 0.5) for u in (0.5, camera.width - 0.5)]
     )
@@ -154,7 +158,7 @@ def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.
 
 
 def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the cell centres (rows * cols, 3) of a grid over a wall's rectangle."""
+    """Return the cell centres (rows * cols, 3) of a grid over the rectangle of a wall."""
     top_left, bottom_left, _, top_right = wall.corners_world
     down, along = (
         axis.ravel()
@@ -171,7 +175,7 @@ def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
 def _variances(
     resection: Resection, wall: KnownWall, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return variances (n,) and pixels (n, 2) of wall points; NaN where not shown."""
+    """Return variances (n,) and pixels (n, 2) of wall points; NaN where not visible."""
     pixels = _seen(resection.camera, points, wall.normal)
     variances = np.full(len(points), np.nan)
     shown = np.isfinite(pixels[:, 0])
@@ -203,7 +207,7 @@ def _seen(
 
 
 def _about(points: NDArray[np.float64]) -> TieWall:
-    """Return the bounding rectangle of points in their best-fitting plane, as a wall."""
+    """Return the bounding rectangle of points, in the plane that fits them best, as a wall."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ axes[:2].T
@@ -217,8 +221,8 @@ def _about(points: NDArray[np.float64]) -> TieWall:
 
 _MIN_TIES: Final = 8
 _CROWDED_RATIO: Final = 10
-# Unlike those of wrong ties, residuals of correct ties are concentrated near 0. Therefore, several
-# radii are tested, given as shares of the limit.
+# Residuals of correct ties are concentrated near 0, unlike those of wrong ties. Therefore, several
+# radii are tested, which are given as shares of the limit.
 _CHANCE_RADII: Final = (0.2, 0.35, 0.6, 1.0)
 _PLACE_PX: Final = 8.0
 _MIN_CHECKS: Final = 5
@@ -249,19 +253,19 @@ FOCAL_ESTIMATED: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """An orientation with the values that the gates test; None for undefined values.
+    """An orientation and the values that the gates test; undefined values are None.
 
     Attributes:
         photo: the photo.
-        seen: its ties.
+        seen: ties of the photo.
         is_check: (n,) True for check points.
         walls: (n,) index of the wall of each tie.
         estimate: the estimated pose.
         known: the walls of the inliers.
-        error: predicted error on these walls, None if the photo shows none of them.
-        params: parameters with the limits.
-        search_radius_px: radius around the expected positions within which ties were searched for,
-            so that wrong ties are within it, too; inf if the whole photo was searched.
+        error: predicted error on these walls; None if the photo shows none of them.
+        params: parameters that contain the limits.
+        search_radius_px: radius around the expected positions within which ties were searched for;
+            infinite if the whole photo was searched. Wrong ties are also within this radius.
     """
 
     photo: Photo
@@ -276,17 +280,17 @@ class Candidate:
 
     @cached_property
     def control(self) -> NDArray[np.bool_]:
-        """Inliers among the control points."""
+        """Mask (n,) of the inliers among the control points."""
         return self.estimate.agreeing & ~self.is_check
 
     @cached_property
     def withheld(self) -> NDArray[np.bool_]:
-        """Inliers among the check points."""
+        """Mask (n,) of the inliers among the check points."""
         return self.estimate.agreeing & self.is_check
 
     @cached_property
     def checked(self) -> NDArray[np.bool_]:
-        """Inliers among the check points that do not duplicate a control point.
+        """Mask (n,) of the inliers among the check points that do not duplicate a control point.
 
         A key point with two main directions has two features at the same position, and both may be
         matched with the same point.
@@ -303,19 +307,19 @@ class Candidate:
 
     @cached_property
     def gsd_m(self) -> float | None:
-        """Smallest cell size of its walls, None if unknown."""
+        """Smallest cell size of the walls in metres; None if unknown."""
         return min((wall.gsd_m for wall in self.known if wall.gsd_m is not None), default=None)
 
     @property
     def chance(self) -> float:
-        """Binomial probability that at least as many check points agree with a wrong pose."""
+        """Probability that at least as many check points agree with a wrong pose (binomial)."""
         from scipy.special import bdtrc  # importing scipy.stats would take seconds
 
         fit, limit = self.estimate.fit, self.estimate.limit
         inside = self.estimate.agreeing & (fit.normalised > 0.0)
         lengths_px = np.linalg.norm(fit.residuals_px[inside], axis=1)
         px = float(np.median(lengths_px / fit.normalised[inside]))
-        # Wrong ties occur only where there is texture, not all over the photo.
+        # Wrong ties occur only in textured areas.
         textured = max(hull_area(self.seen.pixels_photo), 1.0) / 4.0
         area = min(textured, (2.0 * self.search_radius_px) ** 2)
         found = []
@@ -334,32 +338,32 @@ class Candidate:
 
     @property
     def check_over_control(self) -> float | None:
-        """Ratio of the share of inliers among check points to that among control points."""
+        """Share of inliers among check points, divided by that among control points."""
         if self.is_check.sum() < _MIN_CHECKS:
             return None
         return float(self.estimate.agreeing[self.is_check].mean()) / self.control_share
 
     @property
     def check_rms_over_control(self) -> float | None:
-        """Ratio of the RMS residual of check points to that of control points."""
+        """RMS residual of check points, divided by that of control points."""
         if self.withheld.sum() < _MIN_CHECKS:
             return None
         squares = self.estimate.fit.normalised**2
         return math.sqrt(squares[self.withheld].mean() / squares[self.control].mean())
 
     def in_cells(self, length_m: float) -> float | None:
-        """Convert a length on the wall to cells of its raster; None if the cell size is unknown."""
+        """Convert a length on the wall to raster cells; None if the cell size is unknown."""
         return length_m / self.gsd_m if self.gsd_m else None
 
     @cached_property
     def poor_quarter(self) -> tuple[int, str] | None:
-        """Number of ties in a quarter of the photo with too few ties, and the reason.
+        """Number of ties in the first quarter of the photo with too few ties, and the reason.
 
-        In markiewicz2015, each quarter needs two ties. However, a quarter without ties may show
-        only an obstacle, or an area beyond the end of the wall. Such a photo is usable if the other
-        quarters determine the pose so well that the largest predicted error on the walls in that
-        quarter meets the limit for the average over the photo. A quarter that shows no wall needs
-        no ties. `strict` applies the rule of the paper.
+        In markiewicz2015, each quarter needs two ties. However, a quarter without ties may only
+        show an obstacle or an area beyond the end of the wall. Such a photo is usable if its other
+        quarters determine the pose well enough: the largest predicted error on the walls in the
+        quarter without ties must be below the limit for the average over the photo. A quarter that
+        shows no wall needs no ties. `strict` applies the rule of the paper.
         """
         params = self.params
         for quarter, count in enumerate(self.quadrant_counts):
@@ -382,7 +386,7 @@ class Candidate:
 
     @property
     def before_wall_m(self) -> float | None:
-        """Distance of the camera from the nearest wall with control points and a known side."""
+        """Distance in metres to the nearest wall with control points and a known side."""
         centre = self.estimate.resection.camera.centre_world
         used = self.walls[self.control]
         return min(
@@ -396,9 +400,9 @@ class Candidate:
 
     @cached_property
     def hull_ratio(self) -> float:
-        """Ratio of the area of the control points' hull to the area of the walls in the photo.
+        """Area of the hull of the control points relative to that of the walls in the photo.
 
-        It is 0 if the photo shows none of the walls.
+        The value is 0 if the photo shows none of the walls.
         """
         if self.error is None:
             return 0.0
@@ -409,7 +413,7 @@ class Candidate:
     def needed_tie(self) -> tuple[float, NDArray[np.float64]] | None:
         """Largest predicted error, in cells, if one tie is omitted, and the pixel of that tie.
 
-        An undetected error of a tie displaces the pose by no more than the uncertainty of the pose
+        An undetected error of a tie displaces the pose at most by the uncertainty of the pose
         without that tie.
         """
         without = [wall_error(one, self.known) for one in self.estimate.without_one]
@@ -429,11 +433,12 @@ class Gate:
     """A criterion for an orientation.
 
     Attributes:
-        name: name in the record.
-        value: function that computes the value to test; None passes.
-        limit: the smallest value that passes, or the name of a parameter that contains it.
-        is_upper: whether the limit is the largest value that passes instead.
-        reason: function that returns the reason for a refusal, given the candidate, its value and
+        name: name of the gate in the record.
+        value: function that computes the tested value; None passes the gate.
+        limit: the smallest value that passes, or the name of the parameter that contains this
+            value.
+        is_upper: whether the limit is the largest value that passes, not the smallest.
+        reason: function that returns the reason for a rejection, given the candidate, its value and
             the limit.
     """
 
@@ -596,10 +601,11 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[
 
     Args:
         candidate: the orientation.
-        gates: the gates, in order; if None, they are chosen by the origin of the ties.
+        gates: the gates, in order; if None, they depend on whether the ties were measured by hand.
 
     Returns:
-        Name of the first gate that is not passed, and the reason; None if all are passed.
+        Name of the first gate that the orientation does not pass, and the reason; None if it passes
+        all.
     """
     if gates is None:
         gates = GATES_BY_HAND if candidate.estimate.without_one else GATES
@@ -613,7 +619,7 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[
 
 
 def too_few(n_ties: int) -> str:
-    """Return the reason why there are too few ties for an orientation; empty if they suffice."""
+    """Return why there are too few ties for an orientation; empty if there are enough."""
     if n_ties >= _MIN_TIES:
         return ""
     return (
@@ -638,7 +644,7 @@ def warnings_for(candidate: Candidate) -> list[Note]:
 
 
 def hull_area(pixels: NDArray[np.float64]) -> float:
-    """Return the area of the convex hull of points (n, 2); 0 if collinear or fewer than three."""
+    """Return the area of the convex hull of points (n, 2); 0 if it has no area."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(pixels) < 3:

@@ -40,12 +40,13 @@ POSE_DISAGREES: Final = DiagnosticSpec(
 class OrientGiven(Method):
     """Use poses from other programs unchanged.
 
-    The poses are not verified, so their status is `ok`, the source of their lens is `given`, and
-    their error on the wall is known only if the files contain it. If the ties of the run that
-    estimated the poses are given, they show which walls support these. A photo with at least six
-    ties measured by hand is oriented from these, with the given lens, and must pass the gates for
-    such ties; fewer ties are used only to check the given pose. If no photo shows a wall with its
-    given pose, the poses are refused, since they are not in the coordinate system of the scan.
+    The poses are not verified: their status is `ok`, the source of their lens is `given`, and their
+    error on the wall is known only if the files contain it. If the ties of the run that estimated
+    the poses are connected, they show on which walls each pose is based. A photo with at least six
+    ties measured by hand is oriented from these ties, with the given lens, and must pass the gates
+    for such ties. If there are fewer, they are only used to check the given pose. The poses are
+    rejected if no photo shows a wall with its given pose, since they cannot be in the coordinate
+    system of the scan.
     """
 
     id: ClassVar[str] = "orient.given"
@@ -67,7 +68,7 @@ class OrientGiven(Method):
     Out = OrientOut
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> OrientOut:
-        """Check poses that have ties, and return all poses."""
+        """Check the poses of photos with ties, and return all poses."""
         given = {camera.photo: camera for camera in inputs.cameras.cameras}
         if inputs.walls is not None:
             _require_a_wall_in_view(list(given.values()), inputs.walls)
@@ -148,10 +149,10 @@ def _disagreement(
 
 
 def _joined(hand: Ties, earlier: Ties, kept: NDArray[np.bool_]) -> Ties:
-    """Append those ties of an earlier run that `kept` (n,) selects to ties measured by hand."""
+    """Append ties of an earlier run, selected by `kept` (n,), to ties measured by hand."""
     names = tuple(dict.fromkeys((*hand.photo_names, *earlier.photo_names)))
     place = np.array([names.index(name) for name in earlier.photo_names], dtype=np.int32)
-    # Any, since the arrays of the product are collected by name.
+    # The arrays of the product are collected by name and have various types.
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(hand, name), getattr(earlier, name)[kept]])
         for name in (
@@ -181,10 +182,10 @@ def _on_walls(ties: Ties, walls: Walls | None, *, is_within_buffer: bool) -> Tie
 
 
 def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
-    """Refuse the poses if none of them shows the front of a wall.
+    """Check that at least one photo shows the front of a wall.
 
     Raises:
-        MethodError: none of them shows a wall.
+        MethodError: no photo shows the front of a wall.
     """
     oriented = [camera.viewing() for camera in cameras if camera.status == "ok"]
     for wall in walls.walls:

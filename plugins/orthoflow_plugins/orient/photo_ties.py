@@ -16,12 +16,12 @@ from orthoflow.geometry.key_points import Features, find_features, mutual_matche
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.pose import camera_rays
 
-# Larger photos are reduced: SIFT needs 0.23 GB per million pixels, and thousands of key points at
-# half the resolution are as good as more of them at full resolution.
+# Larger photos are reduced. SIFT needs 0.23 GB per million pixels, and thousands of key points at
+# half the resolution are as good as a larger number at full resolution.
 _MAX_SIDE_PX: Final = 1600
 _MAX_RATIO: Final = 0.85
 _MAX_PARTNERS: Final = 8
-# Limits for matches with poses that are accurate to a few pixels.
+# Limits for matches between photos whose poses are accurate to a few pixels.
 _MAX_OFF_LINE_PX: Final = 6.0
 _MAX_OFF_POINT_PX: Final = 8.0
 _MIN_ANGLE: Final = np.radians(2.0)
@@ -34,9 +34,9 @@ class PhotoTies:
     Attributes:
         photo: (m,) index of the photo of each observation.
         point: (m,) index of the observed point, 0..k-1; each point is observed at least twice.
-        pixels: (m, 2) pixels of the photo.
-        scale: (m,) photo pixels per pixel of the reduced picture in which the key point was found.
-        points_world: (k, 3) metres, intersections of rays for the given poses.
+        pixels: (m, 2) photo pixels of each observation.
+        scale: (m,) photo pixels per pixel of the reduced image in which the key point was found.
+        points_world: (k, 3) points in metres, intersected from the rays of the given poses.
     """
 
     photo: NDArray[np.intp]
@@ -53,19 +53,19 @@ def photo_features(photo: Photo, n_most: int) -> Features:
 
 
 def _reduction(width: int, height: int) -> float:
-    """Return the number of photo pixels per pixel of the picture used for key points."""
+    """Return the number of photo pixels per pixel of the image in which key points are found."""
     return max(1.0, max(width, height) / _MAX_SIDE_PX)
 
 
 def overlapping_pairs(
     cameras: Sequence[ViewingCamera], points: Sequence[NDArray[np.float64]], least_share: float
 ) -> list[tuple[int, int]]:
-    """Choose the pairs of photos with enough overlap.
+    """Select the pairs of photos with enough overlap.
 
     Args:
         cameras: cameras of the photos.
-        points: (n, 3) wall points visible in each photo.
-        least_share: minimum share of each photo's points that the other must show.
+        points: for each photo, the wall points (n, 3) that it shows.
+        least_share: minimum share of the points of each photo that the other photo must show.
     """
     shares = np.zeros((len(cameras), len(cameras)))
     for first, shown in enumerate(points):
@@ -93,7 +93,7 @@ def tie_photos(
         cameras: cameras of the photos, accurate to a few pixels.
         features: key points of the photos.
         pairs: pairs of photos to match.
-        n_most: maximum number of points; those with the most observations are preferred.
+        n_most: maximum number of points; points with the most observations are preferred.
     """
     starts = np.concatenate([[0], np.cumsum([len(item.pixels) for item in features])])
     rays = [
@@ -118,7 +118,7 @@ def _off_line_px(
     first: tuple[ViewingCamera, NDArray[np.float64]],
     second: tuple[ViewingCamera, NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Return the distances (n,) of the second photo's rays from their epipolar lines, in pixels."""
+    """Return the distances (n,), in pixels, between rays of the second photo and epipolar lines."""
     rotation = second[0].rotation @ first[0].rotation.T
     baseline = second[0].translation - rotation @ first[0].translation
     lines = first[1] @ (cross_matrix(baseline) @ rotation).T
@@ -128,7 +128,7 @@ def _off_line_px(
 
 
 def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return tracks of linked key points, longest first, without two key points in one photo."""
+    """Return tracks of linked key points, longest first, with at most one key point per photo."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -154,7 +154,7 @@ def _located(
     rays: Sequence[NDArray[np.float64]],
     tracks: Sequence[NDArray[np.intp]],
 ) -> PhotoTies:
-    """Intersect the rays of each track, and keep tracks that agree, grouped by length."""
+    """Intersect the rays of each track, and keep the tracks whose rays agree, grouped by length."""
     counts = [len(item.pixels) for item in features]
     photo_of = np.repeat(np.arange(len(cameras)), counts)
     pixels = np.vstack([item.pixels for item in features])
@@ -188,9 +188,9 @@ def _located(
 def _meeting(
     tracks: NDArray[np.intp], centres: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return tracks (k, m) whose rays intersect in front of the cameras at a sufficient angle.
+    """Select the tracks (k, m) whose rays intersect in front of the cameras at sufficient angles.
 
-    The second value contains the points of intersection (k, 3).
+    Also return the points of intersection (k, 3).
     """
     unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
     cosines = np.einsum("nid,njd->nij", unit, unit)

@@ -1,4 +1,4 @@
-"""Orientation of single photos: ties, check points, lens priors and acceptance."""
+"""Orientation of single photos: ties, check points, lens priors and tests."""
 
 from __future__ import annotations
 
@@ -45,13 +45,14 @@ from orthoflow_plugins.orient.report import Oriented, numbers_json
 
 MIN_TIES: Final = 6
 _MAX_WRONG: Final = 2
-# Maximum number of subsets to try, which suffices to leave out any two of 24 ties.
+# Maximum number of subsets to try. It is large enough to leave out any two of 24 ties.
 _MAX_TRIALS: Final = 300
-# Probability that correct ties are classified as contradictory.
+# Accepted probability of classifying correct ties as contradictory.
 _CONTRADICTION: Final = 1e-3
 # Limit of residuals, in standard deviations of a coordinate.
 _LIMIT: Final = 3.5
-# Poses that differ by more than this are distinct; the same pose from two starts differs far less.
+# Poses that differ by more than this angle are distinct. From different initial values, the same
+# pose differs by far less.
 _ONE_POSE_RAD: Final = math.radians(2.0)
 BY_HAND: Final = DiagnosticSpec(
     code="photo-oriented-by-hand",
@@ -78,10 +79,10 @@ def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
     """Orient a photo from its ties measured by hand; return the reason if this fails.
 
     Args:
-        tied: the photo, with at least `MIN_TIES` ties measured by hand.
+        tied: the photo, which must have at least `MIN_TIES` ties measured by hand.
 
     Returns:
-        The orientation from these ties only, and the start of an adjustment with all ties.
+        The orientation from these ties only, and the initial values of an adjustment with all ties.
     """
     seen = tied.seen
     known, hand = lens_prior(tied.photo), seen.take(tied.by_hand)
@@ -113,7 +114,7 @@ def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
 
 
 def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] | str:
-    """Find consistent ties: all of them, or all except one or two that are clearly wrong."""
+    """Find consistent ties: all ties, or all except one or two that are clearly wrong."""
     n_most = min(_MAX_WRONG, len(hand) - MIN_TIES)
     if math.comb(len(hand), n_most) > _MAX_TRIALS:
         n_most = 1
@@ -147,7 +148,7 @@ def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] |
 
 
 def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
-    """Adjust from every initial pose, and yield the fits that are consistent with the ties."""
+    """Adjust from each initial pose, and yield the fits that are consistent with the ties."""
     from scipy.special import chdtrc  # importing scipy.stats would take seconds
 
     for lens in (known.prior, *known.guesses):
@@ -156,7 +157,7 @@ def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
                 found = adjust(seen, start, prior=lens, lens=known.freedom)
             except GeometryError:
                 continue
-            # The prior of the lens counts as observations.
+            # The prior of the lens counts as additional observations.
             cofactors = np.diag(found.covariance / found.sigma0**2)
             of_lens = cofactors[POSE_PARAMETERS:] / found.lens.sigmas**2
             redundancy = float(2 * len(seen) - len(cofactors) + of_lens.sum())
@@ -178,7 +179,7 @@ def _distinct(fits: Iterator[_Fit]) -> list[_Fit]:
 
 
 def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
-    """Return initial poses by SQPnP and, for coplanar points, by IPPE."""
+    """Compute initial poses by SQPnP and, for coplanar points, by IPPE."""
     import cv2
 
     straight = undistorted_pixels(seen.pixels_photo, lens)
@@ -192,7 +193,7 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
     centroid = points.mean(axis=0)
     _, across, axes = np.linalg.svd(points - centroid, full_matrices=False)
     if across[2] < 1e-2 * across[1]:
-        # IPPE requires exactly coplanar points.
+        # IPPE only accepts exactly coplanar points.
         flat = points - np.outer((points - centroid) @ axes[2], axes[2])
         posed.append((cv2.SOLVEPNP_IPPE, flat))
     call: Any = cv2.solvePnPGeneric
@@ -220,18 +221,18 @@ def _as_stated(resection: Resection) -> Resection:
 
 
 def _places(pixels: NDArray[np.float64] | Sequence[NDArray[np.float64]]) -> str:
-    """List pixels in the convention of files with ties."""
+    """Format pixels in the convention of tie files."""
     counted = to_opencv(np.asarray(pixels))
     return ", ".join(f"(u {u:.0f}, v {v:.0f})" for u, v in counted)
 
 
 _SEED_LIMIT: Final = 2**31 - 1
-# Check points are drawn evenly from a grid with this many cells per side.
+# Check points are selected evenly from a grid with this many cells per side.
 _STRATA: Final = 6
-# Number of photos with which the EXIF focal length of a lens is tested.
+# The EXIF focal length of a lens is tested with at most this many photos.
 _TESTED_PER_LENS: Final = 5
-# If the focal lengths of at least this many photos of a camera agree within this factor, they take
-# precedence over the contradicting EXIF value of another photo.
+# If at least this many photos of a camera agree on the focal length within this factor, they take
+# precedence over a contradicting EXIF value of another photo.
 _MIN_OTHERS: Final = 2
 _SAME_FOCAL: Final = 1.05
 EXIF_CONTRADICTED: Final = DiagnosticSpec(
@@ -257,9 +258,9 @@ class Trusted:
 
     Attributes:
         tied: the photo with its ties.
-        estimate: its separate orientation.
-        by_hand: its orientation only from ties measured by hand, or None.
-        kept: (n,) bool, the ties used in `by_hand`.
+        estimate: the separate orientation of the photo.
+        by_hand: the orientation only from ties measured by hand, or None.
+        kept: (n,) bool, the ties used for `by_hand`.
     """
 
     tied: TiedPhoto
@@ -268,7 +269,7 @@ class Trusted:
     kept: NDArray[np.bool_]
 
     def judged(self, ties: Ties, params: OrientParams, estimate: Estimate) -> Oriented:
-        """Test a pose; if it fails or contradicts ties by hand, return the pose from these ties."""
+        """Test a pose; return the pose from ties by hand if it fails or contradicts these ties."""
         found = judged(self.tied, candidate_of(self.tied, ties, params, estimate))
         is_with_hand = not (self.kept & (found.role == TieRole.REJECTED)).any()
         if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
@@ -280,7 +281,7 @@ Look = TypeVar("Look", bound=Trusted | Oriented)
 
 
 def require(ties: Ties, photos: Photos) -> None:
-    """Refuse inputs without photos or ties.
+    """Check that there are photos and ties, and that the ties refer to these photos.
 
     Raises:
         MethodError: there are no photos or no ties, or the ties refer to other photos.
@@ -304,8 +305,8 @@ def require(ties: Ties, photos: Photos) -> None:
 def tied_photo(
     photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
 ) -> TiedPhoto:
-    """Choose the ties of a photo and split them into control and check points."""
-    # Draw once per photo, so that its samples do not depend on the ties of other photos.
+    """Select the ties of a photo, and split them into control and check points."""
+    # Draw one seed per photo, so that its samples do not depend on the ties of other photos.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
     chosen = ties_of_photo(ties, photo.name)
     chosen = chosen[ties.role[chosen] != TieRole.REJECTED]
@@ -338,10 +339,10 @@ def withheld(
     share: float,
     rng: np.random.Generator,
 ) -> NDArray[np.bool_]:
-    """Choose check points (n,): a share of the ties, evenly from all parts of the image.
+    """Select check points (n,): a share of the ties, evenly from all parts of the image.
 
-    The ties are shuffled and sorted by image cell; then every (1 / share)-th tie is taken. So each
-    cell contributes its share, and the total is at least `share`.
+    The ties are shuffled and sorted by image cell; then every (1 / share)-th tie is selected. Each
+    cell thus contributes its share, and the share of all ties is at least `share`.
     """
     shuffled = rng.permutation(len(pixels_photo))
     cells = image_cells(pixels_photo, size_px, _STRATA)
@@ -358,9 +359,9 @@ def with_believable_priors(
 ) -> list[Photo]:
     """Replace EXIF focal lengths that contradict the ties.
 
-    Due to digital zoom, adapters or cropping, EXIF may be wrong for all photos of a lens. The
-    photos with the most ties are tested, and the resulting focal length is used for all photos of
-    the lens.
+    Because of digital zoom, adapters or cropping, EXIF may be wrong for all photos taken with a
+    lens. The photos with the most ties are tested, and the resulting focal length is used for all
+    photos taken with that lens.
     """
     believed = list(photos)
     lenses: dict[tuple[object, ...], list[int]] = {}
@@ -369,8 +370,8 @@ def with_believable_priors(
             key = (photo.camera, photo.width, photo.height, photo.exif_focal_px)
             lenses.setdefault(key, []).append(at)
     for members in lenses.values():
-        # Use a separate random generator, so that orientations do not depend on the presence of
-        # EXIF.
+        # Use a separate random generator, so that orientations do not depend on whether EXIF
+        # exists.
         rng = np.random.default_rng(0)
         tied = [tied_photo(photos[at], ties, params, rng) for at in members]
         tied.sort(key=lambda each: -len(each.seen))
@@ -421,13 +422,13 @@ def looked_at(
     ctx: StepContext,
     share: float = 1.0,
 ) -> list[Look]:
-    """Orient photos one by one, and again if EXIF contradicts other photos of the camera.
+    """Orient photos one by one; repeat those whose EXIF contradicts other photos of the camera.
 
     Args:
         photos: the photos.
         look: function that orients one photo.
         ctx: context for progress and diagnostics.
-        share: share of the step's progress.
+        share: share of the progress of the step.
     """
     found = []
     for nth, tied in enumerate(photos):
@@ -445,7 +446,6 @@ def looked_at(
 
 
 def _focal_px(found: Trusted | Oriented) -> float | None:
-    """Return the focal length of an oriented photo; None if it is not oriented."""
     if isinstance(found, Trusted):
         return found.estimate.resection.camera.fx
     return found.camera.intrinsics.fx if found.camera.intrinsics is not None else None
@@ -454,7 +454,7 @@ def _focal_px(found: Trusted | Oriented) -> float | None:
 def _focal_of_others(
     photo: Photo, photos: Sequence[TiedPhoto], found: Sequence[Trusted | Oriented]
 ) -> float | None:
-    """Return the focal length of the camera's other photos if they agree and contradict EXIF."""
+    """Return the focal length of other photos of the camera if they agree and contradict EXIF."""
     if photo.intrinsics is not None or photo.exif_focal_px is None:
         return None
     camera = (photo.camera, photo.width, photo.height)
@@ -477,14 +477,14 @@ def by_itself(
     """Orient a photo from its own ties.
 
     Returns:
-        A final result if the photo is oriented only from ties by hand or not at all; otherwise an
-        orientation that is still to be tested.
+        A final result if the photo is oriented only from ties by hand or not at all; otherwise, an
+        orientation that has yet to be tested.
     """
     alone, kept = None, np.zeros(len(tied.seen), dtype=np.bool_)
     reason = too_few(len(tied.seen))
     if tied.by_hand.sum() >= MIN_TIES:
         alone, pose = oriented_by_hand(tied, ties, params)
-        # Ties by hand are never check points, so other ties are needed to check the pose.
+        # Ties measured by hand are never check points, so other ties are needed to check the pose.
         too_few_others = too_few(int((~tied.by_hand).sum()))
         if pose is not None:
             own, start = pose
@@ -525,7 +525,7 @@ def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, start: Start) -> 
 def candidate_of(
     tied: TiedPhoto, ties: Ties, params: OrientParams, estimate: Estimate
 ) -> Candidate:
-    """Return the data with which an orientation is tested."""
+    """Collect the values with which an orientation is tested."""
     used = np.zeros(len(ties.photo), dtype=np.bool_)
     used[tied.chosen[estimate.agreeing]] = True
     known = known_walls(ties, used)
@@ -545,7 +545,7 @@ def candidate_of(
 
 
 def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
-    """Accept an orientation, or refuse it with a reason."""
+    """Accept an orientation, or reject it with a reason."""
     against, estimate = refusal(candidate), candidate.estimate
     entry = numbers_json(candidate) if candidate.control.any() else {}
     if against is not None:

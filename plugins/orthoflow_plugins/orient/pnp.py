@@ -30,17 +30,17 @@ from orthoflow_plugins.orient.pose import (
 )
 from orthoflow_plugins.orient.report import hand_over
 
-# solvePnP needs six points unless they are coplanar.
+# solvePnP needs six points if they are not coplanar.
 _LEAST: Final = 6
 
 
 class OrientPnp(Method):
-    """Orient each photo separately: a robust pose, then a weighted adjustment with the full lens.
+    """Orient each photo separately by a robust pose and a weighted adjustment with the full lens.
 
-    Some ties are withheld to check the pose. A photo is `ok` only if it has enough ties, they are
-    well distributed, more withheld ties agree than would by chance, the camera is in front of the
-    wall, and the predicted error on the wall is small; otherwise its status is the reason for its
-    rejection.
+    Some ties are withheld as check points. The status of a photo is `ok` only if it has enough
+    well-distributed ties, if more withheld ties agree with the pose than expected by chance, if the
+    camera is in front of the wall, and if the predicted error on the wall is small. Otherwise, the
+    status is the reason for the rejection.
     """
 
     id: ClassVar[str] = "orient.pnp"
@@ -68,7 +68,7 @@ class OrientPnp(Method):
     Out = OrientOut
 
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
-        """Orient the photos one by one."""
+        """Orient each photo separately."""
         estimator = estimate_pose if params.method == "weighted" else estimate_by_opencv
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
         return OrientOut(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
@@ -80,16 +80,16 @@ class OrientPnp(Method):
 
 
 def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo by `cv2.solvePnP` (Levenberg-Marquardt); return the reason if this fails.
+    """Orient a photo by `cv2.solvePnP` (Levenberg-Marquardt); return a reason if this fails.
 
-    All ties have the same weight, the lens is fixed, and solvePnP gets no initial pose. Outliers
-    are rejected, and solvePnP is called again, until the set of inliers no longer changes. The
-    first inliers come from robust sampling, since least squares with all ties would fail.
+    All ties have the same weight, the lens is fixed, and solvePnP gets no initial pose. solvePnP
+    and the rejection of outliers alternate until the set of inliers no longer changes. The first
+    inliers are found by robust sampling, since least squares with all ties would fail.
     """
     robust = robust_start(tied, params)
     if robust is None:
         return no_pose(tied.seen)
-    # All pixels have the same uncertainty, and the points are considered exact.
+    # solvePnP assumes that all pixels have the same uncertainty and that the points are exact.
     n = len(tied.seen)
     sigma_px = np.full(n, expected_px(tied.control(robust.agreeing)))
     equal = replace(tied, seen=replace(tied.seen, sigma_px=sigma_px, sigma_m=np.zeros(n)))
@@ -101,7 +101,7 @@ def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
 
 
 def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
-    """Return the camera at the pose of solvePnP.
+    """Return the camera with the pose from solvePnP.
 
     Raises:
         GeometryError: solvePnP finds no pose.
@@ -112,9 +112,9 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
         raise GeometryError(f"solvePnP needs {_LEAST} ties; only {len(seen)} agree with one pose")
     if lens.skew:
         raise GeometryError(f"solvePnP does not support skew, and the lens has {lens.skew:.1f} px")
-    # Large survey coordinates would reduce the precision.
+    # Shift the origin, since large survey coordinates would reduce the precision.
     middle = seen.points_world.mean(axis=0)
-    # Any, because OpenCV's type stubs do not accept these arrays.
+    # The type stubs of OpenCV do not accept these arrays.
     call: Any = cv2.solvePnP
     try:
         found, turn, shift = call(

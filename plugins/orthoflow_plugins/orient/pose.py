@@ -1,4 +1,4 @@
-"""Pose of a single photo: lens prior, robust start, adjustment and rejection of ties."""
+"""Pose of a single photo: lens prior, robust initial pose, adjustment and rejection of ties."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
 from orthoflow.sdk import DiagnosticSpec, MethodParams, MetricSpec, Ports
 
-# Declaration and values of a diagnostic about a photo.
+# Declaration and values of a diagnostic about one photo.
 Note: TypeAlias = tuple[DiagnosticSpec, Mapping[str, Any]]
 NOT_ORIENTED: Final = DiagnosticSpec(
     code="photo-not-oriented",
@@ -45,7 +45,7 @@ NOT_ORIENTED: Final = DiagnosticSpec(
 def _median_and_worst(
     name: str, label: str, *, is_headline: bool = False, description: str = ""
 ) -> tuple[MetricSpec, MetricSpec]:
-    """Declare a metric with its median and worst value over the photos."""
+    """Declare a metric that consists of the median and the worst value over the photos."""
 
     def spec(which: str, **more: Any) -> MetricSpec:
         return MetricSpec(
@@ -100,7 +100,7 @@ class OrientOut(Ports):
 
 
 class OrientParams(MethodParams):
-    """Rejection, share of check points, and the limits of the gates."""
+    """Rejection of ties, share of check points, and limits of the gates."""
 
     rejection_sigma: float = Field(
         default=3.5,
@@ -168,16 +168,16 @@ reduced the accuracy and underestimated the error by a further 10 %.
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
 _MAX_TRIALS: Final = 20_000
-# The standard deviation of unit weight has converged if its relative change is below this.
+# The standard deviation of unit weight has converged if it changes relatively by less than this.
 _SETTLED_SHARE: Final = 0.02
 _SIGMA0_RANGE: Final = (0.1, 3.0)
 _MAX_CHANCE_SHARE: Final = 0.1
 _TIGHTENING: Final = 0.8
 _MAX_TIGHTENED: Final = 7
-# Minimum number of ties for the adjustment of a lens with a prior.
+# Minimum number of ties to adjust a lens that has a prior.
 _LEAST_FOR_LENS: Final = 8
-# A calibration belongs to another lens if its focal length deviates from that determined by the
-# ties by more than both limits.
+# A calibration belongs to another lens if its focal length differs from that determined by the ties
+# by more than both limits.
 _MIN_FOCAL_OFF: Final = 0.03
 _FOCAL_OFF_SIGMAS: Final = 5.0
 _LEAST_FOR_FOCAL: Final = 25
@@ -198,8 +198,8 @@ class Lens:
     """The lens of one or more photos.
 
     Attributes:
-        prior: the most likely lens; its pose is not used.
-        freedom: prior standard deviations of its parameters.
+        prior: camera with the most likely lens; its pose is not used.
+        freedom: prior standard deviations of the lens parameters.
         source: source of the prior: `calibration`, `exif`, `UNKNOWN` ...
         guesses: other lenses to try for the first pose.
     """
@@ -211,7 +211,7 @@ class Lens:
 
 
 def lens_prior(photo: Photo) -> Lens:
-    """Return the prior of a photo's lens, with focal lengths to try."""
+    """Return the prior for the lens of a photo, with focal lengths to try."""
     known, freedom = photo.lens_prior()
     if photo.intrinsics is not None:
         return Lens(prior=known, freedom=freedom, source=photo.intrinsics.source)
@@ -237,11 +237,11 @@ def lens_groups(
         cameras: cameras from separate orientations, as initial values of lenses without a prior.
         sharing: with `focal-group`, photos of the same size share a lens if they have the same EXIF
             focal length or calibration, or if they have neither; with `shared`, all photos of the
-            same size share a lens; with `per-photo`, none do.
+            same size share a lens; with `per-photo`, each photo has its own lens.
         apart: photos that get a separate lens in any case.
 
     Returns:
-        Index of each photo's lens, and the lenses.
+        Index of the lens of each photo, and the lenses.
     """
     members: dict[tuple[object, ...], list[int]] = {}
     for at, photo in enumerate(photos):
@@ -263,7 +263,7 @@ def lens_groups(
 
 
 def focal_sigma(resection: Resection) -> float:
-    """Return the standard deviation of ln(focal length); inf if it was not adjusted."""
+    """Return the standard deviation of ln(focal length); infinite if it was not adjusted."""
     if "focal" not in resection.lens.names:
         return math.inf
     column = POSE_PARAMETERS + resection.lens.names.index("focal")
@@ -271,7 +271,7 @@ def focal_sigma(resection: Resection) -> float:
 
 
 def camera_rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rays (n, 3) with z = 1 in camera axes; NaN where the distortion has no inverse."""
+    """Return rays (n, 3) in camera axes, with z = 1; NaN where the distortion has no inverse."""
     found = undistorted(*camera.bent_rays(pixels.T), camera.distortion)
     rays = np.column_stack([found[0], found[1], np.ones(len(pixels))])
     rays[~(found[2] < _UNDONE)] = np.nan
@@ -284,9 +284,9 @@ class TiedPhoto:
 
     Attributes:
         photo: the photo.
-        chosen: (n,) indices of its ties among all ties.
+        chosen: (n,) indices of the ties of the photo among all ties.
         seen: these ties as observations.
-        is_check: (n,) True for check points, which are withheld from every estimation.
+        is_check: (n,) True for check points, which are never used to estimate the pose.
         by_hand: (n,) True for ties measured by hand.
         seed: seed of the robust sampling.
     """
@@ -310,13 +310,13 @@ class Estimate:
     Attributes:
         resection: the adjusted camera.
         source: source of the lens prior: `calibration`, `exif`, `none` ...
-        fit: residuals of all ties of the photo, control and check points.
-        agreeing: (n,) bool, ties within the limit.
-        limit: rejection limit in standard deviations, as in `fit.normalised`.
+        fit: residuals of all ties of the photo, both control and check points.
+        agreeing: (n,) bool, ties whose residuals are within the limit.
+        limit: rejection limit for `fit.normalised`, in standard deviations.
         notes: diagnostics of the method.
         numbers: further results of the method by name, for the record.
-        without_one: for a pose from ties measured by hand, the accuracy if each of them is left out
-            in turn; otherwise empty.
+        without_one: for a pose from ties measured by hand, the accuracy without each of these ties;
+            otherwise empty.
     """
 
     resection: Resection
@@ -361,7 +361,7 @@ class Start:
 
 
 def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo from its weighted control points; return the reason if this fails."""
+    """Orient a photo from its weighted control points; return a reason if this fails."""
     start = robust_start(tied, params)
     if start is None:
         return no_pose(tied.seen)
@@ -373,10 +373,10 @@ def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
 
 
 def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
-    """Return the focal length in pixels from a photo's ties if it contradicts EXIF.
+    """Return the focal length in pixels from the ties of a photo if it contradicts EXIF.
 
     Returns:
-        None if it agrees with EXIF or cannot be determined.
+        None if the focal length agrees with EXIF or cannot be determined.
     """
     exif_px = tied.photo.exif_focal_px
     if tied.photo.intrinsics is not None or exif_px is None or len(tied.seen) < _LEAST_FOR_FOCAL:
@@ -398,7 +398,7 @@ def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
 
 
 def no_pose(seen: SeenPoints) -> str:
-    """Return the message that too few ties agree."""
+    """Return the message that too few ties agree with one pose."""
     return f"no pose agrees with enough of its {len(seen)} ties"
 
 
@@ -407,7 +407,7 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
     lens, control = lens_prior(tied.photo), tied.seen.take(~tied.is_check)
     threshold_px = params.threshold_px
     if threshold_px is None:
-        # With an approximate lens, even correct ties deviate more.
+        # With an approximate lens, residuals of correct ties are larger.
         slack = 1.0 if lens.source not in ("exif", UNKNOWN) else 2.0
         threshold_px = slack * params.rejection_sigma * expected_px(control)
     best: tuple[ViewingCamera, NDArray[np.bool_]] | None = None
@@ -419,7 +419,7 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
         return None
     agreeing = np.zeros(len(tied.seen), dtype=np.bool_)
     agreeing[~tied.is_check] = best[1]
-    # Duplicate points do not contribute to a pose.
+    # Ties with the same point count only once towards a pose.
     if len(set(map(tuple, tied.seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
     return Start(camera=best[0], lens=replace(lens, prior=best[0]), agreeing=agreeing)
@@ -428,14 +428,14 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
 def adjusted(
     tied: TiedPhoto, start: Start, params: OrientParams, solve: Solver | None = None
 ) -> Estimate:
-    """Alternate adjustment and rejection until the set of control points no longer changes.
+    """Alternate between adjustment and rejection until the control points no longer change.
 
     Args:
         tied: the photo.
-        start: pose, lens and first control points.
+        start: initial pose, lens and control points.
         params: parameters of the rejection.
-        solve: function that estimates the pose; None for the weighted, robust adjustment of pose
-            and lens.
+        solve: function that estimates the pose; if None, the weighted robust adjustment of pose and
+            lens is used.
 
     Raises:
         GeometryError: the inliers do not determine the camera.
@@ -447,7 +447,7 @@ def adjusted(
         used = agreeing & ~is_check
         lens = start.lens.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
         control, soft_limit = seen.take(used), math.inf if solve else SOFT_LIMIT * unit
-        # If the lens is not adjusted, use the lens of the prior.
+        # Use the lens of the prior if the lens is not adjusted.
         begin = camera if lens.sigmas.size else posed(prior, camera)
         if solve:
             camera = solve(control, begin)
@@ -485,11 +485,11 @@ def image_cells(
 
 
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
-    """Tighten a limit until it accepts hardly any outliers by chance.
+    """Tighten a limit so that hardly any outliers are within it by chance.
 
-    Near a pose, residuals of outliers are uniformly distributed. The ring from one to three times
-    the limit has eight times the area of the circle inside, so an eighth as many outliers as in the
-    ring are expected within the limit.
+    Small residuals of outliers are uniformly distributed. The ring from one to three times the
+    limit has eight times the area of the circle within the limit, so the circle is expected to
+    contain an eighth as many outliers as the ring.
     """
     lengths = np.sort(normalised[np.isfinite(normalised)])
     for tightened in limit * _TIGHTENING ** np.arange(_MAX_TIGHTENED):
@@ -500,13 +500,16 @@ def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
 
 
 def unit_deviation(normalised: NDArray[np.float64]) -> float:
-    """Return the robust standard deviation of unit weight, restricted to plausible values."""
+    """Return the robust standard deviation of unit weight, limited to plausible values."""
     median = float(np.median(normalised)) if normalised.size else 1.0
     return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
 
 
 def expected_px(seen: SeenPoints) -> float:
-    """Return the a priori standard deviation of a tie, at a scale estimated from all ties."""
+    """Return the a priori standard deviation of a tie in pixels.
+
+    The image scale is estimated from all ties.
+    """
     spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
     lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
     per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
@@ -528,9 +531,9 @@ def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDAr
 
 
 def _contradicted_calibration(found: Estimate, control: SeenPoints) -> str:
-    """Return the reason why a calibration contradicts a photo's ties; empty if it does not.
+    """Return why the ties of a photo contradict its calibration; empty if they do not.
 
-    The pose absorbs most of a wrong focal length, so the residuals do not reveal it.
+    The pose compensates for most of a wrong focal length, so the residuals do not reveal it.
     """
     camera = found.resection.camera
     if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
@@ -557,12 +560,12 @@ def _robust_pose(
 
     Args:
         seen: the ties.
-        lens: the camera's interior orientation; its pose is ignored.
+        lens: interior orientation of the camera; its pose is ignored.
         threshold_px: maximum residual of an inlier.
         seed: seed of the sampling.
 
     Returns:
-        The camera at that pose and its inliers (n,); None if no pose is found.
+        The camera with this pose, and a mask (n,) of its inliers; None if no pose is found.
     """
     import cv2
 
@@ -578,10 +581,10 @@ def _robust_pose(
     usac.maxIterations = _MAX_TRIALS
     usac.confidence = _CONFIDENCE
     usac.randomGeneratorState = seed
-    # Results are not reproducible with several threads.
+    # With several threads, results are not reproducible.
     usac.isParallel = False
     usac.score = cv2.SCORE_METHOD_MSAC
-    # The subsequent adjustment replaces the local optimisation and takes a third of its time.
+    # The subsequent adjustment replaces local optimisation, and takes only a third of its time.
     usac.loMethod = cv2.LOCAL_OPTIM_NULL
     call: Any = cv2.solvePnPRansac
     try:

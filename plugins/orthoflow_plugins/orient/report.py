@@ -34,11 +34,11 @@ from orthoflow_plugins.orient.pose import NOT_ORIENTED, Note, ties_of_photo
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# 4.55 % of a normal distribution is beyond this limit, and at most a quarter of any distribution
-# (Chebyshev).
+# Limit in standard deviations. It is exceeded by 4.55 % of a normal distribution, and by at most a
+# quarter of any distribution (Chebyshev).
 _BEYOND: Final = 2.0
 _SIDE_PX: Final = 900
-# Colours as in markiewicz2015, Figure 17: control green, rejected red, check yellow.
+# Colours as in Figure 17 of markiewicz2015: control green, rejected red, check yellow.
 _ROLE_RGB: Final = {
     TieRole.REJECTED: (220, 40, 40),
     TieRole.CONTROL: (40, 200, 60),
@@ -48,18 +48,19 @@ _MAX_FIGURES: Final = 24
 _SUB_PIXEL_BITS: Final = 4
 # Number of cells along the longer side of a map of predicted errors.
 _MAP_CELLS: Final = 90
-# Histograms with normal distributions as in markiewicz2015, Figures 18, 20, 21 and 23.
+# Number of bars in histograms; normal distributions are shown as in Figures 18, 20, 21 and 23 of
+# markiewicz2015.
 _BARS: Final = 40
 _BARS_OF_A_PHOTO: Final = 25
-# Maximum number of rows in the figure of single photos.
+# Maximum number of photos that are shown separately in a figure.
 _MAX_PHOTOS: Final = 30
-# Height of the highest bar relative to its row.
+# Height of the highest bar relative to the height of the row.
 _ROW_SHARE: Final = 0.8
 _BAR_COLOUR: Final = "#9db8d2"
 _CURVE_COLOUR: Final = "#b03a2e"
-# Length of an arrow in the plan of the photos.
+# Length of the arrow that shows the direction of view in the plan of the photos.
 _VIEW_M: Final = 0.4
-# Maximum number of control points per photo in the plan.
+# Maximum number of control points per photo in the plan of the photos.
 _MAX_CONTROL: Final = 300
 _PERCENTILE: Final = 99.5
 # Maximum length of a photo name in figures.
@@ -74,11 +75,11 @@ class Oriented:
     """The result of one photo.
 
     Attributes:
-        camera: its orientation, or the reason why there is none.
-        chosen: (n,) indices of its ties among all ties.
+        camera: orientation of the photo, or the reason why there is none.
+        chosen: (n,) indices of the ties of the photo among all ties.
         role: (n,) `TieRole` of these ties.
-        residuals_px: (n, 2) observed minus computed; NaN if the photo is not oriented.
-        entry: entry in the record.
+        residuals_px: (n, 2) observed minus computed pixels; NaN if the photo is not oriented.
+        entry: entry of the photo in the record.
         notes: diagnostics of the photo.
         candidate: the tested values, if the orientation was accepted.
     """
@@ -135,7 +136,7 @@ def numbers_json(candidate: Candidate) -> dict[str, JsonValue]:
 
 
 def residual_table(candidate: Candidate) -> list[ResidualRow]:
-    """Return the rows of the residual table, separately for control and check points."""
+    """Return the residual table, with separate rows for control and check points."""
     units = {"px": 1.0, "mm": pixel_mm(candidate)}
     if candidate.gsd_m is not None:
         units["cell"] = units["mm"] / (1000.0 * candidate.gsd_m)
@@ -152,13 +153,13 @@ def residual_rows(
     residuals_px: NDArray[np.float64],
     units: Mapping[str, float],
 ) -> list[ResidualRow]:
-    """Return the rows of one photo and role.
+    """Return the rows of the residual table for one photo and role.
 
     Args:
         photo: name of the photo.
         role: `control` or `check`.
-        residuals_px: (n, 2), observed minus computed.
-        units: size of a pixel in each unit, by the unit's name; includes `cell` if known.
+        residuals_px: (n, 2) observed minus computed pixels.
+        units: size of a pixel in each unit, by the name of the unit; includes `cell` if known.
 
     Returns:
         One row per coordinate and unit; empty if there are no residuals.
@@ -244,7 +245,7 @@ def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
 
 
 def _chance_of_mean(values: NDArray[np.float64]) -> float | None:
-    """Return the p-value of the mean (t test against 0); None for fewer than two values."""
+    """Return the p-value of the t test that the mean is 0; None for fewer than two values."""
     from scipy.special import stdtr  # importing scipy.stats would take seconds
 
     n = len(values)
@@ -320,7 +321,7 @@ def draw_ties(
     scale = min(1.0, _SIDE_PX / max(photo.width, photo.height))
     size = (max(1, round(photo.width * scale)), max(1, round(photo.height * scale)))
     small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    # Dim the photo so that the marks are easy to see.
+    # Dim the photo so that the marks are visible.
     canvas = np.rint(0.7 * small).astype(np.uint8)
     unit = 1 << _SUB_PIXEL_BITS
     for kind, colour in _ROLE_RGB.items():
@@ -353,7 +354,7 @@ def _with_legend(canvas: NDArray[np.uint8], counts: Mapping[TieRole, int]) -> by
 
 
 def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
-    """Draw the predicted error on each wall, using the most accurate photo at each position.
+    """Draw a map of the predicted error on each wall, for the most accurate photo at each position.
 
     Args:
         ctx: the context.
@@ -374,7 +375,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         shown = np.isfinite(best)
         if not shown.any():
             continue
-        # Use percentiles, so that a sparsely covered corner does not dominate the scale.
+        # With percentiles, a sparsely covered corner does not dominate the scale.
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         error_mm = np.where(shown, 1e3 * best, np.nan)
         label = "predicted error of a coordinate [mm]"
@@ -393,8 +394,8 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
 def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     """Draw the positions of photos and control points in two views of the first wall.
 
-    One view is along the wall, the other faces it; for a floor, the second view is a plan. The
-    figure follows skarlatos2012, Figure 3.
+    One view is along the wall, and the other one faces it; for a floor, the second view is a plan.
+    The figure follows Figure 3 of skarlatos2012.
 
     Args:
         ctx: the context.
@@ -410,7 +411,7 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     feet = np.array([one.estimate.resection.camera.centre_world for one in candidates])
     everything = np.vstack([feet, *(wall.corners_world for wall in walls.values())]) - origin
     spans_m = np.ptp(everything @ axes_world.T, axis=0)
-    # Both views have the same scale.
+    # Draw both views at the same scale.
     heights = np.clip(2.9 * spans_m[[2, 1]] / spans_m[0], 0.5, 3.5)
     figure = column_figure(float(heights.sum()) + 0.9)
     panels = figure.subplots(2, 1, height_ratios=heights)
@@ -455,7 +456,7 @@ def _draw_position(
     *,
     is_named: bool,
 ) -> None:
-    """Draw a photo's position, view and control points on two axes (3, 2) of the world."""
+    """Draw position, direction and control points of a photo on two world axes (3, 2)."""
     camera = candidate.estimate.resection.camera
     control = (candidate.seen.points_world[candidate.control] - origin) @ shown
     step = max(1, len(control) // _MAX_CONTROL)
@@ -463,7 +464,7 @@ def _draw_position(
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
     axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
-    # In the other view, photos one above the other coincide, so their names would overlap.
+    # In the other view, the names of photos one above the other would overlap.
     if is_named:
         axes.annotate(
             candidate.photo.name, (x, y), xytext=(2, 2), textcoords="offset points", fontsize=6.0
@@ -476,7 +477,7 @@ def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -
     reach = _reach(np.vstack(list(pooled.values())))
     for (kind, values), row in zip(pooled.items(), panels, strict=True):
         for label, column, axes in zip("uv", values.T, row, strict=True):
-            # Drawing one outline is faster than drawing forty bars.
+            # A single outline is drawn faster than forty bars.
             counts, edges = np.histogram(column, bins=_BARS, range=(-reach, reach))
             axes.stairs(counts, edges, fill=True, color=_BAR_COLOUR)
             _draw_curves(axes, column, edges)
@@ -499,7 +500,7 @@ def _draw_each(
     photos: Sequence[Oriented],
     pooled: dict[TieRole, NDArray[np.float64]],
 ) -> None:
-    """Draw a row per photo and a panel per role and coordinate."""
+    """Draw one row per photo, with one panel per role and coordinate."""
     shown = photos[:_MAX_PHOTOS]
     figure = column_figure(len(pooled) * (0.45 + 0.22 * len(shown)))
     panels = figure.subplots(len(pooled), 2, squeeze=False, sharex=True, sharey=True)
@@ -548,12 +549,12 @@ def _draw_curves(
     scale: float = 1.0,
     base: float = 0.0,
 ) -> None:
-    """Draw the normal distribution and the density of values, which may have several peaks."""
+    """Draw the normal distribution and the estimated density, which may have several peaks."""
     grid = np.linspace(edges[0], edges[-1], 161)
     curve = scale * _normal(values, edges, grid) + base
     axes.plot(grid, curve, color="black", linestyle="--", linewidth=0.6, label="normal")
-    # Use Silverman's rule of thumb with a robust spread, since an SD increased by outliers would
-    # smooth secondary peaks away.
+    # Use Silverman's rule of thumb with a robust spread, since a standard deviation increased by
+    # outliers would remove secondary peaks.
     spread = min(float(values.std()), median_deviation(values, float(np.median(values))))
     width = max(0.9 * spread * len(values) ** -0.2, 1e-9)
     some = values[:: max(1, len(values) // _MAX_KERNELS)]
@@ -563,19 +564,19 @@ def _draw_curves(
 
 
 def _end_of(name: str) -> str:
-    """Shorten a photo's name at its beginning, since the names of a series differ at the end."""
+    """Shorten a photo name at its beginning, since the names in a series differ at the end."""
     return name if len(name) <= _NAME_LETTERS else f"..{name[2 - _NAME_LETTERS :]}"
 
 
 def _reach(values: NDArray[np.float64]) -> float:
-    """Return the largest residual to draw, for all panels of a figure."""
+    """Return the largest residual to draw, common to all panels of a figure."""
     return round_scale(max(float(np.percentile(np.abs(values), _PERCENTILE)), 1e-6))
 
 
 def _normal(
     values: NDArray[np.float64], edges: NDArray[np.float64], grid: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return counts per bar of a normal distribution with the mean and SD of the values."""
+    """Return the counts per bar of a normal distribution with the mean and SD of the values."""
     mean, deviation = float(values.mean()), max(float(values.std()), 1e-9)
     density = np.exp(-0.5 * ((grid - mean) / deviation) ** 2) / deviation / np.sqrt(2.0 * np.pi)
     return np.asarray(len(values) * (edges[1] - edges[0]) * density)
