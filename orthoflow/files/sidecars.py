@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.geotiff import GridPlace, RasterParts, local_crs_name
 from orthoflow.files.wall_descriptions import ORTHO_FILE, WallDescription, described
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import Bend, WallFrame
 from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
@@ -61,6 +61,17 @@ _GEOTIFF: Final[dict[RasterAxes, str]] = {
 }
 
 
+_FROM_PLANE: Final = (
+    "origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world"
+)
+# The angle has the sign of the radius in this formula, negative if `concave` is false.
+_FROM_CYLINDER: Final = (
+    "origin_world + gsd_m * {straight} * {axis} + (r - depth_m) * sin(angle) * {tangent} + (r - "
+    "(r - depth_m) * cos(angle)) * normal_world with r = {sign}radius_m and angle = gsd_m * {bent} "
+    "/ r"
+)
+
+
 def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
     """Return a wall's raster frame: world = origin + gsd * (column * u + row * v) + depth * n."""
     plane = frame.plane
@@ -71,6 +82,8 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
     geotiff = _GEOTIFF[frame.raster_axes]
     if frame.raster_down > 0.0:
         geotiff = geotiff.replace(" - gsd_m", " + gsd_m")
+    if frame.bend is not None:
+        geotiff = geotiff.replace("in the plane", "on the unrolled surface")
     return placed | {
         "origin_world": numbers(frame.origin_world),
         "u_world": numbers(frame.u_world),
@@ -86,11 +99,69 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         "height_of_top_m" if frame.raster_axes == "wall" else "y_of_top_m": top_m,
         "crs": frame.map_crs or local_crs_name(frame.crs),
         "raster": {
-            "world_from_raster": "origin_world + gsd_m * (column * u_world + row * v_world) + "
-            "depth_m * normal_world; v_world points down, cell centres are at .5",
+            "world_from_raster": f"{_world_from_raster(frame.bend)}; v_world points down, cell "
+            "centres are at .5",
             "geotiff": f"{geotiff}; pixel is area",
         },
+        **chart_json(frame),
     }
+
+
+def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
+    """Return the shape of the surface of a raster, and axis and radius of a cylinder.
+
+    The zero direction points from the axis to the left or top edge of the raster, where the arc
+    begins. The axes of the frame are those at its top-left corner.
+    """
+    if (bend := frame.bend) is None:
+        return {"chart": "plane"}
+    along_u, zero = bend.along == "u", frame.normal_world * math.copysign(1.0, -bend.radius_m)
+    return {
+        "chart": "cylinder",
+        "axis": numbers(-frame.v_world if along_u else frame.u_world),
+        "point": numbers(frame.origin_world + bend.radius_m * frame.normal_world),
+        "radius_m": abs(bend.radius_m),
+        "zero_direction": numbers(zero),
+        "concave": bend.radius_m > 0.0,
+        "arc_along": bend.along,
+    }
+
+
+def _world_from_raster(bend: Bend | None) -> str:
+    if bend is None:
+        return _FROM_PLANE
+    bent, straight = ("column", "row") if bend.along == "u" else ("row", "column")
+    tangent, axis = ("u_world", "v_world") if bend.along == "u" else ("v_world", "u_world")
+    return _FROM_CYLINDER.format(
+        straight=straight,
+        axis=axis,
+        tangent=tangent,
+        bent=bent,
+        sign="" if bend.radius_m > 0.0 else "-",
+    )
+
+
+def _bend_of(content: Mapping[str, object], name: str) -> Bend | None:
+    """Return the curvature that a sidecar states.
+
+    Raises:
+        InputError: the raster is on a surface that cannot be read.
+    """
+    chart = content.get("chart", "plane")
+    if chart == "plane":
+        return None
+    if chart != "cylinder":
+        raise InputError(f"{name}: chart must be plane or cylinder, got {shown_value(chart)}")
+    along, radius_m = content.get("arc_along"), _number(content.get("radius_m"))
+    if along not in ("u", "v") or not radius_m > 0.0:
+        raise InputError(
+            f"{name}: a cylinder needs arc_along (u or v) and a positive radius_m, got "
+            f"{shown_value(along)} and {shown_value(content.get('radius_m'))}"
+        )
+    return Bend(
+        along="u" if along == "u" else "v",
+        radius_m=radius_m if content.get("concave") is True else -radius_m,
+    )
 
 
 def read_sidecar(path: Path) -> dict[str, object]:
@@ -173,6 +244,7 @@ def frame_of_raster(
             map_crs=None if map_crs is None else str(map_crs),
             up=tuple(up.tolist()) if up.shape == (3,) and abs(up @ up - 1.0) < _UNIT else None,
             name=str(content.get("name", "")),
+            bend=_bend_of(content, name),
         )
         if placed.raster_down != raster.down:
             raise InputError(
@@ -182,9 +254,13 @@ def frame_of_raster(
             )
         right_m = raster.corner_m[0] - left_m
         below_m = (raster.corner_m[1] - top_m) * raster.down
+        if placed.bend is not None:
+            corner = (right_m / raster.gsd_m, below_m / raster.gsd_m)
+            placed = placed.part(corner, width=shape[1], height=shape[0])
+        else:
+            placed = replace(placed, origin_world=origin + right_m * u + below_m * v)
         return replace(
             placed,
-            origin_world=origin + right_m * u + below_m * v,
             left_m=raster.corner_m[0] if placed.raster_axes == "wall" else 0.0,
         )
     except GeometryError as error:
@@ -232,11 +308,13 @@ def raster_tags(
     plane = frame.plane
     of_frame = ("map_crs", "up_world", "origin_world", "u_world", "v_world", "normal_world")
     of_raster = ("x_of_left_m", "height_of_top_m", "y_of_top_m")
+    of_chart = () if frame.bend is None else tuple(chart_json(frame))
     placed = frame_json(frame)
     return {
         "content": content,
         "frame": json.dumps(
-            {key: placed[key] for key in (*of_frame, *of_raster) if key in placed}, sort_keys=True
+            {key: placed[key] for key in (*of_frame, *of_raster, *of_chart) if key in placed},
+            sort_keys=True,
         ),
         "gsd_m": repr(float(frame.gsd_m)),
         "name": name,

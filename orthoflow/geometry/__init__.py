@@ -1,6 +1,7 @@
 """Geometry of planes, cameras, rasters and simulated scenes: pure array arithmetic."""
 
 from orthoflow.geometry.frames import (
+    Bend,
     Plane,
     UpDirection,
     WallFrame,
@@ -16,6 +17,7 @@ from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.surfaces import Cone, Cylinder
 
 __all__ = [
+    "Bend",
     "Cone",
     "Cylinder",
     "Plane",

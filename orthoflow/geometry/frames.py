@@ -182,18 +182,44 @@ RasterAxes = Literal["map", "wall", "level", "plane"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class WallFrame:
-    """A raster on a plane: u to the right of the viewer, v down, n towards the viewer.
-
-    The world coordinates of a position (column, row) at a given depth are `origin_world + gsd_m *
-    (column * u_world + row * v_world) + depth_m * normal_world`. The centre of cell (row, column)
-    is at (column + 0.5, row + 0.5); `u x v = -n`.
+class Bend:
+    """The curvature of a raster that unrolls a part of a circular cylinder.
 
     Attributes:
-        origin_world: (3,) float64 metres, outer corner of the top-left cell, on the plane.
-        u_world: (3,) unit vector.
-        v_world: (3,) unit vector.
-        normal_world: (3,) unit vector.
+        along: `u` if rows of the raster follow the arc, with columns parallel to the axis of the
+            cylinder (towers, columns, apses); `v` if columns follow it (barrel vaults).
+        radius_m: radius, positive if the axis is on the viewer's side of the surface (seen from
+            inside), negative if the surface is seen from outside.
+    """
+
+    along: Literal["u", "v"]
+    radius_m: float
+
+    def __post_init__(self) -> None:
+        if self.along not in ("u", "v") or not 0.0 < abs(self.radius_m) < math.inf:
+            raise GeometryError(
+                "a curved raster needs an arc along u or v and a radius, got "
+                f"{self.along!r} and {self.radius_m} m"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallFrame:
+    """A raster on a plane or cylinder: u to the right of the viewer, v down, n to the viewer.
+
+    On a plane, the world coordinates of a position (column, row) at a given depth are
+    `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`. The centre
+    of cell (row, column) is at (column + 0.5, row + 0.5); `u x v = -n`.
+
+    On a cylinder, this holds at the top-left corner only; u or v is the length of the arc on the
+    cylinder, and the depth is the distance from it along its local normal. Every position has axes
+    of its own (see `axes_at`).
+
+    Attributes:
+        origin_world: (3,) float64 metres, outer corner of the top-left cell, on the surface.
+        u_world: (3,) unit vector, at the origin.
+        v_world: (3,) unit vector, at the origin.
+        normal_world: (3,) unit vector, at the origin.
         gsd_m: side of a cell in metres.
         width: number of columns.
         height: number of rows.
@@ -203,6 +229,7 @@ class WallFrame:
         name: name of the wall, used in the name of the raster's coordinate system.
         left_m: distance along the wall from its left edge to the left edge of this raster, if the
             raster shows only part of the wall.
+        bend: curvature of a raster on a cylinder; None on a plane.
     """
 
     origin_world: NDArray[np.float64]
@@ -216,6 +243,7 @@ class WallFrame:
     up: tuple[float, float, float] | None = None
     name: str = ""
     left_m: float = 0.0
+    bend: Bend | None = None
 
     def __post_init__(self) -> None:
         if not (self.gsd_m > 0.0 and self.width > 0 and self.height > 0):
@@ -228,6 +256,16 @@ class WallFrame:
             raise GeometryError("a wall frame needs an origin and axes of three numbers each")
         if not np.allclose(np.cross(self.u_world, self.v_world), -self.normal_world, atol=1e-9):
             raise GeometryError("a wall frame needs u x v = -n, but these axes mirror the image")
+        if self.bend is not None:
+            # Blocks of cells may exceed a whole turn by a part of a block.
+            n_cells = self.width if self.bend.along == "u" else self.height
+            if (n_cells - 1) * self.gsd_m > math.tau * abs(self.bend.radius_m):
+                raise GeometryError(
+                    f"a curved wall frame must not exceed one turn, got {n_cells} cells of "
+                    f"{self.gsd_m} m at a radius of {abs(self.bend.radius_m)} m"
+                )
+            if self.map_crs is not None:
+                raise GeometryError("a curved wall frame cannot be a map")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -242,13 +280,16 @@ class WallFrame:
         the top edge. For floors and ceilings, X and Y are the horizontal world axes. Y of a ceiling
         increases with the row number, so that the ceiling can be superimposed on the floor. For
         sloping planes, and if up is unknown, X and Y are distances from the top-left corner.
+        Cylinders with an upright axis are treated as walls, others as sloping planes.
         """
         if self.map_crs is not None:
             return "map"
-        if self.up is None:
+        if self.up is None or (self.bend is not None and self.bend.along == "v"):
             return "plane"
         if -float(self.v_world @ self.up) >= _LEAST_COSINE:
             return "wall"
+        if self.bend is not None:
+            return "plane"
         first = basis_from_up(np.array(self.up))[0]
         is_level = abs(float(self.normal_world @ self.up)) >= _LEAST_COSINE
         return "level" if is_level and float(self.u_world @ first) >= _LEAST_COSINE else "plane"
@@ -281,30 +322,76 @@ class WallFrame:
         """
         if self.map_crs is not None:
             return self.map_crs
-        zero = self.world_from_wall(self.wall_from_raster(np.zeros((1, 2))))[0]
+        at = self.wall_from_raster(np.zeros((1, 2)))
+        zero, axes = self.world_from_wall(at)[0], self.axes_at(at)[0, :2]
         # The position is rounded to millimetres, the axes to 1e-6.
-        axes = np.concatenate([self.u_world, self.v_world])
-        place = [*np.round(1e3 * zero), *np.round(1e6 * axes)]
+        place = [*np.round(1e3 * zero), *np.round(1e6 * axes.ravel())]
+        if self.bend is not None:
+            place.append(np.round(1e3 * self.bend.radius_m))
         digest = hashlib.sha256(",".join(f"{value:.0f}" for value in place).encode()).hexdigest()
         return f"{self.name or 'plane'} {digest[:8]}"
 
     @property
     def plane(self) -> Plane:
-        """Plane that contains the raster."""
+        """Plane that contains the raster; of a cylinder, the tangent plane at its middle."""
+        if self.bend is not None:
+            normal = self.facing_world
+            return Plane(normal=normal, offset_m=float(normal @ self.middle_world))
         return Plane(
             normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
         )
 
+    @property
+    def middle_world(self) -> NDArray[np.float64]:
+        """Point (3,) of the surface at the middle of the raster."""
+        middle: NDArray[np.float64] = self.world_from_wall(0.5 * self._size)[0]
+        return middle
+
+    @property
+    def facing_world(self) -> NDArray[np.float64]:
+        """Unit normal (3,) at the middle of the raster, the same everywhere on a plane."""
+        normal: NDArray[np.float64] = self.axes_at(0.5 * self._size)[0, 2]
+        return normal
+
+    @property
+    def flat(self) -> WallFrame:
+        """The same raster on a plane; a cylinder is unrolled onto the plane at the origin."""
+        return self if self.bend is None else replace(self, bend=None)
+
     def of_rows(self, rows: slice) -> WallFrame:
         """Return the frame of the part of the raster with the given rows."""
+        height = rows.stop - rows.start
+        if self.bend is not None:
+            return self.part((0.0, float(rows.start)), width=self.width, height=height)
         corner = self.origin_world + rows.start * self.gsd_m * self.v_world
-        return replace(self, origin_world=corner, height=rows.stop - rows.start)
+        return replace(self, origin_world=corner, height=height)
+
+    def part(
+        self, corner: tuple[float, float] | NDArray[np.float64], *, width: int, height: int
+    ) -> WallFrame:
+        """Return the frame of another part of the same surface.
+
+        Args:
+            corner: column and row of its top-left corner; they may be outside the raster.
+            width: number of columns.
+            height: number of rows.
+        """
+        at = np.array([corner], dtype=np.float64)
+        placed = replace(self, origin_world=self.world_from_wall(at)[0], width=width, height=height)
+        if self.bend is None:
+            return placed
+        u, v, normal = self.axes_at(at)[0]
+        return replace(placed, u_world=u, v_world=v, normal_world=normal)
 
     def has_cells_of(self, other: WallFrame) -> bool:
         """Return whether both frames have the same cells, to within 0.001 cells at the corners."""
-        if self.shape != other.shape:
+        if self.shape != other.shape or (self.bend is None) != (other.bend is None):
             return False
-        apart = np.abs(self.corners_world() - other.corners_world()).max()
+        # Cylinders of different radii or sides may share their corners, but not their middle.
+        apart = max(
+            np.abs(self.corners_world() - other.corners_world()).max(),
+            0.0 if self.bend is None else np.abs(self.middle_world - other.middle_world).max(),
+        )
         return bool(apart <= 1e-3 * self.gsd_m)
 
     def world_from_wall(
@@ -313,6 +400,8 @@ class WallFrame:
         """Return the world points (n, 3) at positions (n, 2) = (column, row) and depths (n,)."""
         # In notebooks, users may pass a single position as a list of two numbers.
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
+        if self.bend is not None:
+            return self._on_cylinder(self.bend, pixels, depths_m)
         in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
         lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels)), self.normal_world)
         points: NDArray[np.float64] = self.origin_world + in_plane + lifted
@@ -321,6 +410,8 @@ class WallFrame:
     def wall_from_world(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return wall positions (n, 3) = (column, row, depth in metres) of world points (n, 3)."""
         relative = points_world - self.origin_world
+        if self.bend is not None:
+            return self._from_cylinder(self.bend, relative)
         return np.column_stack(
             [
                 relative @ self.u_world / self.gsd_m,
@@ -328,6 +419,65 @@ class WallFrame:
                 relative @ self.normal_world,
             ]
         )
+
+    def axes_at(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the axes u, v, n (n, 3, 3), as rows, at positions (n, 2) = (column, row)."""
+        pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
+        axes = np.array([self.u_world, self.v_world, self.normal_world])
+        if self.bend is None:
+            return np.broadcast_to(axes, (len(pixels), 3, 3))
+        bent = 0 if self.bend.along == "u" else 1
+        angles = pixels[:, bent] * self.gsd_m / self.bend.radius_m
+        cosines, sines = np.cos(angles)[:, None], np.sin(angles)[:, None]
+        turned = np.repeat(axes[None], len(pixels), axis=0)
+        turned[:, bent] = cosines * axes[bent] + sines * axes[2]
+        turned[:, 2] = cosines * axes[2] - sines * axes[bent]
+        return turned
+
+    def metres_per_cell(self, depths_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sizes (n, 2) of cells along u and v at depths (n,), in metres.
+
+        In front of a cylinder seen from inside, cells are narrower along the arc.
+        """
+        sizes = np.full((len(depths_m), 2), self.gsd_m)
+        if self.bend is not None:
+            sizes[:, 0 if self.bend.along == "u" else 1] *= 1.0 - depths_m / self.bend.radius_m
+        return sizes
+
+    @property
+    def _size(self) -> NDArray[np.float64]:
+        return np.array([[self.width, self.height]], dtype=np.float64)
+
+    def _on_cylinder(
+        self, bend: Bend, pixels: NDArray[np.float64], depths_m: NDArray[np.float64] | float
+    ) -> NDArray[np.float64]:
+        bent, straight = (0, 1) if bend.along == "u" else (1, 0)
+        axes = (self.u_world, self.v_world)
+        angles = self.gsd_m * pixels[:, bent] / bend.radius_m
+        from_axis = bend.radius_m - np.broadcast_to(depths_m, len(pixels))
+        points: NDArray[np.float64] = (
+            self.origin_world
+            + np.multiply.outer(self.gsd_m * pixels[:, straight], axes[straight])
+            + np.multiply.outer(from_axis * np.sin(angles), axes[bent])
+            + np.multiply.outer(bend.radius_m - from_axis * np.cos(angles), self.normal_world)
+        )
+        return points
+
+    def _from_cylinder(self, bend: Bend, relative: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return wall positions (n, 3); the cut of the cylinder is opposite the raster's middle."""
+        bent, straight = (0, 1) if bend.along == "u" else (1, 0)
+        axes, side = (self.u_world, self.v_world), math.copysign(1.0, bend.radius_m)
+        aside = side * (relative @ axes[bent])
+        away = side * (bend.radius_m - relative @ self.normal_world)
+        middle = 0.5 * self.gsd_m * float(self._size[0, bent]) / bend.radius_m
+        # Angles are measured from the middle, because they jump by a turn opposite of it.
+        cosine, sine = math.cos(middle), math.sin(middle)
+        angles = middle + np.arctan2(cosine * aside - sine * away, cosine * away + sine * aside)
+        on_wall = np.empty((len(relative), 3))
+        on_wall[:, bent] = angles * bend.radius_m / self.gsd_m
+        on_wall[:, straight] = relative @ axes[straight] / self.gsd_m
+        on_wall[:, 2] = bend.radius_m - side * np.hypot(aside, away)
+        return on_wall
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert (n, 2) = (column, row) to (n, 2) = (X, Y), in metres as in files."""

@@ -93,11 +93,11 @@ def is_shown(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, kw_only=True)
 class Wall:
-    """Rasters of the scanned surface on one plane.
+    """Rasters of the scanned surface on one plane or cylinder.
 
     Attributes:
         frame: position of the cells; all rasters have `frame.shape`.
-        plane_index: index of the plane in `Planes`.
+        plane_index: index of the plane in `Planes`; curved surfaces are numbered after all planes.
         name: name of the plane.
         depth_m: float32 metres along the normal, NaN if void.
         sigma_m: float32 metres, spread of the depths in a cell, NaN if unknown.
@@ -159,6 +159,7 @@ class Walls(Product):
         "u_world": Tolerance(limit=1e-6, unit="1"),
         "v_world": Tolerance(limit=1e-6, unit="1"),
         "normal_world": Tolerance(limit=1e-6, unit="1"),
+        "radius_m": Tolerance(limit=1e-4, unit="m"),
     }
 
     walls: tuple[Wall, ...]
@@ -281,6 +282,7 @@ class Layers(Product):
         "rgb": Tolerance(limit=2, unit="grey"),
         "quality": Tolerance(limit=1e-3, unit="1"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
+        "radius_m": Tolerance(limit=1e-4, unit="m"),
     }
 
     layers: tuple[Layer, ...]
@@ -370,6 +372,7 @@ class Orthoimages(Product):
         "rgb": Tolerance(limit=2, unit="grey"),
         "error_m": Tolerance(limit=1e-4, unit="m"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
+        "radius_m": Tolerance(limit=1e-4, unit="m"),
     }
 
     images: tuple[Orthoimage, ...]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -11,9 +13,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from orthoflow.errors import GeometryError
+from orthoflow.files.geotiff import GridPlace
+from orthoflow.files.sidecars import frame_json, frame_of_raster
 from orthoflow.geometry import basis_from_up, up_vector
 from orthoflow.geometry.frames import (
     UP_VECTORS,
+    Bend,
     Plane,
     UpDirection,
     WallFrame,
@@ -27,12 +32,21 @@ from orthoflow.geometry.frames import (
     signed_area,
     wall_axes,
 )
+from orthoflow.products import Product
 from tests import samples, scenes
 from tests.long_loops import seeds
 
 UP = np.array([0.0, 0.0, 1.0])
 # 0.5 x 0.3 m, its corner at (1, 2, 3); x is to the right, down is down, the viewer in the south.
 FRAME = samples.facing_south(0.1, 5, 3, (1.0, 2.0, 3.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unrolled(Product):
+    """A product that holds a frame."""
+
+    type_name: ClassVar[str] = "unrolled"
+    frame: WallFrame
 
 
 def turned() -> WallFrame:
@@ -58,6 +72,82 @@ def test_places_on_a_wall_are_metres_to_the_right_down_and_before_it() -> None:
         points = frame.world_from_wall(placed[:, :2], placed[:, 2])
         np.testing.assert_allclose(frame.wall_from_world(points), placed, atol=1e-9)
         np.testing.assert_allclose(frame.plane.distances_m(points), placed[:, 2], atol=1e-12)
+
+
+CURVED = [
+    replace(turned(), gsd_m=0.1, width=60, height=50, bend=Bend(along=along, radius_m=radius_m))
+    for along, radius_m in (("u", 3.0), ("u", -1.0), ("v", 3.0), ("v", -2.0))
+]
+
+
+@pytest.mark.parametrize("frame", CURVED, ids=lambda frame: str(frame.bend))
+def test_places_on_a_cylinder_are_arcs_and_distances_from_it(frame: WallFrame) -> None:
+    bend = frame.bend
+    assert bend is not None
+    bent, straight = (0, 1) if bend.along == "u" else (1, 0)
+    axes = np.array([frame.u_world, frame.v_world])
+    random = np.random.default_rng(7)
+    cells = random.uniform([0.0, 0.0], [frame.width, frame.height], (200, 2))
+    depths_m = random.uniform(-0.4, 0.4, 200)
+    points = frame.world_from_wall(cells, depths_m)
+    np.testing.assert_allclose(
+        frame.wall_from_world(points), np.column_stack([cells, depths_m]), atol=1e-9
+    )
+    # The distance from the axis, and the angle about it, by plain geometry.
+    from_axis = points - (frame.origin_world + bend.radius_m * frame.normal_world)
+    across = from_axis - np.outer(from_axis @ axes[straight], axes[straight])
+    radii_m = np.linalg.norm(across, axis=1)
+    side = math.copysign(1.0, bend.radius_m)
+    np.testing.assert_allclose(radii_m, abs(bend.radius_m) - side * depths_m)
+    np.testing.assert_allclose(from_axis @ axes[straight], 0.1 * cells[:, straight], atol=1e-12)
+    arcs_rad = 0.1 * cells[:, bent] / abs(bend.radius_m)
+    np.testing.assert_allclose(
+        across @ -frame.normal_world * side / radii_m, np.cos(arcs_rad), atol=1e-12
+    )
+    # Axes are the derivatives: scaled by the depth along the arc, right-handed as on a plane.
+    local = frame.axes_at(cells)
+    np.testing.assert_allclose(np.cross(local[:, 0], local[:, 1]), -local[:, 2], atol=1e-12)
+    np.testing.assert_allclose(local[:, 2], -side * across / radii_m[:, None], atol=1e-12)
+    sizes_m = frame.metres_per_cell(depths_m)
+    for axis in range(2):
+        step = 1e-5 * np.eye(2)[axis]
+        moved = frame.world_from_wall(cells + step, depths_m)
+        moved -= frame.world_from_wall(cells - step, depths_m)
+        wanted = 2e-5 * sizes_m[:, axis, None] * local[:, axis]
+        np.testing.assert_allclose(moved, wanted, atol=1e-11)
+    np.testing.assert_allclose(sizes_m[:, bent], 0.1 * radii_m / abs(bend.radius_m))
+
+
+@pytest.mark.parametrize("frame", CURVED, ids=lambda frame: str(frame.bend))
+def test_parts_of_a_cylinder_have_its_cells(frame: WallFrame) -> None:
+    part = frame.part((4.0, 7.0), width=11, height=20)
+    cells = np.array([[0.0, 0.0], [3.0, 4.0], [11.0, 20.0]])
+    expected = frame.world_from_wall(cells + np.array([4.0, 7.0]), 0.1)
+    np.testing.assert_allclose(part.world_from_wall(cells, 0.1), expected, atol=1e-12)
+    rows = frame.of_rows(slice(7, 27))
+    assert rows.has_cells_of(frame.part((0.0, 7.0), width=frame.width, height=20))
+    assert not rows.has_cells_of(rows.flat)
+    np.testing.assert_allclose(rows.plane.normal, rows.facing_world)
+    np.testing.assert_allclose(rows.distances_m(rows.middle_world[None]), [0.0], atol=1e-9)
+    content = json.loads(json.dumps(frame_json(part)))
+    place = GridPlace(gsd_m=0.1, corner_m=(0.3, -0.4))
+    read = frame_of_raster(content, raster=place, shape=(5, 6), name="wall_3.json")
+    assert read.has_cells_of(frame.part((7.0, 11.0), width=6, height=5))
+    from_axis = expected - np.array(content["point"])
+    away_m = np.linalg.norm(np.cross(from_axis, np.array(content["axis"])), axis=1)
+    np.testing.assert_allclose(away_m, content["radius_m"] + (-0.1 if content["concave"] else 0.1))
+    payload = Unrolled(frame=part).to_payload()
+    assert Unrolled.from_payload(payload).frame.bend == frame.bend
+    assert "bend" not in str(Unrolled(frame=part.flat).to_payload().metadata)
+
+
+def test_towers_are_walls_and_vaults_have_axes_of_their_own() -> None:
+    up = {"up": (0.0, 0.0, 1.0)}
+    tower = replace(FRAME, **up, bend=Bend(along="u", radius_m=-2.0))  # type: ignore[arg-type]
+    assert (tower.raster_axes, tower.raster_corner_m) == ("wall", (0.0, 3.0))
+    vault = replace(FRAME, **up, bend=Bend(along="v", radius_m=2.0))  # type: ignore[arg-type]
+    assert (vault.raster_axes, vault.raster_corner_m) == ("plane", (0.0, 0.0))
+    assert len({frame.crs for frame in (tower, vault, FRAME)}) == 3
 
 
 @pytest.mark.parametrize(
@@ -114,6 +204,8 @@ def test_frames_have_the_same_cells_to_a_thousandth_of_one() -> None:
         ({"gsd_m": math.nan}, "needs a positive cell size"),
         ({"u_world": np.zeros(2)}, "an origin and axes of three numbers each"),
         ({"v_world": -FRAME.v_world}, "these axes mirror the image"),
+        ({"bend": Bend(along="u", radius_m=0.05)}, "must not exceed one turn, got 5 cells"),
+        ({"bend": Bend(along="u", radius_m=1.0), "map_crs": "site"}, "cannot be a map"),
     ],
 )
 def test_what_is_no_frame_is_refused(change: dict[str, object], sentence: str) -> None:
