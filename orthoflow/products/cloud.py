@@ -22,25 +22,25 @@ _BLOCKS_LEAST: Final = 16
 class PointCloud(Product):
     """Points of one or more scans in one world frame.
 
-    The world coordinates of point i are `origin + (x[i], y[i], z[i])`. Because float32 is only used
-    for offsets, survey coordinates of 10^6 m lose no precision.
+    The world coordinates of point i are `origin + (x[i], y[i], z[i])`. Only the offsets are
+    float32, so survey coordinates of 10^6 m lose no precision.
 
     Attributes:
         origin: (3,) float64 metres.
-        x: (n,) float32 offset from the origin in metres; y and z likewise. Separate contiguous
-            arrays are read at full memory bandwidth.
+        x: (n,) float32 metres, offset from the origin; y and z likewise. The arrays are separate
+            because contiguous arrays are read at full memory bandwidth.
         up: (3,) float64 unit vector in world axes.
         intensity: (n,) float32, 0 to 1, NaN if not measured; None if no point has an intensity.
         rgb: (n, 3) uint8 sRGB, or None.
         has_rgb: (n,) bool, True for points with a colour; None if all have one or `rgb` is None.
         scan: (n,) uint16 index of the scan of each point, or None.
         row: (n,) uint32 row in the grid of the scan, or None; `column` likewise.
-        point_id: (n,) uint32 index of each point in the cloud as read; None if it is the index in
-            this cloud. See `selected`.
+        point_id: (n,) uint32 index of each point in the cloud as read; None if it equals the index
+            in this cloud. See `selected`.
         stations: (s, 3) float64 metres, positions of the scanner or the viewer, or None.
         stations_source: `file`, `view_from` (given by the user), or None if there are no stations.
-        source: information for users on how the cloud was read: files, unit, ranges before
-            normalisation, numbers of dropped points.
+        source: information for users on how the cloud was read, such as the files, the unit, the
+            ranges before normalisation and the numbers of dropped points.
     """
 
     type_name: ClassVar[str] = "cloud"
@@ -112,9 +112,10 @@ class PointCloud(Product):
 
     @cached_property
     def boxes_m(self) -> NDArray[np.float32] | None:
-        """Return bounding boxes (blocks, 2, 3) of consecutive points; None for small clouds.
+        """Return bounding boxes (blocks, 2, 3) of blocks of points, metres; None for small clouds.
 
-        They are computed when first used.
+        The first row of a box is its minimum (x, y, z), relative to the origin, and the second its
+        maximum.
         """
         return block_boxes_m(self) if len(self) > _BLOCKS_LEAST * BOXED_POINTS else None
 
@@ -139,18 +140,19 @@ class PointCloud(Product):
         )
 
     def require_points(self, n_least: int) -> None:
-        """Refuse a cloud that cannot be processed.
+        """Require a minimum number of points, and finite coordinates.
 
         Raises:
-            ProductError: it has fewer than `n_least` points, or coordinates that are not finite.
+            ProductError: the cloud has fewer than `n_least` points, or coordinates that are not
+                finite.
         """
         if len(self) < n_least:
             raise ProductError(
                 f"the cloud has {len(self)} points, but at least {n_least} are needed"
             )
         for name, values in (("x", self.x), ("y", self.y), ("z", self.z), ("origin", self.origin)):
-            # The sum is finite if and only if all terms are finite, since float64 cannot overflow
-            # here; it needs no mask as large as the cloud.
+            # The sum is finite if and only if all values are finite, since it cannot overflow
+            # float64 here. Unlike `np.isfinite(values)`, it needs no array as large as the cloud.
             if not np.isfinite(np.sum(values, dtype=np.float64)):
                 raise ProductError(
                     f"the cloud has coordinates in {name} that are NaN or infinite: read it with "

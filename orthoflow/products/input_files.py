@@ -9,7 +9,7 @@ from typing import ClassVar
 
 @dataclass(frozen=True, kw_only=True)
 class InputFiles:
-    """Files of one input of a workflow, sorted by name, identified by content and not stored.
+    """Files of one input of a workflow, sorted by name; they are identified by their content.
 
     Attributes:
         name: name of the input in the workflow.

@@ -1,4 +1,4 @@
-"""Data of inspections: check points, the truth of a simulated scene, and results."""
+"""Data of inspections: check points, the ground truth of a simulated scene, and results."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class CheckPoints(Product):
     """Surveyed points that were not used to produce the data that they check.
 
     Attributes:
-        names: names of the points.
+        names: name of each point.
         points_world: (n, 3) float64 metres.
         classes: class of each point, such as `flat` or `vertical`; empty if none is given.
         wall: (n,) int32 number of the wall in whose orthoimage the point was measured (index of its
             plane in `planes.json`); -1 if not measured.
-        pixels_wall: (n, 2) float64 measured (column, row), NaN where not measured.
-        places_m: (n, 2) float64 measured X and Y in the coordinates of the GeoTIFF of the
-            orthoimage: metres in the plane of the wall, or easting and northing of a map. NaN if
-            the point was measured in another way; None if all points were.
-        shown_world: (n, 3) float64 metres, world coordinates of the measured position; NaN if the
-            point was measured in another way; None if all points were.
+        pixels_wall: (n, 2) float64 (column, row) as measured, NaN where not measured.
+        places_m: (n, 2) float64 X and Y as measured, in the coordinates of the orthoimage's
+            GeoTIFF: metres in the plane of the wall, or easting and northing of a map. NaN if a
+            point was measured in another way; None if this applies to all points.
+        shown_world: (n, 3) float64 metres, world coordinates of the measured position. NaN if a
+            point was measured in another way; None if this applies to all points.
     """
 
     type_name: ClassVar[str] = "checkpoints"
@@ -86,20 +86,22 @@ class TakenPhoto:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Product):
-    """The truth of a simulated scene.
+    """Ground truth of a simulated scene.
 
     Attributes:
         scene: surfaces and their colours, which can be rendered from any position.
         planes: planes that a detector should find.
-        labels: (n,) int16 index in `planes` of each point of the simulated cloud, -1 if none.
+        labels: (n,) int16 index in `planes` of the plane of each point of the simulated cloud; -1
+            if the point is on none of them.
         stations: (s, 3) float64 metres, positions of the scanner.
-        lowest_elevation_deg: lowest elevation that the scanner measures, positive above the
+        lowest_elevation_deg: lowest elevation angle that the scanner measures, positive above the
             horizon.
-        highest_elevation_deg: highest elevation that the scanner measures.
-        n_spoilt: number of points that are gross outliers or mixtures of two distances.
+        highest_elevation_deg: highest elevation angle that the scanner measures.
+        n_spoilt: number of points that are gross outliers or mixed pixels.
         cameras: true orientations of the photos, or None if there are no photos.
         photos: geometry of the photos, in the order of `cameras`.
-        details: JSON parameters of the simulation (scan step, noise, relief ...), for users only.
+        details: parameters of the simulation as JSON (such as scan step, noise and relief),
+            intended only for users.
     """
 
     type_name: ClassVar[str] = "truth"
@@ -123,9 +125,9 @@ class Finding:
 
     Attributes:
         name: name of the metric, which contains the unit if it has one.
-        value: the number.
-        unit: unit; `1` for shares and counts.
-        wall: index in `Walls` of the wall described, -1 for all walls together.
+        value: the result, in `unit`.
+        unit: `1` for shares and counts.
+        wall: index of the wall in `Walls`; -1 if the result refers to all walls together.
     """
 
     name: str
@@ -145,7 +147,7 @@ class Inspection(Product):
         kind: (n,) uint8 class of each point, an index in `kinds`.
         kinds: names of the classes.
         findings: numerical results.
-        details: further JSON results, for users only.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "inspection"

@@ -15,8 +15,6 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products.product import JsonValue, Product, Tolerance, require_shapes
 
-# An opening has one of these kinds if the laser passed through it, if its back was measured, or if
-# there were no returns, respectively.
 OpeningKind = Literal["through", "niche", "no data"]
 
 _CORNERS_LEAST: Final = 3
@@ -26,7 +24,7 @@ class OutlineSource(IntEnum):
     """Source of the position of a side of an outline.
 
     Attributes:
-        DEPTH: depths of the raster of the wall.
+        DEPTH: the depth raster of the wall.
         IMAGE: a photo, accurate to a fraction of a cell.
         UNSEEN: unknown, because the wall next to the side was not measured.
     """
@@ -54,10 +52,10 @@ class Opening:
         area_m2: area of the outline.
         width_m: extent along u.
         height_m: extent along v.
-        sill_m: height of the lowest corner above the lower edge of the raster.
-        seen_share: share of the outline along which the adjacent wall was measured.
+        sill_m: height of the lowest corner above the bottom edge of the raster.
+        seen_share: share of the length of the outline along which the adjacent wall was measured.
         depth_m: median distance from the face of the wall to the back; None if not measured.
-        crs: coordinate system of `outline_m`, as `WallFrame.crs`.
+        crs: coordinate system of `outline_m`; see `WallFrame.crs`.
     """
 
     wall: int
@@ -104,7 +102,7 @@ class Opening:
 
     @property
     def edge_sigma_m(self) -> float | None:
-        """RMS of `side_sigma_m` over the sides that were seen; None if there are none."""
+        """RMS of `side_sigma_m` over the sides that were seen; None if no side was seen."""
         seen = self.side_sigma_m[np.isfinite(self.side_sigma_m)]
         return math.sqrt(float(np.mean(seen**2))) if len(seen) else None
 
@@ -122,8 +120,8 @@ class Openings(Product):
     Attributes:
         openings: all openings, sorted by wall, then from left to right.
         walls: numbers of the searched walls, including walls without openings.
-        map_crs: coordinate system of the world, if the raster of a wall specifies one.
-        details: further JSON results, for users only.
+        map_crs: coordinate system of the world, if one is specified in the raster of any wall.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "openings"

@@ -21,7 +21,8 @@ from orthoflow.products.product import (
 )
 from orthoflow.products.walls import Wall
 
-# A photo is upright, or upside down, if the cosine between its top and the vertical exceeds this.
+# A photo counts as upside down if the cosine of the angle between its up direction and the vertical
+# is below minus this value.
 _UPRIGHT: Final = 0.5
 PHOTOS_UPSIDE_DOWN: Final = DiagnosticSpec(
     code="photos-upside-down",
@@ -30,7 +31,7 @@ PHOTOS_UPSIDE_DOWN: Final = DiagnosticSpec(
     "down, walls and orthoimages are upside down and floor and ceiling are swapped",
     remedy="set {step[read.scan]}.up={opposite}",
 )
-# Focal length relative to the longer side, if neither a calibration nor EXIF contains it.
+# Focal length relative to the longer side, assumed if neither a calibration nor EXIF provides it.
 _USUAL_FOCAL: Final = 0.8
 
 
@@ -39,8 +40,8 @@ class Intrinsics:
     """Interior orientation; the centre of the first pixel is at (0.5, 0.5).
 
     Attributes:
-        width: pixels.
-        height: pixels.
+        width: width in pixels.
+        height: height in pixels.
         fx: focal length along u in pixels; `fy` along v.
         cx: u of the principal point in pixels; `cy` is its v.
         distortion: k1, k2, p1, p2, k3 (Brown's model, as in OpenCV).
@@ -78,7 +79,7 @@ class Intrinsics:
         rotation: NDArray[np.float64] | None = None,
         translation: NDArray[np.float64] | None = None,
     ) -> ViewingCamera:
-        """Return the camera with this lens at a pose, by default at the origin of the world.
+        """Return a camera with this lens at a pose, by default at the origin of the world.
 
         Args:
             rotation: (3, 3), camera_from_world.
@@ -103,8 +104,8 @@ class Photo:
     """One photograph.
 
     Attributes:
-        name: file name, with its folders in the input if several photos have the same file name.
-            Poses and ties refer to it.
+        name: file name, preceded by its folders in the input if several photos have the same file
+            name. Poses and ties refer to a photo by this name.
         encoded: unchanged bytes of the file. Pixel coordinates refer to the image as stored; the
             EXIF orientation is not applied.
         width: width of the stored image in pixels.
@@ -131,7 +132,7 @@ class Photo:
     folder: str = ""
 
     def lens_prior(self) -> tuple[ViewingCamera, LensFreedom]:
-        """Return the lens known before an orientation: from a calibration, EXIF, or a default.
+        """Return the lens assumed before the orientation, from a calibration, EXIF or a default.
 
         Returns:
             A camera with the most probable lens, at the origin of the world, and the standard
@@ -168,7 +169,7 @@ class Photos(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration(Product):
-    """Calibrations by photo name or pattern; the first match applies to a photo.
+    """Lens calibrations by photo name or pattern; the first that matches a name applies.
 
     Attributes:
         patterns: photo names or shell patterns.
@@ -197,15 +198,15 @@ class TieRole(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class TieWall:
-    """Properties of a wall that orientations need.
+    """Properties of a wall that are needed for orientation.
 
     Attributes:
         name: label of the wall.
         corners_world: four corners (x, y, z) of its raster in metres: top-left, then
             counter-clockwise for the viewer, as in `WallFrame.corners_world`.
         normal_world: unit vector (x, y, z) towards the viewer; photos are never taken from behind.
-        gsd_m: cell size of its raster in metres. If this is None, the wall has no raster, and
-            errors are not limited in cells.
+        gsd_m: cell size of its raster in metres. None if the wall has no raster; limits in cells do
+            not apply then.
         plane_index: index of its plane in `Planes`; None if unknown.
     """
 
@@ -245,23 +246,23 @@ class Ties(Product):
     the visible side of a wall nor its cell size is known.
 
     Attributes:
-        photo_names: photos to which `photo` refers.
+        photo_names: names of the photos to which `photo` refers.
         photo: (n,) int32 index into `photo_names`.
         wall: (n,) int32 index of the wall, -1 if unknown.
         pixels_photo: (n, 2) float64 (u, v); the centre of the first pixel is at (0.5, 0.5).
         points_world: (n, 3) float64 metres.
-        sigma_px: (n,) float64 a priori standard deviation of u and of v.
-        sigma_m: (n,) float64 a priori standard deviation of x, of y and of z. Adjustments propagate
-            it to the photo and add its variance to that of `sigma_px`.
+        sigma_px: (n,) float64 pixels, a priori standard deviation of u and of v.
+        sigma_m: (n,) float64 metres, a priori standard deviation of x, of y and of z. Adjustments
+            propagate it to the photo and add the resulting variance to that of `sigma_px`.
         role: (n,) uint8 `TieRole`.
         residual_px: (n, 2) float64 observed minus computed; NaN before an orientation.
         walls: walls to which `wall` refers; empty if not given.
         by_hand: (n,) uint8, 1 for ties measured by hand; None if there are none. Such ties are
             never withheld, and their standard deviations are not estimated.
         search_radius_px: for each photo, the radius around the expected position of a tie within
-            which the photo was searched, so wrong ties are within it, too; None if the whole photo
+            which the photo was searched (even wrong ties are within it); None if the whole photo
             was searched. Empty if all photos were searched completely.
-        details: further JSON results, for users only.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "ties"
@@ -319,7 +320,8 @@ class Ties(Product):
         """See `Product.check_against`.
 
         Raises:
-            ProductError: a position or an error of a tie is invalid, or a photo is unknown.
+            ProductError: a coordinate or a standard deviation of a tie is invalid, or a photo is
+                unknown.
         """
         for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m"):
             if not np.isfinite(getattr(self, name)).all():
@@ -330,7 +332,7 @@ class Ties(Product):
         _require_photos("ties", self.photo_names, others)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall that users see: the index of its plane in `planes.json`."""
+        """Return the wall number shown to users: the index of the plane in `planes.json`."""
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
         return wall if known is None else known
 
@@ -341,7 +343,8 @@ class Camera:
 
     Attributes:
         photo: name of the photo.
-        status: `ok`, or the reason in one sentence; in this case, all following fields are None.
+        status: `ok`, or one sentence with the reason why the photo is not oriented; all following
+            fields are then None.
         intrinsics: interior orientation.
         rotation_camera_from_world: (3, 3) float64, det +1; x right, y down, z forward.
         translation_camera_from_world: (3,) float64 metres.
@@ -365,7 +368,7 @@ class Camera:
     sigma_wall_m: float | None = None
 
     def viewing(self) -> ViewingCamera:
-        """Return the camera for projections.
+        """Return the camera model for projections.
 
         Raises:
             ProductError: the photo is not oriented.
@@ -387,9 +390,9 @@ class ResidualRow:
         unit: `px` in the photo, `cell` of the raster of the wall, or `mm` on the wall (pixels times
             the median size of a pixel on the wall).
         n: number of residuals.
-        mean: mean.
-        shift_p: probability that the mean is at least as large by chance (Student's t, two-sided);
-            None for one tie.
+        mean: arithmetic mean.
+        shift_p: probability of a mean at least this far from zero if the expected value is zero
+            (two-sided t-test); None for one tie.
         sd: standard deviation.
         median: median.
         nmad: 1.4826 times the median absolute deviation from the median.
@@ -400,7 +403,7 @@ class ResidualRow:
         beyond_own: share of residuals that exceed twice the RMSE of this axis.
         beyond_cells: share of residuals that exceed two cells of the raster of the wall; None if
             the cell size is unknown.
-        beyond_any: share of ties with a u or v that exceeds twice the RMSE of its axis.
+        beyond_any: share of ties whose residual in u or v exceeds twice the RMSE of that axis.
     """
 
     photo: str
@@ -430,7 +433,7 @@ class Cameras(Product):
         cameras: orientation of each photo, in the order of the photos.
         ties: ties with their roles and residuals after the orientation, or None.
         residual_table: statistics of the residuals of oriented photos; may be empty.
-        details: further JSON results, for users only.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "cameras"
@@ -453,9 +456,9 @@ class Cameras(Product):
             up: (3,) unit vector, vertical axis of the scan.
 
         Returns:
-            Values of the diagnostic; empty if the vertical axis agrees with the photos.
+            The values; empty if at most half of the photos are upside down.
         """
-        # Rows of a photo count downwards, so its top is the negative second axis.
+        # The up direction of a photo is the negative second axis of its camera, which points down.
         tops = [-one.viewing().rotation[1] @ up for one in self.cameras if one.status == "ok"]
         n_down = sum(float(top) < -_UPRIGHT for top in tops)
         if 2 * n_down <= len(tops):
@@ -500,7 +503,6 @@ class Cameras(Product):
 
 
 def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:
-    """Refuse names that do not belong to the photos of a step, if it has any."""
     for product in others.values():
         known = {photo.name for photo in product.photos} if isinstance(product, Photos) else None
         unknown = [name for name in names if known is not None and name not in known]

@@ -17,8 +17,8 @@ from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 from orthoflow.products.surfaces import Surfaces
 
 SideSource = Literal["stations", "photos", "guess", "given"]
-# Kind of a plane, the first part of its name. Planes of the kinds `level` and `slope` are neither
-# floors nor ceilings nor walls.
+# Kind of a plane, which is the first part of its name. Planes of the kinds `level` and `slope` are
+# neither walls nor floors nor ceilings.
 PlaneKind = Literal["wall", "floor", "ceiling", "level", "slope"]
 
 _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
@@ -27,14 +27,14 @@ _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
     "given": "given",
     "guess": "guess",
 }
-# The value of markiewicz2015.
+# The value used in markiewicz2015.
 _USUAL_TOLERANCE_M: Final = 0.05
 
 
 def plane_name(kind: PlaneKind, place: int) -> str:
-    """Return the name of a plane and its wall, which contains the plane's index in `planes.json`.
+    """Return the name of a plane and of its wall; the number is the plane's index in `planes.json`.
 
-    The names of the files `wall_<number>_*` contain this number for all kinds of planes.
+    For planes of all kinds, the names of the files begin with `wall_<number>_`.
 
     >>> plane_name("floor", 3)
     'floor 3'
@@ -50,8 +50,8 @@ class Spread:
         low: lower limit of the class, in its unit.
         high: upper limit of the class.
         n_points: number of measured points.
-        sigma_m: robust standard deviation of their distances.
-        name: name of the material, or None for other classes.
+        sigma_m: robust standard deviation of the distances, as in `Thickness`.
+        name: name of the material; None if the class is not a material.
     """
 
     low: float
@@ -63,14 +63,15 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class Thickness:
-    """Thickness of the cloud on one plane; classes are empty if their values are unknown.
+    """Thickness of the cloud on one plane.
 
     Attributes:
-        sigma_m: robust standard deviation of the distances, without relief.
-        width_95_m: width of the range that contains 95 % of the distances.
+        sigma_m: robust standard deviation of the distances from the plane. To exclude relief, each
+            distance is reduced by the mean distance of a small tile of the plane.
+        width_95_m: width of the range that contains the middle 95 % of these distances.
         scan_step_m: median distance between neighbouring points on the plane.
-        incidence_deg: classes of the angle of incidence.
-        range_m: classes of the distance from the scanner.
+        incidence_deg: classes by angle of incidence; empty if unknown.
+        range_m: classes by distance from the scanner; empty if unknown.
         material: thickness by material.
     """
 
@@ -90,8 +91,8 @@ class ScanRow:
         row: number of the row.
         scan: number of the scan.
         n_points: number of points of the row on the plane.
-        sigma_m: robust standard deviation of their distances, without relief; None if there are too
-            few points.
+        sigma_m: robust standard deviation of their distances, as in `Thickness`; None if there are
+            too few points.
         material: thickness by material.
     """
 
@@ -121,14 +122,13 @@ class Planes(Product):
         part_plane: (p,) int32 index of the plane of each part, or None.
         viewpoint: source of the visible side of planes: `stations`, `view_from`, `given` or
             `guess`.
-        side_from: source of the visible side of each plane, if planes differ; empty if `viewpoint`
-            applies to all.
+        side_from: source of the visible side of each plane; empty if `viewpoint` applies to all.
         tolerance_m: maximum distance of points from their plane in the detection; the default is
             that of markiewicz2015.
-        thickness: thickness of the cloud on each plane, None for planes with too few points; empty
+        thickness: thickness of the cloud on each plane; None for planes with too few points; empty
             if not measured.
         scan_row: scan row with the most points on the first plane, if the cloud has rows.
-        details: further JSON results, for users only.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "planes"
@@ -211,9 +211,9 @@ class Planes(Product):
         )
 
     def turned(self, index: int) -> Planes:
-        """Return the planes with one of them viewed from the opposite side."""
+        """Return the planes, with the plane of this index viewed from the opposite side."""
         corners, parts = self.corners.copy(), self.part_corners
-        # The top-left corner of one side is the top-right corner of the other.
+        # The top-left corner seen from one side is the top-right corner seen from the other.
         corners[index] = corners[index, ::-1]
         if parts is not None and self.part_plane is not None:
             parts = parts.copy()
@@ -234,7 +234,7 @@ class Planes(Product):
         return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
 
     def sigma_angle_deg(self, index: int) -> float:
-        """Return the largest standard deviation, over all axes, of a plane's direction."""
+        """Return the largest standard deviation of a plane's normal in any direction, degrees."""
         largest = float(np.linalg.eigvalsh(self.covariance[index, :3, :3])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 
@@ -242,7 +242,7 @@ class Planes(Product):
         """See `Product.check_against`.
 
         Raises:
-            ProductError: a covariance, a number of points or a deviation is invalid.
+            ProductError: a covariance, a number of points or an RMS distance is invalid.
         """
         variances = np.diagonal(self.covariance, axis1=1, axis2=2)
         if not np.isfinite(self.covariance).all() or (variances < 0.0).any():

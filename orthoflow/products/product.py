@@ -33,7 +33,7 @@ _NO_SENSE: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """Maximum difference between two values of a field that count as equal.
+    """Maximum difference at which two values of a field count as equal.
 
     Attributes:
         limit: largest absolute difference, in `unit`.
@@ -127,7 +127,7 @@ class Product:
 
 
 def require_shapes(what: str, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]) -> None:
-    """Refuse arrays with unexpected shapes; arrays that are None are ignored.
+    """Require that arrays have the expected shapes; arrays that are None are ignored.
 
     Raises:
         ProductError: an array has an unexpected shape.
@@ -251,11 +251,6 @@ def _member(kind: type[IntEnum], stored: int, name: str) -> IntEnum:
 
 
 def _of_kind(hint: object, value: object, name: str) -> object:
-    """Return a stored value if its type is allowed; records may contain arbitrary values.
-
-    Raises:
-        ProductError: the type is not allowed.
-    """
     if isinstance(value, float) and not math.isfinite(value):
         raise ProductError(f"the stored {name} must be finite, got {value}")
     kinds = _kinds(hint)

@@ -21,7 +21,7 @@ from orthoflow.products.product import Array, JsonValue, Product, Tolerance
 
 # Percentiles of larger rasters are estimated from some of their rows.
 _CELLS_ASKED: Final = 1 << 25
-# Source of the intensity of a wall: the laser, the grey values of its colours, or none.
+# Source of a wall's intensity: the laser, the luminance of the colours, or none.
 IntensitySource = Literal["laser", "luminance", "none"]
 
 
@@ -82,12 +82,12 @@ SHOWN_STATES: Final = (*PAINTED_STATES, OrthoMask.FILLED)
 
 
 def is_painted(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return a mask of the cells of an orthoimage with a colour from a source."""
+    """Return a mask of the cells that have a colour from a source, given an orthoimage's mask."""
     return np.isin(mask, PAINTED_STATES)
 
 
 def is_shown(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return a mask of the cells of an orthoimage with a colour, including filled cells."""
+    """Return a mask of the cells that have a colour or are filled, given an orthoimage's mask."""
     return np.isin(mask, SHOWN_STATES)
 
 
@@ -108,7 +108,7 @@ class Wall:
         rgb: (rows, cols, 3) uint8, or None.
         rgb_mask: uint8, 1 if the cell has a colour; None if `rgb` is None.
         percentiles_m: (rows, cols, k) float32 metres, percentiles of the depths in a cell (see
-            `Walls.percentiles`), NaN in cells without points; None if not requested.
+            `Walls.percentiles`); NaN in cells without points; None if not requested.
     """
 
     frame: WallFrame
@@ -137,15 +137,15 @@ class Walls(Product):
         up: (3,) float64 unit vector.
         intensity_source: `laser`, `luminance` (grey value of the colours, because there is no laser
             intensity) or `none`.
-        buffer_front_m: maximum distance of points in front of the planes.
-        buffer_behind_m: maximum distance of points behind the planes.
-        buffers_m: distances in front and behind for each wall; empty if `buffer_front_m` and
-            `buffer_behind_m` apply to all walls.
+        buffer_front_m: maximum distance of a wall's points in front of its plane.
+        buffer_behind_m: maximum distance of a wall's points behind its plane.
+        buffers_m: maximum distances in front and behind for each wall; empty if `buffer_front_m`
+            and `buffer_behind_m` apply to all walls.
         percentiles: percentiles (0 to 100) in `Wall.percentiles_m`, in order; empty if none were
             requested.
         included: for each wall, the numbers of other planes that it shows and that have no wall of
             their own; empty if unknown.
-        details: further JSON results, for users only.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "walls"
@@ -205,7 +205,8 @@ class Walls(Product):
 
         Args:
             points_world: (n, 3) metres.
-            is_within_buffer: ignore walls whose raster is farther from a point than their buffer.
+            is_within_buffer: ignore a wall if its raster is farther from the point than the larger
+                of its two buffers.
         """
         nearest = np.full(len(points_world), -1, dtype=np.int32)
         if not self.walls:
@@ -220,11 +221,11 @@ class Walls(Product):
         return nearest
 
     def spacing_m(self) -> float:
-        """Larger value of cell size and point spacing of the finest raster."""
+        """Return the cell size or the point spacing of the finest raster, whichever is larger."""
         return max(min(wall.frame.gsd_m for wall in self.walls), self.points_apart_m())
 
     def points_apart_m(self) -> float:
-        """Approximate point spacing of the finest raster."""
+        """Return the approximate point spacing of the finest raster."""
         wall = min(self.walls, key=lambda wall: wall.frame.gsd_m)
         n_known = n_points = 0
         for rows in row_bands(wall.depth_m.shape):
@@ -244,11 +245,12 @@ class Layer:
         wall: index of the wall in `Walls`.
         source: name of the photo, or `cloud`.
         rgb: (rows, cols, 3) uint8, or uint16 if any photo has 16 bits per channel; 0 in cells
-            without a colour. `geometry.levels` converts between them.
+            without a colour. `geometry.levels` converts between the two types.
         mask: uint8 `LayerMask`; cells with the value 1 have a colour.
         quality: float32; larger values are better; comparable between the layers of a wall; 0 in
             cells without a colour.
-        filled: uint8, 1 if the colour was interpolated from neighbours; or None.
+        filled: uint8, 1 if the colour was interpolated from neighbours; None if no colours were
+            interpolated.
     """
 
     frame: WallFrame
@@ -273,7 +275,7 @@ class Layers(Product):
         plane_indices: index in `Planes` of the plane of each wall; if empty, the index of the wall
             is used.
         icc_profile: colour profile of all sources; None for sRGB or if unknown.
-        details: further JSON results, for users only.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "layers"
@@ -292,7 +294,7 @@ class Layers(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall that users see: the index of its plane in `planes.json`."""
+        """Return the wall number shown to users: the index of the plane in `planes.json`."""
         return self.plane_indices[wall] if wall < len(self.plane_indices) else wall
 
     def name(self, wall: int) -> str:
@@ -312,7 +314,7 @@ class Orthoimage:
         name: name of the wall.
         rgb: (rows, cols, 3) uint8 or uint16 as in the layers; 0 in cells without a colour.
             `geometry.eight_bits` converts to 8 bits.
-        mask: uint8 `OrthoMask`; `is_shown(mask)` are the cells with a colour.
+        mask: uint8 `OrthoMask`; `is_shown(mask)` marks the cells with a colour.
         source: int16 index in `sources`, -1 if the colour is not from a source.
         sources: names of the photos, or `cloud`.
         plane_index: index in `Planes` of the plane of the wall; None if unknown.
@@ -337,9 +339,9 @@ class Orthoimage:
 
     @property
     def expected_mm(self) -> tuple[float, float]:
-        """Return median and 95th percentile of the expected error, millimetres; NaN if unknown.
+        """Return the median and 95th percentile of the expected error, in mm; NaN if unknown.
 
-        If the image is large, they are estimated from some of its rows.
+        For a large image, they are estimated from some of its rows.
         """
         if self.error_m is None:
             return math.nan, math.nan
@@ -352,7 +354,7 @@ class Orthoimage:
 
     @property
     def number(self) -> int:
-        """Number of the wall that users see: the index of its plane in `planes.json`."""
+        """Wall number shown to users: the index of the plane in `planes.json`."""
         return self.wall if self.plane_index is None else self.plane_index
 
 
@@ -363,8 +365,8 @@ class Orthoimages(Product):
     Attributes:
         images: orthoimage of each wall.
         icc_profile: colour profile; None for sRGB or if unknown.
-        layers: layers from which the images were made, if requested, or None.
-        details: further JSON results, for users only.
+        layers: layers from which the images were composed; None if not requested.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "orthoimages"
