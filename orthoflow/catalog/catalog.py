@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 
 EntryState = Literal["fine", "broken", "clash"]
-# Environment variable with comma-separated distributions or entry points.
+# Environment variable with the distributions or entry points of disabled plugins, separated by
+# commas.
 DISABLED: Final = "ORTHOFLOW_DISABLED_PLUGINS"
 
 
@@ -55,7 +56,7 @@ class BrokenPlugin:
         return f"plugin {self.entry_point} of {self.distribution} cannot be loaded: {self.error}"
 
     def mentions(self, method_id: str) -> bool:
-        """Return whether the plugin's code contains this method id, and so probably declares it."""
+        """Return whether the plugin's code contains this method id, and so may declare it."""
         quoted = (f'"{method_id}"', f"'{method_id}'")
         for path in source_files((package_path(self.module.partition(":")[0]),)):
             try:
@@ -72,11 +73,11 @@ class Announced:
     """Origin and state of an entry.
 
     Attributes:
-        distribution: distribution that declares it; the first one in a clash.
-        state: `clash` if several declare it and none takes precedence; `broken` if it cannot be
-            used.
-        problem: one sentence with the distributions concerned; for a usable entry, the other
-            distributions that declare it.
+        distribution: distribution that declares the entry; the first one if several do.
+        state: `clash` if several distributions declare the entry and none takes precedence;
+            `broken` if it cannot be used.
+        problem: one sentence that names the distributions concerned; also set for a usable entry
+            that several distributions declare differently.
     """
 
     distribution: DistributionInfo
@@ -93,7 +94,7 @@ class KindEntry(Announced):
 
 @dataclass(frozen=True, kw_only=True)
 class ProductEntry(Announced):
-    """A product type, with the import strings of class and publisher."""
+    """A product type, with the import strings of its class and its publisher."""
 
     spec: ProductSpec
 
@@ -103,7 +104,7 @@ class MethodEntry(Announced):
     """A method, whose class is loaded on first use; broken if its kind cannot be used.
 
     Attributes:
-        spec: id, import string, summary.
+        spec: id, import string and summary.
         kind: kind with the ports of the method; None if no plugin declares it.
         product_types: all product types that ports may have.
     """
@@ -113,7 +114,7 @@ class MethodEntry(Announced):
     product_types: frozenset[str] = frozenset()
 
     def load(self) -> type[Method]:
-        """Import the class and check the rules on which the framework relies, once.
+        """Import the class on the first call, and check the rules on which the framework relies.
 
         Raises:
             PluginError: the entry is not usable, the import fails, or the class violates a rule;
@@ -132,7 +133,7 @@ class MethodEntry(Announced):
     def looked_at(self) -> MethodEntry:
         """Return the entry, with the state `broken` if its class cannot be loaded.
 
-        Built-in methods are not checked, to save half a second; the tests of each release load
+        Built-in methods are not loaded, which saves half a second; the tests of each release load
         them.
         """
         if self.state != "fine" or self.distribution.name == DISTRIBUTION:
@@ -144,7 +145,7 @@ class MethodEntry(Announced):
         return self
 
     def source_files(self) -> tuple[Path, ...]:
-        """Python files whose content can change the results of the method, sorted.
+        """Return the Python files whose content can change the results of the method, sorted.
 
         These are all files in the packages of the hooks and of the class.
         """
@@ -172,11 +173,12 @@ class Catalog:
     disabled: tuple[str, ...] = ()
 
     def method(self, method_id: str) -> MethodEntry:
-        """Return a method that can be loaded.
+        """Return the entry of a usable method.
 
         Raises:
             WorkflowError: no plugin has a method with that id.
-            PluginError: several plugins have it, its kind is unusable, or its plugin fails to load.
+            PluginError: several plugins declare it, its kind is unusable, or its plugin fails to
+                load.
         """
         entry = self.methods.get(method_id)
         if entry is None:
@@ -196,7 +198,7 @@ class Catalog:
         """Return the class of a product type.
 
         Raises:
-            PluginError: no plugin or several declare the type, or its class cannot be imported.
+            PluginError: no plugin declares the type, or its class cannot be imported or is invalid.
         """
         from orthoflow.catalog.loading import import_target  # noqa: PLC0415 - loads pydantic
         from orthoflow.products.product import Product  # noqa: PLC0415 - loads numpy
@@ -215,7 +217,7 @@ class Catalog:
         """Return the publisher of a product type; None if it has none.
 
         Raises:
-            PluginError: no plugin or several declare the type, or its publisher cannot be imported.
+            PluginError: no plugin declares the type, or its publisher cannot be imported.
         """
         from orthoflow.catalog.loading import import_target  # noqa: PLC0415 - loads pydantic
 
@@ -239,7 +241,8 @@ class Catalog:
         return entry
 
     def _suggest(self, method_id: str) -> str:
-        # Compare only the part after the dot, since the kind is the same for all methods of a kind.
+        # Compare only the part after the dot, since the part before it is the same for all
+        # candidates.
         kind, _, name = method_id.partition(".")
         siblings = {other.partition(".")[2]: other for other in self._of_kind(kind)}
         if not siblings:

@@ -1,4 +1,4 @@
-"""Discovery of plugins through entry points, isolated from each other's errors."""
+"""Discovery of plugins through entry points; an error in one plugin does not affect the others."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from orthoflow.sdk.hooks import (
 from orthoflow.sdk.lines import describe_error
 from orthoflow.version import DISTRIBUTION
 
-# The excluded names are devices of Windows, and files are named after methods and steps.
+# Device names of Windows are excluded because files are named after methods and steps.
 NAME_PATTERN: Final = (
     r"(?!(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?![a-z0-9_-]))[a-z][a-z0-9_-]{0,31}"
 )
@@ -102,8 +102,8 @@ def _installed_entry_points() -> Iterable[EntryPoint]:
     try:
         return metadata.entry_points(group=ENTRY_POINT_GROUP)
     except ValueError:
-        # Python's own function fails for all if one file is unreadable. A distribution may be found
-        # twice; the first one is used, as in imports.
+        # `metadata.entry_points` fails completely if one distribution is unreadable. A distribution
+        # may be found twice; as in imports, the first one is used.
         found: dict[str, list[EntryPoint]] = {}
         for distribution in metadata.distributions():
             with suppress(ValueError):
@@ -140,7 +140,6 @@ def _announced(entry: EntryPoint) -> list[MethodSpec | KindSpec | ProductSpec]:
 
 
 def _check(spec: MethodSpec | KindSpec | ProductSpec) -> None:
-    """Check the spelling of the fields of a spec; fields of another type raise here."""
     ports = (*spec.inputs.items(), *spec.outputs.items()) if isinstance(spec, KindSpec) else ()
     if not all(isinstance(text, str) for port in ports for text in port):
         raise PluginError(f"ports of kind {_name(spec)} must be names of product types")
@@ -174,7 +173,6 @@ def _describe_failure(
 def _by_name(
     claims: Iterable[_AnyClaim], spec_class: type[_Spec]
 ) -> dict[str, list[tuple[_Spec, DistributionInfo]]]:
-    """Return the claims for each name, in order."""
     found: dict[str, list[tuple[_Spec, DistributionInfo]]] = {}
     for spec, distribution in claims:
         if isinstance(spec, spec_class):
@@ -255,7 +253,7 @@ def _collect_methods(
     product_types = frozenset(products)
 
     def entry_of(spec: MethodSpec, distribution: DistributionInfo) -> MethodEntry:
-        # A kind of the same plugin takes precedence over that of another plugin.
+        # A plugin's own kind takes precedence over a kind of the same name from another plugin.
         claims = by_kind.get(spec.kind, [])
         own = next((claim for claim in claims if claim[1].name == distribution.name), None)
         shared = kinds.get(spec.kind)

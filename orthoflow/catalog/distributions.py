@@ -34,7 +34,7 @@ class DistributionInfo:
 
 
 def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
-    """Return the distribution of an entry point, without importing it."""
+    """Return the distribution of an entry point, without importing the plugin."""
     code = package_path(entry_point.module)
     folder = code if code is not None and code.is_dir() else None
     distribution = entry_point.dist
@@ -49,7 +49,6 @@ def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
 
 
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
-    """Return name and version from the metadata; empty if missing or unreadable."""
     try:
         stated = distribution.metadata
     except ValueError:
@@ -58,7 +57,7 @@ def _name_and_version(distribution: Distribution) -> tuple[str, str]:
 
 
 def package_path(module: str) -> Path | None:
-    """Return the folder of the outermost regular package of a module, or the file of a module.
+    """Return the folder of a module's outermost regular package, or its file if it has no package.
 
     Only namespace packages, which contain no code, are imported. None if the module does not exist.
     """
@@ -91,7 +90,7 @@ def canonical_name(name: str) -> str:
 def direct_requirements(name: str) -> frozenset[str] | None:
     """Return the canonical names of the direct requirements of a distribution, for all platforms.
 
-    Extras are excluded. None if it is not installed or its metadata cannot be read.
+    Extras are excluded. None if the distribution is not installed or its metadata is unreadable.
     """
     try:
         stated = requires(name) or []
@@ -103,9 +102,10 @@ def direct_requirements(name: str) -> frozenset[str] | None:
 
 @cache
 def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
-    """Return the canonical names of distributions and all their direct and indirect requirements.
+    """Return the canonical names of distributions and of their direct and indirect requirements.
 
-    None if one of the given distributions is not installed, so that its requirements are unknown.
+    None if one of the given distributions is not installed, since its requirements are then
+    unknown.
     """
     left = [canonical_name(name) for name in names]
     if any(direct_requirements(name) is None for name in left):

@@ -26,7 +26,7 @@ class UserInterrupt(KeyboardInterrupt):
 def guarded() -> Iterator[None]:
     """Protect the program from side effects of the code in the block.
 
-    Its output goes to standard error; the working directory and the recursion limit are restored.
+    Output of the code goes to standard error; working directory and recursion limit are restored.
 
     Raises:
         UserInterrupt: the user pressed Ctrl-C.
@@ -40,13 +40,12 @@ def guarded() -> Iterator[None]:
         left = sys.getrecursionlimit()
         sys.setrecursionlimit(limit)
         if left < limit:
-            # This replaces a RecursionError caused by the lower limit.
+            # This error replaces a RecursionError caused by the lower limit.
             raise PluginError(f"the plugin lowers Python's recursion limit from {limit} to {left}")
 
 
 @contextmanager
 def _working_folder_kept() -> Iterator[None]:
-    """Restore the working directory, even if it has been deleted."""
     folder = os.open(".", os.O_PATH)
     try:
         yield
@@ -57,7 +56,6 @@ def _working_folder_kept() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_marked() -> Iterator[None]:
-    """Raise `UserInterrupt` on Ctrl-C, unlike a `KeyboardInterrupt` that a plugin raises."""
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.default_int_handler or threading.current_thread() is not (
         threading.main_thread()
