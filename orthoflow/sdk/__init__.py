@@ -1,4 +1,4 @@
-"""The interface for authors of methods: base classes, context of a step, hooks and specs."""
+"""The interface for authors of methods: base classes, step context, hooks and specs."""
 
 from __future__ import annotations
 

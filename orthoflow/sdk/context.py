@@ -31,7 +31,7 @@ __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 # Metrics that the engine measures for every step.
 MEASURED_BY_THE_ENGINE: Final = tuple(COSTS)
 _MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp"}
-# More diagnostics than any step needs, but few enough for a terminal.
+# Maximum number of diagnostics of a step: more than any step needs, but few enough for a terminal.
 _MOST_DIAGNOSTICS: Final = 1_000
 _LARGEST_FIGURE: Final = 64 << 20
 _HEAD_BYTES: Final = 16  # signature of an image file
@@ -42,7 +42,7 @@ class Drawing(Protocol):
     """An object that can write itself to an image file, such as a matplotlib figure."""
 
     def savefig(self, fname: Path) -> None:
-        """Write the image; the suffix decides the format."""
+        """Write the image to a file, whose suffix determines the format."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class DrawnFigure(Figure):
 
 @dataclass(frozen=True, kw_only=True)
 class StepEvent:
-    """A report of a running step.
+    """An event reported by a running step.
 
     Attributes:
         kind: `progress`, `log` or `diagnostic`.
@@ -87,16 +87,17 @@ class StepContext:
         scratch: existing empty folder; methods must not write elsewhere.
         listen: receives progress, log lines and diagnostics.
         is_cancelled: returns whether the step should stop.
-        clock_s: seconds as from `time.perf_counter`, without the time of loading modules and
+        clock_s: like `time.perf_counter`, but excludes the time spent on loading modules and
             compiling kernels, which depends on earlier steps. The engine reports that time as
             `compile_s`.
-        processor_s: processor seconds of all threads and of ended child processes, without those of
-            loading and compiling; it hardly depends on other programs on the machine.
+        processor_s: returns the CPU time of all threads and of ended child processes in seconds,
+            without that of loading modules and compiling kernels. Other programs on the machine
+            hardly affect it.
         metrics: metrics reported by `metric`.
         figures: figures reported by `figure`.
         diagnostics: diagnostics reported by `report` and `warn`.
-        drawing_s: elapsed and processor seconds spent on figures, which the engine does not count
-            as the method's own.
+        drawing_s: elapsed time and CPU time in seconds spent on figures; the engine subtracts them
+            from those of the method.
     """
 
     rng: np.random.Generator
@@ -115,13 +116,13 @@ class StepContext:
     _n_diagnostics: int = 0
 
     def metric(self, name: str, value: float, unit: str) -> None:
-        """Report a metric of the result.
+        """Report a metric.
 
         Args:
-            name: letters, digits, `-`, `_`, `.`, with the unit at the end if there is one, e.g.
+            name: letters, digits, `-`, `_` and `.`; ends with the unit if there is one, e.g.
                 `rms_mm`.
             value: a finite number.
-            unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
+            unit: a unit such as `mm`, `px` or `s`; `1` for counts and shares.
 
         Raises:
             ProductError: the value is not finite, or the name is invalid or was reported before.
@@ -151,15 +152,15 @@ class StepContext:
         """Add a figure to the record and the report.
 
         Args:
-            name: short name, unique in the step; letters, digits, `-`, `_`.
-            content: content of a PNG or WebP file, a function that returns it and is called only if
-                figures are needed, or a matplotlib figure. Charts are PNG; images that look like
-                photos are WebP, a tenth of the size.
-            caption: one sentence on the content of the figure.
+            name: short name that is unique in the step; letters, digits, `-`, `_` and `.`.
+            content: content of a PNG or WebP file; a function that returns this content and is
+                called only if figures are needed; or a matplotlib figure. Use PNG for charts and
+                WebP for images that resemble photos, since this reduces their size to a tenth.
+            caption: one sentence on what the figure shows.
 
         Raises:
-            ProductError: the name is invalid or was used before, or the content is not such an
-                image or is larger than 64 MiB.
+            ProductError: the name is invalid or was used before, or the content is not a PNG or
+                WebP image or is larger than 64 MiB.
         """
         _require_name("figure", name)
         clock_s, processor_s = self.clock_s(), self.processor_s()
@@ -192,10 +193,10 @@ class StepContext:
         self.drawing_s = self.drawing_s[0] + taken_s[0], self.drawing_s[1] + taken_s[1]
 
     def progress(self, fraction: float, text: str = "") -> None:
-        """Report the progress, 0 to 1, which never decreases; stop a cancelled step.
+        """Report the progress, 0 to 1, or stop the step if it was cancelled.
 
         Raises:
-            CancelledStepError: the step was asked to stop.
+            CancelledStepError: the step was cancelled.
         """
         if self.is_cancelled():
             raise CancelledStepError("the step was cancelled")
@@ -207,18 +208,18 @@ class StepContext:
         self.listen(StepEvent(kind="log", text=one_line(text)))
 
     def report(self, spec: DiagnosticSpec, *, subject: str = "", **values: object) -> None:
-        """Report a diagnostic, which is shown on the terminal, in the record and in the report.
+        """Report a diagnostic, which appears on the terminal, in the record and in the report.
 
-        After the thousandth diagnostic of a step, only their number is kept.
+        Diagnostics of a step after the thousandth are only counted.
 
         Args:
             spec: the kind of diagnostic.
             subject: the object concerned, e.g. `scan 0` or `wall 3`; diagnostics with the same spec
                 are grouped.
-            values: numbers and texts to insert into the sentence.
+            values: numbers and strings to insert into the text and the remedy.
 
         Raises:
-            ProductError: a value is missing, or is neither a number nor a text.
+            ProductError: a value is missing, or is neither a number nor a string.
         """
         one = spec.of(subject, values)
         self._n_diagnostics += 1
@@ -239,16 +240,16 @@ class StepContext:
         return list(warning_texts(self.diagnostics))
 
     def cancelled(self) -> bool:
-        """Return whether the step was asked to stop."""
+        """Return whether the step was cancelled."""
         return self.is_cancelled()
 
     def allocate(
         self, port: str, name: str, shape: tuple[int, ...], dtype: DTypeLike
     ) -> NDArray[np.generic]:
-        """Return a zeroed array for an output too large to hold in memory twice.
+        """Return a zeroed array for an output that is too large to be held in memory twice.
 
-        The array is memory-mapped from a file in the scratch folder, so that it does not count
-        towards the memory of the step while it is being filled.
+        The array is memory-mapped from a file in the scratch folder, so it does not count towards
+        the memory of the step while it is being filled.
 
         Args:
             port: output port.
@@ -258,7 +259,7 @@ class StepContext:
 
         Raises:
             OSError: the disk is full.
-            ProductError: the type or the shape is invalid.
+            ProductError: the type contains Python objects, or the shape is negative.
         """
         size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
         if np.dtype(dtype).hasobject or min(shape, default=0) < 0:
@@ -271,7 +272,7 @@ class StepContext:
         folder.mkdir(exist_ok=True)
         path = folder / f"{len(list(folder.iterdir()))}"
         with path.open("wb") as file:
-            # Writing to a sparse file on a full disk would kill the process.
+            # Writing to a memory-mapped sparse file on a full disk would kill the process.
             os.posix_fallocate(file.fileno(), 0, size_bytes)
         return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
 

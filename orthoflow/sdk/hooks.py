@@ -1,8 +1,8 @@
 """Hooks and specs with which a plugin declares its content; they do not import numpy or pydantic.
 
-A plugin is an installed distribution with an entry point in the group `orthoflow.plugins` that
-refers to a module that implements one or more of the hooks below with `hookimpl`. Classes are given
-as import strings and imported on first use.
+A plugin is an installed distribution with an entry point in the group `orthoflow.plugins`. The
+entry point refers to a module that implements one or more of the hooks below with `hookimpl`.
+Classes are given as import strings and imported on first use.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ class MethodSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class KindSpec:
-    """Declaration of a kind: ports that all its methods share, so that they are interchangeable.
+    """Declaration of a kind, whose methods are interchangeable because they have the same ports.
 
     Attributes:
         name: name of the kind.
         summary: one line for listings.
-        inputs: port name -> product type name, or `files` for an input of the workflow; empty for
+        inputs: product type name by port name, or `files` for an input of the workflow; empty for
             sources, whose methods declare their own ports.
-        outputs: port name -> product type name; empty for sources.
-        is_source: whether methods declare their own ports; steps of such kinds have no variants.
+        outputs: product type name by port name; empty for sources.
+        is_source: whether methods declare their own ports; steps of such a kind have no variants.
     """
 
     name: str
@@ -70,8 +70,8 @@ class ProductSpec:
         type_name: name of the type, e.g. `planes`.
         target: import string of the class.
         summary: one line for listings.
-        publisher: import string of `publish(product, folder, digest)`, which writes files for other
-            programs; empty if there are none.
+        publisher: import string of a function `publish(product, folder, digest)` that writes files
+            for other programs; empty if there is none.
     """
 
     type_name: str

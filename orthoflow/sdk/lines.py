@@ -1,4 +1,4 @@
-"""Sanitising of reported texts: one line, printable, with limited length."""
+"""Sanitising of reported text: one printable line of limited length."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LONGEST_NAME_BYTES: Final = 200
 
 
 def one_line(text: object, longest: int = _LONGEST) -> str:
-    r"""Return a text as one printable line, truncated if it is too long.
+    r"""Return text as one printable line, truncated if it is too long.
 
     >>> one_line("no\n  plane \x1b[31m at all")
     'no plane \\x1b[31m at all'
@@ -27,7 +27,7 @@ def one_line(text: object, longest: int = _LONGEST) -> str:
 
 
 def describe_error(error: BaseException) -> str:
-    r"""Return class and message of an error as one line.
+    r"""Return the class and message of an error as one line.
 
     >>> describe_error(ValueError("no such\n  plane"))
     'ValueError: no such plane'
@@ -41,8 +41,8 @@ def is_name(name: object, *, also_of_file: bool = True) -> bool:
 
     Args:
         name: any object.
-        also_of_file: whether the name must be valid for a file (no `/`, `.` or `..`); units such as
-            `m/s` need not be.
+        also_of_file: also require a valid file name (without `/`, and not `.` or `..`); False for
+            units such as `m/s`.
 
     >>> [is_name(name) for name in ("rms_mm", "", "a\nb", "../a", "..", 5, "n" * 300)]
     [True, False, False, False, False, False, False]
@@ -57,7 +57,7 @@ def is_name(name: object, *, also_of_file: bool = True) -> bool:
 
 
 def text_of_path(path: Path) -> str | None:
-    """Return a path as text that can be stored and read again; None if it is not UTF-8."""
+    """Return a path as a string that can be stored and read again; None if it is not UTF-8."""
     try:
         str(path).encode()
     except UnicodeEncodeError:

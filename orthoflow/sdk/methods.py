@@ -25,7 +25,7 @@ _WILDCARD: Final = re.compile(r"(\*|\[[^\]]+\])")
 
 
 class MethodParams(BaseModel):
-    """Base class of a method's parameters: frozen, unknown keys are rejected.
+    """Base class of a method's parameters, which are frozen and reject unknown keys.
 
     Every field has a default and a description, and its name ends with its unit.
     """
@@ -35,7 +35,7 @@ class MethodParams(BaseModel):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Ports:
-    """Base class of a method's `In` and `Out`, which annotate one product class per port.
+    """Base class of a method's `In` and `Out`, which annotate each port with a product class.
 
     `X | None = None` declares an optional port. Subclasses become frozen dataclasses automatically.
     """
@@ -64,9 +64,9 @@ def port_specs(ports: type[Ports]) -> Mapping[str, PortSpec]:
     """Return the ports of an `In` or `Out` class by name, from its annotations.
 
     Raises:
-        PluginError: an annotation is neither a product class nor product class | None.
+        PluginError: an annotation is neither a product class nor `product class | None`.
     """
-    # Any: mypy does not accept a class as the key of a cache.
+    # Cast to Any because mypy does not accept a class as the key of a cache.
     return _port_specs(typing.cast("Any", ports))
 
 
@@ -99,18 +99,18 @@ class MetricSpec:
 
     Attributes:
         name: name of the metric, with wildcards (`*`, `[xy]`) if a part depends on the data.
-        unit: `mm`, `px`, `s`, ...; `1` for counts and shares, `yes/no` for 1 and 0; empty if the
-            name ends with the unit.
-        label: name in reports, e.g. `damp patches`; `{0}`, `{1}` are replaced by the matches of the
-            wildcards. If empty, reports show the name.
-        better: `lower`, `higher` or `one`: the better direction; empty for metrics that are shown
-            but not ranked.
-        description: one sentence of further information, e.g. how it is measured.
-        headline: whether it measures the quality of the result; it is then in the first section of
-            a report, and in comparisons that do not select metrics.
-        counted_by: metric of the same step with the number of items (photos, points) over which
-            this one sums; values over different numbers are not ranked.
-        needs: optional input ports without which it is not reported.
+        unit: a unit such as `mm`, `px` or `s`; `1` for counts and shares; `yes/no` for 1 and 0;
+            empty if the name ends with the unit.
+        label: name in reports, e.g. `damp patches`; `{0}` and `{1}` are replaced by the matches of
+            the wildcards. If empty, reports show the name.
+        better: `lower`, `higher` or `one` (closer to 1), whichever is better; empty for metrics
+            that are shown but not ranked.
+        description: one sentence of further information, e.g. on how it is measured.
+        headline: whether it measures the quality of the result. Such metrics are shown in the first
+            section of a report, and in comparisons that do not select metrics.
+        counted_by: metric of the same step that counts the items (photos or points) on which this
+            metric is based; values based on different numbers of items are not ranked.
+        needs: optional input ports that must be connected for the metric to be reported.
     """
 
     name: str
@@ -149,13 +149,13 @@ class Method:
         result_version: number that the author increments when results change for the same inputs.
         determinism: `exact` (always the same bits), `seeded` (the same bits for the same seed) or
             `loose` (equal within the tolerances of the products).
-        metrics: all metrics that it may report, as `MetricSpec` or as a name. A comparison that
-            selects another metric is rejected, unless the list is empty.
+        metrics: all metrics that it may report, as `MetricSpec` or as a name. Unless this is empty,
+            a comparison that selects another metric is rejected.
         citations: source of the method: DOI, title or URL.
-        unaffected_by: required distributions whose version does not change results; all others are
-            part of the cache key.
-        repeatable: input ports of files that may contain several files with the same content, such
-            as masks; in other ports, a second copy would count twice and is rejected.
+        unaffected_by: required distributions whose version does not change results; the versions of
+            all others are part of the cache key.
+        repeatable: input ports, such as `masks`, for which several files may have the same content;
+            for other ports, a second copy would count twice and is rejected.
         Params: parameters.
         In: input ports.
         Out: output ports.
@@ -172,15 +172,16 @@ class Method:
     In: ClassVar[type[Ports]]
     Out: ClassVar[type[Ports]]
 
-    # Any: each method narrows inputs and params to its own nested classes; a generic base class
-    # would require three type parameters of every author.
+    # Any, because each method narrows inputs and params to its own nested classes; with a generic
+    # base class, every author would have to give three type parameters.
     def run(self, inputs: Any, params: Any, ctx: StepContext) -> Any:
         """Compute the outputs.
 
         Args:
             inputs: instance of `In`; arrays are read-only.
             params: instance of `Params`.
-            ctx: seed, cores, scratch folder, and methods to report metrics, figures and progress.
+            ctx: random generator, cores, scratch folder, and methods to report metrics, figures and
+                progress.
 
         Returns:
             An instance of `Out`.
@@ -202,7 +203,7 @@ class Method:
 
     @classmethod
     def metric_spec(cls, metric: str) -> MetricSpec | None:
-        """Return the declaration of a metric, by its exact name or else by a pattern."""
+        """Return the declaration with this exact name, or else with a pattern that matches it."""
         specs = cls.metric_specs()
         exact = next((spec for spec in specs if spec.name == metric), None)
         return exact or next((spec for spec in specs if fnmatchcase(metric, spec.name)), None)
@@ -237,7 +238,7 @@ def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, .
 
 
 def matched(pattern: str, name: str) -> tuple[str, ...]:
-    """Return the parts of a name that match the wildcards of a pattern, with spaces for `_`.
+    """Return what the wildcards of a pattern match in a name, with `_` replaced by spaces.
 
     >>> matched("wall_*_rmse_[uv]_mm", "wall_3_rmse_u_mm")
     ('3', 'u')
