@@ -6,9 +6,9 @@ Use it in the tests of a plugin:
     def test_conformance(case):
         case.run()
 
-The suite uses only the declarations of the method, does not need pytest itself, and reports each
-problem in one sentence. List a check that a method cannot pass, with the reason, in
-`expected_failures`; the case fails as soon as the check passes, so that outdated entries are
+The suite needs only the declarations of the method, does not depend on pytest, and reports each
+problem in one sentence. If a method cannot pass a check, list the check with the reason in
+`expected_failures`. If the check passes nevertheless, the case fails, so that outdated entries are
 noticed.
 """
 

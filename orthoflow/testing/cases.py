@@ -1,4 +1,4 @@
-"""Test cases: pairs of a method and a check, whose failures are reported in one sentence."""
+"""Test cases, each of which runs one check on one method and reports a failure in one sentence."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ConformanceCase:
     Attributes:
         method_id: id of the method.
         check: the check.
-        subject: returns the method with its runs, which are shared by its cases.
+        subject: returns the method with its runs, which all cases of the method share.
         expected_failure: the reason why the check is expected to fail; empty if it must pass.
     """
 
@@ -49,7 +49,8 @@ class ConformanceCase:
         """Run the check.
 
         Raises:
-            ConformanceError: the method breaks the rule, or an expected failure did not occur.
+            ConformanceError: the method breaks the rule, or it passes although a failure is
+                expected.
         """
         problem = self.problem()
         if self.expected_failure and not problem:
@@ -72,7 +73,6 @@ class ConformanceCase:
 
 
 def _described(error: Exception, subject: Subject) -> str:
-    """Return an error of a run and the line of the method where it was raised."""
     own = package_path(subject.method.__module__)
     frames = traceback.extract_tb(error.__traceback__)
     within = [one for one in frames if own and Path(one.filename).resolve().is_relative_to(own)]
@@ -91,14 +91,14 @@ def conformance_cases(
     """Return all checks that apply to an installed method.
 
     Args:
-        method_id: id of a method in the installed entry points, e.g. `plane.flat`.
-        inputs: products by port, for ports for which the suite has no suitable example; or a
+        method_id: id of an installed method, e.g. `plane.flat`.
+        inputs: products by port, for the ports without a suitable example in the suite; or a
             function that returns this mapping and is called by the first case.
         params: parameters that differ from the defaults, for a fast run.
-        expected_failures: reasons why the method cannot pass a check, by name of the check.
+        expected_failures: reasons why the method cannot pass certain checks, by name of the check.
         golden: file with golden results, which must be reproduced as long as `result_version` is
-            unchanged; the first run adds missing results. Keep it with the tests, under version
-            control.
+            unchanged; the first run adds missing results. Keep the file next to the tests under
+            version control.
 
     Raises:
         ArgumentError: `expected_failures` contains an unknown check or an empty reason.

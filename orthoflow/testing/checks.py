@@ -32,7 +32,8 @@ from orthoflow.testing.physics import (
 )
 from orthoflow.testing.subjects import Subject, output_of, require
 
-# The name of a float parameter must contain one of these units or words for unitless values.
+# The name of a float parameter must contain one of these words, which stand for a unit or for a
+# value without a unit.
 UNIT_SUFFIXES: Final = (*UNITS, "world", "intensity")
 
 
@@ -42,9 +43,9 @@ class Check:
 
     Attributes:
         run: raises AssertionError with one sentence if the method breaks the rule.
-        applies: returns a true value for a method to which the rule applies.
-        is_quick: whether the check needs at most two runs on the example and, apart from these,
-            only inputs that are refused before any computation.
+        applies: returns a true value if the rule applies to the method.
+        is_quick: whether the check runs the method on the example at most twice, and otherwise only
+            on inputs that are rejected before any computation.
     """
 
     run: Callable[[Subject], None]
@@ -134,7 +135,7 @@ def global_state_stays_untouched(subject: Subject) -> None:
 
 
 def nothing_is_written_outside_scratch(subject: Subject) -> None:
-    """No files are written to the working directory, the home or the temporary folder."""
+    """No files are written to the working directory, the home directory or the temporary folder."""
     _ = subject.first  # all rules report an error of every run in the same way
     _, strays = subject.elsewhere
     require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
@@ -162,7 +163,7 @@ def threads_do_not_show(subject: Subject) -> None:
     """The digest is the same with one core and with two."""
     one, two = subject.first, subject.on_two_cores
     for name, digest in one.digests.items():
-        # Outputs that differ between two runs on one core violate the rule above.
+        # If outputs differ between two runs on one core, `results_repeat` reports this.
         is_same = two.digests[name] == digest or subject.again.digests[name] != digest
         require(is_same, f"output {name} depends on the number of cores")
 
@@ -178,7 +179,6 @@ def _check_clouds(
     *,
     may_pass: bool = False,
 ) -> None:
-    """Run the method on spoilt clouds; only an OrthoflowError with a message may be raised."""
     _ = subject.first  # an error of every run is not due to these clouds
     for port in _cloud_ports(subject.method):
         cloud = subject.trial.inputs.get(port)
@@ -210,7 +210,7 @@ def empty_cloud_is_refused(subject: Subject) -> None:
 
 
 def nan_is_refused(subject: Subject) -> None:
-    """A cloud with a coordinate that is NaN causes an OrthoflowError."""
+    """A cloud in which a coordinate is NaN causes an OrthoflowError."""
     _check_clouds(subject, lambda cloud: _with_one_x(cloud, np.nan), "NaN coordinates")
 
 
@@ -223,7 +223,7 @@ def a_huge_coordinate_does_no_harm(subject: Subject) -> None:
 def missing_ties_are_reported(subject: Subject) -> None:
     """Without ties, no photo is reported as oriented."""
     ties = example_ties()
-    # The type is Any, since there are arrays of all types.
+    # Any, because the arrays have various types.
     rows: dict[str, Any] = {
         name: given[:0] for name, given in vars(ties).items() if isinstance(given, np.ndarray)
     }
@@ -247,7 +247,7 @@ def progress_never_goes_back(subject: Subject) -> None:
 
 
 def cancel_is_honoured(subject: Subject) -> None:
-    """The method checks regularly whether its step was cancelled, and then stops."""
+    """The method checks regularly whether its step was cancelled, and stops if so."""
     try:
         subject.run_cancelled()
     except CancelledStepError:

@@ -31,13 +31,13 @@ def example_inputs(
 ) -> dict[str, Product | InputFiles]:
     """Return the required inputs of a method, all from one scene: a photographed wall or a room.
 
-    The true room is included if the method has a port for it. Types that neither scene contains are
-    created by an installed method that outputs them.
+    The ground truth of the room is included if the method has a port for it. Products of types that
+    neither scene contains are created by an installed method that outputs them.
 
     Args:
         method: class of the method.
-        besides: ports that need no example.
-        within: types whose examples are being created from this one.
+        besides: ports for which no example is needed.
+        within: types whose examples depend on this one, to prevent infinite recursion.
 
     Raises:
         ExampleError: there is no example for a port.
@@ -60,7 +60,7 @@ def example(type_name: str, *, within: tuple[str, ...] = ()) -> Product | InputF
 
     Args:
         type_name: the product type.
-        within: types whose examples are being created from this one.
+        within: types whose examples depend on this one, to prevent infinite recursion.
 
     Raises:
         ExampleError: the type belongs to a plugin, and no installed method creates it from other
@@ -101,14 +101,16 @@ def example_room(
     """Return a box-shaped room with exactly known planes.
 
     Args:
-        seed: seed of noise and point positions, which rotation and shift do not affect.
+        seed: seed of the noise and of the positions of points in the room, both of which are
+            independent of rotation and shift.
         n_points: total number of points on the six sides.
         turned_deg: angle by which the room is rotated about the vertical before it is shifted.
         shift_m: (3,) shift in metres.
 
     Returns:
-        The cloud (2 mm noise, grey colours, a station in the centre) and its true planes in the
-        order two long walls, two short walls, floor, ceiling; normals point into the room.
+        The cloud (with 2 mm noise, grey colours and a station in the centre), and its true planes
+        in this order: the two long walls, the two short walls, the floor and the ceiling. The
+        normals point into the room.
     """
     rng = np.random.default_rng(seed)
     size = np.array([5.0, 3.6, 2.6])
@@ -125,7 +127,7 @@ def example_room(
         points.append(local @ turn.T)
         normals.append(normal @ turn.T)
         offsets.append(distance + float(normals[-1] @ origin))
-        # Begin at the top left, and go down, to the right and up.
+        # The corners begin at the top left and continue down, to the right and up.
         u, v = (0.5 * (size @ np.abs(side)) * side for side in wall_axes(normal, up_vector("z")))
         steps = np.array([-u - v, v - u, u + v, u - v])
         corners.append((distance * normal + steps) @ turn.T + origin)

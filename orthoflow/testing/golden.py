@@ -2,9 +2,9 @@
 
 The exact bits of a result also depend on the processor and on the versions of numerical libraries.
 Therefore, the file contains samples of the numbers, which must be reproduced within the tolerances
-of the product types. Metadata values that describe a result have no tolerance, and shares of few
-cells can change considerably with the last bits of the inputs. Such values are compared only if the
-samples of the inputs are the same.
+of the product types. The products declare no tolerances for metadata that describe a result, and
+the last bits of the inputs can change some of these values considerably, such as a share of a few
+cells. Metadata are therefore compared only if the samples of the inputs are the same.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ from orthoflow.products.product import Tolerance
 from orthoflow.testing.trials import Trial
 
 _AT_MOST: Final = 32
-# Share of cells that may differ, since a cell at an edge can change sides with the last bit of a
-# number.
+# Share of the sampled values that may differ, since rounding errors can move a cell at an edge to
+# the other side.
 _STRAY_SHARE: Final = 1 / 16
-# If no tolerance is declared, only the last digits may differ, as in comparisons of records.
+# Absolute and relative tolerance of values for which none is declared, as in comparisons of
+# records.
 _UNSTATED: Final = 1e-6
-# Tolerance of metadata values that describe a result, such as medians or counts. Without wide
-# processor instructions, such a value of a built-in method changed by 3e-4, while all arrays were
-# within their tolerances.
+# Relative tolerance of metadata that describe a result, such as medians or counts. On a processor
+# without wide vector instructions, such a value of a built-in method changed by 3e-4, although all
+# arrays were within their tolerances.
 _METADATA_SHARE: Final = 1e-2
 _DIGITS: Final = 9
 _ROUNDING: Final = 10.0 ** (1 - _DIGITS)
@@ -42,8 +43,8 @@ _ROUNDING: Final = 10.0 ** (1 - _DIGITS)
 _STRIDE: Final = 2_654_435_761
 _METADATA: Final = "metadata"
 
-# By name and shape of each array, up to 32 of its values with nine digits, at positions that depend
-# only on its size; None for NaN.
+# For each array, by its name and shape: up to 32 values with nine digits, at positions that depend
+# only on the array's size; None for NaN.
 Samples: TypeAlias = Mapping[str, Sequence[float | None]]
 
 
@@ -53,10 +54,10 @@ class Golden:
 
     Attributes:
         result_version: result version of the method.
-        tools: library versions declared by the method; other versions may give other results.
+        tools: library versions declared by the method; other versions may give different results.
         params: parameters that differ from the defaults, as JSON.
-        inputs: samples of each array by port, without files.
-        outputs: samples of each array by port.
+        inputs: samples of the input arrays by port; files are omitted.
+        outputs: samples of the output arrays by port.
     """
 
     result_version: int
@@ -76,7 +77,7 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
     parameters are different, or if the inputs, which are results of other methods, have changed.
 
     Args:
-        file: JSON file by method id, created if missing.
+        file: JSON file with results by method id; created if missing.
         trial: the method and its inputs.
         outputs: products by port.
 
@@ -94,7 +95,7 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
         inputs={port: sample_of(product) for port, product in inputs.items()},
         outputs={port: sample_of(product) for port, product in outputs.items()},
     )
-    # Other processes, which test other methods, use the same file.
+    # Processes that test other methods may use the same file.
     with file.open("a+", encoding="utf-8") as stream:
         lock_file(file, stream.fileno(), waits=True)
         stream.seek(0)
@@ -105,7 +106,7 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
             known[trial.method.id] = now
             text = json.dumps(_FORMAT.dump_python(known), indent=1, sort_keys=True)
             stream.truncate(0)
-            # Write each list of numbers in one line, so that version control shows which of them
+            # Write each list of numbers on one line, so that version control shows which lists
             # changed.
             stream.write(re.sub(r"\[[^\[\]]+\]", lambda it: " ".join(it[0].split()), text) + "\n")
             return ""
@@ -126,7 +127,6 @@ def _changes(
     *,
     numbers_stated: bool = True,
 ) -> Iterator[tuple[str, str]]:
-    """Yield each port whose samples differ beyond the tolerances, with the difference."""
     for port in sorted({*before, *after}):
         moved = "one of them has none"
         if port in before and port in after:
@@ -149,9 +149,9 @@ def _parsed(text: str, file: Path) -> dict[str, Golden]:
 
 
 def sample_of(product: Product) -> Samples:
-    """Return a sample of each array, and of the numbers in the metadata; bytes are omitted.
+    """Return a sample of each array, and of the numbers in the metadata.
 
-    A single changed pixel changes all bytes of a compressed image.
+    Bytes are omitted because a single changed pixel changes all bytes of a compressed image.
     """
     payload = product.to_payload()
     stated = dict(_leaves(dict(payload.metadata)))
@@ -172,13 +172,14 @@ def sample_problem(
     *,
     numbers_stated: bool = True,
 ) -> str:
-    """Return the differences between two samples that exceed tolerances; empty if there are none.
+    """Return the first difference between two samples that exceeds a tolerance, or an empty string.
 
     Args:
         before: sample of the first product.
         after: sample of the second product.
         tolerances: tolerances of the product type.
-        numbers_stated: also compare the numbers in the metadata, not only their count.
+        numbers_stated: compare the numbers in the metadata, too; otherwise only their count is
+            compared.
     """
     for array in sorted(before.keys() ^ after.keys()):
         return f"only one of the results has {array}"
@@ -186,7 +187,7 @@ def sample_problem(
         name = array.partition(" [")[0]
         if name == _METADATA and not numbers_stated:
             continue
-        # The tolerances are an absolute value, and a share of the larger number.
+        # Absolute tolerance, and relative tolerance as a share of the larger number.
         stated = tolerances.get(name.rpartition("/")[2])
         amount, share = (_UNSTATED, _UNSTATED) if stated is None else (stated.limit, 0.0)
         share = _METADATA_SHARE if name == _METADATA else share
@@ -207,7 +208,6 @@ def _sampled(array: NDArray[np.generic]) -> list[float | None]:
 
 
 def _leaves(node: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Yield each value of a document with its path."""
     if not isinstance(node, dict | list):
         yield path, node
         return

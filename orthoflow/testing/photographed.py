@@ -1,7 +1,7 @@
-"""A textured wall with known relief: as a raster, as a cloud, and seen by a distorted camera.
+"""A textured wall with known relief: as a raster, as a cloud, and in photos with lens distortion.
 
 It is the example for methods that use photographs. Depth and colour are functions of the position
-on the wall, so the true values of cells, pixels and poses are known exactly.
+on the wall, so the true values of cells and pixels and the true poses are known exactly.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ SIZE_M: Final = (3.0, 2.0)
 GSD_M: Final = 0.006
 DISTORTION: Final = (-0.09, 0.03, 6e-4, -4e-4, 0.0)
 RELIEF_M: Final = 0.06
-# Wavelengths of the texture; the shortest is four cells, to avoid aliasing in raster and photo.
+# Wavelengths of the texture. The shortest is four cells, to avoid aliasing in the raster and the
+# photos.
 _OCTAVES_M: Final = (0.024, 0.06, 0.2)
 # Distance of a board in front of the wall. Ties are on the wall and on the board, because control
 # points close to a single plane do not determine both lens and pose.
@@ -69,7 +70,7 @@ class TexturedWall:
     noises: tuple[_Array, ...]
 
     def depth_m(self, across_m: _Array, down_m: _Array) -> _Array:
-        """Return the relief towards the viewer, at positions in metres from the top-left corner."""
+        """Return the relief, positive towards the viewer, at metres from the top-left corner."""
         wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4)
         return RELIEF_M * (wave + 0.4 * np.sin(5.0 * across_m + 1))
 
@@ -107,7 +108,7 @@ def textured_wall(seed: int = 1, *, gsd_m: float = GSD_M) -> TexturedWall:
 
 
 def walls_of(scene: TexturedWall) -> Walls:
-    """Return the scanned wall, with a window and a different contrast curve from the photos."""
+    """Return the scanned wall with a window; its contrast curve differs from that of the photos."""
     frame = scene.frame
     across, down = places_of_cells(frame)
     rng = np.random.default_rng(5)
@@ -139,7 +140,7 @@ def walls_of(scene: TexturedWall) -> Walls:
 
 
 def places_of_cells(frame: WallFrame) -> tuple[_Array, _Array]:
-    """Return the positions of raster cell centres, metres across and down, each (rows, cols)."""
+    """Return two arrays (rows, cols): metres across and metres down to the cell centres."""
     across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
     return across * frame.gsd_m, down * frame.gsd_m
 
@@ -180,7 +181,7 @@ def camera_before(
     towards: tuple[float, float, float] = (1.5, 0.0, 1.0),
     roll: float = 0.0,
 ) -> ViewingCamera:
-    """Return a distorted camera that looks at the wall, whose bottom-left corner is the origin."""
+    """Return a camera with lens distortion that looks from `centre` at `towards`, in metres."""
     upright = looking_at(np.array(centre), np.array(towards), up_vector("z"))
     rotation = rotation_from_vector(np.array([0.0, 0.0, roll])) @ upright
     return ViewingCamera(
@@ -199,7 +200,7 @@ def camera_before(
 def photo_of(
     scene: TexturedWall, camera: ViewingCamera, *, name: str = "a.png", calibrated: bool = True
 ) -> Photo:
-    """Return the image that a camera takes, traced at pixel centres; black outside the wall."""
+    """Return the photo that a camera takes, ray-traced at pixel centres; black outside the wall."""
     return Photo(
         name=name,
         encoded=_picture(pickle.dumps((scene, camera))),
@@ -213,7 +214,6 @@ def photo_of(
 # An image takes half a second, and most tests of a method use the same few images.
 @lru_cache(maxsize=32)
 def _picture(pickled: bytes) -> bytes:
-    """Return the image of a pickled scene and camera; equal ones share an entry of the cache."""
     known: tuple[TexturedWall, ViewingCamera] = pickle.loads(pickled)
     scene, camera = known
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -234,7 +234,7 @@ def _picture(pickled: bytes) -> bytes:
 
 
 def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
-    """Return a photo's orientation as it is stored in the `Cameras` product."""
+    """Return the orientation of a photo for the `Cameras` product."""
     return Camera(
         photo=name,
         status="ok",
@@ -262,7 +262,7 @@ def nudged(camera: ViewingCamera, vector: tuple[float, ...]) -> ViewingCamera:
 
 
 def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera) -> float:
-    """Return the RMS per coordinate, in the wall's plane, of projected pixels: found minus true."""
+    """Return the RMS per coordinate of the differences between two cameras' pixels on the wall."""
     pixels = np.mgrid[20.0:880.0:9j, 20.0:620.0:9j].reshape(2, -1).T
     landed = []
     for camera in (found, true):
@@ -330,8 +330,8 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
 
     Args:
         seed: seed of positions, noise and wrong ties.
-        noise_m: standard deviation of the coordinates of points; by default, that stored in the
-            ties.
+        noise_m: standard deviation of the coordinates of points; the default is the one stored in
+            the ties.
     """
     rng = np.random.default_rng(seed)
     scene = textured_wall()
@@ -358,7 +358,7 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
         photo_names=tuple(PHOTOGRAPHING),
         photo=rows[:, 0].astype(np.int32),
         wall=rows[:, 1].astype(np.int32),
-        # Rounding errors of pixels are a millionth of the last digit kept.
+        # Rounding errors of pixel coordinates are a millionth of the last digit kept.
         pixels_photo=settled(rows[:, 2:4], 6),
         points_world=settled(rows[:, 4:]),
         sigma_px=np.full(count, _TIE_SIGMA_PX),

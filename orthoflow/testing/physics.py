@@ -43,20 +43,20 @@ _PAINTED_SHARE: Final = 0.3
 _JOINED_SHARE: Final = 0.97
 # Seeds of the rooms or sets of ties whose errors are compared with the predicted ones.
 _DRAWS: Final = (2, 3, 4)
-# A plane farther away than this from a true plane is treated as another plane.
+# A plane farther than this from all true planes is not part of the room.
 _SAME_PLANE_M: Final = 0.02
 # Replaces a variance of zero, so that the ratio of actual to predicted error is far too large.
 _NO_VARIANCE: Final = 1e-30
-# Limits of the ratio of actual to predicted RMS error. The RMS is accurate to 1/8; built-in methods
-# have ratios of 0.82 to 0.93.
+# Limits of the ratio of actual to predicted RMS error. The RMS is accurate to one eighth; built-in
+# methods have ratios of 0.82 to 0.93.
 _STATED_LIMITS: Final = (0.1, 2.0)
 
 
 def planes_follow_a_rigid_motion(subject: Subject) -> None:
-    """Planes found in a room that is rotated about the vertical and shifted move with it.
+    """If a room is rotated about the vertical and shifted, the planes found in it move with it.
 
     Tolerances are 0.02 deg and 1 mm, far above the noise of the fit (2 mm / sqrt(n)) and far below
-    the errors of a method that depends on the axes or loses precision.
+    the errors of a method that depends on the direction of the axes or loses precision.
     """
     shift = np.array([634512.347, 486215.781, 112.193])
     for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
@@ -82,7 +82,7 @@ def _match_planes(found: Planes, truth: Planes) -> None:
 
 
 def stated_errors_of_planes_hold(subject: Subject) -> None:
-    """The errors of planes of random rooms are 0.1 to 2 times those predicted by covariances."""
+    """In random rooms, errors of planes are 0.1 to 2 times those predicted by the covariances."""
     ratios: list[float] = []
     for seed in _DRAWS:
         cloud, truth = example_room(seed=seed, n_points=_ROOM_POINTS)
@@ -92,14 +92,14 @@ def stated_errors_of_planes_hold(subject: Subject) -> None:
 
 
 def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
-    """Return errors divided by predicted standard deviations, at true corners and centres."""
+    """Return actual errors divided by predicted ones, at the corners and centres of true planes."""
     ratios = []
     for index in range(len(found)):
         nearest = int(np.argmax(truth.normal @ found.normal[index]))
         corners = truth.corners[nearest]
         places = np.vstack([corners, corners.mean(axis=0)])
         off_m = places @ found.normal[index] - found.offset[index]
-        # Planes that are not part of the room are ignored here.
+        # Planes that are not part of the room are ignored.
         if np.abs(off_m).max() < _SAME_PLANE_M:
             at = np.column_stack([places, -np.ones(len(places))])
             variances = np.einsum("ij,jk,ik->i", at, found.covariance[index], at)
@@ -108,7 +108,7 @@ def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
 
 
 def stated_errors_of_poses_hold(subject: Subject) -> None:
-    """The errors of poses from random ties are 0.1 to 2 times those predicted by covariances."""
+    """With random ties, errors of poses are 0.1 to 2 times those predicted by the covariances."""
     ratios: list[float] = []
     for seed in _DRAWS:
         run = subject.run_on_photographs(ties=drawn_ties(seed))
@@ -116,7 +116,8 @@ def stated_errors_of_poses_hold(subject: Subject) -> None:
             if camera.status == "ok" and camera.covariance is not None:
                 found, true = camera.viewing(), PHOTOGRAPHING[camera.photo]
                 turn = true.rotation @ found.rotation.T
-                # The rotation vector of a small rotation is half of its skew-symmetric part.
+                # The components of a small rotation vector are the entries of the matrix's
+                # skew-symmetric part.
                 turned = 0.5 * (turn - turn.T)[(2, 0, 1), (1, 2, 0)]
                 error = np.concatenate([turned, true.translation - found.translation])
                 covariance = camera.covariance + _NO_VARIANCE * np.eye(6)
@@ -138,7 +139,7 @@ def _check_ratios(ratios: list[float], what: str) -> None:
 
 
 def poses_are_recovered(subject: Subject) -> None:
-    """Two photos with 0.3 px ties, some of them wrong, are oriented to 0.8 mm on the wall."""
+    """Two photos with noisy ties, some of them wrong, are oriented to 0.8 mm on the wall."""
     for camera in output_of(subject.run_on_photographs(), "cameras", Cameras).cameras:
         require(camera.status == "ok", f"{camera.photo} was not oriented: {camera.status}")
         true = PHOTOGRAPHING[camera.photo]
@@ -151,7 +152,7 @@ def poses_are_recovered(subject: Subject) -> None:
 
 
 def cells_show_their_own_place(subject: Subject) -> None:
-    """With two cell sizes, each painted cell has the colour of its own position, to 0.2 cells."""
+    """With two cell sizes, each coloured cell has the colour of its own position, to 0.2 cells."""
     for gsd_m in _CELL_SIZES_M:
         scene = textured_wall(gsd_m=gsd_m)
         run = subject.run_on_photographs(walls=walls_of(scene), cloud=cloud_of(scene))
@@ -162,7 +163,7 @@ def cells_show_their_own_place(subject: Subject) -> None:
 
 
 def mosaics_show_cells_in_place(subject: Subject) -> None:
-    """Two overlapping layers become an orthoimage whose cells have the colour of their position."""
+    """An orthoimage of two overlapping layers has the right colour in each cell."""
     for gsd_m in _CELL_SIZES_M:
         scene = textured_wall(gsd_m=gsd_m)
         run = subject.run_on_photographs(layers=two_halves(scene), walls=walls_of(scene))
@@ -187,8 +188,8 @@ def _check_cells(
     require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is covered")
     gradient: list[NDArray[np.float64]] = list(np.gradient(truth_grey))
     down, across = gradient
-    # Shown minus true = gradient * displacement; solve for one displacement per layer by least
-    # squares.
+    # Shown minus true = gradient * displacement; the displacement of each layer is the
+    # least-squares solution.
     design = np.column_stack([across[painted], down[painted], np.ones(int(painted.sum()))])
     difference = image.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
     shift_cells = np.linalg.solve(design.T @ design, design.T @ difference)[:2]

@@ -1,4 +1,4 @@
-"""A method to be checked, with its runs, each of which is made only once and only if needed."""
+"""A method to be checked, with its runs, each of which is executed once and only if needed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Subject:
 
     @cached_property
     def first(self) -> TrialRun:
-        """The first run; later runs are not affected by side effects on its inputs."""
+        """The first run, on a copy of the inputs, so that later runs have unchanged inputs."""
         copies = deepcopy(dict(self.trial.inputs))
         run = _run(replace(self.trial, inputs=copies))
         before, after = (_digests(inputs) for inputs in (self.trial.inputs, copies))
@@ -76,10 +76,10 @@ class Subject:
 
     @cached_property
     def elsewhere(self) -> tuple[Mapping[str, str], list[str]]:
-        """Digests of the same run in a new process with another hash seed, and stray files.
+        """Digests of the same run in a new process with another hash seed, and files left behind.
 
-        The stray files were found in its working, home or temporary folder, which are initially
-        empty.
+        These are files in the working, home and temporary folders of the process, which were empty
+        before the run.
 
         Raises:
             AssertionError: the process failed; the message ends with the last line of its output.
@@ -110,7 +110,8 @@ def _digests(inputs: Mapping[str, Product | InputFiles]) -> dict[str, str]:
 
 
 def _run(trial: Trial, *, is_cancelled: bool = False) -> TrialRun:
-    # Outputs may be files mapped from the scratch folder; they remain readable after its removal.
+    # Outputs may be mapped from files in the scratch folder; they remain readable after it is
+    # removed.
     with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
         return run_trial(trial, Path(folder), is_cancelled=is_cancelled)
 
@@ -127,8 +128,8 @@ def _run_elsewhere(trial: Trial, world: Path) -> tuple[Mapping[str, str], list[s
         "PYTHONHASHSEED": "random",
         "HOME": str(places["home"]),
         "TMPDIR": str(places["tmp"]),
-        # Redirect matplotlib's font cache as the engine does, since it does not belong to the
-        # method.
+        # Redirect matplotlib's font cache as the engine does, so that it does not count as a stray
+        # file.
         "MPLCONFIGDIR": str(world / "matplotlib"),
         # Use two threads if this process uses one, otherwise one.
         "OPENBLAS_NUM_THREADS": "2" if os.environ.get("OPENBLAS_NUM_THREADS") == "1" else "1",

@@ -1,7 +1,7 @@
-"""The simulated room as an example, for methods that use a scan or the truth about it.
+"""The simulated room as an example for methods that use a scan or its ground truth.
 
-It has the same bits on every processor, because results of sums, roots and angles are rounded to
-far fewer digits than are accurate.
+Its values are bit-identical on all processors, because the results of sums, roots and angles are
+rounded to far fewer digits than are accurate.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from orthoflow.products import Planes, PointCloud, PointLabels, Product, Truth
 from orthoflow.sdk import StepContext
 
 _SCAN_STEP_M: Final = 0.08
-# The first two are the main wall and the floor.
+# Number of planes in the example, which are the main wall and the floor.
 _N_PLANES: Final = 2
 # Number of decimals kept; rounding errors of metres and unit vectors are ten million times smaller.
 _DECIMALS: Final = 9
 
 
 def settled(values: NDArray[np.float64], decimals: int = _DECIMALS) -> NDArray[np.float64]:
-    """Round values, so that the order of sums and fused instructions make no difference."""
+    """Round values so that neither the order of summation nor fused instructions affect them."""
     # Adding zero converts minus zero, whose bits differ from those of zero.
     return np.asarray(np.round(values, decimals) + 0.0)
 
 
 def few_points(offsets_m: NDArray[np.floating], grey: int | NDArray[np.uint8] = 128) -> PointCloud:
-    """Return a grey cloud of points at offsets (n, 3) from the origin, which is its station."""
+    """Return a grey cloud of points at positions (n, 3) in metres, with a station at the origin."""
     x, y, z = np.ascontiguousarray(offsets_m.T, dtype=np.float32)
     greys = np.broadcast_to(np.uint8(grey), x.shape)
     return PointCloud(

@@ -84,7 +84,7 @@ def run_trial(
         trial: the trial.
         scratch: scratch folder, created if missing.
         is_cancelled: whether the step is cancelled before it starts.
-        draws: whether to keep figures, since drawing takes longer than many methods.
+        draws: whether to draw figures, which takes longer than many methods.
 
     Raises:
         OrthoflowError: raised by the method.
@@ -102,7 +102,7 @@ def run_trial(
     )
     method = trial.method
     state = _global_state()
-    # The type is Any, since the type of the returned value is checked here.
+    # Any, because the type of the returned value is checked below.
     returned: Any = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     if not isinstance(returned, method.Out):
         got = type(returned).__name__
