@@ -59,7 +59,7 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
 
 
 def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) -> str:
-    """Return a shipped recipe that continues with a method of a new kind in two variants.
+    """Return a shipped recipe to which two variants of a method of a new kind are added.
 
     Args:
         method_id: the new method, which has a parameter `factor`.
@@ -77,7 +77,7 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
             for port in port_specs(catalog.method(node["use"]).load().Out).values():
                 given.setdefault(port.type_name, []).append(f"{name}.{port.name}")
         if kind not in document["steps"] and given.keys() >= set(takes):
-            # The cloud is read or simulated, depending on the recipe.
+            # Connect both the reader and the simulation of the cloud, since only one of them runs.
             wires = {name: given[name] if name == "cloud" else given[name][-1] for name in takes}
             double = {"use": method_id, "params": {"factor": 2.0}}
             variants = {"plain": {"use": method_id}, "double": double}
@@ -87,9 +87,8 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
 
 
 def _coarse_document(recipe: str) -> dict[str, Any]:
-    """Return a shipped recipe, changed so that it runs in seconds."""
     text = shipped_workflow(recipe).read_text(encoding="utf-8")
-    # The type is Any, since the document consists of nested mappings.
+    # Any, because the document consists of nested mappings.
     document: dict[str, Any] = YAML(typ="safe").load(text)
     for node in document["steps"].values():
         if coarse := _COARSE.get((recipe, node["use"])):
@@ -98,7 +97,6 @@ def _coarse_document(recipe: str) -> dict[str, Any]:
 
 
 def _dumped(document: dict[str, Any], name: str, metrics: Sequence[str]) -> str:
-    """Return the document as a comparison with a new name."""
     document["name"] = f"compare-{name}"[:_NAME_MOST].rstrip("_-")
     asked = {"metrics": [*metrics]} if metrics else {}
     document["compare"] = {"design": "product", **asked}

@@ -21,7 +21,8 @@ class Port:
     Attributes:
         name: name of the port.
         class_name: product class.
-        same_as: for an output, an input of the same type, which can be returned unchanged.
+        same_as: for an output, the name of an input of the same type, which can be returned
+            unchanged.
     """
 
     name: str
@@ -37,7 +38,8 @@ class KindPorts:
         inputs: input ports in the order of the kind.
         outputs: output ports in the order of the kind.
         imports: names of product classes by module.
-        needs: requirements for other plugins that provide the kind or a product.
+        needs: requirements (`name>=version`) for the distributions that provide the kind or a
+            product.
     """
 
     inputs: tuple[Port, ...]
@@ -53,9 +55,10 @@ def kind_ports(
 
     Args:
         catalog: the installed plugins.
-        kind: a new kind, or an installed one, whose first method that loads is the model.
-        takes: product types of the inputs of a new kind, a port each.
-        gives: existing product types of the outputs of a new kind, a port each.
+        kind: a new kind, or an installed one; in this case, the ports are those required by the
+            first method of the kind that loads.
+        takes: product types of the inputs of a new kind, one port for each.
+        gives: existing product types of the outputs of a new kind, one port for each.
 
     Raises:
         PluginError: the kind cannot be used.
@@ -89,14 +92,6 @@ def _kind_ports(
     given: Mapping[str, str],
     besides: Sequence[DistributionInfo],
 ) -> KindPorts:
-    """Return the ports of a new method.
-
-    Args:
-        catalog: the installed plugins.
-        taken: product types of the inputs by port name.
-        given: product types of the outputs by port name.
-        besides: required distributions in addition to those of the product types.
-    """
     types = dict.fromkeys((*taken.values(), *given.values()))
     classes = {type_name: _class_of(catalog, type_name) for type_name in types}
     imports: dict[str, set[str]] = {}
@@ -104,7 +99,7 @@ def _kind_ports(
         imports.setdefault(module, set()).add(name)
     handed_on = {type_name: name for name, type_name in taken.items()}
     of_types = [catalog.products[name].distribution for name in types if name != FILES]
-    # A version after `>=` cannot contain a local part.
+    # A version after `>=` must not contain a local part.
     needs = {
         f"{one.name}>={one.version.partition('+')[0]}"
         for one in (*of_types, *besides)
