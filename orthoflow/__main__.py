@@ -1,4 +1,4 @@
-"""Lets `python -m orthoflow` do the same as the `orthoflow` command."""
+"""Runs the `orthoflow` command with `python -m orthoflow`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Diagnostics as data: declared once with a code, and grouped and ordered by it.
+"""Diagnostics as data: each is declared once, with a code by which diagnostics are grouped.
 
 A method declares a `DiagnosticSpec` and reports it with `ctx.report(SPEC, subject=..., **values)`.
 The terminal, the report and the record use the code, severity and values; no code parses the text.
@@ -46,19 +46,20 @@ class DiagnosticSpec:
     """Declaration of a diagnostic.
 
     In `text` and `remedy`, `{step}` is replaced by the name of the reporting step, and
-    `{step[raster]}` or `{step[raster.grid]}` by the name of the step of that kind or method, so
+    `{step[raster]}` or `{step[raster.grid]}` by the name of the step with that kind or method, so
     that a remedy can refer to a setting, as in `{step[raster]}.margin_m=0.2`.
 
     Attributes:
         code: stable name for documents and tests, e.g. `scan-without-colour`.
-        severity: `error` (the result is wrong), `warning` (it is limited) or `note`.
-        text: format string with the values and `{subject}`: the problem, with numbers.
-        remedy: format string: what to do about it.
-        rank_by: name of the value by which the worst of a group is chosen: the largest, or with a
-            leading `-` the smallest.
-        settled_by: method ids or codes: a later step with such a method or diagnostic resolves it.
-        is_summary: whether it summarises the step; it is then printed when reported, even if it is
-            a note.
+        severity: `error` (the result is wrong), `warning` (the result is limited) or `note`.
+        text: format string that describes the problem, with fields for the values and `{subject}`.
+        remedy: format string that describes what to do.
+        rank_by: name of the value that determines the worst diagnostic of a group, which is the one
+            with the largest value or, if the name begins with `-`, with the smallest.
+        settled_by: method ids and codes of diagnostics; a later step with one of these methods or
+            diagnostics resolves this diagnostic.
+        is_summary: whether the diagnostic summarises its step; if so, it is printed when it is
+            reported, even if it is a note.
     """
 
     code: str
@@ -84,7 +85,7 @@ class DiagnosticSpec:
         """Return the diagnostic with these values.
 
         Raises:
-            ProductError: a value in the text is missing, or is neither a number nor a text.
+            ProductError: a value in the text is missing, or is neither a number nor a string.
         """
         fields = {**values, "subject": subject, "step": _StepPlaceholder()}
         try:
@@ -122,8 +123,9 @@ class DiagnosticGroup:
     Attributes:
         worst: the diagnostic with the worst value.
         count: number of diagnostics.
-        subjects: distinct subjects of the others, in order.
-        places: distinct addresses of the cells that reported them, that of the worst first.
+        subjects: distinct subjects of the other diagnostics, in order.
+        places: distinct addresses of the cells that reported the diagnostics, beginning with that
+            of the worst one.
     """
 
     worst: Diagnostic
@@ -133,9 +135,9 @@ class DiagnosticGroup:
 
     @property
     def sentence(self) -> str:
-        """The worst diagnostic, the number of others and their subjects, and the remedy."""
+        """The worst diagnostic, the number and the subjects of the others, and the remedy."""
         text = self.worst.text
-        # The same diagnostic of a subject in several combinations counts once.
+        # A diagnostic that several combinations report for the same subject counts once.
         if self.count > 1 and (self.subjects or self.count > len(self.places)):
             also = f"; also {first_few(self.subjects)}" if self.subjects else ""
             text = f"{text} ({'the worst of ' if self.worst.rank_by else ''}{self.count}{also})"
@@ -154,8 +156,9 @@ def grouped(reported: Iterable[tuple[str, Diagnostic]]) -> tuple[DiagnosticGroup
         reported: address of the cell and its diagnostic, in the order of the run.
 
     Returns:
-        A group per code (per text for those without a code of their own), sorted by severity; then
-        groups with a remedy, then frequent ones, then in the order of the run.
+        One group per code, or per text for diagnostics without a code of their own. The most severe
+        groups come first; groups of equal severity are sorted by whether they have a remedy, by
+        size, and by the order of the run.
     """
     groups: dict[tuple[str, str], list[tuple[str, Diagnostic]]] = {}
     for place, one in reported:
@@ -185,9 +188,9 @@ def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
     )
 
 
-# Any: cells of a run or of a record.
+# Any, because these are cells of a run or of a record.
 def standing(cells: Iterable[Any]) -> tuple[tuple[str, Diagnostic], ...]:
-    """Return address and diagnostic of all diagnostics that no later step resolved."""
+    """Return the diagnostics that no later step resolved, each with the address of its cell."""
     cells = tuple(cells)
     settled = {
         (given.digest, name)
@@ -212,21 +215,21 @@ def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
     """Return a function that maps a method or kind to the name of its step, for `placed`.
 
     Args:
-        steps: name of a step and id of its method, of all cells.
+        steps: for each cell, the name of its step and the id of its method.
     """
     found: dict[str, set[str]] = {}
     for step, method in steps:
         for name in (method, method.partition(".")[0]):
             found.setdefault(name, set()).add(step)
-    # If several steps have this kind, the reference is ambiguous and left as it is.
+    # If several steps have this kind or method, the reference is ambiguous and remains unchanged.
     return lambda name: min(found[name]) if len(found.get(name, ())) == 1 else name
 
 
 def placed(one: Diagnostic, step: str, step_of: Callable[[str], str]) -> Diagnostic:
-    """Insert the names of steps into the texts of a diagnostic.
+    """Insert the names of steps into the text and the remedy of a diagnostic.
 
-    Results are shared between workflows in which steps may have different names, so the names are
-    inserted when a result is used.
+    Workflows share results, but may have different names for steps, so the names are inserted when
+    a result is used.
     """
 
     def name(found: re.Match[str]) -> str:
@@ -247,7 +250,7 @@ class _StepPlaceholder:
 
 
 _FORMATTER: Final = string.Formatter()
-# Spec of `ctx.warn`, which has only a text.
+# Spec for `ctx.warn`, which has no values besides its text.
 PLAIN_WARNING: Final = DiagnosticSpec(code="warning", severity="warning", text="{text}")
 TOO_MANY: Final = DiagnosticSpec(
     code="more-diagnostics",
@@ -263,7 +266,7 @@ def _line(text: str) -> str:
 
 
 def _plain(code: str, name: str, value: object) -> Value:
-    # Scalars of numpy, which is not imported here.
+    # Convert scalars of numpy, which is not imported here.
     item = getattr(value, "item", None)
     plain = item() if callable(item) and getattr(value, "ndim", 1) == 0 else value
     if isinstance(plain, float) and not math.isfinite(plain):

@@ -1,7 +1,8 @@
 """All errors that orthoflow raises deliberately.
 
-A message is one sentence: what was given, what was expected, where, and what to do. The command
-line derives the exit code from the class (`exit_code`) and shows tracebacks only with `--debug`.
+A message is one sentence that states what was given, what was expected, where, and what to do. The
+command line derives the exit code from the class (`exit_code`) and shows tracebacks only with
+`--debug`.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class RecordError(OrthoflowError, ValueError):
     exit_code = 3
 
 
-# Each comparison takes some microseconds.
+# Maximum number of names to compare; each comparison takes several microseconds.
 _MOST_CANDIDATES: Final = 1000
 _LONGEST_NAME: Final = 200
 

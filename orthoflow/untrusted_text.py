@@ -18,9 +18,10 @@ from orthoflow.errors import InputError
 
 Value: TypeAlias = str | int | float | None
 
-# Unicode categories: control characters, invisible format characters, surrogates, line ends.
+# Unicode categories of control characters, invisible format characters, surrogates and line ends.
 _UNSEEN: Final = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
-# Format characters that join letters in Persian and Indian scripts, and the parts of emoji.
+# Format characters that join or separate letters in Persian and Indic scripts, and join parts of
+# emoji.
 _JOINERS: Final = "\u200c\u200d"
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE | re.ASCII)
 # Full-width forms of = + - @, which some programs treat like the plain characters.
@@ -28,8 +29,8 @@ _WIDE: Final = ("\uff1d", "\uff0b", "\uff0d", "\uff20")
 # First characters that make spreadsheets treat a cell as a formula, and the apostrophe that
 # prevents this.
 _FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", *_WIDE, "'")
-# A separator or line end, with quotes and spaces that a reader may strip, before the beginning of a
-# formula. A number that extends to the next separator is not a formula.
+# A separator or line end that is followed by the beginning of a formula, possibly after quotes and
+# spaces that a program may strip. A number that extends to the next separator is not a formula.
 _INNER_CELL: Final = re.compile(
     rf"""[,;|\t\r\n] [\s"']*
     (?=[=@{"".join(_WIDE)}] | [+-] (?!(\d+\.?\d*|\.\d+)(e[+-]?\d+)?[\s"']*([,;|\t\r\n]|$)))""",
@@ -42,7 +43,7 @@ def shown(text: str, *, keep: str = "") -> str:
 
     Args:
         text: any text; it may contain unpaired surrogates.
-        keep: characters that are not escaped, such as the line ends of a text with several lines.
+        keep: characters that are not escaped, such as line ends in text with several lines.
 
     >>> print(shown("a\x1b[2Jb\u202etxt.exe\n"), shown("one\ntwo", keep="\n"))
     a\x1b[2Jb\u202etxt.exe\n one
@@ -56,7 +57,7 @@ def shown(text: str, *, keep: str = "") -> str:
 
 
 def shown_json(text: str) -> str:
-    r"""Escape the same characters in JSON, without changing its values.
+    r"""Escape the characters that `shown` escapes in JSON, without changing its values.
 
     >>> print(shown_json('{"name": "a\x9b\u202e"}'))
     {"name": "a\u009b\u202e"}
@@ -70,13 +71,14 @@ def shown_json(text: str) -> str:
 
 
 def csv_text(rows: Iterable[Sequence[Value]]) -> str:
-    r"""Write rows as CSV that no program interprets as formulas, whatever separator it assumes.
+    r"""Return rows as CSV that no program interprets as formulas, whichever separator it assumes.
 
     Depending on country and settings, spreadsheets split a line at `,`, `;` or tabs. Text is
-    therefore quoted. An apostrophe is inserted before `= + - @`, tabs, line ends and apostrophes at
-    the beginning of a text, unless the text is a number, and before `= + - @` after a separator or
-    line end inside a text, also if quotes or spaces are in between. To restore a text, remove these
-    apostrophes. Numbers are written with all their digits.
+    therefore quoted. Cells that begin with `= + - @`, a tab, a line end or an apostrophe are
+    prefixed with an apostrophe, unless they are numbers. Inside a cell, an apostrophe is also
+    inserted before `= + - @` after a separator or line end, even if quotes or spaces are in
+    between. To restore the text, remove these apostrophes. Numbers are written with all their
+    digits.
 
     >>> csv_text([("name", "value"), ("=1+1", -2.5), ("a;=1+1", None)])
     '"name","value"\n"\'=1+1",-2.5\n"a;\'=1+1",\n'
@@ -153,13 +155,13 @@ def open_file(path: Path) -> BufferedReader:
 
 @contextmanager
 def reading(path: Path, most_bytes: int, what: str, *, way_out: str = "") -> Iterator[None]:
-    """Convert errors of opening and reading a file in the block into an `InputError`.
+    """Convert errors that occur while the block opens and reads a file into an `InputError`.
 
     Args:
         path: the file.
         most_bytes: maximum size; a larger file is refused.
         what: expected content, e.g. `a title block (YAML)`.
-        way_out: remedy for a file that is too large, as the end of the message.
+        way_out: end of the message for a file that is too large, which states the remedy.
     """
     try:
         n_bytes = path.stat().st_size
@@ -197,7 +199,7 @@ def text_of_file(path: Path, most_bytes: int, what: str, *, way_out: str = "") -
 
 
 def first_few(names: Sequence[str], most: int = 3) -> str:
-    """List the first few names, and count the others.
+    """List the first few names and the number of others.
 
     >>> first_few(["a", "b", "c", "d", "e"]), first_few(["a", "b"], most=1)
     ('a, b, c and 2 more', 'a and 1 more')

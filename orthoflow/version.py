@@ -1,4 +1,4 @@
-"""Name and version of this release, as written into files."""
+"""Name and version of this release, as they are written into files."""
 
 # Name of the distribution on package indexes.
 DISTRIBUTION = "orthoflow-tls"
