@@ -2,9 +2,9 @@
 
 Intensity decreases with range and incidence angle, and each scan may have its own scale. Where two
 scans overlap, the surface is the same, so the ratios of their intensities separate the three
-effects, independently of the texture. On a single wall, range and incidence are coupled (cosine
-times range is the distance of the station from the plane), so only their joint effect can be
-determined, which suffices for this wall.
+effects, independently of the texture. On a single wall, range and incidence are coupled: the cosine
+of the incidence angle times the range is the distance of the station from the plane. Only their
+joint effect can then be determined, which suffices for this wall.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow.sdk import DiagnosticSpec, StepContext
 
-# Side of the squares in which scans are compared. A square is large enough for many points of each
-# scan, and usually small enough to have a single colour.
+# Side of the squares in which scans are compared. A square contains many points of each scan, but
+# usually only one colour.
 _PLACE_M: Final = 0.05
 _POINTS_MOST: Final = 2_000_000
 _PLACES_LEAST: Final = 20
 _COSINE_LEAST: Final = 0.05
-# At this range and perpendicular incidence, intensities of the first scan are unchanged.
+# Intensities of the first scan that were measured at this range with perpendicular incidence do not
+# change.
 _RANGE_M: Final = 3.0
 _DARKEST: Final = 1.0e-4
 _CHUNK: Final = 1 << 21
@@ -42,9 +43,9 @@ class _Trend:
     """log intensity = scan scale + range_power * log(m) + cosine_power * log(cosine) + texture.
 
     Attributes:
-        scales: (scans,) scales of the scans; the first is 0.
-        range_power: power of the range.
-        cosine_power: power of the cosine of the incidence angle.
+        scales: (scans,) logarithms of the scales of the scans; the first is 0.
+        range_power: exponent of the range.
+        cosine_power: exponent of the cosine of the incidence angle.
     """
 
     scales: NDArray[np.float64]
@@ -53,10 +54,10 @@ class _Trend:
 
 
 def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
-    """Return the cloud with the intensities of scans made under identical conditions.
+    """Return the cloud with intensities as if all points were measured under identical conditions.
 
-    Only points on walls are corrected. If scans do not overlap, the cloud is unchanged and a
-    warning is reported.
+    Only points on walls are corrected. If the scans do not overlap, the cloud is returned unchanged
+    and a warning is reported.
     """
     if cloud.intensity is None or cloud.scan is None or cloud.stations is None:
         ctx.report(NOT_BALANCED, reason="balancing needs scans with known stations")
@@ -87,7 +88,7 @@ def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointClo
 
 @dataclass(frozen=True)
 class _Looks:
-    """Scan geometry of the points in a slab; all arrays are (n,)."""
+    """Scan geometry of n points in a slab."""
 
     points: NDArray[np.int64]
     place: NDArray[np.int64]
@@ -119,11 +120,11 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
 
 
 def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
-    """Return differences between pairs of scans in the same square, as rows.
+    """Return the differences between scans in the same square, one row per pair of scans.
 
     Returns:
-        (n, 5): scan, other scan, and the differences (first minus second) of the means of log
-        intensity, log range and log cosine.
+        (n, 5) with the columns first scan, second scan, and the differences (first minus second)
+        between their mean log intensities, log ranges and log cosines.
     """
     if cloud.intensity is None:
         raise AssertionError("balancing needs a cloud with intensity")
@@ -138,14 +139,14 @@ def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
         np.log(looks.cosine),
     )
     means = np.column_stack([np.bincount(members, values) / counts for values in logs])
-    # Scans of the same square are adjacent in the order of the keys.
+    # Keys are sorted, so the scans of a square are consecutive.
     pairs = np.flatnonzero(keys[1:] // n_scans == keys[:-1] // n_scans)
     scans = np.column_stack([keys[pairs] % n_scans, keys[pairs + 1] % n_scans])
     return np.column_stack([scans, means[pairs] - means[pairs + 1]])
 
 
 def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
-    """Fit the differences with the L1 norm, which is robust to edges of the texture."""
+    """Fit the differences in the L1 norm, which is robust to edges in the texture."""
     if len(table) < _PLACES_LEAST:
         return None
     first, second = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)

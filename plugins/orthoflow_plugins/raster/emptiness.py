@@ -1,4 +1,4 @@
-"""Causes of empty cells of a wall: points outside the buffer, occlusion, sparse or no points."""
+"""Causes of empty cells of a wall: points outside the buffer, occlusion, or few or no points."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from orthoflow_plugins.raster.extents import SampledPoints, points_in
 
 Cause = Literal["behind", "before", "hidden", "sparse", "unseen"]
 
-# Causes are determined on tiles of about this side length, each with several sample points.
+# Side of the tiles for which causes are determined. A tile usually contains several sample points.
 _TILE_M: Final = 0.05
-# Minimum number of sample points of a surface.
+# Tiles with fewer sample points than this contain no surface.
 _POINTS_LEAST: Final = 2
 # Points farther than this behind a wall belong to another room or the street.
 _BEHIND_MOST_M: Final = 4.0
-# Objects farther than this in front of a wall, such as a portico or a balcony, only count as
-# occluders if stations are known.
+# Objects farther than this in front of a wall, such as a portico or a balcony, are considered
+# occluders only if the stations are known.
 _BEFORE_MOST_M: Final = 5.0
-# Share of the points in front of a wall that a suggested buffer includes, per cent.
+# Percentage of the points in front of a wall that a suggested buffer includes.
 _BEFORE_PERCENT: Final = 95.0
 # Side of the voxels through which rays from the wall to the stations are traced.
 _VOXEL_M: Final = 0.1
-# Maximum number of voxels in total and along one axis.
+# Maximum numbers of voxels in total and along an axis.
 _VOXELS_MOST: Final = 1 << 24
 _VOXELS_MOST_ALONG: Final = 1 << 11
-# Length at both ends of a ray that is not tested.
+# Length that is not tested at each end of a ray.
 _ENDS_M: Final = 0.35
 # Maximum number of tested tiles.
 _RAYS_MOST: Final = 4000
@@ -42,17 +42,18 @@ _RAYS_MOST: Final = 4000
 
 @dataclass(frozen=True, kw_only=True)
 class Emptiness:
-    """Shares of the cells of a wall that are empty, by cause.
+    """Shares of the empty cells among all cells of a wall, by cause.
 
     Attributes:
-        shares: share of the cells by cause. `behind`: their points are behind the buffer; `before`:
-            objects are directly in front of the wall, beyond the buffer; `hidden`: objects hide
-            them from every station; `sparse`: close to points of the wall (gaps, shadows of
-            relief, borders); `unseen`: nothing was scanned there.
+        shares: share of the cells for each cause. `behind`: the points of the cell are behind the
+            buffer; `before`: objects are directly in front of the wall, beyond the buffer;
+            `hidden`: objects hide the cell from every station; `sparse`: the cell is close to
+            points of the wall (gaps, shadows of relief and borders); `unseen`: nothing was scanned
+            there.
         behind_m: median depth behind the plane of the points behind the buffer; NaN if there are
             none.
-        before_m: depth in front of the plane that includes 95 % of the points directly in front;
-            NaN if there are none.
+        before_m: depth in front of the plane up to which 95 % of the points directly in front of
+            the wall are included; NaN if there are none.
     """
 
     shares: Mapping[Cause, float]
@@ -61,13 +62,13 @@ class Emptiness:
 
     @property
     def share(self) -> float:
-        """Return the share of all empty cells."""
+        """Share of the cells that are empty, for any cause."""
         return sum(self.shares.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sight:
-    """The scanned points and their stations.
+    """Points of the cloud, and the stations.
 
     Attributes:
         points: sample of the cloud.
@@ -79,20 +80,20 @@ class Sight:
 
     @cached_property
     def room(self) -> _Room:
-        """Return the voxels with points; computed on demand because few walls need them."""
+        """Voxels that contain points; computed on demand, because few walls need them."""
         return _Room.of(self.points)
 
 
 def emptiness_of(
     wall: Wall, slab: Slab, sight: Sight, *, free_m: float = math.inf, threads: int
 ) -> Emptiness:
-    """Determine the causes of empty cells of a wall.
+    """Determine the causes of the empty cells of a wall.
 
     Args:
         wall: the wall.
         slab: its raster and buffer.
-        sight: the scanned points.
-        free_m: objects farther than this in front of the wall belong to the opposite surface.
+        sight: the scanned points and the stations.
+        free_m: objects farther than this in front of the wall belong to a surface that faces it.
         threads: number of threads.
     """
     points = sight.points
@@ -129,10 +130,10 @@ def emptiness_of(
 
 @dataclass(frozen=True, kw_only=True)
 class _Tiles:
-    """Blocks of cells of a wall.
+    """Square blocks of cells of a wall.
 
     Attributes:
-        frame: raster with a cell for each tile; tiles at the right and bottom may be incomplete.
+        frame: raster with one cell per tile; tiles at the right and bottom edges may be incomplete.
         n_void: (rows, cols) number of void cells.
         n_measured: (rows, cols) number of cells with a point.
     """
@@ -173,7 +174,7 @@ def _blocked(
     sight: Sight,
     stations: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the tiles (n,) of a wall that objects hide from every station."""
+    """Return a mask (n,) of the tiles (n,) that objects hide from every station."""
     every = -(-len(tiles) // _RAYS_MOST)
     asked = tiles[::every]
     places = np.column_stack([asked % frame.width, asked // frame.width]).astype(np.float64) + 0.5
@@ -185,8 +186,8 @@ def _blocked(
         lengths_m = np.linalg.norm(rays, axis=1)
         is_met = rays @ frame.normal_world <= 0.0
         rays /= np.maximum(lengths_m, 1e-9)[:, None]
-        # A station may be far from all points, or at the origin of a survey grid, so rays are only
-        # followed inside the voxels.
+        # Follow rays only inside the voxel grid, because a station may be far from all points or
+        # (wrongly) at the origin of a survey grid.
         enter_m, leave_m = room.crossed_m(starts, rays)
         enter_m = np.maximum(enter_m, _ENDS_M)
         leave_m = np.minimum(leave_m, lengths_m - _ENDS_M)
@@ -202,7 +203,7 @@ def _blocked(
 
 @dataclass(frozen=True, kw_only=True)
 class _Room:
-    """The voxels that contain points; positions are relative to the cloud's origin."""
+    """A grid of voxels that contain points or not; positions are relative to the cloud's origin."""
 
     low_m: NDArray[np.float64]
     side_m: float
@@ -211,7 +212,7 @@ class _Room:
     @classmethod
     def of(cls, points: SampledPoints) -> _Room:
         axes = (points.x, points.y, points.z)
-        # Use quantiles, so that isolated distant points do not enlarge the box of the voxels.
+        # Use quantiles, so that isolated distant points do not enlarge the voxel grid.
         low, high = np.array([np.percentile(axis, (0.1, 99.9)) for axis in axes]).T
         low, high = low - 2.0 * _VOXEL_M, high + 2.0 * _VOXEL_M
         side_m = max(
@@ -225,27 +226,27 @@ class _Room:
         )
         inside = ((places >= 0.0) & (places < shape)).all(axis=1)
         voxels = np.ravel_multi_index(tuple(places[inside].astype(np.int64).T), tuple(shape))
-        # A single stray point does not hide a wall.
+        # A single point in a voxel is a stray point and does not hide a wall.
         counts = np.bincount(voxels, minlength=int(shape.prod())).reshape(tuple(shape))
         return cls(low_m=low, side_m=side_m, occupied=counts >= _POINTS_LEAST)
 
     def crossed_m(
         self, starts: NDArray[np.float64], ways: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the distances (metres) at which rays (n, 3) enter and leave the voxel grid.
+        """Return the distances in metres at which rays (n, 3) enter and leave the voxel grid.
 
-        If a ray misses the grid, the exit is before the entry.
+        If a ray misses the grid, the second distance is smaller than the first.
         """
         high_m = self.low_m + self.side_m * np.array(self.occupied.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
             first_m, second_m = (self.low_m - starts) / ways, (high_m - starts) / ways
-        # Rays along a face of the voxels (0 / 0) are bounded by the other axes.
+        # For a ray in a face of the grid, 0 / 0 is NaN; the other axes bound it.
         enter_m = np.nanmax(np.fmin(first_m, second_m), axis=1)
         leave_m = np.nanmin(np.fmax(first_m, second_m), axis=1)
         return enter_m, leave_m
 
     def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the positions (n, 3) whose voxels contain points."""
+        """Return a mask (n,) of the positions (n, 3) that are in voxels with points."""
         voxels = np.floor((places - self.low_m) / self.side_m).astype(np.int64)
         inside = ((voxels >= 0) & (voxels < self.occupied.shape)).all(axis=1)
         held = np.zeros(len(places), dtype=np.bool_)

@@ -1,11 +1,11 @@
 """The extent of a wall, up to adjoining surfaces and including its relief.
 
-In markiewicz2015 (section 6), points within a range in front of and behind each plane are
-rasterised. Here, both this range and the rectangle are determined from the points connected to the
-wall. For this, a sample of the cloud is divided into voxels, and a region grows along the wall and
-in depth from the voxels on the plane. If a detected plane adjoins the wall, the rectangle ends at
-the nearest point of that plane, because a larger rectangle would show the adjoining plane.
-Otherwise, it ends where the points end.
+markiewicz2015 (section 6) rasterises the points within a given range in front of and behind each
+plane. Here, both this range and the rectangle are determined from the points connected to the wall:
+a sample of the cloud is divided into voxels, and from the voxels on the plane, a region grows along
+the wall and in depth. If a detected plane adjoins the wall, the rectangle ends at the nearest point
+of that plane, because a larger rectangle would show the adjoining plane. Otherwise, the rectangle
+ends where the points end.
 """
 
 from __future__ import annotations
@@ -26,49 +26,54 @@ from orthoflow_plugins.raster.selection import area_m2, frame_of
 Side = Literal["left", "right", "top", "bottom"]
 _SIDES: Final[tuple[Side, ...]] = ("left", "right", "top", "bottom")
 
-# Maximum number of points in the sample: one of every n points, chosen by hashing.
+# Maximum number of points in the sample, which consists of one in n points, chosen by hashing.
 _POINTS_MOST: Final = 1 << 21
-# Fibonacci hashing, so that the sample does not coincide with rows or columns of a scan.
+# Multiplier of Fibonacci hashing, so that the sample is independent of the rows and columns of a
+# scan.
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 # Maximum growth of a rectangle on each side.
 _GROWTH_MOST_M: Final = 1.0
-# Maximum depth of relief in front of and behind the plane.
+# Maximum depths of relief in front of and behind the plane.
 _FRONT_MOST_M: Final = 0.5
 _BEHIND_MOST_M: Final = 1.0
 # Maximum number of voxels.
 _VOXELS_MOST: Final = 1 << 22
-# Minimum side of a voxel along the wall, in metres and in spacings of sample points.
+# Minimum side of a voxel along the wall, in metres and as a multiple of the spacing of sample
+# points.
 _SIDE_LEAST_M: Final = 0.03
 _SIDE_STEPS: Final = 3.0
 # Side of a voxel in depth.
 _DEPTH_STEP_M: Final = 0.025
-# Surfaces are connected across this many depth steps, because sides of relief are seldom scanned.
+# Surfaces up to this number of depth steps apart are connected, because the sides of relief are
+# seldom scanned.
 _BRIDGED_STEPS: Final = 5
-# Minimum number of voxels on the plane for a part of the surface.
+# Connected voxels belong to the wall if at least this number of them are on the plane.
 _SEEDS_LEAST: Final = 4
-# A line of cells outside the rectangle belongs to the wall if this share of it is covered.
+# A row or column of cells outside the rectangle belongs to the wall if at least this share of it is
+# covered.
 _COVERED_LEAST: Final = 0.2
-# Share of the outermost points that may be stray points.
+# This share of the outermost points is ignored, because these may be stray points.
 _STRAY_SHARE: Final = 0.02
-# Depth searched beyond the limit. An object that extends into this depth, such as a cornice of an
-# adjoining wall or the side of a piece of furniture, has no front within the limit.
+# Additional depth that is searched beyond the maximum depth of relief. An object that extends into
+# this depth, such as a cornice of an adjoining wall or the side of a piece of furniture, is not
+# relief.
 _BEYOND_MOST_M: Final = 0.1
-# An object that extends farther in front of a wall and is connected to it, such as a fountain on a
-# facade, belongs to the wall up to this distance.
+# An object that is connected to a wall but extends farther in front of it than relief, such as a
+# fountain on a facade, belongs to the wall up to this distance.
 _FAR_FRONT_MOST_M: Final = 3.0
-# Such an object belongs to the wall only if it alone covers more than this share of the wall.
+# Such an object belongs to the wall only if it covers more than this share of the wall.
 _FAR_SHARE_LEAST: Final = 0.03
 # The depth of such an object is at most this share of the distance from the wall to a surface that
 # faces it, or to a scanner.
 _HALFWAY: Final = 0.5
 # A surface faces the wall if the cosine of the angle between the normals is smaller than this.
 _FACING_COSINE: Final = -0.7
-# Opposite walls of a room have similar areas; objects in front of a wall cover a few per cent of
-# it.
+# Minimum ratio of the areas of opposite walls of a room, which are similar; objects in front of a
+# wall cover only a few per cent of it.
 _OPPOSITE_SHARE: Final = 0.25
 _UPRIGHT_SINE: Final = math.sin(math.radians(10.0))
-# Points this close to the lowest and highest points in front of a wall are ignored, because ground
-# and ceiling connect everything.
+# Points less than this distance from the lowest or highest points in front of a wall are ignored,
+# because the ground and the ceiling connect all objects.
 _GROUND_M: Final = 0.15
 # Relief that covers less than this share of the wall does not influence the buffer.
 _RELIEF_LEAST: Final = 5e-4
@@ -77,14 +82,15 @@ _RELIEF_USUAL_M: Final = 0.15
 # Maximum cosine of the angle between the normals of a wall and an adjoining plane.
 _ADJOINING_COSINE: Final = 0.7
 _BESIDE_SINE: Final = 0.9
-# Along at least this share of the wall's side, points of an adjoining plane must be in this range
-# of depths in front of or behind the wall. The undersides of cornices are not as deep.
+# Points of an adjoining plane must cover at least this share of the wall's side, in this range of
+# depths in front of or behind the wall. The undersides of cornices do not extend to these depths.
 _BESIDE_SHARE: Final = 0.3
 _STANDING_M: Final = (0.35, 1.0)
 _BESIDE_STEP_M: Final = 0.1
-# The line of an adjoining plane may be this far inside the rectangle of the points.
+# The intersection with an adjoining plane may be this far inside the rectangle of the points.
 _WITHIN_M: Final = 0.1
-# Maximum distance of points from an adjoining surface, in its sigmas and in metres.
+# Maximum distance of the points of an adjoining surface from its plane, in standard deviations and
+# in metres.
 _NOISE_SIGMAS: Final = 3.0
 _NOISE_MOST_M: Final = 0.02
 
@@ -95,9 +101,9 @@ class SampledPoints:
 
     Attributes:
         origin: (3,) origin of the cloud, metres.
-        x: (n,) float32 coordinates relative to the origin, metres.
-        y: see x.
-        z: see x.
+        x: (n,) float32 x coordinates relative to the origin, metres.
+        y: (n,) float32 y coordinates relative to the origin, metres.
+        z: (n,) float32 z coordinates relative to the origin, metres.
         n_represented: number of points of the cloud per sample point.
     """
 
@@ -109,15 +115,15 @@ class SampledPoints:
 
     @property
     def boxes_m(self) -> None:
-        """Return None, because blocks of points from the whole cloud have no compact boxes."""
+        """None, because the bounding boxes of blocks of sampled points would be too large."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointsInside:
-    """Points in the raster of a wall.
+    """Points inside the raster and the buffer of a wall.
 
     Attributes:
-        places: (n, 2) column and row.
+        places: (n, 2) column and row, fractional.
         depth_m: (n,) metres in front of the plane.
         cells: (n,) row * width + column of their cell.
     """
@@ -128,7 +134,7 @@ class PointsInside:
 
 
 def sampled(cloud: PointCloud) -> SampledPoints:
-    """Return one of every n points, so that walls are examined quickly."""
+    """Return a sample of one in n points, so that walls are examined quickly."""
     every = -(-len(cloud) // _POINTS_MOST)
     index = np.arange(0, len(cloud), every)
     if every > 1:
@@ -140,7 +146,7 @@ def sampled(cloud: PointCloud) -> SampledPoints:
 
 
 def points_in(points: SampledPoints, slab: Slab, *, threads: int) -> PointsInside:
-    """Find the points in the raster of a wall and its buffer."""
+    """Find the points that are inside the raster and the buffer of a wall."""
     from orthoflow.geometry.rastering import entries_inside, wall_from_offset
 
     found = [
@@ -156,13 +162,13 @@ def points_in(points: SampledPoints, slab: Slab, *, threads: int) -> PointsInsid
 
 @dataclass(frozen=True, kw_only=True)
 class Extent:
-    """The extent of a wall.
+    """Extent of a wall.
 
     Attributes:
-        growth_m: growth beyond the rectangle of the points, at the left, right, top and bottom.
-        front_m: depth from the plane towards the viewer.
-        behind_m: depth behind the plane.
-        cut_m: for each side, the maximum width of the wall's part that is excluded because the
+        growth_m: growth beyond the rectangle of the points at the left, right, top and bottom.
+        front_m: depth in front of the plane, positive.
+        behind_m: depth behind the plane, positive.
+        cut_m: for each side, the maximum width of the part of the wall that is excluded because the
             adjoining plane is oblique to the side.
     """
 
@@ -172,8 +178,8 @@ class Extent:
     cut_m: Mapping[Side, float] = field(default_factory=dict)
 
     def widened(self, frame: WallFrame) -> WallFrame:
-        """Add whole cells on each side, so that the positions of the other cells are unchanged."""
-        # Tolerance of a millionth of a cell, as in `frame_over`.
+        """Extend a raster on each side by whole cells, so that other cells keep their positions."""
+        # The tolerance is 1e-6 cells, as in `frame_over`.
         left, right, top, bottom = (int(grown / frame.gsd_m + 1e-6) for grown in self.growth_m)
         corner = np.array([[-left, -top]], dtype=np.float64)
         return replace(
@@ -186,12 +192,12 @@ class Extent:
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """The depth to search, and the minimum buffer.
+    """Buffers of a wall as set by the user, and the minimum buffer.
 
     Attributes:
-        front_m: buffer towards the viewer; None if it is to be determined.
+        front_m: buffer in front of the plane; None if it is to be determined.
         behind_m: buffer behind the plane; None if it is to be determined.
-        least_m: minimum of a determined buffer.
+        least_m: minimum of a buffer that is determined.
     """
 
     front_m: float | None
@@ -200,12 +206,12 @@ class Reach:
 
     @property
     def is_set(self) -> bool:
-        """Return whether both buffers are set."""
+        """Whether both buffers are set."""
         return self.front_m is not None and self.behind_m is not None
 
     @property
     def as_set(self) -> Extent:
-        """Return the extent of a wall without a search."""
+        """Return an extent with the set buffers and no growth."""
         return Extent(
             front_m=self.least_m if self.front_m is None else self.front_m,
             behind_m=self.least_m if self.behind_m is None else self.behind_m,
@@ -221,13 +227,13 @@ def extent_of(
     stations: NDArray[np.float64] | None = None,
     threads: int,
 ) -> Extent:
-    """Determine the extent of the wall of a plane.
+    """Determine the extent of a wall, given its plane.
 
     Args:
         points: sample of the cloud.
         planes: all detected planes.
         index: index of the wall's plane.
-        reach: depths of the wall.
+        reach: buffers as set by the user.
         stations: (k, 3) world coordinates of scanners; None if unknown.
         threads: number of threads.
     """
@@ -263,16 +269,17 @@ def extent_of(
 
 @dataclass(frozen=True, kw_only=True)
 class _Bound:
-    """An adjoining plane, given by the distance of positions (right, down, depth) from it.
+    """An adjoining plane, given as a linear function of position: the distance from the plane.
 
     Attributes:
         side: side of the rectangle that the plane bounds.
-        slopes: (3,) derivatives of the distance, which is positive on the wall's side, along right,
-            down and depth.
-        offset_m: distance at the top-left corner of the rectangle of the points.
-        noise_m: maximum distance of the plane's points from it.
-        beyond_m: smallest distance of the plane from the rectangle's side, positive outside.
-        askew_m: difference between its largest and smallest distance from the side.
+        slopes: (3,) derivatives of the distance with respect to metres to the right, downwards and
+            in front of the wall's plane. The distance is positive on the wall's side.
+        offset_m: distance of the top-left corner of the rectangle of the points.
+        noise_m: maximum distance of the points of the adjoining surface from the plane.
+        beyond_m: smallest distance between the plane and the rectangle's side, positive outside.
+        askew_m: difference between the largest and the smallest distance between the plane and the
+            rectangle's side.
     """
 
     side: Side
@@ -284,20 +291,20 @@ class _Bound:
 
     @property
     def line_m(self) -> float:
-        """Return how far a wall bounded by the plane extends beyond the rectangle's side."""
-        # Points closer to the adjoining surface may belong to either surface.
+        """Distance by which a wall that this plane bounds extends beyond the rectangle's side."""
+        # Points closer to the plane may belong to either surface.
         return self.beyond_m - self.noise_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Search:
-    """The region in which points of a wall are searched for.
+    """The region that is searched for points of a wall.
 
     Attributes:
-        slab: cells of the voxels along the wall, and the range of depths.
+        slab: raster whose cells are the sides of the voxels along the wall, and range of depths.
         width_m: width of the rectangle of the points.
         height_m: height of the rectangle of the points.
-        seed_m: maximum distance of points on the plane.
+        seed_m: maximum distance from the plane of points that count as on the plane.
         bounds: adjoining planes.
     """
 
@@ -325,7 +332,7 @@ class _Search:
         )
         size_m = width_m, height_m
         around = _Around.of(points, rectangle, size_m)
-        # Grow by whole cells, so that a cell begins at the rectangle's corner.
+        # Grow by whole cells, so that the rectangle's corner is also a corner of a cell.
         growth_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
         frame = frame_of(planes, index, gsd_m=side_m, margin_m=growth_m)
         return cls(
@@ -337,17 +344,17 @@ class _Search:
         )
 
     def places_m(self, points: PointsInside) -> NDArray[np.float64]:
-        """Return positions (2, n), metres right of and below the rectangle's top-left corner."""
+        """Return positions (2, n), in metres right of and below the rectangle's top-left corner."""
         return self.slab.frame.gsd_m * (points.places - self.n_beside).T
 
     @property
     def n_beside(self) -> int:
-        """Return the number of cells between the sides of the frame and of the rectangle."""
+        """Number of cells between the left side of the frame and the left side of the rectangle."""
         return math.ceil(_GROWTH_MOST_M / self.slab.frame.gsd_m)
 
     @property
     def inside(self) -> tuple[slice, slice]:
-        """Return the rows and columns of cells in the rectangle of the points."""
+        """Rows and columns of the cells in the rectangle of the points."""
         side_m, first = self.slab.frame.gsd_m, self.n_beside
         rows, columns = (
             max(1, int(length_m / side_m)) for length_m in (self.height_m, self.width_m)
@@ -360,9 +367,11 @@ class _Surface:
     """The points connected to the wall.
 
     Attributes:
-        is_covered: (rows, cols) True for cells of the surface, without stray ones.
-        front_m: (rows, cols) largest depth of the surface; -inf if there is none.
-        behind_m: (rows, cols) smallest depth of the surface; inf if there is none.
+        is_covered: (rows, cols) True for cells of the surface, except isolated cells.
+        front_m: (rows, cols) largest depth of the surface in metres; -inf where there is no
+            surface.
+        behind_m: (rows, cols) smallest depth of the surface in metres; inf where there is no
+            surface.
         is_own: (n,) True for points on the surface.
     """
 
@@ -382,20 +391,20 @@ def _far_front_m(
     near_m: float,
     threads: int,
 ) -> float:
-    """Return the depth of objects connected to a wall that hide much of it; 0 if there are none.
+    """Return the depth of objects that are connected to a wall and hide much of it; 0 if none.
 
     Args:
         points: sample of the cloud.
         planes: all detected planes.
         index: index of the wall's plane.
         search: the region of the wall.
-        stations: (k, 3) world coordinates, or None.
+        stations: (k, 3) world coordinates of scanners; None if unknown.
         near_m: relief up to this depth always belongs to the wall.
         threads: number of threads.
     """
     from scipy import ndimage
 
-    # Objects on floors are not part of the floor.
+    # Objects that stand on a floor are not part of the floor.
     is_upright = abs(float(planes.normal[index] @ planes.up)) < _UPRIGHT_SINE
     most_m = min(_FAR_FRONT_MOST_M, free_before_m(planes, index, stations))
     if not is_upright or most_m <= near_m + _BEYOND_RELIEF_M:
@@ -407,7 +416,8 @@ def _far_front_m(
         return 0.0
     is_far = surface.front_m > near_m
     is_far &= ~(surface.behind_m <= near_m)
-    # Remove thin parts, which are objects that extend beyond this depth, such as adjoining walls.
+    # Remove thin parts, because they belong to objects such as adjoining walls, which extend
+    # farther in depth.
     is_far = np.asarray(ndimage.binary_opening(is_far, np.ones((3, 3), dtype=np.bool_)))
     rows, columns = far.inside
     gained_m = surface.front_m[rows, columns][is_far[rows, columns]]
@@ -419,12 +429,12 @@ def _far_front_m(
 
 
 def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | None) -> float:
-    """Return half the distance from a wall to the nearest surface that faces it, or to a scanner.
+    """Return half the distance from a wall to the nearest facing surface or scanner, or infinity.
 
-    Objects farther in front may belong to that surface; the distance is infinite if there is none.
-    A plane whose visible side was guessed may be the front of an object on the wall, seen from the
-    wrong side. Such planes count as facing the wall only if they, together with nearer ones, are
-    large enough to be the opposite side of a room.
+    Objects farther in front of the wall may belong to the facing surface. If the visible side of a
+    plane was only guessed, the plane may be the front of an object on the wall. Such planes are
+    considered to face the wall only if, together with nearer ones, they are large enough to be the
+    opposite wall of a room.
     """
     normal, offset_m = planes.normal[index], float(planes.offset[index])
     facing = [
@@ -446,7 +456,7 @@ def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | No
 
 
 def _without_ground(inside: PointsInside, search: _Search, near_m: float) -> PointsInside:
-    """Remove ground and ceiling in front of a wall, because they connect objects to it."""
+    """Remove the ground and the ceiling in front of a wall, because they connect objects to it."""
     _, down_m = search.places_m(inside)
     is_before = inside.depth_m > near_m
     if not is_before.any():
@@ -460,7 +470,7 @@ def _without_ground(inside: PointsInside, search: _Search, near_m: float) -> Poi
 
 
 def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
-    """Return the voxels connected to those on the plane; None if no voxels are on the plane."""
+    """Return the surface connected to the voxels on the plane; None if there are no such voxels."""
     from scipy import ndimage
 
     slab = search.slab
@@ -506,16 +516,16 @@ def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
 
 
 def _searched_m(set_m: float | None, most_m: float) -> float:
-    """Return the search depth of a wall, which limits its growth."""
+    """Return the depth to search in front of or behind a wall."""
     return most_m + _BEYOND_MOST_M if set_m is None else min(set_m, most_m)
 
 
 def _relief_m(depth_m: NDArray[np.float64], most_m: float, search: _Search) -> float:
-    """Return the depth of the wall's relief, ignoring thin and tiny parts."""
+    """Return the depth of the wall's relief; thin and very small parts are ignored."""
     from scipy import ndimage
 
     inner = np.where(np.isfinite(depth_m) & (depth_m <= most_m), depth_m, -np.inf)
-    # Undetected floors and ceilings, and sides of relief, are thin in this view.
+    # Seen along the normal, undetected floors and ceilings and the sides of relief are thin.
     opened = np.asarray(ndimage.minimum_filter(inner, 3, mode="constant", cval=-np.inf))
     opened = np.sort(opened[np.isfinite(opened)])
     rows, columns = search.inside
@@ -536,7 +546,8 @@ def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Sear
         is_within = (down_m >= 0.0) & (down_m <= search.height_m)
     else:
         is_within = (right_m >= 0.0) & (right_m <= search.width_m)
-    # Lines of cells outside the rectangle, from the inside out; the first may be partly inside.
+    # Rows or columns of cells outside the rectangle, from the inside out; the first may be partly
+    # inside.
     lines, beyond_m, within_m = {
         "left": (is_covered[rows, :first].T[::-1], -right_m, 0.0),
         "right": (
@@ -565,7 +576,7 @@ def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Sear
 
 
 def _covered_m2(planes: Planes, index: int) -> float:
-    """Return the area of a plane's connected parts, or of its rectangle if there are no parts."""
+    """Return the area of the connected parts of a plane, but at most that of its rectangle."""
     whole = area_m2(planes.corners[index])
     parts = sum(area_m2(corners) for corners in _parts(planes, index))
     return min(whole, parts) if parts > 0.0 else whole
@@ -581,10 +592,10 @@ def _parts(planes: Planes, index: int) -> NDArray[np.float64]:
 def _bounds(
     planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float], around: _Around
 ) -> Iterator[_Bound]:
-    """Yield the planes that adjoin the sides of a wall, the innermost plane for each side.
+    """Yield the adjoining plane of each side of a wall: the innermost one, if there are several.
 
-    A part of an adjoining wall that projects from it at some distance, such as a chimney breast,
-    does not bound the wall, because the wall's own surface continues to the next plane.
+    If the wall has points beyond the innermost plane, the plane does not bound the wall, and the
+    next one is used. An example is the side of a chimney breast on the adjoining wall.
     """
     found: dict[Side, list[_Bound]] = {}
     for other in range(len(planes)):
@@ -617,7 +628,8 @@ def _bound(
     middle = np.array([0.5 * size_m[0], 0.5 * size_m[1], 0.0])
     if offset_m + float(slopes @ middle) < 0.0:
         slopes, offset_m = -slopes, -offset_m
-    # The inside, where distances are positive, is to the right of a left wall and below a ceiling.
+    # The inside, where distances are positive, is to the right of an adjoining wall on the left and
+    # below a ceiling.
     sides: tuple[Side, Side] = ("left", "right") if axis == 0 else ("top", "bottom")
     is_first = bool(slopes[axis] > 0.0)
     along = 1 - axis
@@ -643,9 +655,9 @@ class _Around:
     """Points in and around a wall, in metres relative to its rectangle.
 
     Attributes:
-        places_m: (3, n) metres right of and below the top-left corner, and in front of the plane,
-            for points clearly in front of or behind it.
-        own_m: (3, n) the same for points on the plane or on relief of the usual depth.
+        places_m: (3, n) points clearly in front of or behind the plane: metres to the right of and
+            below the top-left corner, and in front of the plane.
+        own_m: (3, n) points on the plane or on relief of usual depth, in the same coordinates.
     """
 
     places_m: NDArray[np.float64]
@@ -658,7 +670,7 @@ class _Around:
         growth_m = _GROWTH_MOST_M
         corner = rectangle.world_from_wall(np.array([[-growth_m, -growth_m]]) / rectangle.gsd_m)[0]
         width_m, height_m = (length_m + 2.0 * growth_m for length_m in size_m)
-        # 32 x 32 cells; any size would do, because only positions are used.
+        # Use 32 x 32 cells; the size is arbitrary, because only positions are used.
         gsd_m = max(width_m, height_m) / 32.0
         frame = replace(
             rectangle,
@@ -679,7 +691,7 @@ class _Around:
 
 
 def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
-    """Return whether points of a plane extend along a side of a wall, in front of or behind it."""
+    """Return whether a plane has points along a wall's side, in front of or behind the wall."""
     places_m = around.places_m
     is_near = np.abs(bound.offset_m + bound.slopes @ places_m) <= bound.noise_m
     return any(
@@ -689,7 +701,7 @@ def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool
 
 
 def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
-    """Return whether a wall has points between two planes at the same side."""
+    """Return whether a wall has points between two planes that adjoin the same side."""
     places_m = around.own_m
     is_between = inner.offset_m + inner.slopes @ places_m < -inner.noise_m
     is_between &= outer.offset_m + outer.slopes @ places_m > outer.noise_m
@@ -697,7 +709,7 @@ def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: 
 
 
 def _runs_along(bound: _Bound, places_m: NDArray[np.float64], size_m: tuple[float, float]) -> bool:
-    """Return whether positions (3, n) cover enough of a bound's side."""
+    """Return whether positions (3, n) cover a sufficient share of the side that a plane bounds."""
     along = 1 if bound.side in {"left", "right"} else 0
     length_m = size_m[along]
     n_steps = max(1, round(length_m / _BESIDE_STEP_M))

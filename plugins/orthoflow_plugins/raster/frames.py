@@ -1,4 +1,4 @@
-"""Grids of walls: crops, and maps of horizontal planes."""
+"""Rasters of walls: cropping, and maps of horizontal planes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Rectangle = tuple[float, float, float, float]
 Polygon = tuple[tuple[float, float], ...]
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
-# Maximum displacement of a point in the map of a tilted raster, in cells.
+# Maximum displacement, in cells, of a point in the map of a tilted plane.
 _OFF_CELLS_MOST: Final = 0.5
 TILTED: Final = DiagnosticSpec(
     code="map-of-a-tilted-plane",
@@ -41,7 +41,7 @@ NO_MAP: Final = DiagnosticSpec(
 
 
 def outline_m(crop: Rectangle | Polygon) -> NDArray[np.float64]:
-    """Return corners (n, 2) of a crop, metres right of and below the raster's top-left corner."""
+    """Return the corners (n, 2) of a crop, metres right of and below the top-left corner."""
     corners = np.array(crop, dtype=np.float64)
     if corners.ndim == 2:
         return corners
@@ -58,12 +58,12 @@ def area_m2(crop: Rectangle | Polygon) -> float:
 
 
 def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> WallFrame | None:
-    """Remove columns and rows outside a crop from a grid; return None if no cell is inside.
+    """Remove the columns and rows outside a crop from a frame; return None if no cell is inside.
 
-    The other cells are unchanged, so the cells of different crops coincide.
+    Cells keep their positions, so that the cells of different crops coincide.
     """
     outline_px = outline_m(crop) / frame.gsd_m
-    # Tolerance of a millionth of a cell, as in `frame_over`.
+    # The tolerance is 1e-6 cells, as in `frame_over`.
     first = np.floor(outline_px.min(axis=0) + 1e-6).clip(0, None).astype(np.int64)
     last = np.ceil(outline_px.max(axis=0) - 1e-6).astype(np.int64)
     width, height = np.minimum(last, [frame.width, frame.height]) - first
@@ -79,7 +79,7 @@ def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> WallFrame | None:
 
 
 def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
-    """Make cells of a cropped wall void if their centres are outside the crop (even-odd rule)."""
+    """Set cells of a cropped wall to void if their centres are outside the crop (even-odd rule)."""
     corners = outline_m(crop) / wall.frame.gsd_m
     # Make the corners relative to the first cell of the cropped grid.
     corners -= np.floor(corners.min(axis=0) + 1e-6).clip(0, None)
@@ -97,17 +97,18 @@ def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
 def mapped(
     frames: Mapping[int, WallFrame], planes: Planes, crs: str, *, reach_m: float, ctx: StepContext
 ) -> dict[int, WallFrame]:
-    """Return grids: those of horizontal planes in the map, all others in their planes.
+    """Replace the frames of horizontal planes by frames in the map; other frames are unchanged.
 
     Args:
-        frames: grid of each plane by index.
+        frames: frame of each plane by index.
         planes: the planes.
         crs: coordinate system of the cloud, with x as easting and y as northing.
-        reach_m: maximum distance of points from a plane, for the displacement caused by a tilt.
+        reach_m: maximum distance of points from a plane, which determines the displacement if the
+            plane is tilted.
         ctx: receives warnings.
 
     Raises:
-        MethodError: the system does not exist, or z does not point up.
+        MethodError: the coordinate system does not exist, or z does not point up.
     """
     from orthoflow.files.geotiff import require_map_crs
 
@@ -126,14 +127,15 @@ def mapped(
         tilt_rad = math.atan2(math.hypot(east, north), up)
         if math.degrees(tilt_rad) > LEVEL_LIMIT_DEG:
             continue
-        # Maximum displacement of a point, due to its depth and to the foreshortening of the slope.
+        # Maximum displacement of a point, due to its depth and to the foreshortening of the plane.
         extent_m = frame.gsd_m * math.hypot(frame.width, frame.height)
         off_m = reach_m * math.sin(tilt_rad) + extent_m * (1.0 - math.cos(tilt_rad))
         if off_m > _OFF_CELLS_MOST * frame.gsd_m:
             name, tilt_deg = planes.names[index], math.degrees(tilt_rad)
             ctx.report(TILTED, subject=name, tilt_deg=tilt_deg, off_mm=1e3 * off_m)
             continue
-        # Whole cells extend beyond the rectangle; distribute this excess evenly over all sides.
+        # The raster, which has whole cells, extends beyond the rectangle: by the same length on
+        # opposite sides.
         middle = frame.wall_from_world(planes.corners[index].mean(axis=0)[None])[0, :2]
         beyond = middle - 0.5 * np.array([frame.width, frame.height])
         origin = frame.world_from_wall(beyond[None])[0]

@@ -1,4 +1,4 @@
-"""`raster.grid`: the scanned surface over each wall as a regular raster (markiewicz2015, 3.4)."""
+"""`raster.grid`: the scanned surface of each wall as a regular raster (markiewicz2015, 3.4)."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ from orthoflow_plugins.raster.walls import rastered_wall, require_memory
 
 ExtentOf = Callable[[int], Extent]
 
-# Points of `near` farther from the wall than this are probably wrong.
+# A point of `near` that is farther from the wall than this is probably wrong.
 _FAR_M: Final = 1.0
-# A missing strip wider than this would be noticed in a drawing.
+# A missing strip that is wider than this would be noticed in a drawing.
 _CUT_WORTH_WORDS_M: Final = 0.05
 OBLIQUE: Final = DiagnosticSpec(
     code="wall-beside-an-oblique-surface",
@@ -78,13 +78,13 @@ CROP_OF_SEVERAL: Final = DiagnosticSpec(
 
 
 class RasterGrid(Method):
-    """Rasterise the cloud on each wall: depth, spread, count, intensity and colour.
+    """Rasterise the cloud on each wall: depth, spread, number of points, intensity and colour.
 
-    Narrow gaps are interpolated between neighbouring points of a scan if its rows and columns are
-    known, otherwise between the measured cells around the gap, from the positions of their points.
-    Wider gaps, such as windows, remain void. In cells with up to 16 points, mean intensities and
-    colours are extrapolated along their gradient from the mean position of the points to the centre
-    of the cell.
+    Narrow gaps are interpolated. If the rows and columns of a scan are known, they are interpolated
+    between neighbouring points of the scan, and otherwise from the measured cells around the gap,
+    at the positions of their points. Wider gaps, such as windows, remain void. In cells with up to
+    16 points, mean intensities and colours are extrapolated along their gradients from the mean
+    position of the points to the centre of the cell.
     """
 
     id: ClassVar[str] = "raster.grid"
@@ -92,7 +92,6 @@ class RasterGrid(Method):
     result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
-        # This identifies the first wall.
         MetricSpec("omega_deg", label="direction of the first normal (omega)"),
         MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
         MetricSpec("area_m2", label="area of the first wall's raster"),
@@ -104,7 +103,6 @@ class RasterGrid(Method):
         MetricSpec(
             "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
         ),
-        # This is also reported by cause.
         MetricSpec("empty_share", label="cells without a depth"),
         MetricSpec("empty_*_share", label="cells without a depth, by cause"),
         MetricSpec("measured_share", label="cells with a measured depth"),
@@ -135,7 +133,7 @@ class RasterGrid(Method):
         walls: Walls
 
     def run(self, inputs: In, params: RasterParams, ctx: StepContext) -> Out:
-        """Rasterise the selected planes, with one or a few passes over the cloud for each."""
+        """Rasterise the selected planes."""
         from orthoflow.geometry.cloud_quality import scan_step_m
 
         cloud, planes = inputs.cloud, inputs.planes
@@ -213,7 +211,7 @@ def _extents(
     params: RasterParams,
     ctx: StepContext,
 ) -> ExtentOf:
-    """Return a function that determines the extent of a plane's wall on first use."""
+    """Return a function that determines the extent of a wall when first called with its plane."""
     reach = Reach(
         front_m=params.buffer_m if params.buffer_front_m is None else params.buffer_front_m,
         behind_m=params.buffer_m if params.buffer_behind_m is None else params.buffer_behind_m,
@@ -235,7 +233,7 @@ def _extents(
 def _frames(
     planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> tuple[dict[int, WallFrame], dict[int, int]]:
-    """Return the grids of the selected planes by index, and the covered planes.
+    """Return the frames of the selected planes by index, and the planes that these walls cover.
 
     Raises:
         MethodError: a selected plane does not exist, or no wall contains the requested part.
@@ -275,7 +273,7 @@ def _frames(
 def _report_doubts(
     chosen: list[int], planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> None:
-    """Report walls cut by oblique neighbours, and points of `near` far from all walls."""
+    """Report walls cut off by oblique planes, and points of `near` far from all walls."""
     for index in chosen:
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - params.margin_m

@@ -1,7 +1,7 @@
-"""Kernels that compute the surface of a wall from points, and close gaps between points.
+"""Kernels that compute the surface of a wall from points and close gaps between points.
 
-Kernels for the entries of `geometry.rastering` run in all threads; each thread processes the cells
-that it owns.
+Kernels with the arguments `owners` and `owner` process the entries of `geometry.rastering`. They
+run in all threads; each thread processes the cells that it owns.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ from orthoflow.geometry.rastering import Entries, is_own
 from orthoflow.geometry.slabs import Offsets
 
 # Maximum number of points in a cell with few points. The mean position of more points is near the
-# centre of the cell. That of few points may be off by up to half a point spacing, and in the same
-# direction in many cells if the cell size is a multiple of the spacing.
+# centre of the cell. The mean position of few points may be off by up to half a point spacing, in
+# the same direction in many cells if the cell size is a multiple of the spacing.
 FEW_POINTS: Final = 16
-# Tolerance outside a triangle, so that a centre on an edge belongs to at least one triangle.
+# Tolerance outside a triangle, so that the centre of a cell on an edge is in at least one triangle.
 _ON_EDGE: Final = 1e-9
 
 
 class FewPoints(NamedTuple):
-    """Positions of points in cells with few points; all arrays are flat over cells.
+    """Positions of points in cells with few points; the first axis of all arrays is the cell.
 
     Attributes:
-        n_inside: number of points in each cell.
-        depths_m: depth of the surface.
-        layer_m: points farther than this from the surface belong to another layer.
-        n_summed: uint8 number of points on the surface, in cells with few points.
-        places: (cells, 2) float32 sums of the positions of these points right of and below the
-            centre, in cells.
+        n_inside: number of points.
+        depths_m: depth of the surface in metres.
+        layer_m: points whose depth differs from the surface by more than this, in metres, belong to
+            another layer.
+        n_summed: uint8 number of points on the surface; only for cells with few points.
+        places: (cells, 2) float32 sums of the positions of these points to the right of and below
+            the centre of the cell, in cells.
     """
 
     n_inside: NDArray[np.uint32]
@@ -53,13 +54,13 @@ def keep_nearest_around(
     owners: int,
     owner: int,
 ) -> None:
-    """Keep the point nearest to the centre of each cell, from the cell and its eight neighbours.
+    """Select the point nearest to the centre of each cell, in the cell and its eight neighbours.
 
     Args:
         entries: one chunk.
         offsets: points of the whole cloud.
         wall_from_offset: (3, 4) as in `Target`.
-        winners: (cells,) of `WINNER`, updated; points are counted in their own cells.
+        winners: (cells,) of `WINNER`, updated; `n_points` counts only points inside a cell.
         width: columns of the raster.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells are visited.
@@ -96,7 +97,7 @@ def add_moments(
     owners: int,
     owner: int,
 ) -> None:
-    """Count points per cell (cells,), and sum their depths and squared depths (cells, 2)."""
+    """Add up the numbers of points (cells,), and depths and squared depths (cells, 2)."""
     for k in range(entries.cells.size):
         cell = entries.cells[k]
         if is_own(cell, owners, owner):
@@ -115,7 +116,7 @@ def sort_into_cells(
     owners: int,
     owner: int,
 ) -> None:
-    """Append the depths of points to those of their cells.
+    """Write the depths of points to `sorted_m`, grouped by cell.
 
     Args:
         entries: one chunk.
@@ -143,14 +144,14 @@ def median_depths(
     first: int,
     end: int,
 ) -> None:
-    """Set the median depth of the layer with the most points in each cell.
+    """Set the median depth of each cell, using only the layer with the most points.
 
-    The depths of a cell are divided into layers at differences of more than `layer_m`. If layers
-    have the same number of points, the one nearest to the viewer is used. Thus, no depth is between
-    two surfaces, and stray points have no influence.
+    The depths of a cell are divided into layers where consecutive depths differ by more than
+    `layer_m`. If several layers have the most points, the one nearest to the viewer is used.
+    Medians are therefore never between two surfaces, and stray points have no influence.
 
     Args:
-        ends: (cells,) end of each cell's depths in `sorted_m`.
+        ends: (cells,) index after the last depth of each cell in `sorted_m`.
         sorted_m: depths grouped by cell; sorted in place.
         layer_m: depth step that separates two layers.
         medians_m: (cells,) metres, overwritten; NaN if the cell is void.
@@ -169,7 +170,7 @@ def median_depths(
 
 @kernel_part
 def _sort(values: NDArray[np.float32]) -> None:
-    """Sort by Shell's method with gap ratio 3, because numba's sort takes seconds to compile."""
+    """Sort by Shell's method with gap ratio 3, since numba's sort takes seconds to compile."""
     gap = 1
     while gap < values.size // 3:
         gap = 3 * gap + 1
@@ -189,7 +190,8 @@ def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
     best_size, best_first, first = 1, 0, 0
     for k in range(1, depths.size + 1):
         if k == depths.size or depths[k] - depths[k - 1] > layer_m:
-            # `>=`, because depths are ascending and later layers are nearer to the viewer.
+            # `>=` selects the last layer, which is nearest to the viewer because depths are
+            # ascending.
             if k - first >= best_size:
                 best_size, best_first = k - first, first
             first = k
@@ -215,8 +217,9 @@ def add_values(  # noqa: PLR0913, PLR0917
         entries: one chunk.
         values: (points of the cloud, channels); points whose first channel is NaN are ignored.
         has_value: (points of the cloud,) True for points to use; empty to use all.
-        depths_m: (cells,) depth of the surface.
-        layer_m: a point farther than this from the surface belongs to another layer.
+        depths_m: (cells,) depth of the surface in metres.
+        layer_m: points whose depth differs from the surface by more than this belong to another
+            layer.
         sums: (cells, channels + 1); the last channel counts the points.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells are visited.
@@ -253,7 +256,7 @@ def add_places(
         entries: one chunk.
         offsets: points of the whole cloud.
         wall_from_offset: (3, 4) as in `Target`.
-        few: the sums, updated.
+        few: sums of positions, updated.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells are visited.
     """
@@ -262,7 +265,7 @@ def add_places(
         cell = entries.cells[k]
         if not is_own(cell, owners, owner) or few.n_inside[cell] > FEW_POINTS:
             continue
-        # A void cell has no surface; its depth is NaN.
+        # `not ... <=` also skips void cells, whose depth is NaN.
         if not abs(entries.depths_m[k] - few.depths_m[cell]) <= few.layer_m:
             continue
         point = entries.points[k]
@@ -278,9 +281,10 @@ class ScanGrid(NamedTuple):
     """Points of one scan by row and column.
 
     Attributes:
-        points: (rows, cols) int64 index in the cloud, -1 if there is no point.
+        points: (rows, cols) int64 index in the cloud; -1 if there is no point.
         offsets: points of the cloud.
-        wall_from_offset: (3, 4) float64 matrix from offsets to column, row and depth in metres.
+        wall_from_offset: (3, 4) float64 transform from offsets in metres to (column, row, depth in
+            metres).
     """
 
     points: NDArray[np.int64]
@@ -292,9 +296,9 @@ class Reach(NamedTuple):
     """Limits within which neighbouring points of a scan are assumed to be on the same surface.
 
     Attributes:
-        step: number of rows and columns of the scan between the points.
+        step: distance between neighbours in rows or columns of the scan.
         side_cells: maximum distance on the wall along u and along v, in cells.
-        step_m: maximum difference between their depths.
+        step_m: maximum difference between their depths, in metres.
     """
 
     step: int
@@ -303,7 +307,7 @@ class Reach(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Sums over the triangles that cover each cell, indexed by the flat cell number.
+    """Sums over the triangles that cover each cell, in row order of the cells.
 
     Attributes:
         n: uint16 number of triangles.
@@ -327,12 +331,13 @@ def recover_between(
     is_void: NDArray[np.bool_],
     sums: Sums,
 ) -> None:
-    """Add the linearly interpolated values of triangles of neighbouring points to void cells.
+    """Interpolate void cells linearly in triangles of neighbouring points, and sum the values.
 
-    A square of four neighbours is divided along both diagonals, which have equal weight.
+    Each square of four neighbours is divided along both diagonals, and the two divisions have equal
+    weight.
 
     Args:
-        grid: one scan.
+        grid: points of a scan.
         intensity: intensities of the cloud, or empty.
         rgb: colours of the cloud, or empty.
         reach: limits for neighbours.
@@ -349,8 +354,8 @@ def recover_between(
             if chosen[0] < 0:
                 continue
             _place(grid, chosen[0], corners[0])
-            # In each of the four squares around a point, the triangle with its right angle at the
-            # point.
+            # In each of the four squares around a point, use the triangle with its right angle at
+            # the point.
             for quarter in range(4):
                 across = column + (step if quarter % 2 else -step)
                 down = row + (step if quarter // 2 else -step)
@@ -368,7 +373,7 @@ def recover_between(
 
 @kernel_part
 def _place(grid: ScanGrid, point: int, place: NDArray[np.float64]) -> None:
-    """Set `place` to the column, row and depth of a point."""
+    """Set `place` to the column, the row and the depth in metres of a point."""
     offsets = grid.offsets
     x, y, z = offsets.x[point], offsets.y[point], offsets.z[point]
     m = grid.wall_from_offset
@@ -395,7 +400,7 @@ def _fill(
     is_void: NDArray[np.bool_],
     sums: Sums,
 ) -> None:
-    """Add a triangle to the void cells whose centres are inside it."""
+    """Add the values of a triangle to the sums of void cells whose centres are inside it."""
     ax, ay, bx, by = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
     cx, cy = corners[2, 0], corners[2, 1]
     area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)

@@ -1,4 +1,4 @@
-"""The surface `tin`: a triangulation of one point per cell, for the whole wall."""
+"""The surface `tin`: a triangulation of the whole wall, with one point per cell."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _ROWS_AT_ONCE: Final = 256
 _ROUNDING_CELLS: Final = 1e-6
 
 
-# Values at the centres of the cells: depth, and intensity and colour (cells, 3) if the cloud has
-# them; NaN and 0 outside all triangles.
+# Values at the centres of the cells: depth, and, if the cloud has them, intensity and colour
+# (cells, 3). Outside all triangles, depth and intensity are NaN, and colour is 0.
 Net = tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.uint8] | None]
 
 
@@ -30,16 +30,17 @@ def interpolate_net(
 ) -> Net:
     """Interpolate values at all cell centres linearly in a Delaunay triangulation.
 
-    The triangulation closes gaps, including windows, and turns steps into slopes.
+    The triangulation closes all gaps, including windows, and turns steps in depth into slopes.
 
     Args:
         cloud: the points.
         slab: raster and buffer of the wall.
-        point: (cells,) index in the cloud of the vertex of each cell; `NO_POINT` if there is none.
+        point: (cells,) for each cell, the index in the cloud of the point that is a vertex;
+            `NO_POINT` if there is none.
         depth_m: (cells,) depth of the vertices.
 
     Raises:
-        MethodError: the points form no triangle.
+        MethodError: no triangle covers the centre of a cell.
     """
     from scipy.spatial import Delaunay, QhullError
 
@@ -53,7 +54,7 @@ def interpolate_net(
             rgb[~np.asarray(cloud.has_rgb)[taken]] = np.nan
         values.append(rgb)
     table = np.column_stack([np.asarray(part, dtype=np.float64) for part in values])
-    # Columns and rows; the centres of cells are at .5.
+    # Vertices are in columns and rows; the centres of cells are at (column + 0.5, row + 0.5).
     matrix = wall_from_offset(slab.frame, cloud.origin)
     offsets = np.stack([axis[taken] for axis in (cloud.x, cloud.y, cloud.z)]).astype(np.float64)
     found = np.full((slab.n_cells, table.shape[1]), np.nan, dtype=np.float32)
@@ -74,7 +75,7 @@ def interpolate_net(
 def _interpolate(
     delaunay: Delaunay, table: NDArray[np.float64], slab: Slab, found: NDArray[np.float32]
 ) -> None:
-    """Interpolate values (cells, channels) of cells in triangles from those of the vertices."""
+    """Interpolate values (cells, channels) inside triangles from those of the vertices."""
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import ConvexHull
 
@@ -83,7 +84,8 @@ def _interpolate(
     for top in range(0, slab.frame.height, _ROWS_AT_ONCE):
         bottom = min(top + _ROWS_AT_ONCE, slab.frame.height)
         rows, columns = (axis.ravel() for axis in np.mgrid[top:bottom, : slab.frame.width] + 0.5)
-        # Exclude positions outside the hull, because scipy tests every triangle for each of them.
+        # Exclude positions outside the convex hull, because scipy tests all triangles for each of
+        # these.
         inside = np.ones(rows.size, dtype=np.bool_)
         for right, down, offset in sides:
             inside &= right * columns + down * rows + offset <= _ROUNDING_CELLS

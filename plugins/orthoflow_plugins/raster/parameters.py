@@ -14,7 +14,7 @@ Place = tuple[float, float, float]
 
 
 class RasterParams(MethodParams):
-    """Cell size, depth of the surface, selection of planes, and closing of gaps."""
+    """Parameters for the cell size, the depth of the surface, the selection of planes, and gaps."""
 
     gsd_m: float = Field(
         default=0.005,

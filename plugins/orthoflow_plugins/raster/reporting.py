@@ -17,15 +17,15 @@ from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Cause, Emptiness
 
-# For walls with more cells than this, medians are estimated from some of the rows.
+# For walls with more cells, medians are estimated from only some of the rows.
 _CELLS_ASKED: Final = 1 << 26
 # Maximum spacing of the points of a scan, in cells.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0
 # Minimum share of empty or interpolated cells for a warning.
 _SHARE_WORTH_WORDS: Final = 0.1
-# Minimum share of cells for a cause to be reported.
+# Minimum share of cells for a warning about a cause.
 _CAUSE_WORTH_WORDS: Final = 0.01
-# Minimum share for a warning about omitted objects in front of a wall.
+# Minimum share of cells for a warning about omitted objects in front of a wall.
 _LEFT_OUT_WORTH_WORDS: Final = 0.05
 # Smallest share that is not printed as 0.0 %.
 _SHARE_LEAST: Final = 0.0005
@@ -130,7 +130,7 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 def warn(
     ctx: StepContext, walls: Sequence[Wall], steps_m: Sequence[float], intensity_source: str
 ) -> None:
-    """Report limitations of walls: missing data, and cells finer than the point spacing."""
+    """Report missing data of walls, and cells that are finer than the point spacing."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
@@ -159,7 +159,7 @@ def warn(
 
 
 def _least_gsd_m(step_m: float) -> float:
-    """Return the smallest cell size with two significant digits that suits a point spacing."""
+    """Return the smallest cell size, with two significant digits, that suits a point spacing."""
     least_m = step_m / _STEP_MOST_CELLS
     digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
     # Round up, because the nearest number with two significant digits may be too fine.
@@ -195,12 +195,12 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:
-    """Report planes that are not rasterised because a larger wall shows them.
+    """Report planes that are not rasterised because a larger wall contains them.
 
     Args:
         ctx: context of the step.
         names: names of all planes.
-        covered: for the index of each such plane, the index of the wall that shows it.
+        covered: index of each such plane, with the index of the wall that contains it.
     """
     for wall in sorted(set(covered.values())):
         left_out = [names[index] for index, shown_by in covered.items() if shown_by == wall]
@@ -213,7 +213,7 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
     Args:
         ctx: context of the step.
         walls: at least one wall.
-        step_m: point spacing on the first wall.
+        step_m: point spacing on the first wall, in metres.
         up: (3,) unit vector.
     """
     frame = walls[0].frame
@@ -243,7 +243,7 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
 
 
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
-    """Report the causes of empty cells as metrics, and as diagnostics if many are affected."""
+    """Report the causes of empty cells as metrics, and as diagnostics if many cells are empty."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
     for cause in _CAUSES:
         shares = [of_wall.shares[cause] for of_wall in empty]
@@ -256,8 +256,8 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
             f"{wall.name}: {of_wall.share:.1%} of its cells are empty: "
             + ", ".join(f"{share:.1%} {cause}" for cause, share in shares_of.items())
         )
-        # Do not warn about the few tiles at the border of a hole, which also contain its
-        # surroundings.
+        # Do not warn about causes with few cells: tiles at the border of a hole contain cells of
+        # its surroundings, too.
         least = max(_CAUSE_WORTH_WORDS, 0.1 * of_wall.share)
         if shares_of["before"] < _LEFT_OUT_WORTH_WORDS and of_wall.share < _SHARE_WORTH_WORDS:
             continue
@@ -281,10 +281,10 @@ def _digits(depth_m: float) -> float | None:
 
 
 def _rounded_up(depth_m: float) -> float | None:
-    """Return a buffer in whole decimetres that includes a depth."""
+    """Round a depth up to whole decimetres; None for NaN."""
     return math.ceil(10.0 * depth_m) / 10.0 if math.isfinite(depth_m) else None
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
-    """Return all rows of a raster, or some if it is large."""
+    """Return the rows of a raster, or only some of them if it is large."""
     return values[:: max(1, values.size // _CELLS_ASKED)]

@@ -1,4 +1,4 @@
-"""Selection of the planes that become walls, and their rasters."""
+"""Selection of the planes that become walls."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.products import Planes
 from orthoflow_plugins.raster.parameters import Constraint, RasterParams
 
-# Maximum tilt of a plane that counts as vertical or horizontal.
+# Maximum angle between a vertical or horizontal plane and the exact direction.
 _LEAN_DEG: Final = 10.0
-# A plane belongs to the relief of a larger wall if the angle between them is less than the first
-# value and the wall contains more than the second value of its area.
+# A plane is part of the relief of a larger wall if the angle between the two is less than the first
+# value and the wall contains more than the second value, a share, of the plane's area.
 _PARALLEL_DEG: Final = 5.0
 _COVERED_SHARE: Final = 0.8
 
 
-# Returns the buffers in front of and behind the plane of a wall.
+# Function that returns the buffers in front of and behind a plane, given its index.
 BufferOf = Callable[[int], tuple[float, float]]
 
 
@@ -31,7 +31,8 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
     """Return the indices of the planes to rasterise, those with the most points first.
 
     Raises:
-        MethodError: there are no planes, or none has the requested orientation or rank.
+        MethodError: there are no planes, none has the requested orientation, or a requested rank
+            does not exist.
     """
     if len(planes) == 0:
         raise MethodError("no plane was found in the cloud, but at least one is needed for a wall")
@@ -52,7 +53,7 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
     if params.near:
         return sorted({nearest_plane(planes, fitting, np.array(place)) for place in params.near})
     large = [k for k in fitting if area_m2(planes.corners[k]) >= params.min_area_m2]
-    # The plane with the most points is exempt from the minimum area, so that a scan of one small
+    # The minimum area does not apply to the plane with the most points, so that a scan of a small
     # object has a wall.
     chosen: list[int] = []
     for index in sorted({fitting[0], *large}):
@@ -63,7 +64,8 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
         chosen.append(index)
     if not params.skip_covered:
         return chosen
-    # A larger wall with fewer points may also cover a wall that was selected before.
+    # A wall that was selected later, because it has fewer points, may be larger and cover an
+    # earlier one.
     return [
         index
         for index in chosen
@@ -78,11 +80,11 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
 def covered_planes(
     planes: Planes, params: RasterParams, buffer_m: BufferOf, chosen: Sequence[int]
 ) -> dict[int, int]:
-    """Return the wall that shows each omitted plane, by index of the plane.
+    """Return the wall that contains each omitted plane, by the index of the plane.
 
     Args:
         planes: all planes, those with the most points first.
-        params: the criteria.
+        params: criteria for the selection.
         buffer_m: function that returns the buffers of walls.
         chosen: result of `chosen_planes`.
     """
@@ -105,15 +107,15 @@ def covered_planes(
 
 
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
-    """Return the plane nearest to a point (3,); if tied, the one with the most points."""
+    """Return the plane nearest to a point (3,), or of several, the one with most points."""
     return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))
 
 
 def distance_m(planes: Planes, index: int, place: NDArray[np.float64]) -> float:
-    """Return the distance of a point (3,) from the measured surface of a plane.
+    """Return the distance between a point (3,) and the measured surface of a plane.
 
-    The measured surface consists of the plane's connected parts, or of its rectangle if there are
-    none.
+    The measured surface consists of the connected parts of the plane, or of its rectangle if no
+    parts are known.
     """
     rectangles = planes.corners[index][None]
     if planes.part_corners is not None and planes.part_plane is not None:
@@ -129,7 +131,7 @@ def area_m2(corners: NDArray[np.float64]) -> float:
 
 
 def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> WallFrame:
-    """Return the raster over the rectangle of a plane, widened on all sides."""
+    """Return the frame over the rectangle of a plane, extended by a margin on all sides."""
     corners = planes.corners[index]
     right = _unit(corners[3] - corners[0])
     down = _unit(corners[1] - corners[0])
@@ -141,7 +143,7 @@ def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> Wa
 
 
 def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> float:
-    """Return the distance of a point (3,) from a rectangle (4, 3)."""
+    """Return the distance between a point (3,) and a rectangle (4, 3)."""
     sides = np.array([corners[3] - corners[0], corners[1] - corners[0]])
     shares = (place - corners[0]) @ sides.T / np.maximum((sides**2).sum(axis=1), 1e-12)
     nearest = corners[0] + np.clip(shares, 0.0, 1.0) @ sides
@@ -149,7 +151,7 @@ def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> flo
 
 
 def _covers(planes: Planes, wall: int, index: int, buffer_m: BufferOf) -> bool:
-    """Return whether a plane is in a wall's buffer, parallel to it and mostly inside its frame."""
+    """Return whether a plane is parallel to a wall, in its buffer and mostly inside its frame."""
     normal = planes.normal[wall]
     if float(normal @ planes.normal[index]) < math.cos(math.radians(_PARALLEL_DEG)):
         return False

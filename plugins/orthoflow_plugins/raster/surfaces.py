@@ -1,4 +1,4 @@
-"""The surface of a wall: one depth per cell, and values of its points."""
+"""The surface of a wall: depth, intensity and colour of each cell."""
 
 from __future__ import annotations
 
@@ -35,43 +35,49 @@ from orthoflow_plugins.raster.parameters import RasterParams
 
 # Rules by which a cell gets the values of a single point instead of the mean of several.
 ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
-# Minimum depth difference between layers in a cell.
+# Minimum difference in depth between layers in a cell.
 LAYER_M: Final = 0.02
-# Radius of the filter of the surface `denoised`; the sigma of its Gaussian weight is half of it.
+# Radius of the filter for the surface `denoised`; sigma of the Gaussian weights is half the radius.
 DENOISE_CELLS: Final = 4
-# Maximum number of cells of temporary arrays.
+# Maximum number of cells in temporary arrays.
 CELLS_AT_ONCE: Final = 1 << 20
-# Maximum distance between neighbours in the scan, as a multiple of the radius of a narrow gap.
+# Maximum distance on the wall between neighbours in a scan, as a multiple of the radius of a narrow
+# gap.
 SPAN_GAPS: Final = 4
-# If the product of a scan's rows and columns exceeds this, they are not used (2 GB of indices).
+# Maximum number of cells in the grid of a scan (2 GB of indices); the rows and columns of larger
+# scans are not used.
 _GRID_CELLS_MOST: Final = 1 << 28
 # Number of depths sorted at once (256 MB).
 _POINTS_AT_ONCE: Final = 1 << 26
 
-# Maximum distance between neighbours, in rows and in columns.
+# Radius of the neighbourhood for outliers, in rows and columns.
 _NEAR_CELLS: Final = 2
-# Minimum number of known neighbours for a decision.
+# With fewer known neighbours, a cell is not checked.
 _KNOWN_LEAST: Final = 6
-# A cell that agrees with fewer neighbours than this is a speck.
+# A cell with which fewer neighbours agree is an outlier.
 _AGREEING_LEAST: Final = 2
-# Sparse cells are compared with neighbours up to this number of rows and columns away.
+# Radius of the neighbourhood for sparse cells, in rows and columns.
 _SPARSE_CELLS: Final = 4
-# At least this many neighbours, and half of the known ones, must agree with a sparse cell.
+# At least this number of neighbours, and half of the known neighbours, must agree with a sparse
+# cell.
 _SPARSE_LEAST: Final = 3
-# Maximum slope of a surface whose sparse cells agree (27 degrees).
+# Maximum slope of a surface on which sparse cells agree (27 degrees).
 _SLOPE: Final = 0.5
-# A cell is sparse if the number of known neighbours is below this fraction of the maximum nearby.
+# A cell is sparse if its number of known neighbours is below this share of the largest number
+# nearby.
 _SPARSE_SHARE: Final = 0.35
 # Half the maximum width of the scan shadow of an edge, in cells.
 _AROUND_CELLS: Final = 16
-# Maximum depth difference between cells on one surface due to noise, in standard deviations.
+# Maximum difference in depth, due to noise, between cells on the same surface, in standard
+# deviations.
 _CLOSE_SIGMAS: Final = 4.0
-# Maximum differences in the two passes, in standard deviations of the noise of a cell. The first
-# pass removes most of the noise, so the second one can be stricter at steps.
+# Maximum differences in depth in the two passes of the filter, in standard deviations of the noise
+# of a cell. The first pass removes most of the noise, so the second pass can be stricter at steps.
 _REACHES: Final = (3.0, 1.5)
-# Void cells are set this many maximum differences below all others, so that they have no weight.
+# Void cells are filled with a depth far below all others, by this multiple of the maximum
+# difference, so that they get no weight.
 _VOID_REACHES: Final = 8.0
-# Noise below this needs no filter.
+# Depths with less noise are not filtered.
 _NOISE_LEAST_M: Final = 2.0e-5
 
 _Number = TypeVar("_Number", np.float32, np.uint8)
@@ -79,18 +85,19 @@ _Number = TypeVar("_Number", np.float32, np.uint8)
 
 @dataclass(frozen=True, kw_only=True)
 class CellSurface:
-    """The surface of one wall; all arrays are flat over its cells.
+    """The surface of a wall; the first axis of all arrays is the cell, in row order.
 
     Attributes:
-        depth_m: float32 depths, NaN for void cells.
-        sigma_m: float32 standard deviations, NaN for fewer than two points.
+        depth_m: float32 depths in metres; NaN for void cells.
+        sigma_m: float32 standard deviations of depths in metres; NaN for fewer than two points.
         count: uint32 numbers of points.
-        intensity: float32, NaN for void cells, or None.
-        rgb: (cells, 3) uint8, 0 for void cells, or None.
+        intensity: float32; NaN for void cells. None if the cloud has no intensity.
+        rgb: (cells, 3) uint8; 0 for void cells. None if the cloud has no colour.
         has_rgb: (cells,) True for cells with a colour; None if all cells with points have one.
-        percentiles_m: (cells, k) float32, NaN in cells without points, or None.
-        places: (cells, 2) float32 mean position of the points of a cell right of and below its
-            centre, in cells; (0, 0) for many points, NaN for none.
+        percentiles_m: (cells, k) float32 percentiles of depths in metres; NaN for cells without
+            points. None if not requested.
+        places: (cells, 2) float32 mean position of the points of a cell, to the right of and below
+            its centre, in cells; (0, 0) if there are many points, NaN if there are none.
     """
 
     depth_m: NDArray[np.float32]
@@ -109,7 +116,7 @@ def surface_of(cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: 
     Args:
         cloud: the points.
         slab: raster and buffer of the wall or of a part of it.
-        params: parameters, with the rule for depths.
+        params: parameters, including the rule for depths.
         threads: number of threads.
     """
     if params.surface in ONE_POINT:
@@ -127,7 +134,8 @@ def carried_to_centres(
 ) -> CellSurface:
     """Extrapolate intensity and colour of cells with few points to the centres of the cells.
 
-    If the rule uses a single point per cell, the values of this point remain unchanged.
+    If the rule for depths selects a single point per cell, the values of this point are not
+    changed.
     """
     if params.surface in ONE_POINT or (surface.intensity is None and surface.rgb is None):
         return surface
@@ -145,7 +153,7 @@ def carried_to_centres(
         threads=threads,
     )
     if intensity is not None and surface.intensity is not None:
-        # Cells next to cells without intensity keep their value.
+        # Cells next to cells without intensity cannot be extrapolated and keep their values.
         is_lost = few[~np.isfinite(intensity[few])]
         intensity[is_lost] = surface.intensity[is_lost]
     if surface.has_rgb is not None:
@@ -156,7 +164,7 @@ def carried_to_centres(
 def _surface_of_winners(
     cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """Return the surface with depth, intensity and colour of one point per cell, in one pass."""
+    """Compute a surface in one pass, with the depth, intensity and colour of one point per cell."""
     winners = empty_winners(slab.n_cells)
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=threads):
@@ -171,7 +179,7 @@ def _surface_of_winners(
     if has_rgb is not None:
         has_rgb = values_of_winners(winners, has_rgb[:, np.newaxis], 0)[:, 0]
     surface = CellSurface(
-        # The nearest point may be in a neighbouring cell; cells without points of their own remain
+        # The nearest point may be in a neighbouring cell, but cells that contain no points remain
         # void.
         depth_m=np.where(count > 0, winners["depth_m"], np.float32(np.nan)),
         sigma_m=_spread_m(count, moments),
@@ -183,7 +191,7 @@ def _surface_of_winners(
     )
     if params.surface != "tin":
         return surface
-    # The values of the triangulation at cell centres replace those of points.
+    # Replace the values of points by those of the triangulation at the centres of the cells.
     depth_m, intensity, rgb = interpolate_net(cloud, slab, winners["point"], winners["depth_m"])
     is_known = np.isfinite(depth_m)[:, np.newaxis]
     places = np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1)
@@ -213,7 +221,7 @@ def _contest(
 def _surface_of_all(
     cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """Compute a surface in two or three passes: count, sort for medians, average."""
+    """Compute a surface in two or three passes: counts, medians (if used) and means."""
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=threads):
         share_cells(threads, partial(kernels.add_moments, entries, count, moments))
@@ -239,7 +247,7 @@ def _surface_of_all(
         places=np.zeros((slab.n_cells, 2), dtype=np.float32),
     )
     intensity, rgb, has_rgb = _averaged_values(cloud, slab, few, threads=threads)
-    # Means of positions: NaN if there is no point, 0 in cells with many points.
+    # Compute mean positions: NaN for cells without points, and 0 for cells with many points.
     n_summed = np.where(count <= kernels.FEW_POINTS, few.n_summed, np.uint8(1))[:, np.newaxis]
     with np.errstate(invalid="ignore"):
         np.divide(few.places, n_summed, out=few.places)
@@ -262,14 +270,14 @@ def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDA
         moments: (cells, 2) sums of depths and squared depths; overwritten.
 
     Returns:
-        (cells,) metres, NaN for fewer than two points.
+        (cells,) metres; NaN for fewer than two points.
     """
     mean, squares = moments.T
     with np.errstate(divide="ignore", invalid="ignore"):
         np.divide(mean, n_points, out=mean)
         squares -= mean * mean * n_points
         np.maximum(squares, 0.0, out=squares)
-        # Subtract 1.0 instead of 1, because 0 - 1 overflows in unsigned integers.
+        # Subtract 1.0 instead of 1, because 0 - 1 overflows with unsigned integers.
         np.divide(squares, n_points - 1.0, out=squares)
         np.sqrt(squares, out=squares)
     squares[n_points < 2] = np.nan
@@ -280,7 +288,7 @@ def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDA
 def _grouped(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], *, threads: int
 ) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.int64]]]:
-    """Yield ranges of cells, the depths of all points in them, and the end index of each cell."""
+    """Yield ranges of cells, the depths of all points in these, and the end index of each cell."""
     width = slab.frame.width
     totals = np.cumsum(count, dtype=np.int64)
     first = n_before = 0
@@ -307,7 +315,7 @@ def _sort_depths(
     *,
     threads: int,
 ) -> None:
-    """Sort the depths of each cell in place, and set the medians of their best layers."""
+    """Sort the depths of each cell in place, and set the medians of the layers with most points."""
     task = partial(kernels.median_depths, ends, depths_m, layer_m, medians_m)
     in_parts(task, medians_m.size, threads=threads)
 
@@ -320,7 +328,7 @@ def _percentiles_m(
     *,
     threads: int,
 ) -> NDArray[np.float32]:
-    """Return percentiles (cells, k) of the depths of all points, interpolated as in numpy."""
+    """Return percentiles (cells, k) of the depths of all points, interpolated as in NumPy."""
     percentiles_m = np.full((count.size, len(percentiles)), np.nan, dtype=np.float32)
     for cells, depths_m, ends in _grouped(cloud, slab, count, threads=threads):
         _sort_depths(depths_m, ends, np.empty(len(ends), np.float32), math.inf, threads=threads)
@@ -342,7 +350,7 @@ def _percentiles_m(
 def _averaged_values(
     cloud: PointCloud, slab: Slab, few: kernels.FewPoints, *, threads: int
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
-    """Return means of intensity (cells,) and colour (cells, 3), and a mask (cells,) of colours."""
+    """Return mean intensities (cells,), mean colours (cells, 3), and a mask of known colours."""
     # For each channel: the values of the points, a mask of the points with a value (empty if all
     # have one, or if the others are NaN), and the sums per cell.
     of_all = np.empty(0, dtype=np.bool_)
@@ -352,7 +360,7 @@ def _averaged_values(
         of_intensity = np.zeros((slab.n_cells, 2))
         channels.append((np.asarray(cloud.intensity)[:, np.newaxis], of_all, of_intensity))
     if cloud.rgb is not None:
-        # Integers need half the memory and are exact.
+        # Integer sums need half the memory and are exact.
         of_colour = np.zeros((slab.n_cells, 4), dtype=np.uint32)
         has_rgb = of_all if cloud.has_rgb is None else np.asarray(cloud.has_rgb)
         channels.append((np.asarray(cloud.rgb), has_rgb, of_colour))
@@ -368,7 +376,8 @@ def _averaged_values(
         share_cells(threads, *passes)
     intensity = None if cloud.intensity is None else np.empty(slab.n_cells, dtype=np.float32)
     rgb = None if cloud.rgb is None else np.empty((slab.n_cells, 3), dtype=np.uint8)
-    # Process in parts, because the computation needs several times the memory of the result.
+    # Process the cells in parts, because the computation needs several times the memory of the
+    # result.
     for first in range(0, slab.n_cells, CELLS_AT_ONCE):
         part = slice(first, first + CELLS_AT_ONCE)
         with np.errstate(invalid="ignore"):
@@ -383,15 +392,16 @@ def _averaged_values(
 def without_specks(
     depth_m: NDArray[np.float32], *, gsd_m: float, layer_m: float, threads: int
 ) -> NDArray[np.float32]:
-    """Set cells to void if their depth is an outlier, with which hardly any neighbour agrees.
+    """Set cells to void if their depth is an outlier that agrees with hardly any neighbour.
 
-    Otherwise, such a cell would show a distant part of a photo. In the scan shadow of an edge,
-    cells are sparser than around it, and there are outliers and mixed pixels from both sides of the
-    edge. In such regions, most of the few neighbours must agree, allowing for a slope.
+    In an orthoimage, such a cell would show a distant part of a photo. In the scan shadow of an
+    edge, known cells are sparse, and many of them are outliers or mixed pixels from both sides of
+    the edge. In such regions, half of the few neighbours must agree with a cell, allowing for a
+    slope.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
-        gsd_m: side of a cell.
+        gsd_m: side of a cell in metres.
         layer_m: depths that differ by more belong to different layers.
         threads: number of threads.
     """
@@ -404,7 +414,7 @@ def without_specks(
 
 
 def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask of known cells with far fewer known neighbours than cells nearby."""
+    """Return a mask of known cells that have far fewer known neighbours than cells nearby."""
     import cv2
 
     near = 2 * _NEAR_CELLS + 1
@@ -422,10 +432,10 @@ def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def denoised(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Average depths over neighbours on the same surface (bilateral filter, Tomasi 1998).
+    """Average depths of neighbouring cells on the same surface (bilateral filter, Tomasi 1998).
 
-    The maximum depth difference depends on the noise of the raster, so that steps of more than
-    about six standard deviations are preserved exactly.
+    The maximum difference in depth depends on the noise of the raster. Steps of more than about six
+    standard deviations are preserved.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
@@ -466,16 +476,17 @@ def _find_specks(
     first_row: int,
     end_row: int,
 ) -> None:
-    """Find the specks in some rows.
+    """Mark outliers in the rows from `first_row` to `end_row` (exclusive).
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
         is_sparse: (rows, cols) True for sparse cells of an otherwise dense surface.
         agree_m: maximum difference between depths that agree; the same for sparse cells; and the
-            increase of the latter per row or column of distance, due to a slope.
-        is_speck: (rows, cols) set for known cells if fewer than two of at least six known cells in
-            the 5 x 5 neighbourhood agree, and for sparse cells if fewer than three, or fewer than
-            half of the known ones, in the 9 x 9 neighbourhood agree.
+            increase of this second value per row or column of distance, due to a slope.
+        is_speck: (rows, cols) output. A known cell is an outlier if at least six cells in its 5 x 5
+            neighbourhood are known but fewer than two of them agree. A sparse cell is an outlier if
+            fewer than three cells in its 9 x 9 neighbourhood, or fewer than half of the known ones,
+            agree.
         first_row: first row to visit.
         end_row: the row after the last one.
     """
@@ -504,7 +515,7 @@ def _count_around(
     agree_m: float,
     slope_m: float,
 ) -> tuple[int, int]:
-    """Count the known cells around a cell, and those that agree with it.
+    """Return the number of known cells around a cell, and of those that agree with it.
 
     Depths agree if they differ by at most `agree_m` plus `slope_m` per row or column of distance.
     """
@@ -530,10 +541,10 @@ def close_gaps(
     *,
     threads: int,
 ) -> NDArray[np.uint8]:
-    """Interpolate narrow gaps of a surface in place; filled cells get spread NaN and count 0.
+    """Interpolate narrow gaps in a surface in place; filled cells get spread NaN and no points.
 
-    Gaps are interpolated between neighbouring points of a scan if its rows and columns are known,
-    otherwise between the measured cells around them.
+    If the rows and columns of a scan are known, gaps are interpolated between neighbouring points
+    of the scan; otherwise, they are interpolated from the measured cells around them.
 
     Returns:
         (cells,) `SurfaceMask`.
@@ -568,15 +579,15 @@ def _recover_between_neighbours(
     *,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Fill void cells of a surface by linear interpolation between neighbours in the scan grids.
+    """Fill void cells of a surface by linear interpolation between neighbours in the scans' grids.
 
-    A point that the scanner missed is between its neighbours in the scan, however far apart these
-    are on the raster. A gap between points that are close neighbours on one surface is therefore
-    interpolated. A gap through which the laser passed is not, because there are no neighbours on
-    both sides of it. Clouds without rows and columns have no neighbours.
+    A point that the scanner missed is between its neighbours in the scan, however far apart they
+    are on the raster. Gaps between neighbours on the same surface are therefore interpolated. A gap
+    through which the laser passed is not interpolated, because its two sides are not neighbours in
+    the scan.
 
     Returns:
-        (cells,) True for filled cells; their spread is NaN and their count 0.
+        (cells,) True for filled cells; their spread is NaN, and their number of points is 0.
     """
     import cv2
 
@@ -606,7 +617,7 @@ def _recover_between_neighbours(
             grid = kernels.ScanGrid(points, offsets, matrix)
             voids = is_void.reshape(slab.frame.shape)
             kernels.recover_between(grid, intensity, rgb, reach, voids, sums)
-        # The value of a cell is the mean over the triangles that cover it.
+        # The value of a cell is the mean of the triangles that cover it.
         filled = np.flatnonzero(is_void & (sums.n > 0))
         n = sums.n[filled].astype(np.float32)
         is_void[filled] = False
@@ -627,7 +638,7 @@ def _unchanged(values: NDArray[_Number]) -> NDArray[_Number]:
 
 
 def _grids(cloud: PointCloud, chosen: NDArray[np.uint32]) -> Iterator[NDArray[np.int64]]:
-    """Yield the indices of the chosen points of each scan by row and column."""
+    """Yield the indices of the chosen points as an array (rows, cols) for each scan."""
     if cloud.row is None or cloud.column is None:
         raise AssertionError("the cloud has no rows and columns")
     scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]
@@ -651,7 +662,7 @@ def _points_on(
     *,
     threads: int,
 ) -> NDArray[np.uint32]:
-    """Return the indices of points on the surface of the cells in a mask (cells,)."""
+    """Return the indices of points on the surface, in the cells of a mask (cells,)."""
     found = [np.empty(0, dtype=np.uint32)]
     for entries in entries_inside(cloud, slab, threads=threads):
         beside = is_near[entries.cells]

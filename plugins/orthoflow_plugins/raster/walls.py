@@ -1,4 +1,4 @@
-"""Rasters of single walls: surface and narrow gaps; large walls are processed in bands of rows."""
+"""Rasters of single walls; large walls are processed in bands of rows."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _BYTES_WORKING: Final = 90
 # Bytes per vertex of a triangulation, which is not processed in bands.
 _BYTES_VERTEX: Final = 700
 _MEMORY_SHARE: Final = 0.75
-# Larger walls are processed in bands of this number of cells, which need 1.5 GB of memory.
+# Number of cells in a band, which needs 1.5 GB of memory; larger walls are processed in bands.
 _BAND_CELLS: Final = 1 << 24
-# Margin in rows; outliers are detected within 20 cells.
+# Margin of a band in rows, for the detection of outliers, which uses cells up to 20 rows away.
 _REACH_OF_OUTLIERS: Final = 32
 
 
 def bytes_needed(shapes: Sequence[tuple[int, int]], *, is_tin: bool = False) -> int:
-    """Estimate the memory needed to rasterise walls with these numbers of rows and columns."""
+    """Estimate the memory in bytes needed to rasterise walls of given shapes (rows, columns)."""
     sizes = [rows * columns for rows, columns in shapes]
-    # Finished large walls are kept in files, and need the memory of one band while they are
-    # processed.
+    # Finished large walls are stored in files; while they are processed, they need the memory of
+    # one band.
     kept = _BYTES_KEPT * sum(size for size in sizes if size <= IN_MEMORY_CELLS)
     if is_tin:
         return kept + (_BYTES_WORKING + _BYTES_VERTEX) * max(sizes)
@@ -42,15 +42,15 @@ def bytes_needed(shapes: Sequence[tuple[int, int]], *, is_tin: bool = False) -> 
 
 
 def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None:
-    """Raise an error if cells are too fine for the memory of the machine.
+    """Check that the memory of the machine suffices for the rasters.
 
     Raises:
-        MethodError: the rasters would not fit into memory.
+        MethodError: the rasters do not fit into memory.
     """
     sizes = [frame.width * frame.height for frame in frames]
     needed = bytes_needed([frame.shape for frame in frames], is_tin=is_tin)
     memory = psutil.virtual_memory().total
-    # Cells are numbered with 32 bits.
+    # Indices of cells have 32 bits.
     if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
         largest = frames[int(np.argmax(sizes))]
         raise MethodError(
@@ -70,7 +70,7 @@ def rastered_wall(
     allocate: Allocate,
     threads: int,
 ) -> Wall:
-    """Rasterise the wall of a plane; large walls are processed in bands of rows.
+    """Rasterise a wall; large walls are processed in bands of rows.
 
     Args:
         cloud: the points.
@@ -85,8 +85,8 @@ def rastered_wall(
 
     frame, width = slab.frame, slab.frame.width
     cells_most = _BAND_CELLS + (slab.n_cells if params.surface == "tin" else 0)
-    # The filter for noise is applied twice. The interpolation of gaps needs the distance between
-    # neighbours across a gap, a disc on each side, and a margin.
+    # The noise filter is applied twice. The interpolation of gaps needs the distance between
+    # neighbours across a gap, the radius of a disc on each side, and a margin.
     reach_rows = _REACH_OF_OUTLIERS + 2 * DENOISE_CELLS
     reach_rows += (SPAN_GAPS + 2) * params.recover_gap_cells + 2
     whole: dict[str, NDArray[np.generic]] = {}
@@ -101,7 +101,6 @@ def rastered_wall(
                 whole[name] = allocate(name, shape, values.dtype)
             of_band = values.reshape(-1, width, *values.shape[1:])
             whole[name][band.rows] = of_band[band.inner]
-    # The arrays have the same types as those of the bands.
     arrays = cast("dict[str, Any]", whole)
     return Wall(frame=frame, plane_index=index, name=planes.names[index], **arrays)
 
@@ -113,7 +112,7 @@ def _rastered(
     *,
     threads: int,
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the arrays of a `Wall` for a slab, flat over cells."""
+    """Return the arrays of a `Wall` for a slab; their first axis is the cell, in row order."""
     from orthoflow_plugins.raster.surfaces import carried_to_centres, close_gaps, surface_of
 
     surface = surface_of(cloud, slab, params, threads=threads)

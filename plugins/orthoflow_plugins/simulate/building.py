@@ -19,15 +19,15 @@ Extent = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Paint:
-    """A texture with its parameters.
+    """Texture of a rectangle.
 
     Attributes:
         kind: kind of pattern.
-        rgb: ground colour, 0..255.
+        rgb: background colour, 0..255.
         reflectance: laser reflectance, 0..1.
-        contrast: contrast, 0..1.
+        contrast: contrast of the pattern, 0..1.
         period_m: size of the motif in metres.
-        seed: seed that selects one of the textures of this kind.
+        seed: seed of the random details.
     """
 
     kind: TextureKind
@@ -39,12 +39,12 @@ class Paint:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Parameters of the texture, in the order of `Scene.texture_params`."""
+        """Parameters in the order of `Scene.texture_params`."""
         return (*self.rgb, self.reflectance, self.contrast, self.period_m, self.seed)
 
 
 class Surface(NamedTuple):
-    """A rectangle of a scene under construction: position, size and role."""
+    """A rectangle of a scene under construction."""
 
     centre: NDArray[np.float64]
     axis_a: NDArray[np.float64]
@@ -63,7 +63,7 @@ class TruePlane:
     Attributes:
         name: label of the plane.
         plane: the plane, with the normal towards the room.
-        outline: (4, 3) float64 metres, a rectangle in the plane that contains its whole surface.
+        outline: (4, 3) float64 metres, corners of a rectangle that contains the whole surface.
     """
 
     name: str
@@ -73,7 +73,7 @@ class TruePlane:
 
 @dataclass(kw_only=True)
 class SceneDraft:
-    """Collects rectangles and true planes.
+    """A scene under construction.
 
     Attributes:
         surfaces: the rectangles so far.
@@ -115,7 +115,8 @@ class Side:
 
     Attributes:
         draft: the draft to which rectangles are added.
-        foot: (3,) point of the wall nearest to the room's origin, where a = b = 0.
+        foot: (3,) point of the wall nearest to the room's origin, in metres; the position of a = b
+            = 0.
         axis_a: (3,) unit vector to the right for a viewer in the room.
         axis_b: (3,) unit vector upwards in the wall.
         normal: (3,) unit vector into the room.
@@ -145,7 +146,7 @@ class Side:
     def rims(
         self, extent: Extent, depths_m: tuple[float, float], paint: Paint, role: SurfaceRole
     ) -> None:
-        """Add the four faces between two depths along the outline of an extent."""
+        """Add the four faces along the outline of an extent that connect two depths."""
         a0, a1, b0, b1 = extent
         low, high = min(depths_m), max(depths_m)
         for along, axis, places, ends in (
@@ -160,7 +161,7 @@ class Side:
             ]
 
     def box(self, extent: Extent, depth_m: float, paint: Paint, *, base_m: float = 0.0) -> None:
-        """Add relief that projects by `depth_m` from the depth `base_m`, unless `depth_m` is 0."""
+        """Add a box that projects by `depth_m` from the depth `base_m`, unless `depth_m` is 0."""
         if depth_m <= 0.0:
             return
         role = SurfaceRole.RELIEF if base_m >= 0.0 else SurfaceRole.RECESS
@@ -181,7 +182,7 @@ class Side:
             self.box(bar, depth_m, paint, base_m=base_m)
 
     def recess(self, extent: Extent, depth_m: float, paint: Paint, *, plane: int = -1) -> Extent:
-        """Add a recess `depth_m` deep; return the hole that must be cut into the wall."""
+        """Add a recess of depth `depth_m`; return the hole that must be cut into the wall."""
         self.place(extent, -depth_m, paint, SurfaceRole.RECESS, plane=plane)
         self.rims(extent, (-depth_m, 0.0), paint, SurfaceRole.RECESS)
         return extent
@@ -206,8 +207,8 @@ def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m
 
     Args:
         draft: the draft to which rectangles are added.
-        omega_deg: direction of the outward normal, as in markiewicz2015.
-        phi_deg: inclination of the outward normal.
+        omega_deg: azimuth of the outward normal, as in markiewicz2015.
+        phi_deg: elevation of the outward normal.
         distance_m: distance from the room's origin to the wall.
     """
     omega, phi = math.radians(omega_deg), math.radians(phi_deg)
@@ -225,7 +226,7 @@ def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m
 
 
 def flat_side(draft: SceneDraft, *, normal: tuple[float, float, float], height_m: float) -> Side:
-    """Return an empty floor or ceiling at the given height above the room's origin."""
+    """Return an empty floor or ceiling at a given height above the room's origin."""
     n = np.array(normal) / np.linalg.norm(normal)
     right = np.array([1.0, 0.0, 0.0]) - n[0] * n
     right /= np.linalg.norm(right)
@@ -251,9 +252,9 @@ def add_block(
     Args:
         draft: the draft to which rectangles are added.
         base: (3,) centre of its bottom, metres.
-        yaw_deg: rotation about the vertical; at 0 the length is along x.
-        size_m: length, depth and height.
-        paint: texture of all its faces.
+        yaw_deg: rotation about the vertical; if 0, the length is along x.
+        size_m: length, depth and height in metres.
+        paint: texture of all faces.
     """
     yaw = math.radians(yaw_deg)
     along = np.array([math.cos(yaw), math.sin(yaw), 0.0])

@@ -1,4 +1,4 @@
-"""Results of the simulation: cloud, truth and check points, with their metrics."""
+"""Results of the simulation: cloud, ground truth and check points, with their metrics."""
 
 from __future__ import annotations
 
@@ -61,20 +61,20 @@ class Delivery:
 
     @property
     def stations_world(self) -> NDArray[np.float64]:
-        """Stations (s, 3) of the scans in world coordinates, metres."""
+        """World coordinates (s, 3) of the stations, metres."""
         return self.scan.stations @ self.world_from_room.T + self.shift_world_m
 
     @property
     def up_world(self) -> NDArray[np.float64]:
-        """Up direction (3,) in world axes."""
+        """Unit vector (3,) upwards in world axes."""
         return self.world_from_room[:, 2].copy()
 
 
 def cloud_of(delivery: Delivery) -> PointCloud:
-    """Return the cloud; a shift of the world only changes its origin and its stations."""
+    """Return the cloud; a shift of the room in the world only changes its origin and stations."""
     points = delivery.scan.points
     x, y, z = (
-        # No rounding errors occur if axes are only permuted.
+        # If axes are only permuted, these products are exact.
         np.asarray(
             sum(
                 share * axis
@@ -109,17 +109,17 @@ def truth_of(
     shots: tuple[Shot, ...],
     parameters: Mapping[str, JsonValue],
 ) -> Truth:
-    """Return the truth; planes are sorted by their numbers of points.
+    """Return the ground truth, with planes in descending order of the number of points.
 
     Args:
         delivery: the scanned room.
-        cloud: its points in world coordinates.
-        shots: its photos, in the room frame.
+        cloud: the scanned points in world coordinates.
+        shots: the photos, in the room frame.
         parameters: parameters of the simulation, which are only recorded.
     """
     rectangle = delivery.scan.points.rectangle
     scene = delivery.room.scene
-    # The additional entry is for spoilt points.
+    # The last entry is for gross outliers and mixed distances.
     plane_of = np.append(scene.plane_index, np.int16(-1)).astype(np.int16)
     raw = plane_of[np.where(rectangle == SPOILT, len(scene), rectangle)]
     n_points = np.bincount(raw + 1, minlength=len(delivery.room.planes) + 1)[1:]
@@ -148,7 +148,7 @@ def truth_of(
 
 
 def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
-    """Report metrics and the true orthoimage of the main wall."""
+    """Report metrics, and the true orthoimage of the main wall."""
     main = truth.planes.names.index("main wall")
     ctx.metric("n_points", len(cloud), "1")
     ctx.metric("n_true_planes", len(truth.planes), "1")
@@ -167,7 +167,7 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
 
 
 def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> None:
-    """Report metrics and a contact sheet of the photos, if there are any."""
+    """If there are photos, report metrics and a contact sheet."""
     if not photos.photos:
         return
     ctx.metric("n_photos", len(photos.photos), "1")
@@ -195,11 +195,11 @@ def _contact_sheet(photos: Photos) -> bytes:
 
 
 def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> tuple[float, float] | None:
-    """Measure the point spacing on a plane from 10 cm tiles; None if no tile is fully on it.
+    """Measure the point spacing on a plane in 10 cm tiles; None if no tile is entirely inside.
 
     Returns:
-        The spacing of a square grid with the same density, in metres: median and 90th percentile
-        over the tiles.
+        The median and the 90th percentile over the tiles, in metres, of the spacing of a square
+        grid with the same density.
     """
     frame = frame_over(truth.planes.corners[plane], truth.planes.normal[plane], gsd_m=_TILE_M)
     counts = np.zeros(frame.shape, dtype=np.int64)
@@ -208,7 +208,7 @@ def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> tuple[float, f
         pixels = np.floor(frame.wall_from_world(cloud.points_world(chosen))[:, :2]).astype(int)
         inside = np.all((pixels >= 0) & (pixels < [frame.width, frame.height]), axis=1)
         np.add.at(counts, (pixels[inside, 1], pixels[inside, 0]), 1)
-    # Tiles whose neighbours all contain points are not cut by the wall's border.
+    # A tile is entirely inside the wall if all neighbouring tiles contain points.
     whole = counts[binary_erosion(counts > 0, np.ones((3, 3), dtype=np.bool_))]
     if whole.size == 0:
         return None
@@ -231,7 +231,7 @@ def _true_planes(
     normals = [item.plane.normal @ turn.T for item in chosen]
     corners = []
     for item, normal in zip(chosen, normals, strict=True):
-        # The bounding rectangle of the outline along the wall axes.
+        # Compute the bounding rectangle of the outline along the wall axes.
         axes = wall_axes(normal, delivery.up_world)
         along = item.outline @ turn.T @ axes.T
         (left, low), (right, high) = along.min(axis=0), along.max(axis=0)
@@ -258,13 +258,13 @@ def _true_planes(
 
 
 def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDArray[np.float64]:
-    """Return the RMS distance of points from their planes, summed in a fixed order."""
+    """Return the RMS distance of points from their planes; the order of summation is fixed."""
     offsets = planes.offset - planes.normal @ cloud.origin
     sums = np.zeros(len(planes))
     for start in range(0, len(cloud), _CHUNK):
         part = np.flatnonzero(labels[start : start + _CHUNK] >= 0) + start
         own = labels[part]
-        # Do not use a dot product, because in BLAS the order of summation depends on the number of
+        # Do not use a dot product, because its order of summation in BLAS depends on the number of
         # threads.
         distances = -offsets[own]
         for axis, values in enumerate((cloud.x, cloud.y, cloud.z)):
@@ -281,7 +281,7 @@ class _Spots(Rows):
     in_rectangle: NDArray[np.float64]
 
     def moved(self, step: NDArray[np.float64]) -> _Spots:
-        """Return the positions moved by a common vector (2,), or each by its own vector (n, 2)."""
+        """Return positions displaced by a common vector (2,) or by individual vectors (n, 2)."""
         return _Spots(rectangle=self.rectangle, in_rectangle=self.in_rectangle + step)
 
     def points(self, scene: Scene) -> NDArray[np.float64]:
@@ -297,13 +297,13 @@ class _Spots(Rows):
 def check_points(delivery: Delivery, views: SceneCameras, *, n_most: int) -> CheckPoints:
     """Choose check points of each class on the main wall.
 
-    `flat` points are crossings of the painted lines of a fresco that are surrounded by 4 cm of
-    plain wall; `vertical edge` points are front corners of mouldings. Each point is visible from at
-    least one station.
+    Points of the class `flat` are crossings of the painted lines of a fresco, surrounded by at
+    least 4 cm of flat wall. Points of the class `vertical edge` are front corners of mouldings.
+    Each point is visible from at least one station.
 
     Args:
         delivery: the scanned room.
-        views: its scene, prepared for rendering.
+        views: scene of the room, prepared for rendering.
         n_most: maximum number of points per class.
     """
     scene, stations = delivery.room.scene, np.unique(delivery.scan.stations, axis=0)
@@ -350,7 +350,7 @@ def _lattice(scene: Scene, index: int) -> _Spots:
 def _corners(
     scene: Scene, views: SceneCameras, stations: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the front corners of mouldings that are parallel to the wall."""
+    """Return the corners of the front faces of mouldings."""
     walls = np.flatnonzero((scene.plane_index == _MAIN_WALL) & (scene.role == SurfaceRole.WALL))
     normal, foot = scene.normal[walls[0]], scene.centre[walls[0]]
     heights = (scene.centre - foot) @ normal
@@ -365,7 +365,7 @@ def _corners(
         in_rectangle=scene.extent[fronts][:, [[0, 2], [0, 3], [1, 2], [1, 3]]].reshape(-1, 2),
     )
     seen = _are_seen(scene, views, spots.moved(_INSIDE_M * inwards), stations)
-    # A corner that two bars share is in the middle of a face and has no edge.
+    # If two bars meet at a corner, it is inside a larger face and not on an edge.
     beside = spots.moved(_INSIDE_M * inwards * np.array([-1.0, 1.0]))
     return spots.points(scene)[seen & ~_are_level(scene, views, beside)]
 
@@ -373,7 +373,7 @@ def _corners(
 def _are_seen(
     scene: Scene, views: SceneCameras, spots: _Spots, stations: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the positions that are visible from any station."""
+    """Return a mask (n,) of the positions that are visible from at least one station."""
     points = spots.points(scene)
     seen = np.zeros(len(points), dtype=np.bool_)
     for station in stations:
@@ -383,7 +383,7 @@ def _are_seen(
 
 
 def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.bool_]:
-    """Return a mask (n,) of positions that lie on the visible surface, whatever its rectangle."""
+    """Return a mask (n,) of positions that are on the visible surface, of any rectangle."""
     points, normals = spots.points(scene), scene.normal[spots.rectangle]
     inwards = np.where(np.einsum("ij,ij->i", normals, points) > 0.0, -1.0, 1.0)[:, None] * normals
     hits = views.cast(points + _LIFT_M * inwards, -inwards)
@@ -391,7 +391,7 @@ def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.b
 
 
 def _spread(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:
-    """Return points far from each other; each is the one farthest from those chosen before."""
+    """Choose points far apart: each is the one farthest from those chosen before."""
     if len(points) <= n_most:
         return points
     chosen = [0]

@@ -1,6 +1,6 @@
-"""Simulated photography: camera positions, camera and JPEG files.
+"""Simulated photos: camera positions, the camera and JPEG files.
 
-The layouts are those of markiewicz2015; pictures have the defects of real lenses and sensors.
+The layouts are those of markiewicz2015. Photos have the defects of real lenses and sensors.
 """
 
 from __future__ import annotations
@@ -37,22 +37,23 @@ PhotoLayout = Literal["none", "quick", "variant1", "variant2"]
 # wall, towards it, and upwards.
 _FREE_LOW_M: Final = (-2.3, -1.65, -1.15)
 _FREE_HIGH_M: Final = (2.3, 1.95, 1.3)
-# Up to this height above the room's origin, there is furniture behind the middle of the room.
+# Up to this height above the room's origin, there is furniture in the half of the room that is
+# farther from the main wall.
 _FURNITURE_M: Final = -0.45
 _WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
-# Legs and upper body of a person: heights of lower and upper end above the room's origin, and half
-# the width.
+# Legs and upper body of a person: heights of the lower and upper ends above the room's origin, and
+# half the width, in metres.
 _BODY_M: Final = ((-1.45, -0.6, 0.17), (-0.6, 0.3, 0.25))
 _ABSENT: Final = 0.5
 _OF_PEOPLE: Final = (
     *("centre", "axis_a", "axis_b", "extent"),
     *("plane_index", "role", "texture", "texture_params"),
 )
-# Maximum relative error of the focal length in EXIF.
+# Maximum relative error of the focal length in the EXIF data.
 _EXIF_ERROR: Final = 0.02
-# Grey levels are approximately this root of the light intensity.
+# Grey levels are approximately proportional to light intensity to the power of 1 / gamma.
 _GAMMA: Final = 2.2
 
 
@@ -61,7 +62,7 @@ class Shot:
     """A photo to be taken.
 
     Attributes:
-        taken: its name and acquisition parameters.
+        taken: name of the photo, and acquisition parameters.
         camera: the camera, in the room frame.
     """
 
@@ -71,13 +72,13 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """The degradation of images.
+    """Degradation of images.
 
     Attributes:
         noise_grey: standard deviation of the noise per pixel and channel, grey levels.
         vignetting: share of the light that is lost in the corners.
         supersample: number of rays along each side of a pixel.
-        exposures: maximum relative deviation of the exposure of a photo.
+        exposures: maximum relative deviation of a photo's exposure.
     """
 
     noise_grey: float
@@ -92,14 +93,14 @@ def _block(
     return tuple((wall, a, b) for wall in walls for b in up for a in along)
 
 
-# Width and height of the area shown on the wall, distance from the wall, in metres; targets: number
-# of the wall and (a, b) on it.
+# For each layout: width and height of the area shown on the wall, and distance from the wall, in
+# metres; targets of the photos, given by the number of the wall and a position (a, b) on it.
 _LAYOUTS: Final = {
     # Six photos of the main wall with 25 % overlap.
     "quick": ((2.4, 1.8), 2.6, _block((-1.75, 0.0, 1.75), (-0.65, 0.75))),
-    # Eight photos of four walls, each showing a whole wall.
+    # Eight photos, each of a whole wall: two of each of the four walls.
     "variant1": ((5.9, 3.5), 3.95, _block((-0.1, 0.1), (0.05,), range(4))),
-    # A block over the main wall with 70 % overlap along rows of photos and 50 % between rows.
+    # A block of photos of the main wall, with an overlap of 70 % in a row and 50 % between rows.
     "variant2": (
         (2.4, 1.8),
         2.6,
@@ -119,14 +120,14 @@ def planned_shots(
 ) -> tuple[Shot, ...]:
     """Plan the photos of a layout, with random variations of their positions.
 
-    The camera aims at a target, but is displaced sideways and slightly rotated about its axis. All
-    photos are taken with one camera with Brown distortion.
+    The camera is aimed at a target, but is displaced sideways and slightly rotated about its axis.
+    All photos are taken with the same camera, with Brown distortion.
 
     Args:
         layout: the layout of the photos.
         rng: random generator for the lens and the positions.
-        gsd_m: pixel size on the wall.
-        obliquity_deg: maximum intended angle between optical axis and wall normal.
+        gsd_m: pixel size on the wall in metres.
+        obliquity_deg: maximum intended angle between the optical axis and the wall normal.
         geometry: positions of the walls.
     """
     if layout == "none":
@@ -177,10 +178,10 @@ def planned_shots(
 def with_passers_by(
     scene: Scene, n_photos: int, count: int, rng: np.random.Generator
 ) -> tuple[Scene, ...]:
-    """Return each photo's scene with people in front of the main wall; empty without people.
+    """Return the scene of each photo, with people in front of the main wall; empty if count is 0.
 
-    Each person appears in about half of the photos, chosen at random, 0.5 to 1.4 m in front of the
-    wall and always in the same clothes.
+    Each person is in about half of the photos, chosen at random, 0.5 to 1.4 m in front of the wall,
+    and wears the same clothes in all photos.
     """
     if not count:
         return ()
@@ -225,14 +226,14 @@ def take_photos(
     *,
     intrinsics: Intrinsics | None = None,
 ) -> Photos:
-    """Take all photos of a room in its own frame.
+    """Render all photos of a room, in the room frame.
 
     Args:
-        views: the room, or the scene of each photo.
+        views: the room, or one scene per photo.
         shots: the photos.
         film: degradation of the images.
         ctx: context of the step.
-        rng: random generator for all noise.
+        rng: random generator for the noise.
         intrinsics: known calibration of the camera, or None.
     """
     if not shots:
@@ -266,11 +267,11 @@ def true_cameras(
     world_from_room: NDArray[np.float64],
     shift_world_m: NDArray[np.float64],
 ) -> Cameras:
-    """Return the true orientations in world coordinates.
+    """Return the true camera poses in world coordinates.
 
     Args:
         shots: the photos, in the room frame.
-        world_from_room: (3, 3) rotation.
+        world_from_room: (3, 3) rotation from the room frame to world axes.
         shift_world_m: (3,) world position of the room's origin.
     """
     cameras = []

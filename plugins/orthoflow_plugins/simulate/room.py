@@ -39,7 +39,7 @@ from orthoflow_plugins.simulate.room_model import (
 SpectralGap = Literal["none", "easy", "hard", "inverted"]
 
 _PANORAMA_FACTOR: Final = 3.0
-# Share of the laser's pattern that differs from the visible pattern.
+# Share of the pattern measured by the laser that differs from the visible pattern.
 _SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
     "none": 0.0,
     "easy": 0.3,
@@ -51,16 +51,16 @@ _SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
 class SimulateRoom(Method):
     """Scan and photograph a decorated room with relief, a niche, a door and a free-standing object.
 
-    There are two scans per station: a panorama and a detail scan of the main wall. Points are
-    ordered by scan, then by column, then by row from bottom to top. The noise of a distance depends
-    on range, incidence angle and material; some points are gross outliers, and at edges the
-    distances of two surfaces are mixed. All noise is a function of the seed and the position in the
-    scan, so it does not depend on threads.
+    There are two scans per station: a panorama, and a detail scan of the main wall. Points are
+    sorted by scan, column and row (from bottom to top). The noise of a distance depends on range,
+    incidence angle and material. Some points are gross outliers, and at edges, the distances of two
+    surfaces are mixed. All noise is a function of the seed and the position in the scan, so it does
+    not depend on the number of threads.
 
-    Photos are taken with one hand-held camera with Brown distortion, slightly misaimed and rotated,
-    and are stored as JPEG files in the sRGB colours of the scene. `photos` is empty for
-    `photo_layout: none`, and `calibration` is empty if the camera is not calibrated. The EXIF focal
-        length, with an error of up to 2 %, is always known.
+    Photos are taken with a hand-held camera, which has Brown distortion and is slightly displaced
+    and rotated, and are stored as JPEG files in the sRGB colours of the scene. `photos` is empty
+    for `photo_layout: none`, and `calibration` is empty if the camera is not calibrated. The EXIF
+    data always contain the focal length, with an error of up to 2 %.
     """
 
     id: ClassVar[str] = "simulate.room"
@@ -279,7 +279,7 @@ class SimulateRoom(Method):
         """No inputs."""
 
     class Out(Ports):
-        """The scan, the photos and their truth; `cameras` are the true orientations."""
+        """The scan, the photos and the ground truth; `cameras` are the true poses."""
 
         cloud: PointCloud
         photos: Photos
@@ -290,11 +290,11 @@ class SimulateRoom(Method):
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Numba and NumPy for the points, OpenCV for the JPEG files."""
+        """Return numba and NumPy, which compute the points, and OpenCV, which writes JPEG files."""
         return {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Build the room, scan and photograph it, and return the truth."""
+        """Build the room, simulate scans and photos, and return these with the ground truth."""
         del inputs
         from orthoflow.geometry.scene_views import SceneCameras
         from orthoflow_plugins.simulate.deliverables import (
@@ -313,7 +313,8 @@ class SimulateRoom(Method):
         )
 
         scan_rng, photo_rng, wall_rng = ctx.rng.spawn(3)
-        # Use a separate random stream, so that noise and photos are those of the designed room.
+        # Use a separate random stream, so that noise and photos are the same as in the designed
+        # room.
         place_rng = ctx.rng.spawn(1)[0]
         if params.design_seed is not None:
             wall_rng = np.random.default_rng(params.design_seed)
@@ -401,7 +402,7 @@ class SimulateRoom(Method):
 
 
 def _turn_about_up(turn_deg: float) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation about the room's z axis; exactly the identity for 0 degrees."""
+    """Return the rotation (3, 3) about the room's z axis; for 0 degrees, exactly the identity."""
     if turn_deg == 0.0:
         return np.eye(3)
     cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))

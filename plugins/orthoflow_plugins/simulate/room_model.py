@@ -1,9 +1,9 @@
-"""The simulated room: four decorated walls that are not exactly perpendicular, and objects.
+"""The simulated room: four decorated walls that are not exactly perpendicular, and furniture.
 
-The room frame is in metres, z up, with the origin in the middle of the room 1.5 m above the floor.
-The main wall has the position of that in markiewicz2015: omega 102 deg, inclined by 0.8 deg.
-Alternatively, walls are generated at random, with cornices, pilasters, niches, panels and recessed
-doors; the positions of all planes can be random as well.
+Coordinates in the room frame are in metres, with z upwards and the origin in the middle of the
+room, 1.5 m above the floor. The main wall has the orientation of the wall in markiewicz2015: omega
+is 102 degrees, and the inclination is 0.8 degrees. Walls can also be random, with cornices,
+pilasters, niches, panels and recessed doors, and so can the positions of all planes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from orthoflow_plugins.simulate.building import (
 FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
 _MAIN_OMEGA_DEG: Final = 102.0
-# Maximum random changes of the planes, in degrees and metres; small enough that surfaces extend
+# Maximum random changes of the planes, in degrees and metres: small enough that surfaces extend
 # beyond the corners of every random room.
 _DRAWN_OMEGA_DEG: Final = 0.5
 _DRAWN_PHI_DEG: Final = 1.0
@@ -41,9 +41,9 @@ _DRAWN_SLOPE: Final = 0.008
 # The floor is only raised, so that there is no gap below the furniture.
 _DRAWN_FLOOR_M: Final = (0.03, 0.07)
 _DRAWN_CEILING_M: Final = (-0.05, 0.05)
-# Visible area of the main wall.
+# Visible area of the main wall in square metres.
 _MAIN_WALL_M2: Final = 16.7
-# Maximum share of the main wall covered by textile, and the share in the designed room.
+# Share of the main wall covered by textile: the maximum, and the share in the designed room.
 MOST_TEXTILE: Final = 0.35
 TEXTILE_BY_DESIGN: Final = 0.095
 
@@ -57,8 +57,8 @@ OAK: Final = Paint(TextureKind.WOOD, (132, 92, 58), 0.35, 0.4, 0.12, 13)
 _DARK: Final = Paint(TextureKind.PLAIN, (92, 88, 84), 0.2, 0.4, seed=14)
 _OBJECT: Final = Paint(TextureKind.TILES, (38, 96, 160), 0.3, 0.5, 0.09, 15)
 _DAMASK: Final = Paint(TextureKind.TEXTILE, (150, 62, 58), 0.4, period_m=0.15, seed=102)
-# Walls: name; background texture and extent from corner to corner of a random wall; background
-# texture of the designed wall.
+# For each wall: name; background texture of the random wall, and its ends at the corners in metres;
+# background texture of the designed wall.
 _WALLS: Final = (
     (
         "main wall",
@@ -90,18 +90,18 @@ _LEVELS: Final = (
     ("floor", Paint(TextureKind.TILES, (150, 138, 122), 0.35, period_m=0.35, seed=501)),
     ("ceiling", Paint(TextureKind.FRESCO, (206, 206, 210), 0.8, period_m=0.5, seed=502)),
 )
-# Furniture: position along the main wall and towards it, rotation, size and paint. The first object
-# is a screen 0.6 m in front of the main wall; no face is parallel to a wall.
+# For each piece of furniture: position along the main wall and towards it, rotation, size and
+# paint. The first is a screen 0.6 m in front of the main wall. No face is parallel to a wall.
 _FURNITURE: Final = (
     (0.1, 1.78, 6.0, (0.9, 0.1, 1.3), _OBJECT),
     (2.3, -0.9, -4.0, (0.5, 0.9, 0.75), OAK),
     (-0.2, -1.3, 20.0, (0.8, 0.5, 0.7), _DARK),
 )
-# Distance by which random objects extend behind adjoining walls, floor and ceiling.
+# Distance by which random objects extend beyond adjoining walls, floor and ceiling.
 _BEYOND_M: Final = 0.1
 # Narrower bays remain empty.
 _BAY_LEAST_M: Final = 0.7
-# Margin on both sides of an object in a bay.
+# Margin on each side of an object in a bay.
 _BESIDE_M: Final = 0.12
 _PLAQUE_GAP_M: Final = 0.1
 _PLAQUE_TRIES: Final = 40
@@ -112,10 +112,10 @@ class Geometry:
     """Positions of the planes of a room, in the room frame.
 
     Attributes:
-        walls: omega and phi in degrees and distance in metres of the main, opposite, right and left
-            wall.
-        floor: normal and height of the floor.
-        ceiling: normal and height of the ceiling.
+        walls: omega and phi in degrees, and distance from the origin in metres, of the main,
+            opposite, right and left walls.
+        floor: normal of the floor, and height in metres.
+        ceiling: normal of the ceiling, and height in metres.
     """
 
     walls: tuple[tuple[float, float, float], ...] = (
@@ -129,7 +129,7 @@ class Geometry:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Geometry:
-        """Return random plane positions of a room that is about as large as the designed one."""
+        """Return random positions of the planes, for a room about as large as the designed one."""
 
         def about(value: float, width: float) -> float:
             return value + float(rng.uniform(-width, width))
@@ -166,7 +166,7 @@ class Room:
     """The finished room.
 
     Attributes:
-        scene: its surfaces, in the room frame; `scene.plane_index` is an index into `planes`.
+        scene: surfaces in the room frame; `scene.plane_index` is an index into `planes`.
         planes: planes that a detector should find, clipped to the room.
     """
 
@@ -187,11 +187,12 @@ def build_room(
     """Build the room.
 
     Args:
-        rng: random generator for the four walls; None for the designed walls.
+        rng: random generator for random walls; None for the designed walls.
         relief: scale of all mouldings; 1 for the designed size (up to 15 cm).
         obstacle: whether a free-standing object is in front of the main wall.
         spectral_gap: 0 if the laser measures the visible patterns, 1 if it measures different ones.
-        textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
+        textile_share: share of the main wall that is covered by a repeated motif, at most
+            `MOST_TEXTILE`.
         n_plaques: maximum number of plaques on a random main wall.
         geometry: positions of the planes of the room.
     """
@@ -201,7 +202,7 @@ def build_room(
         for number, side in enumerate(sides):
             _build_wall(side, number, relief, [] if number else _cloths(textile_share))
     else:
-        # Use separate random streams, so that cloth and plaques do not change the rest of the
+        # Use separate random streams, so that cloth and plaques do not affect the rest of the
         # walls.
         cloth_rng, plaque_rng = rng.spawn(2)
         cloth = _drawn_cloth(textile_share, cloth_rng)
@@ -224,15 +225,16 @@ def build_room(
 
 
 def main_wall_axes() -> NDArray[np.float64]:
-    """Return horizontal unit vectors (2, 3): rightwards along the main wall, and towards it."""
+    """Return horizontal unit vectors (2, 3): to the right along the main wall, and towards it."""
     omega = math.radians(_MAIN_OMEGA_DEG)
     return np.array(
         [[math.sin(omega), -math.cos(omega), 0.0], [math.cos(omega), math.sin(omega), 0.0]]
     )
 
 
-# A moulding: extent, width of the bars of a frame (0: solid), height, paint, and depth of its base.
-# A recess: name if it is a separate plane, extent, depth, and paint (None for that of the wall).
+# A moulding: extent, width of the bars (of a frame; 0 for a solid moulding), height, paint, and
+# depth of the base. A recess: name (if it is a separate plane), extent, depth, and paint (None for
+# the paint of the wall).
 Moulding = tuple[Extent, float, float, Paint, float]
 Recess = tuple[str, Extent, float, Paint | None]
 
@@ -325,7 +327,7 @@ def _build_wall(
 
 
 def _cloths(share: float) -> list[Extent]:
-    """Return extents of cloth that cover a share of the main wall, starting from its middle."""
+    """Return the extents of cloths that cover a share of the main wall, from its middle."""
     middle: Extent = (-0.73, 0.83, -1.3, 1.3)
     by_design: Extent = (-0.45, 0.65, -0.45, 1.0)
     beside: list[Extent] = [
@@ -349,14 +351,15 @@ def _cloths(share: float) -> list[Extent]:
 
 
 def _grown(small: Extent, large: Extent, area_m2: float) -> Extent:
-    """Return a rectangle of a given area: the small one, shrunk or grown towards the large one."""
+    """Return a rectangle with a given area, similar in shape to a small and a large one."""
     one, other = np.array(small), np.array(large)
     full = _area_m2(small)
     if area_m2 <= full:
         middle = np.repeat([0.5 * (one[0] + one[1]), 0.5 * (one[2] + one[3])], 2)
         grown = middle + math.sqrt(area_m2 / full) * (one - middle)
     else:
-        # Both sides are extended by the same share, the solution of a quadratic equation.
+        # Each side is extended by the same share of its growth; the share solves a quadratic
+        # equation.
         (width, height), (wider, higher) = (np.diff(e.reshape(2, 2))[:, 0] for e in (one, other))
         linear = width * (higher - height) + height * (wider - width)
         square = (wider - width) * (higher - height)
@@ -371,7 +374,7 @@ def _area_m2(extent: Sequence[float]) -> float:
 
 
 def _clipped(planes: list[TruePlane]) -> tuple[TruePlane, ...]:
-    """Clip each outline to the room; return the bounding upright rectangles of the results."""
+    """Clip each outline to the room, and replace it by the bounding rectangle of the result."""
     bounds = [item.plane for item in planes if not item.name.startswith(("niche", "door"))]
     return tuple(
         TruePlane(name=item.name, plane=item.plane, outline=_visible_rectangle(item, bounds))
@@ -397,7 +400,7 @@ def _visible_rectangle(item: TruePlane, bounds: list[Plane]) -> NDArray[np.float
 
 
 def _cut(polygon: NDArray[np.float64], bound: Plane) -> NDArray[np.float64]:
-    """Return the part of a convex polygon (n, 3) in front of a plane (Sutherland and Hodgman)."""
+    """Return the part of a convex polygon (n, 3) in front of a plane (Sutherland-Hodgman)."""
     distances = bound.distances_m(polygon)
     kept: list[NDArray[np.float64]] = []
     for start in range(len(polygon)):
@@ -420,21 +423,21 @@ def draw_wall(
     relief: float = 1.0,
     cloth: Extent | None = None,
 ) -> list[Extent]:
-    """Build a random wall with relief of up to 0.3 m and recesses up to 0.45 m deep.
+    """Build a random wall with relief up to 0.3 m high and recesses up to 0.45 m deep.
 
-    Returns the extents of its recesses.
+    The function returns the extents of the recesses.
 
-    Niches and doors are registered as separate planes.
+    Niches and doors are added as separate planes.
 
     Args:
         wall: the wall.
         name: name of its plane.
-        ground: background texture of the wall and its niches.
+        ground: background texture of the wall and of its niches.
         span: positions of the two adjoining walls, metres.
         rng: random generator for the objects.
         relief: scale of all relief.
-        cloth: extent of a cloth with a repeated motif; openings of the wall are cut out of the
-            cloth, too.
+        cloth: extent of a cloth with a repeated motif; recesses of the wall are also cut out of the
+            cloth.
     """
     plane = wall.true_plane(name, _FULL)
     top_m = _draw_cornice(wall, relief, rng)
@@ -457,7 +460,7 @@ def _draw_plaques(
     relief: float,
     rng: np.random.Generator,
 ) -> None:
-    """Add plaques to a wall beside its recesses, as many as there is room for."""
+    """Add plaques to a wall beside its recesses: `n_plaques`, or as many as there is space for."""
     taken = list(holes)
     for _ in range(n_plaques):
         for _ in range(_PLAQUE_TRIES):
@@ -481,7 +484,7 @@ def _overlap(one: Extent, other: Extent) -> bool:
 
 
 def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
-    """Return a random extent of cloth that covers a share of the main wall; None for 0."""
+    """Return a random extent of a cloth with a given share of the main wall; None for 0."""
     if share <= 0.0:
         return None
     a0, a1 = _WALLS[0][2]
@@ -492,7 +495,7 @@ def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
 
 
 def _draw_cornice(wall: Side, relief: float, rng: np.random.Generator) -> float:
-    """Build a cornice of up to three steps; return the height at which it begins."""
+    """Build a cornice with up to three steps; return the height of its lower edge."""
     n_steps = int(rng.integers(0, 4))
     height_m, depth_m = rng.uniform(0.12, 0.45), relief * rng.uniform(0.06, 0.3)
     for step in range(n_steps):

@@ -1,12 +1,12 @@
 """The simulated scanner: stations, scan patterns, measurements and their errors.
 
-Noise depends only on the position in the angular grid, so it does not depend on threads.
+Noise depends only on the position in the angular grid, not on the number of threads.
 
-A laser and a camera measure different reflectances. At the single wavelength of a laser, red lead,
-gold, wet plaster and retouchings rank differently in brightness than in the three broad bands of a
-camera. In the simulation, reflectance decreases with red and increases with green, each with a gain
-and a power that depend on the material; wet patches are darker, and retro-reflecting spots saturate
-the detector.
+A laser and a camera measure different reflectances: sorted by brightness, red lead, gold, wet
+plaster and retouchings have a different order at the single wavelength of a laser than in the three
+broad bands of a camera. In the simulation, laser reflectance decreases with the level of red and
+increases with the level of green; the gain and the exponent of both depend on the material. Wet
+patches are darker, and retroreflecting spots saturate the detector.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ _MISSED: Final = -1
 SPOILT: Final = -2
 _TURN: Final = 2.0 * np.pi
 
-# Arrays of a cloud, which are the measurements (`Scanned`), and their positions in the scan grids.
+# Names and types of the arrays of a cloud: measurements (`Scanned`), and positions in the scan
+# grids.
 _MEASURED: Final = (
     ("x", np.float32),
     ("y", np.float32),
@@ -44,22 +45,22 @@ _MEASURED: Final = (
 )
 _PLACES: Final = (("scan", np.uint16), ("row", np.uint32), ("column", np.uint32))
 
-# The zenith is not scanned, since its points would be too dense on the ceiling above the station.
+# The zenith is not scanned, because points on the ceiling above the station would be too dense.
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
 
-# Coordinates of the stations along the main wall, towards it and above the origin, metres; all
-# stations are away from objects.
+# Coordinates of the stations in metres: along the main wall, towards it, and above the origin. No
+# station is close to an object.
 _STATIONS_M: Final = (
     (-1.15, -0.10, 0.0),
     (1.20, 0.15, 0.12),
     (0.10, -0.60, -0.15),
     (0.05, 0.80, 0.20),
 )
-# Maximum random displacement of a station along the same axes.
+# Maximum random displacements of a station along the same axes.
 _STATIONS_DRAWN_M: Final = (0.3, 0.3, 0.15)
-# Ranges of the random values per material: reflectance of black, decrease with red, increase with
-# green, and the powers of these two.
+# Ranges of the random values of a material: reflectance of black, decrease with red, increase with
+# green, and exponents of the decrease and the increase.
 _BLACK: Final = (0.75, 0.9)
 _RED: Final = (0.6, 0.85)
 _GREEN: Final = (0.4, 0.65)
@@ -70,7 +71,7 @@ _WET_M: Final = 0.7
 _WET_FROM: Final = 0.6
 _WET_DARKER: Final = 0.45
 _WAVES: Final = 24
-# Distance from the middle of the room at which points are displaced by `bending_m`.
+# Distance from the middle of the room at which the displacement is `bending_m`.
 _BENT_M: Final = 5.0
 _SPOT_EVERY_M: Final = 0.4
 _SPOT_SHARE: Final = 0.05
@@ -79,7 +80,7 @@ _SPOT_RADIUS_M: Final = 0.012
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """A scan: a station and its directions, in the room frame.
+    """A scan: a station and ray directions, in the room frame.
 
     Attributes:
         station: (3,) position in metres.
@@ -105,16 +106,17 @@ class Errors:
     """The errors of the scanner.
 
     Attributes:
-        noise_m: standard deviation of a distance measured at 3 m, perpendicular to a plain wall.
-        outlier_share: share of points at a random distance.
+        noise_m: standard deviation of a distance of 3 m, measured perpendicular to a plain wall.
+        outlier_share: share of points with a random distance.
         beam_m: diameter of the laser spot; distances are mixed if the spot covers two surfaces.
-        colour_noise: standard deviation of the noise of a colour channel, grey levels.
-        inversion: share of inverted contrast in the laser reflectance (see `laser_reflectance`).
-        band_seed: seed of the laser reflectances of materials and of the common errors of points.
-        registration_m: standard deviation of the error of each coordinate of a station.
+        colour_noise: standard deviation of the noise of each colour channel, grey levels.
+        inversion: share of the laser reflectance that follows from the materials (see
+            `laser_reflectance`).
+        band_seed: seed for the laser reflectances of materials and the common errors of points.
+        registration_m: standard deviation of the registration error of a scan, per coordinate.
         bending_m: displacement 5 m from the middle of the room, as caused by drift along a path.
-        shared_m: standard deviation, per coordinate, of errors common to neighbouring points of all
-            scans, as in clouds from photos.
+        shared_m: standard deviation, per coordinate, of errors common to neighbouring points, as in
+            clouds computed from photos; all scans have the same errors.
         shared_length_m: correlation length of the errors common to neighbouring points.
     """
 
@@ -132,15 +134,15 @@ class Errors:
 
 @dataclass(frozen=True, kw_only=True)
 class Scanned(Rows):
-    """The result of a scan, one entry per ray, column by column.
+    """Measurements of a scan, one entry per ray, column by column.
 
     Attributes:
-        x: float32 metres from the room's origin.
-        y: float32 metres from the room's origin.
-        z: float32 metres from the room's origin.
+        x: float32 x coordinates, metres from the room's origin.
+        y: float32 y coordinates, metres from the room's origin.
+        z: float32 z coordinates, metres from the room's origin.
         intensity: float32 intensity, 0..1.
         rgb: (n, 3) uint8 colours.
-        rectangle: int32 index of the rectangle hit, `SPOILT` or `_MISSED`.
+        rectangle: int32 index of the rectangle that the ray hit, `SPOILT` or `_MISSED`.
     """
 
     x: NDArray[np.float32]
@@ -153,14 +155,14 @@ class Scanned(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """Several scans, one after the other.
+    """Measurements of several scans, one scan after the other.
 
     Attributes:
         points: the measurements.
         scan: (n,) index of the scan.
         row: (n,) row in the grid of the scan.
         column: (n,) column in the grid of the scan.
-        stations: (s, 3) station of each scan, in the room frame.
+        stations: (s, 3) position of the station of each scan, in the room frame, metres.
     """
 
     points: Scanned
@@ -173,13 +175,13 @@ class Scan:
 def station_positions(
     n_stations: int, rng: np.random.Generator | None = None
 ) -> NDArray[np.float64]:
-    """Return stations (s, 3) in the room frame, metres, displaced at random if `rng` is given."""
+    """Return stations (s, 3) in the room frame, metres; `rng` displaces them at random."""
     places = np.array(_STATIONS_M[:n_stations])
     if rng is not None:
         places += rng.uniform(-1.0, 1.0, places.shape) * _STATIONS_DRAWN_M
     along, towards = main_wall_axes()
     up = np.array([0.0, 0.0, 1.0])
-    # Do not use a matrix product, because its last digit depends on the processor.
+    # Do not use a matrix product, because its rounding depends on the processor.
     return np.array([a * along + t * towards + h * up for a, t, h in places])
 
 
@@ -194,8 +196,8 @@ def planned_sweeps(
 
     Args:
         stations: (s, 3) in the room frame, metres.
-        steps_m: point spacing of the panorama and of the detail scan, where the perpendicular from
-            the station meets the main wall.
+        steps_m: point spacings of the panorama and of the detail scan, at the foot of the
+            perpendicular from the station to the main wall.
         main_wall: plane of the main wall.
         outline: (4, 3) corners of the main wall in the room frame.
         seeds: two seeds per station.
@@ -203,8 +205,8 @@ def planned_sweeps(
     lowest, highest = math.radians(LOWEST_ELEVATION_DEG), math.radians(HIGHEST_ELEVATION_DEG)
     _, towards = main_wall_axes()
     forward = math.atan2(towards[1], towards[0])
-    # Points along the edges are needed, because the middle of an upper edge appears higher than its
-    # ends.
+    # Use points along the edges, because seen from a station, the middle of an upper edge is at a
+    # higher elevation than its ends.
     shares = np.linspace(0.0, 1.0, 33)[:, None]
     rim = np.concatenate(
         [a + shares * (b - a) for a, b in zip(outline, np.roll(outline, -1, 0), strict=True)]
@@ -241,7 +243,7 @@ def planned_sweeps(
 
 
 def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepContext) -> Scan:
-    """Scan a scene whose origin is that of the room; rays without a hit are dropped."""
+    """Scan a scene whose origin is that of the room; rays without a hit give no points."""
     scanner = Scanner(scene, errors)
     starts = np.concatenate([[0], np.cumsum([sweep.n_columns * sweep.n_rows for sweep in sweeps])])
     arrays = {
@@ -291,8 +293,8 @@ class Scanner:
         """Scan some columns; the noise of a ray depends only on seed, column and row.
 
         Args:
-            sweep: the scan.
-            scanned: output, entries of the whole scan.
+            sweep: plan of the scan.
+            scanned: output, with entries for the whole scan.
             first: first column.
             last: last column, exclusive.
         """
@@ -309,7 +311,7 @@ class Scanner:
         cosine = np.abs(np.einsum("ni,in->n", self._normal[hits.rectangle], ways))
         into = scanned.take(slice(first * sweep.n_rows, last * sweep.n_rows))
         into.rectangle[:] = hits.rectangle
-        # Noise increases with range and incidence angle, and is larger on cloth.
+        # Noise increases with range and incidence angle, and is higher on cloth.
         slope = 1.0 + 0.45 * np.minimum(1.0 / np.maximum(cosine, 0.05) - 1.0, 4.0)
         cloth = np.where(self._is_cloth[into.rectangle], 1.4, 1.0)
         sigma = errors.noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
@@ -319,7 +321,7 @@ class Scanner:
             is_mixed = np.isfinite(mixed) & is_hit
             measured[is_mixed] = mixed[is_mixed]
             into.rectangle[is_mixed] = SPOILT
-        # For most gross outliers, the distance is too short; for some, it is too long.
+        # The distances of most gross outliers are too short; those of the others are too long.
         short = distance * (0.3 + 0.68 * uniforms(states, 2))
         gross = np.where(uniforms(states, 1) < 0.8, short, distance + 2.0 * uniforms(states, 2))
         is_gross = (uniforms(states, 0) < errors.outlier_share) & is_hit
@@ -349,7 +351,7 @@ class Scanner:
         states: NDArray[np.uint64],
         distance: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return mixed distances (n,) where the spot's edge hits another depth; NaN elsewhere."""
+        """Return mixed distances (n,) where the laser spot covers two depths, and NaN elsewhere."""
         turn, reach = _TURN * uniforms(states, 3), 0.5 * self._errors.beam_m / distance
         aside = reach * np.cos(turn) / np.maximum(0.05, np.cos(elevation))
         rims = _directions(azimuth + aside, elevation + reach * np.sin(turn))
@@ -365,19 +367,20 @@ class Scanner:
 def shared_errors(
     points: NDArray[np.float64], station: NDArray[np.float64], errors: Errors
 ) -> NDArray[np.float64]:
-    """Return the correlated errors of points (3, n) of a station, metres."""
+    """Return the correlated errors, in metres, of points (3, n) measured from a station."""
     off = np.zeros_like(points)
     if errors.registration_m:
         place_mm = np.rint(1e3 * station).astype(np.int64) % 2**31
         of_station = np.random.default_rng([errors.band_seed, *place_mm.tolist()])
         off += errors.registration_m * of_station.normal(size=(3, 1))
     if errors.bending_m:
-        # Displace points upwards and sideways by a parabola along the longer axis of the room.
+        # Displace points upwards and sideways; displacements form a parabola along the longer axis
+        # of the room.
         along = (points[0] / _BENT_M) ** 2
         off[1:] += errors.bending_m * along / math.sqrt(2.0)
     if errors.shared_m:
-        # The sum of waves with random directions is practically Gaussian and has a Gaussian
-        # correlation.
+        # A sum of waves with random directions is practically Gaussian, with a Gaussian correlation
+        # function.
         waves = np.random.default_rng([errors.band_seed, 1])
         for axis in range(3):
             ways = waves.normal(size=(_WAVES, 3)) / errors.shared_length_m
@@ -410,10 +413,10 @@ def laser_reflectance(
         scene: the scene with the rectangles, with its origin at (0, 0, 0).
         rectangle: (n,) rectangle of each point.
         points: (3, n) metres.
-        colours: (4, n) red, green, blue 0..255, and the reflectance of the texture.
-        inversion: 0 if the laser measures the reflectance of the textures, 1 if all contrast
-            follows from the response of the materials.
-        seed: seed for materials, patches and spots.
+        colours: (4, n) red, green and blue (0..255), and reflectance of the texture (0..1).
+        inversion: 0 if the laser measures the reflectance of the textures, 1 if the contrast is
+            entirely that of the materials, computed from their colours.
+        seed: seed for the materials, wet patches and spots.
     """
     plain: NDArray[np.float64] = colours[3].astype(np.float64)
     if inversion == 0.0:
@@ -451,7 +454,7 @@ def laser_reflectance(
 def smooth_noise(
     x: NDArray[np.float64], y: NDArray[np.float64], seed: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return noise, 0..1, that is smooth between lattice points and different for each seed."""
+    """Return noise (0..1) that is smooth between lattice points; its values depend on the seed."""
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     s, t = x - column, y - row
     s, t = s * s * (3.0 - 2.0 * s), t * t * (3.0 - 2.0 * t)
