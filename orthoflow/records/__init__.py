@@ -1,6 +1,6 @@
-"""Finished runs: writing the record, and the read API."""
+"""Functions that write the record of a run, and the API for reading it."""
 
-# Names from the record format, re-exported for the packages above.
+# These names belong to the record format and are re-exported for other packages.
 from orthoflow_provenance.document import COSTS as COSTS
 from orthoflow_provenance.document import Metric as Metric
 from orthoflow_provenance.document import RecordedCell as RecordedCell

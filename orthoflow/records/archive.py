@@ -1,4 +1,4 @@
-"""Exports of runs for archives and other programs: RO-Crate and W3C PROV."""
+"""Exports of runs for archives and other programs, as RO-Crate and W3C PROV."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ _CONTEXT: Final[list[JsonValue]] = [
     "https://w3id.org/ro/terms/workflow-run/context",
     {"buildInstructions": "https://codemeta.github.io/terms/buildInstructions"},
 ]
-# Properties that are not derived from the record: of the crate, and of its other entities.
+# These properties of the crate, and of its other entities, are not derived from the record.
 _FREE: Final = {"./": {"license", "author", "creator", "description"}, "": {"description"}}
 _MEDIA_TYPES: Final = {".h5": "application/x-hdf5", ".tif": "image/tiff", ".yaml": "text/yaml"}
 _UNIT_CODES: Final = {
@@ -92,22 +92,22 @@ def write_crate(
 ) -> tuple[Path, ...]:
     """Write a run as an RO-Crate: record, report, products, workflow and their metadata.
 
-    Input files are referenced by their digests, not copied, because they may be large and belong to
-    others. To include them, embed them in the record (see `write_embedded`).
+    Input files are referenced by their digests and not copied, because they may be large or may
+    belong to somebody else. To include them, embed them in the record (see `write_embedded`).
 
     Args:
         run: the run.
-        folder: existing folder, empty except for a record that was embedded into it.
+        folder: existing folder, empty except for a record with embedded files.
         license_text: URL or name of the license of the results.
         author: author of the results, as name or ORCID; empty if unknown.
 
     Returns:
-        The files; the metadata file is first.
+        The paths of the files, beginning with the metadata file.
 
     Raises:
         StoreError: the disk cannot be written to.
-        RecordError: a name in the record cannot be a file name, a link replaces a file, or a cell
-            uses a product that no cell produced.
+        RecordError: a name in the record is not allowed as a file name, a file has been replaced by
+            a link, or a cell uses a product that no cell produced.
     """
     texts = crate_texts(run.record)
     for name, content in texts.items():
@@ -126,16 +126,15 @@ def _write(folder: Path, name: str, content: bytes) -> None:
 
 
 def _copy_files(run: Run, folder: Path) -> list[str]:
-    """Copy the record, the report with figures, and the published files; return their paths."""
     is_new = run.path == folder / RECORD_FILE
     if not is_new:
         with writing_to(folder):
             shutil.copyfile(run.path, folder / RECORD_FILE)
     pages = [REPORT_FILE, *pages_of(run).values()]
     wanted = [*pages]
-    # A report that was written with links refers to these files.
+    # If the report was written with links, it refers to these files.
     wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
-    # The other files may be in a folder other than that of the record and its signature.
+    # The record and its signature may be in another folder than the other files.
     signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
     signed = copy_files(run.path.parent, folder, [signature], ()) if not is_new else ()
     wanted += [
@@ -143,7 +142,7 @@ def _copy_files(run: Run, folder: Path) -> list[str]:
         for address, files in run.files.items()
         for file in files
     ]
-    # Published files that belong to no cell, such as the table of all metrics.
+    # These published files, such as the table of all metrics, belong to no cell.
     wanted += [file.path for file in run.record.published if file.path.count("/") == 1]
     copied = copy_files(run.folder, folder, wanted, run.record.published)
     for page in set(pages) & set(copied) if is_new else ():
@@ -190,15 +189,18 @@ def crate_metadata(
 def metadata_differences(
     record: RunRecord, files: Sequence[PublishedFile], stated: Mapping[str, Any]
 ) -> list[str]:
-    """Return the entity and property of each difference between a crate's metadata and a record.
+    """Compare the metadata of a crate with a record.
 
-    The order of lists is ignored, as are the facts that only the author of a crate knows: license,
-    author, descriptions, persons and organizations.
+    The order of lists is ignored, and so are the properties that only the author of the crate
+    knows: license, author, descriptions, persons and organizations.
 
     Args:
         record: record of the run.
         files: the files of the crate, according to the metadata.
-        stated: the metadata.
+        stated: the metadata of the crate.
+
+    Returns:
+        The entity and property of each difference.
 
     Raises:
         RecordError: a cell of the record uses a product that no cell produced.
@@ -232,13 +234,11 @@ def _unordered(value: Any) -> Any:
 
 
 class _Crate:
-    """The entities of a crate by id."""
-
     def __init__(self) -> None:
         self.entities: dict[str, Entity] = {}
 
     def add(self, identifier: str, kind: JsonValue, /, **facts: JsonValue) -> str:
-        """Add an entity; if it exists, add only missing properties and extend its lists."""
+        """Add an entity. If it exists, add only missing properties and extend its lists."""
         entity = self.entities.setdefault(identifier, {"@id": identifier, "@type": kind})
         for name, value in facts.items():
             if name in entity and isinstance(value, list):
@@ -248,22 +248,19 @@ class _Crate:
         return identifier
 
     def extend(self, identifier: str, name: str, more: Iterable[JsonValue]) -> None:
-        """Extend a list of an entity, without duplicates; ignored if there is no such entity."""
+        """Extend a list of an entity without duplicates, unless the entity does not exist."""
         if identifier in self.entities:
             known = self.entities[identifier].setdefault(name, [])
             assert isinstance(known, list)  # noqa: S101 - lists alone are extended
             known += [item for item in more if item not in known]
 
     def link(self, identifier: str, name: str, *targets: str) -> None:
-        """Extend a list of references of an entity."""
         self.extend(identifier, name, _refs(targets))
 
     def formal(self, identifier: str, name: str, kind: str) -> str:
-        """Add a formal parameter: an input, output or parameter of a method or of the workflow."""
         return self.add(identifier, "FormalParameter", additionalType=kind, name=name)
 
     def connect(self, owner: str, identifier: str, source: str, target: str) -> None:
-        """Connect two formal parameters of a step or of the workflow."""
         self.add(
             identifier,
             "ParameterConnection",
@@ -278,12 +275,11 @@ def _ref(identifier: str) -> dict[str, JsonValue]:
 
 
 def _refs(identifiers: Iterable[str]) -> list[JsonValue]:
-    """Return references to entities, without duplicates."""
     return [_ref(identifier) for identifier in dict.fromkeys(identifiers)]
 
 
 def _file_id(file: RecordedFile) -> str:
-    """Return an id derived from the content of a file that is not in the crate (RFC 6920)."""
+    """Return an id (RFC 6920) that identifies a file outside the crate by its content."""
     digest = base64.urlsafe_b64encode(bytes.fromhex(file.sha256)).decode().rstrip("=")
     return f"ni:///sha-256;{digest}"
 
@@ -319,7 +315,6 @@ def _add_author(crate: _Crate, author: str) -> None:
 def _add_run(
     crate: _Crate, record: RunRecord, files: Sequence[PublishedFile], license_text: str
 ) -> None:
-    """Add the root, the workflow, its run, and orthoflow as the program that ran it."""
     names = [file.path for file in files]
     crate.add(
         "./",
@@ -393,7 +388,6 @@ def _add_run(
 
 
 def _add_files(crate: _Crate, record: RunRecord, files: Sequence[PublishedFile]) -> None:
-    """Add the files in the crate, and the input files, which are identified by content."""
     lists = {environment_file(item.id) for item in record.environments}
     for part in files:
         name = part.path
@@ -437,8 +431,8 @@ def _add_cell(
         crate: crate to extend.
         record: record that contains the cell.
         cell: a cell that was executed.
-        position: index of the cell in the run, from 0.
-        given: `address.port` of each output of an earlier cell -> id of its formal parameter.
+        position: index of the cell in the run, starting at 0.
+        given: `address.port` of the outputs of earlier cells -> ids of their formal parameters.
     """
     tool = _add_method(crate, cell)
     variant = cell.assignment.get(cell.step, "")
@@ -503,7 +497,6 @@ def _add_cell(
 
 
 def _add_method(crate: _Crate, cell: RecordedCell) -> str:
-    """Add the method of a cell with its ports, parameters and distribution."""
     tool, origin = _tool_id(cell), f"#distribution-{cell.distribution}"
     version = cell.distribution_version
     crate.add(origin, "SoftwareApplication", name=cell.distribution, version=version)
@@ -533,7 +526,6 @@ def _add_method(crate: _Crate, cell: RecordedCell) -> str:
 
 
 def _add_action(crate: _Crate, cell: RecordedCell) -> str:
-    """Add the execution of a cell with its products, metrics and costs."""
     note = "computed in this run" if cell.status == "ok" else "failed in this run"
     if cell.cached_from:
         note = f"computed by the earlier run {cell.cached_from} and taken from the store"
@@ -582,7 +574,7 @@ def _add_action(crate: _Crate, cell: RecordedCell) -> str:
 
 
 def _add_final(crate: _Crate, source: str, of_tool: str, product: RecordedProduct) -> None:
-    """Add an output that no other cell uses as an output of the workflow."""
+    """Add an output of the workflow, which is an output that no other cell uses."""
     output = crate.formal(f"{WORKFLOW_FILE}#out/{source}", source, "CreativeWork")
     crate.link(WORKFLOW_FILE, "output", output)
     crate.connect(WORKFLOW_FILE, f"#to-{output}", of_tool, output)
@@ -591,7 +583,6 @@ def _add_final(crate: _Crate, source: str, of_tool: str, product: RecordedProduc
 
 
 def _how_to_read(record: RunRecord) -> str:
-    """Return instructions for reading the record and checking the files of the crate."""
     version = record.created_by.partition(" ")[2]
     given = [entry.embedded for entry in record.inputs if entry.files]
     source = "the input files" if given else "the record alone"
@@ -612,9 +603,9 @@ def _media_type(name: str) -> str:
     return known or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
-# `Any`: the `prov` library accepts many types as attribute values.
+# The type is `Any` because the `prov` library accepts many types as attribute values.
 Attributes = list[tuple[QualifiedName | str | Identifier, Any]]
-# Attribute names belong to orthoflow; names of entities belong to the run.
+# Attribute names are in this namespace, and names of entities are in the namespace of the run.
 _TERMS: Final = "urn:orthoflow:terms:"
 _NAMES: Final = {
     "orthoflow": _TERMS,
@@ -629,9 +620,9 @@ _PARTS: Final = ("cell", "product", "input", "file", "published", "workflow")
 def prov_document(record: RunRecord) -> ProvDocument:
     """Describe a run as a PROV document.
 
-    Entities are products, inputs and their files, and published files, all with digests; activities
-    are the executed cells with method, version, parameters, seed, times and metrics; agents are
-    orthoflow and the distributions of the methods.
+    The entities are products, inputs with their files, and published files, all with digests. The
+    activities are the executed cells with their method, version, parameters, seed, times and
+    metrics. The agents are orthoflow and the distributions of the methods.
     """
     document = ProvDocument()
     run = f"urn:orthoflow:run:{quote(record.run_id, safe='')}:"
@@ -661,7 +652,7 @@ def _add_workflow(document: ProvDocument, record: RunRecord) -> None:
 
 
 def _add_inputs(document: ProvDocument, record: RunRecord) -> None:
-    """Add inputs and their files, without duplicates; an omitted optional input has no entity."""
+    """Add inputs and their files without duplicates; omit optional inputs that were not given."""
     known: set[str] = set()
     for entry in record.inputs:
         if not entry.files:
@@ -678,7 +669,6 @@ def _add_inputs(document: ProvDocument, record: RunRecord) -> None:
 
 
 def _add_software(document: ProvDocument, record: RunRecord, cells: Iterable[RecordedCell]) -> None:
-    """Add orthoflow and the distributions that act on its behalf."""
     program = record.created_by
     for name in dict.fromkeys([program, *map(_distribution, cells)]):
         title, _, version = name.rpartition(" ")
@@ -689,7 +679,6 @@ def _add_software(document: ProvDocument, record: RunRecord, cells: Iterable[Rec
 
 
 def _add_activity(document: ProvDocument, cell: RecordedCell) -> None:
-    """Add the activity of a cell, with its inputs and outputs."""
     name = _name("cell", cell.address)
     attributes = _attributes(_type("Cell"), cell.address, plain_fields(cell))
     attributes += [(_name("parameter", key), _literal(value)) for key, value in cell.params.items()]
@@ -716,7 +705,6 @@ def _add_activity(document: ProvDocument, cell: RecordedCell) -> None:
 def _add_published(
     document: ProvDocument, record: RunRecord, cells: Iterable[RecordedCell]
 ) -> None:
-    """Add the published files of the run, each linked to its cell."""
     owners = {f"{PRODUCTS_FOLDER}/{cell_file_name(cell.address)}": cell.address for cell in cells}
     for file in record.published:
         name = _name("published", file.path)
@@ -728,7 +716,6 @@ def _add_published(
 
 
 def _source(product: RecordedProduct) -> str:
-    """Return the entity name of an input: `inputs.name`, or `address.port` of another cell."""
     owner, _, name = product.source.partition(".")
     return _name("input", name) if owner == "inputs" else _name("product", product.source)
 
@@ -742,7 +729,7 @@ def _type(name: str) -> QualifiedName:
 
 
 def _name(part: str, name: str) -> str:
-    """Return a qualified name; characters not allowed in a local name are written as %XX."""
+    """Return a qualified name; characters that are not allowed in a local name become %XX."""
     return f"{part}:{quote(name, safe='') or '_'}"
 
 
@@ -752,7 +739,6 @@ def _attributes(kind: QualifiedName, label: str, facts: Mapping[str, str | float
 
 
 def _literal(value: JsonValue) -> JsonValue:
-    """Return a scalar unchanged, and any other value as JSON text."""
     if isinstance(value, bool | int | float | str):
         return value
     return json.dumps(value, ensure_ascii=False)

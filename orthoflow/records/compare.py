@@ -43,15 +43,15 @@ Verdict = Literal["identical", "within tolerance", "different", "not measured"]
 
 @dataclass(frozen=True, kw_only=True)
 class Distance:
-    """The largest difference among all fields with the same unit.
+    """The largest difference between two products, among all fields with the same unit.
 
     Attributes:
         unit: `m`, `px`, `grey`, `deg`, or `1` for plain numbers.
         largest: largest absolute difference in `unit`; None if values cannot be subtracted
-            (different shapes or types, missing values, NaN instead of a number).
+            (different shapes or types, missing values, or NaN in only one product).
         limit: tolerance of `field`.
         field: name of the field with the largest difference, e.g. `walls/0/depth_m`.
-        n_values: number of values in `unit` that differ by more than their tolerance.
+        n_values: number of values with this unit that differ by more than their tolerance.
     """
 
     unit: str
@@ -63,18 +63,18 @@ class Distance:
 
 @dataclass(frozen=True, kw_only=True)
 class ProductDistance:
-    """Comparison of two products that are expected to be equal.
+    """Comparison of the same output in two runs.
 
     Attributes:
-        cell: address of the cell that produced them.
-        port: output port of the cell.
+        cell: address of the cell that has the output.
+        port: port of the output.
         type_name: product type.
         verdict: `identical` (same bits), `within tolerance`, `different`, or `not measured` if the
             digests differ and the arrays of one product are not available.
         left: digest of the product in the first run; empty if there is none.
         right: digest of the product in the second run; empty if there is none.
-        distances: one distance per unit in which the products differ.
-        reason: one sentence for `different` and `not measured`, otherwise empty.
+        distances: the largest difference for each unit in which the products differ.
+        reason: reason for `different` or `not measured`, as one sentence; otherwise empty.
     """
 
     cell: str
@@ -94,7 +94,7 @@ class RunProducts:
     Attributes:
         run: the run.
         stores: stores that may contain arrays that the record references only by digest.
-        own: requested address -> address in this run, where the two differ.
+        own: address in the comparison -> address in this run, for cells whose addresses differ.
     """
 
     run: Run
@@ -107,7 +107,7 @@ class RunProducts:
         return {} if cell is None else cell.outputs
 
     def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
-        """Return arrays and metadata of an output; None if they are not available."""
+        """Return the arrays and metadata of an output; None if they are not available."""
         output = self.outputs(address)[port]
         if output.embedded:
             return self.run.payload(self.own.get(address, address), port)
@@ -183,7 +183,7 @@ def _distance(
 
 
 def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
-    """Add to the difference of a metadata value the name and unit given next to the value."""
+    """Add the name and unit that the metadata give for a differing value, if any."""
     path = difference.name.split("/")
     beside: JsonValue = dict(payload.metadata)
     for part in path[:-1]:
@@ -227,17 +227,17 @@ def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
 
 
 Side = TypeVar("Side")
-# Methods also report times and memory, which depend on the machine.
+# Methods, too, may report times and memory, which depend on the machine.
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pair(Generic[Side]):
-    """The values of one item in two runs.
+    """The values of one item, such as a metric or parameter, in two runs.
 
     Attributes:
         cell: address of the cell; empty for items of the whole run.
-        name: name of the input, parameter, metric or package.
+        name: name of the item.
         left: value in the first run; None if there is none.
         right: value in the second run; None if there is none.
     """
@@ -259,7 +259,7 @@ class Pair(Generic[Side]):
 
     @property
     def is_rounded(self) -> bool:
-        """Whether both are values of a metric that differ only by rounding."""
+        """Whether the item is a metric whose values differ only by rounding."""
         left, right = self.left, self.right
         return (
             isinstance(left, ComparedMetric)
@@ -288,8 +288,8 @@ class ParameterValue:
 
     Attributes:
         value: value as JSON.
-        is_set: whether it was set in the workflow or on the command line; otherwise it is the
-            default.
+        is_set: whether the value was set in the workflow or on the command line; otherwise it is
+            the default.
     """
 
     value: JsonValue
@@ -307,8 +307,9 @@ class CellFacts:
         result_version: result version of the method.
         determinism: exact, seeded or loose.
         seed: seed; None if the method uses none.
-        code: digests of code that is not from a release; empty if all code is from releases.
-        tools: versions of libraries that affect results.
+        code: digests of the code of the method and the framework, as far as it is not from a
+            release.
+        tools: library -> version, for libraries that can affect results.
         error: reason why the cell failed or was skipped, otherwise empty.
     """
 
@@ -324,7 +325,7 @@ class CellFacts:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """These properties as text, status and method first."""
+        """These properties as text, beginning with status and method."""
         parts = (
             self.status,
             f"{self.method} result version {self.result_version}"
@@ -344,17 +345,17 @@ class CellFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedMetric:
-    """A metric of one cell; two are equal if value and unit are equal.
+    """A metric of one cell; two metrics are equal if their values and units are equal.
 
     Attributes:
         value: value of the metric.
         unit: unit of the value.
         is_cost: whether the metric is a time or memory use, which depends on the machine and its
             load.
-        is_cached: whether an earlier run computed the cell; costs are then those of the earlier
+        is_cached: whether an earlier run computed the cell; if so, costs are those of the earlier
             run.
         environment: id of the environment in which the metric was computed.
-        better: which values are better; empty if there is no better direction.
+        better: which values are better; empty if neither higher nor lower values are.
         headline: whether the metric describes the quality of the result.
     """
 
@@ -367,7 +368,7 @@ class ComparedMetric:
     headline: bool = field(compare=False, default=False)
 
     def is_near(self, other: ComparedMetric | None) -> bool:
-        """Whether it is equal to another metric apart from rounding."""
+        """Whether this metric is equal to another one, apart from rounding."""
         return (
             other is not None and self.unit == other.unit and is_rounding(self.value, other.value)
         )
@@ -375,21 +376,23 @@ class ComparedMetric:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunComparison:
-    """Comparison of two runs, including the rows that do not differ.
+    """Comparison of two runs, including items that do not differ.
 
     Attributes:
         left: record of the first run.
         right: record of the second run.
         workflow: unified diff of the workflow texts; empty if they are the same.
-        overrides: command-line options that changed the workflow.
+        overrides: command-line options that changed the workflow, in each run.
         inputs: files of each input, without folders.
-        cells: method, version, seed and status of each cell, by its address in the first run if it
-            exists there.
-        readdressed: address in the second run -> address in the first run, where the two differ,
-            e.g. for a step and for a variant with the same parameters.
+        cells: method, version, seed and status of each cell; cells that exist in the first run have
+            their address there.
+        readdressed: address in the second run -> address in the first run, for cells whose
+            addresses differ, e.g. because a variant in one run has the parameters of the step in
+            the other.
         parameters: resolved parameters of each cell.
-        environment: Python, system, processor and packages; several values are separated by commas.
-            Packages recorded in only one run are omitted if no method of either run requires them.
+        environment: versions of Python and packages, system, and processor. If a run has several
+            values, they are separated by commas. Packages that only one run recorded are omitted
+            unless a method requires them.
         metrics: metrics of each cell.
         products: comparison of each product of the cells that exist in both runs.
     """
@@ -436,14 +439,14 @@ class RunComparison:
 
     @property
     def of_shared_steps(self) -> str:
-        """Return which steps the rows of `shared` belong to; empty if both runs have all steps."""
+        """Return a phrase that counts the steps both runs have; empty if they have all steps."""
         n_shared = sum(row.is_shared for row in self.cells)
         all_shared = n_shared == len(self.cells)
         counted = "step" if n_shared == 1 else f"{n_shared} steps"
         return "" if all_shared else f", of the {counted} that both have"
 
     def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
-        """Leave out rows of cells that exist in only one of the runs."""
+        """Return the rows without those of cells that exist in only one run."""
         alone = {row.cell for row in self.cells if not row.is_shared}
         return tuple(row for row in rows if row.cell not in alone)
 
@@ -454,8 +457,8 @@ class RunComparison:
             changed: whether to return only parameters that differ.
 
         Returns:
-            Columns `cell`, `parameter`, `left` and `right`; None if a run does not have the
-            parameter.
+            A table with the columns `cell`, `parameter`, `left` and `right`; a value is None if the
+            run does not have the parameter.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -470,8 +473,8 @@ class RunComparison:
         """Return all metrics of both runs next to each other.
 
         Returns:
-            Columns `cell`, `metric`, `left`, `right`, `difference` (right minus left; NaN if one is
-            missing) and `unit`.
+            A table with the columns `cell`, `metric`, `left`, `right`, `difference` (right minus
+            left; NaN if a value is missing) and `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -488,8 +491,9 @@ class RunComparison:
 def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunComparison:
     """Compare two runs.
 
-    Cells correspond if their step, dataset and seed are the same and each varied step upstream has
-    the same method and parameters; otherwise, if their addresses are the same.
+    Two cells correspond if they have the same step, dataset and seed, and if all upstream steps
+    with variants have the same method and parameters. The remaining cells correspond if they have
+    the same address.
 
     Args:
         left: the first run.
@@ -502,7 +506,7 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     readdressed = _readdressed(left, right)
-    # Name of a cell of the second run in this comparison -> its address in that run.
+    # Map the name of a cell in this comparison to its address in the second run.
     own = {_label(right, address, readdressed): address for address in right.cells}
     both = [address for address in left.cells if address in own]
     sides = (left.record, right.record)
@@ -534,7 +538,7 @@ def compare_metrics(left: Run, right: Run) -> tuple[Pair[ComparedMetric], ...]:
         for address in both
         for row in _pairs(address, *(_metrics(run.cells[address]) for run in (left, right)))
     )
-    # Keep metrics that only one of the runs declares as a cost.
+    # Keep metrics that are declared as a cost in only one run.
     return tuple(
         row for row in rows if not all(side.is_cost for side in (row.left, row.right) if side)
     )
@@ -566,8 +570,8 @@ def _per_cell(
 def _readdressed(left: Run, right: Run) -> dict[str, str]:
     """Find cells of the second run that have a different address in the first.
 
-    Names of variants are only labels: cells with the same methods and parameters correspond, then
-    cells with the same address.
+    Names of variants are only labels, so cells with the same methods and parameters correspond,
+    even if their addresses differ. The remaining cells correspond if their addresses are the same.
     """
     varied = {
         step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
@@ -593,9 +597,12 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
 
 
 def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
-    """Return the name of a cell of the second run: the address of its counterpart in the first."""
+    """Return the name of a cell of the second run in the comparison.
+
+    This is the address of the corresponding cell of the first run.
+    """
     if address not in readdressed and address in readdressed.values():
-        # There is no counterpart, and in the first run, this address belongs to a different cell.
+        # No cell of the first run corresponds, and the address belongs to a different cell there.
         return f"{address} ({right.record.run_id})"
     return readdressed.get(address, address)
 
@@ -606,8 +613,8 @@ def _identity(run: Run, cell: RecordedCell, varied: Collection[str]) -> tuple[ob
     Args:
         run: run of the cell.
         cell: the cell.
-        varied: steps with variants in either run; they are identified by method and parameters, and
-            a step without variants is treated as having one.
+        varied: steps that have variants in either run; in both runs, they are identified by their
+            method and parameters.
     """
     called = {
         one.step: (one.method, canonical_json(dict(one.params)))
@@ -625,7 +632,8 @@ def _text_differences(left: RunRecord, right: RunRecord) -> tuple[str, ...]:
 
 def _facts(cell: RecordedCell) -> CellFacts:
     if cell.status == "skipped":
-        # Ignore the versions of a skipped method: they are known only if another cell loaded it.
+        # Ignore the version of a skipped method, which is known only if another cell used the
+        # method.
         unloaded = MethodIdentity(method=cell.method)
         cell = replace(cell, seed=None, **shared_fields(unloaded, MethodIdentity))
     preimage = read_preimage(cell.key_preimage)

@@ -29,7 +29,7 @@ from orthoflow.workflow.source import ProblemLog
 
 
 class ProblemsError(OrthoflowError):
-    """Several problems; `problems` has one sentence for each."""
+    """Several problems; `problems` contains one sentence for each."""
 
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = tuple(problems)
@@ -37,11 +37,11 @@ class ProblemsError(OrthoflowError):
 
 
 class RefusedRunError(ProblemsError, RecordError):
-    """A run cannot be repeated unchanged, or input files differ from the record."""
+    """A run cannot be repeated without changes, or input files differ from the record."""
 
 
 class MissingMethodsError(ProblemsError, PluginError):
-    """Methods or product types in a record are not installed."""
+    """Methods or product types that a record needs are not installed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +49,10 @@ class InputSearch:
     """Result of a search for input files.
 
     Attributes:
-        paths: input -> its files in the order of the record; inputs that were not given are
-            missing.
+        paths: input -> its files in the order of the record; optional inputs that were not given
+            are omitted.
         problems: one sentence for each missing or changed file.
-        is_changed: whether one of the files exists with different content.
+        is_changed: whether one of the files was found with different content.
     """
 
     paths: Mapping[str, tuple[Path, ...]]
@@ -72,18 +72,19 @@ def find_inputs(
 ) -> InputSearch:
     """Search for files with the content given in a record.
 
-    If paths are given for an input, only these are searched, under any name. Otherwise, the
-    extracted files are used, or else the paths where stores last found the content and the paths in
-    the workflow, relative to the working directory and the run folder.
+    If paths are given for an input, only these are searched, and the files may have any name.
+    Otherwise, the files extracted from the record are used. If there are none, two places are
+    searched: the paths that stores have recorded for the content, and the paths in the workflow,
+    relative to the working directory and to the run folder.
 
     Args:
         workflow: workflow of the record.
         recorded: recorded inputs.
         run_folder: folder of the record.
         digests: cache of digests, so that each file is read only once.
-        given: `NAME=PATH` as for `--input`.
+        given: inputs as `NAME=PATH`, as for `--input`.
         extracted: input -> files extracted from the record.
-        noted: digest caches of other stores that may contain paths of the files.
+        noted: digest caches of other stores, which may contain paths of the files.
 
     Raises:
         InvalidArgumentsError: `given` contains a name that is not an input of the workflow.
@@ -121,7 +122,10 @@ def find_inputs(
 
 
 def _given_files(workflow: Workflow, given: Sequence[str]) -> dict[str, tuple[Path, ...]]:
-    """Return the files given with `--input`; `scan=FOLDER` applies to `scan` of all datasets."""
+    """Return the files given with `--input`.
+
+    `scan=FOLDER` applies to the input `scan` of all datasets.
+    """
     log = ProblemLog(file="")
     specs = workflow.input_specs
     options = [
@@ -171,7 +175,7 @@ class PlacedInputs:
 
     @cached_property
     def folder(self) -> Path:
-        """The folder, created on first use.
+        """The temporary folder, which is created on first use.
 
         Raises:
             StoreError: the disk cannot be written to.
@@ -182,14 +186,14 @@ class PlacedInputs:
             return Path(self._stack.enter_context(made))
 
     def named(self, entry: RecordedInput, paths: tuple[Path, ...]) -> tuple[Path, ...]:
-        """Return the files found for an input, with their recorded names and in the recorded order.
+        """Return files with the names and order recorded for an input; create links if needed.
 
         Raises:
             StoreError: the disk cannot be written to.
         """
         names = [file.name for file in entry.files]
-        # Files with the same name are sorted by folder, so new folders are needed to keep their
-        # order.
+        # Files with the same name are sorted by folder, so put each in a numbered folder to keep
+        # the order.
         if [path.name for path in paths] == names and len(set(names)) == len(names):
             return paths
         links = []
@@ -207,7 +211,7 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[PlacedInputs]:
 
     Args:
         run: the run.
-        beside: folder on a disk with enough space, created if missing.
+        beside: folder for the temporary folder, on a disk with enough space; created if missing.
 
     Raises:
         RecordError: the record is damaged.

@@ -35,10 +35,10 @@ _INTERRUPTED: Final = CancelledStepError.__name__
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run; a running or interrupted run is opened with the results so far.
+    """Open a run; if it is unfinished, it contains the results so far.
 
     Args:
-        path: a run folder, or the `run.h5` in it.
+        path: a run folder, or the `run.h5` in this folder.
 
     Raises:
         ArgumentError: the path does not exist, or the folder contains no run.
@@ -50,20 +50,20 @@ def open_run(path: str | Path) -> Run:
 
 
 def has_outline(folder: Path) -> bool:
-    """Return whether a folder contains a run that has started and has no record yet."""
+    """Return whether a folder contains a run that has started but has no record yet."""
     return (folder / OUTLINE_FILE).is_file() and not (folder / RECORD_FILE).is_file()
 
 
 def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
     """Open an unfinished run; cells without a result have the status `skipped`.
 
-    Its record is in a temporary folder, which is removed at exit.
+    The record is in a temporary folder, which is removed at exit.
 
     Args:
         folder: run folder.
-        publish: whether to write the products of an interrupted run into the run folder; otherwise
-            they are written next to the temporary record, unless the run folder already contains
-            them.
+        publish: whether to write the products of an interrupted run into the run folder. Otherwise,
+            the products are written next to the temporary record, unless the run folder already
+            contains them.
 
     Raises:
         ArgumentError: the outline or the store of the run is missing or unreadable, or the run is
@@ -128,7 +128,7 @@ def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
         write_record(path, dataclasses.replace(record, published=published), store.product_file)
     except RecordFormatError as error:
         raise StoreError(f"the record of {folder} cannot be assembled: {error}") from error
-    # An interrupted run may have published its files; the folder of a running one is not changed.
+    # If all published files are already in the run folder, use these.
     is_there = all(published_state(folder, file) == "same" for file in published)
     return dataclasses.replace(
         read_run(path), files_folder=folder if is_there else aside, home=folder

@@ -1,4 +1,4 @@
-"""Replay: checks whether a recorded run can be repeated, and plans it from its record."""
+"""Functions that check whether a recorded run can be repeated, and plan its replay."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Replay:
     Attributes:
         workflow: workflow read from the record.
         plan: plan of the workflow's cells with the recorded parameters and seeds.
-        notes: changes that may affect results: code, libraries, Python, processor.
+        notes: changes of code, libraries, Python or processor that may affect results.
         changed_methods: ids of methods whose code has changed but whose result version has not.
     """
 
@@ -62,23 +62,23 @@ def plan_replay(
     placed: PlacedInputs | None = None,
     earlier: Sequence[Store] = (),
 ) -> Replay:
-    """Check that a run can be repeated, and plan it without running any cell.
+    """Check that a run can be repeated, and plan its replay without running any cell.
 
     Args:
         run: the run.
         catalog: the installed plugins.
         store: store for the results of the replay.
         options: options of the replay.
-        inputs: `NAME=PATH` as for `--input`.
-        placed: extracted and renamed input files, see `embedded_inputs`; None if all files have
-            their recorded names.
-        earlier: other stores that may contain paths of input files.
+        inputs: inputs as `NAME=PATH`, as for `--input`.
+        placed: place for extracted and renamed input files, see `embedded_inputs`; None if all
+            files have their recorded names.
+        earlier: other stores, which may contain paths of the input files.
 
     Raises:
         RefusedRunError: the record was changed, a method has another result version or other
             parameters, or an input file was changed.
-        MissingInputsError: the only problem is missing input files.
-        MissingMethodsError: the only problem is missing methods or product types.
+        MissingInputsError: input files are missing, and there is no other problem.
+        MissingMethodsError: methods or product types are missing, and there is no other problem.
         InvalidArgumentsError: `inputs` contains a name that is not an input of the workflow.
         InputError: a given path does not exist.
     """
@@ -137,7 +137,7 @@ def _variant(cell: RecordedCell, workflow: Workflow) -> StepVariant | None:
 
 
 def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Workflow:
-    """Set the files that were found; inputs without files were not given originally."""
+    """Set the files of the inputs; inputs without files were not given in the original run."""
     specs = {
         name: dataclasses.replace(
             spec,
@@ -150,7 +150,7 @@ def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Wo
 
 
 def _inconsistencies(run: Run) -> Iterator[str]:
-    """Yield cells that contradict the cache key under which they were computed."""
+    """Yield a sentence for each contradiction between a cell and its inputs or cache key."""
     files = {f"inputs.{entry.name}": input_digest(entry.files) for entry in run.record.inputs}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
@@ -175,12 +175,12 @@ def _inconsistencies(run: Run) -> Iterator[str]:
 
 
 def _loose_ends(run: Run) -> Iterator[str]:
-    """Yield cell inputs that are neither inputs of the run nor outputs of earlier cells."""
+    """Yield a sentence for each cell input that is no input of the run and no earlier output."""
     given = {"inputs": {entry.name for entry in run.record.inputs}}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
             owner, _, name = product.source.rpartition(".")
-            # A skipped cell may lack an output of an upstream cell, which is why it was skipped.
+            # The missing output of an upstream cell may be the reason why this cell was skipped.
             is_lacking = cell.status == "skipped" and owner != "inputs" and owner in given
             if not is_lacking and name not in given.get(owner, ()):
                 yield f"{cell.address}: no earlier step outputs {product.source!r}, its {port}"
@@ -188,7 +188,7 @@ def _loose_ends(run: Run) -> Iterator[str]:
 
 
 def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return missing methods, and differences from recorded methods, without duplicates."""
+    """Return missing methods, and differences between installed and recorded methods."""
     missing: list[str] = []
     others: list[str] = []
     for cell in run.record.cells:
@@ -204,7 +204,6 @@ def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple
 
 
 def _differences(cell: RecordedCell, catalog: Catalog, origin: str) -> Iterator[str]:
-    """Yield differences between an installed and a recorded method that prevent a replay."""
     if cell.seed is not None and cell.seed < 0:
         yield f"step {cell.address}: the seed must not be negative, got {cell.seed}"
     cls = catalog.method(cell.method).load()
@@ -243,7 +242,7 @@ def _cell(recorded: RecordedCell, workflow: Workflow) -> Cell:
         params=recorded.params,
         params_set=recorded.params_set,
         inputs={port: _source(product.source) for port, product in recorded.inputs.items()},
-        # A method that uses no seed is also passed a generator, but does not use it.
+        # A method without a seed is also passed a generator, so any number will do.
         seed=recorded.seed or 0,
         cores=variant.cores if variant else None,
         timeout_s=variant.timeout_s if variant else None,
@@ -260,7 +259,6 @@ def _source(text: str) -> CellOutput | WorkflowInput:
 
 
 def _changes(run: Run, plan: RunPlan) -> tuple[frozenset[str], tuple[str, ...]]:
-    """Return methods whose code has changed, and all changes that may affect results."""
     here = environment(1)
     notes = [
         f"{name}: {getattr(here, name)} here, {getattr(recorded, name)} in the record"
@@ -291,7 +289,7 @@ def _changes(run: Run, plan: RunPlan) -> tuple[frozenset[str], tuple[str, ...]]:
 MetricVerdict = Literal[
     "same", "rounding", "products", "not in the record", "code changed", "different"
 ]
-# Verdicts that count as a difference of the replay.
+# With these verdicts, the replay counts as different.
 DIFFERING: Final = frozenset({"code changed", "different"})
 
 
@@ -304,12 +302,11 @@ class ReplayedMetric:
         metric: name of the metric.
         recorded: value in the record; None if there is none.
         recorded_unit: unit in the record.
-        replayed: value of the replay; None if there is none.
+        replayed: value in the replay; None if there is none.
         replayed_unit: unit in the replay.
-        verdict: `same` (same bits); `rounding`; `products` if inputs or outputs of the step do not
-            have the same bits but are within tolerance or not measured; `not in the record`; `code
-            changed` if the code of the step or of a step upstream has changed; otherwise
-            `different`.
+        verdict: `same` (same bits); `rounding`; `products` if inputs or outputs of the step differ
+            but are within tolerance or not measured; `not in the record`; `code changed` if the
+            code of the step or of an upstream step has changed; otherwise `different`.
     """
 
     cell: str
@@ -332,7 +329,7 @@ def replayed_metrics(
     Args:
         original: the run that was replayed.
         made: the replay.
-        distances: comparison of all products.
+        distances: comparison of the products of both runs.
         changed_methods: ids of methods whose code has changed.
     """
     identical = {f"{item.cell}.{item.port}" for item in distances if item.verdict == "identical"}
@@ -367,7 +364,6 @@ def replayed_metrics(
 
 
 def _is_of_identical(cell: RecordedCell, identical: set[str]) -> bool:
-    """Whether the inputs and outputs of a step have the same bits in both runs."""
     taken = {given.source for given in cell.inputs.values()}
     given = {f"{cell.address}.{port}" for port in cell.outputs}
     return all(one in identical or one.startswith("inputs.") for one in taken | given)

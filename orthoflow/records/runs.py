@@ -66,7 +66,8 @@ from orthoflow.workflow.model import (
 if TYPE_CHECKING:
     pass
 
-# As for floats in product metadata (SPEC 11.3): the last digits depend on libraries.
+# The last digits depend on libraries; this is also the tolerance of floats in product metadata
+# (SPEC 11.3).
 _ROUNDING: Final = 1e-6
 _UNITLESS: Final = ("1", "yes/no")
 _COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
@@ -105,7 +106,7 @@ class MetricRow(Metric):
 def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
     """Return the metrics reported by the method, then those measured by the engine (time, memory).
 
-    Cells without a result have no rows: their costs are not comparable.
+    Cells without a result have no rows, because their costs are not comparable.
     """
     if cell.status != "ok":
         return ()
@@ -131,7 +132,7 @@ def is_rounding(left: float, right: float) -> bool:
 
 
 def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
-    """Write the rows with a header, in full precision."""
+    """Write rows of metrics with a header, in full precision."""
     text = csv_text([_COLUMNS, *([getattr(row, name) for name in _COLUMNS] for row in rows)])
     path.write_text(text, encoding="utf-8", newline="")
 
@@ -144,7 +145,7 @@ def upstream_cells(cells: Mapping[str, RecordedCell], address: str) -> Iterator[
     """Yield a cell and all cells upstream of it, nearest first."""
     waiting, seen = [address], {address}
     for name in waiting:
-        # The list grows during the iteration.
+        # The list grows while the loop runs.
         yield cells[name]
         for given in cells[name].inputs.values():
             before = given.source.rpartition(".")[0]
@@ -154,9 +155,9 @@ def upstream_cells(cells: Mapping[str, RecordedCell], address: str) -> Iterator[
 
 
 def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
-    """Return the published files of a cell, naturally sorted (wall 2 before wall 10), or ().
+    """Return the published files of a cell, in natural order (wall 2 before wall 10).
 
-    Links are ignored, whatever their target.
+    Links are omitted, whatever their target.
     """
     inside = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}"
     names = sorted(files_below(run_folder, inside), key=_by_number)
@@ -172,15 +173,15 @@ PublishedState: TypeAlias = Literal["same", "changed", "missing", "no file"]
 
 
 def published_state(folder: Path, file: PublishedFile) -> PublishedState:
-    """Compare a published file with the record, without following links or opening devices.
+    """Compare a published file with its entry in the record; do not follow links or open devices.
 
     Args:
         folder: run folder.
-        file: entry of the file in the record.
+        file: the entry.
     """
     try:
         with open_below(folder, file.path) as stream:
-            # Compare sizes first, so that a sparse file of a terabyte is not read.
+            # Compare the sizes first, so that a huge sparse file is not read.
             if os.fstat(stream.fileno()).st_size != file.size_bytes:
                 return "changed"
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -192,17 +193,17 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
 
 
 def described_file(folder: Path, path: str) -> PublishedFile:
-    """Return the size and digest of a file that the caller has just written into a folder."""
+    """Return the entry of a file that the caller has just written into a folder."""
     file = path_inside(folder, path)
     return PublishedFile(path=path, size_bytes=file.stat().st_size, sha256=file_sha256(file))
 
 
 def require_unchanged(run: Run, *paths: Path) -> None:
-    """Refuse changed published files, before other files are derived from them.
+    """Raise an error if one of the published files was changed.
 
     Args:
         run: the run.
-        paths: files in its folder.
+        paths: published files in the folder of the run.
 
     Raises:
         RecordError: a file was changed, is a link or a device, or is not in the record.
@@ -231,13 +232,13 @@ REPORT_FILE: Final = "report.html"
 METADATA_FILE: Final = "ro-crate-metadata.json"
 WORKFLOW_FILE: Final = "workflow.yaml"
 RESOLVED_FILE: Final = "workflow-resolved.json"
-#: limit for report pages and the files that they refer to
+#: Maximum size of a report page, and of a file that it refers to.
 LARGEST_PAGE_BYTES: Final = 1 << 30
 _DAMAGED: Final = "the file is damaged"
 _AWAY: Final = "; use another copy, and check it with `orthoflow verify`"
 FIGURES_FOLDER: Final = "figures"
 GRAPH_FILE: Final = "graph.svg"
-# Folder of the pages of the datasets, for a run on several datasets.
+# A run on several datasets has one page per dataset in this folder.
 PAGES_FOLDER: Final = "pages"
 _MOST_NAMED: Final = 12
 _LONGEST_REASON: Final = 400
@@ -250,10 +251,12 @@ class Run:
     Attributes:
         path: the record file.
         record: everything in the record except the arrays of products.
-        output: function that reads an output, by address and port, from the open record; if None,
-            the record is opened for each output.
-        files_folder: folder of the run's files, if it is not the folder of the record.
-        home: run folder of an unfinished run, whose record is elsewhere.
+        output: function that reads the output with a given address and port from the open record;
+            if None, the record is opened for each output.
+        files_folder: folder of the run's files if it differs from the folder of the record, else
+            None.
+        home: run folder of an unfinished run, whose record is in another folder; None for other
+            runs.
         content_sha256: digest that seals the record; empty if it was not read from a file.
     """
 
@@ -266,14 +269,14 @@ class Run:
 
     @property
     def file_name(self) -> str:
-        """Final name of the record file, which is renamed after all other files are written."""
+        """Final name of the record file, which has a temporary name while the run is written."""
         return RECORD_FILE if self.path.name.startswith(f".{RECORD_FILE}") else self.path.name
 
     @contextmanager
     def held_open(self) -> Iterator[Run]:
-        """Return the run with its record kept open, for repeated reading.
+        """Yield the run with its record open, for repeated reading.
 
-        Opening a record checks all of it, which would be too slow if repeated for many datasets.
+        Opening a record checks its seal, which would be too slow if repeated for many datasets.
 
         Raises:
             RecordError: the record is damaged or missing.
@@ -285,7 +288,7 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Folder of the record, with `products/` and the report."""
+        """Folder that contains `products/` and the report, and usually the record."""
         return self.files_folder or self.path.parent
 
     @property
@@ -299,17 +302,17 @@ class Run:
         return {cell.address: cell for cell in self.record.cells}
 
     def cell(self, address: str, *, repeat: int = 0, **variants: str) -> RecordedCell:
-        """Return one cell.
+        """Return one cell of the run.
 
         Args:
             address: address of the cell; with `variants`, the name of the step suffices.
             repeat: number of the repeat, from 0.
-            variants: name of a step with variants, or `data` -> variant or dataset; for a sweep,
-                the part of the name before the parameters suffices if only one variant matches.
-                Entries on which the cell does not depend are ignored.
+            variants: name of a step with variants -> name of the variant, and `data` -> name of the
+                dataset. For a sweep, the part of the name before the parameters suffices if only
+                one variant matches. Entries that do not apply to the cell are ignored.
 
         Raises:
-            ArgumentError: the run has no such cell, or several.
+            ArgumentError: the run has no such cell or several.
         """
         if address in self.cells and not variants and not repeat:
             return self.cells[address]
@@ -371,7 +374,7 @@ class Run:
         return shown(f"<Run {sentence}>")
 
     def with_failure(self, sentence: str) -> str:
-        """Append the first failed step and its error to a sentence about the run, if any failed."""
+        """Append the first failed cell and its error, if any, to a sentence about the run."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed:
             return sentence
@@ -397,7 +400,7 @@ class Run:
         return figures[name]
 
     def payload(self, address: str, port: str) -> Payload:
-        """Return an output as named arrays and JSON metadata, which requires no plugin.
+        """Return an output as named arrays and JSON metadata; no plugin is needed.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell has no such output.
@@ -406,7 +409,7 @@ class Run:
         return next(self.payloads([(address, port)]))
 
     def payloads(self, places: Sequence[tuple[str, str]]) -> Iterator[Payload]:
-        """Yield outputs, each given by address and port, one by one; opens the record once.
+        """Yield the outputs at the given addresses and ports; the record is opened only once.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell has no such output.
@@ -450,7 +453,7 @@ class Run:
         Args:
             address: address of the cell; with `variants`, the name of the step suffices.
             port: name of the output.
-            repeat: see `cell`, as for `variants`.
+            repeat: see `cell`.
             variants: see `cell`.
 
         Raises:
@@ -472,7 +475,7 @@ class Run:
 
     @property
     def files(self) -> Mapping[str, tuple[Path, ...]]:
-        """Published files by the address of their cell; cells without files are omitted."""
+        """Address of a cell -> published files of the cell; cells without files are omitted."""
         found = {address: published_files(self.folder, address) for address in self.cells}
         return {address: files for address, files in found.items() if files}
 
@@ -493,7 +496,7 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Read a record file of any name.
+    """Read a record file, which may have any name.
 
     Raises:
         RecordError: the record is damaged, not a record, or of another format.
@@ -503,7 +506,7 @@ def read_run(path: Path) -> Run:
 
 
 def find_record(path: str | Path) -> Path:
-    """Return the record file of a run folder; a file is returned unchanged.
+    """Return the record file in a run folder; if the path is a file, return it unchanged.
 
     Raises:
         ArgumentError: the path does not exist, or the folder contains no finished run.
@@ -528,10 +531,11 @@ def find_record(path: str | Path) -> Path:
 
 @contextmanager
 def record_errors(path: Path) -> Iterator[None]:
-    """Convert any error that occurs while reading a record into a one-sentence error.
+    """Convert any error that the block raises while reading a record into a one-sentence error.
 
     Raises:
-        RecordError: replaces all errors except orthoflow's own and missing permission.
+        RecordError: the block raised an error other than errors of orthoflow and a missing
+            permission.
     """
     try:
         yield
@@ -543,21 +547,21 @@ def record_errors(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise ArgumentError(f"{path} cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        # For damaged files, h5py raises various errors, depending on the damaged structure.
+        # If a file is damaged, h5py raises different errors depending on the damaged structure.
         if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
             raise ArgumentError(f"{path} is not a file; give a run folder or its run.h5") from error
         raise RecordError(f"{path} is not a record or is damaged: {error}{_AWAY}") from error
 
 
 def _with_path(path: Path, sentence: str) -> str:
-    """Replace the bare file name at the start of a message by the path given by the user."""
+    """Put the path that the user gave at the start of a message, instead of the file name."""
     if sentence.startswith(path.name):
         return f"{path}{sentence.removeprefix(path.name)}"
     return f"{path}: {sentence}"
 
 
 def path_inside(folder: Path, name: str) -> Path:
-    """Return the path of a file whose name comes from a record.
+    """Return the path of a file in a folder; the file name comes from a record.
 
     Raises:
         RecordError: the name is not allowed as a file name.
@@ -569,17 +573,17 @@ def path_inside(folder: Path, name: str) -> Path:
 
 
 def environment_file(environment_id: str) -> str:
-    """Return the file name of the package list of an environment in a crate."""
+    """Return the name of the file in a crate that lists the packages of an environment."""
     return f"requirements-{environment_id.removeprefix('sha256:')[:12]}.txt"
 
 
 def encoded(text: str) -> bytes:
-    """Encode a text of a record; unpaired surrogates, as in parameters, become JSON escapes."""
+    """Encode text from a record as UTF-8; unpaired surrogates become backslash escapes."""
     return text.encode("utf-8", "backslashreplace")
 
 
 def crate_texts(record: RunRecord) -> dict[str, bytes]:
-    """Return the files of a crate that repeat texts of the record: path -> content."""
+    """Return path -> content for the files of a crate that repeat text from the record."""
     lists = {
         environment_file(environment.id): "".join(
             f"{name}=={version}\n" for name, version in environment.packages.items()
@@ -591,10 +595,11 @@ def crate_texts(record: RunRecord) -> dict[str, bytes]:
 
 
 def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFigure]:
-    """Return the files for figures of cells: relative path -> figure.
+    """Return relative path -> figure for the figures of cells.
 
     Raises:
-        RecordError: the name or type of a cell or figure cannot be used for a file.
+        RecordError: the name of a cell or figure is not allowed as a file name, or the type of a
+            figure has no suffix.
     """
     named: list[tuple[str, RecordedFigure]] = []
     problem = ""
@@ -613,18 +618,18 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
 
 
 def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]) -> int:
-    """Write files into a folder without following links; existing files are replaced.
+    """Write files into a folder, replacing existing files; do not follow links.
 
     Args:
         folder: the folder, created if missing.
-        contents: relative path -> function, called in a thread, that returns the bytes, or None for
-            no file.
+        contents: relative path -> function that returns the content, or None if no file is to be
+            written; it is called in a thread.
 
     Returns:
         The number of files written.
 
     Raises:
-        StoreError: the disk cannot be written to, or a link is in the path.
+        StoreError: the disk cannot be written to, or a path contains a link.
     """
     with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -650,10 +655,10 @@ def copy_files(
         source: source folder.
         target: existing folder.
         paths: paths relative to both folders.
-        published: entries of published files in the record, against which copies are checked.
+        published: entries of the published files in the record, with which the files are compared.
 
     Returns:
-        The paths of files that exist.
+        The paths of the files that exist and were copied.
 
     Raises:
         RecordError: a file is a link or a device, or differs from the record.
@@ -663,7 +668,7 @@ def copy_files(
     known = {file.path: file for file in published}
     for path in paths:
         if path in known:
-            # Hash each file only once: published files may have gigabytes.
+            # Hash each file only once, because published files can be very large.
             state = published_state(source, known[path])
             if state == "missing":
                 continue
@@ -685,10 +690,10 @@ def copy_files(
 
 @contextmanager
 def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
-    """Write a file into a folder; it gets its final name when it is complete.
+    """Yield a stream for a new file in a folder; the file gets its final name at the end.
 
     Raises:
-        StoreError: the disk cannot be written to, or a link is in the path.
+        StoreError: the disk cannot be written to, or the path contains a link.
     """
     try:
         with writing_to(folder), create_below(folder, path) as stream:
@@ -698,7 +703,7 @@ def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
 
 
 def _suffix(run: Run, figure: RecordedFigure) -> str:
-    # WebP is converted to PNG for papers and word processors.
+    # WebP figures are written as PNG, which can be used in papers and word processors.
     shown = "image/png" if figure.media_type == "image/webp" else figure.media_type
     if shown not in FIGURE_SUFFIXES:
         raise RecordError(
@@ -712,7 +717,7 @@ _DATASETS = "datasets"
 
 
 def datasets_of(run: Run) -> tuple[str, ...]:
-    """Return the datasets that have cells in a run, in order; usually none.
+    """Return the datasets that have cells in a run; empty if the workflow has no datasets.
 
     Invalid names are omitted, because folders and pages are named after datasets.
     """
@@ -723,9 +728,9 @@ def datasets_of(run: Run) -> tuple[str, ...]:
 
 
 def parts_of(run: Run) -> dict[str, Run]:
-    """Return, for each dataset, its part of a run, including shared cells, as a separate run.
+    """Return dataset -> its part of a run, including cells shared by datasets.
 
-    Products are read from the record of the whole run.
+    Each part is a run, whose products are read from the record of the whole run.
     """
     cells: dict[str, list[RecordedCell]] = {name: [] for name in datasets_of(run)}
     for cell in run.record.cells:
@@ -773,7 +778,7 @@ def _record_of(
 
 
 def pages_of(run: Run) -> dict[str, str]:
-    """Return dataset -> path of its page in the run folder; empty without several datasets."""
+    """Return dataset -> path of its page in the run folder; empty for fewer than two datasets."""
     names = datasets_of(run)
     return {name: f"{PAGES_FOLDER}/{name}.html" for name in names} if len(names) > 1 else {}
 

@@ -1,4 +1,4 @@
-"""Seals of report pages, and the name of the signature of a record."""
+"""Seals of report pages, and the name of the signature file of a record."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Final
 from orthoflow.records.runs import Run
 
 SIGNATURE_SUFFIX: Final = ".sig"
-# Text before the digests at the end of a page.
+# This text precedes the digests at the end of a page.
 PAGE_MARK: Final = "orthoflow report of"
 
 
 def sealed_page(text: str, runs: Sequence[Run]) -> str:
-    """Return a report page with the digests of its records and of its own text appended."""
+    """Append the digests of the records and of the page itself to a report page."""
     digests = [run.content_sha256 for run in runs if run.content_sha256]
     sealed = f"{text}\n<!-- {PAGE_MARK} {' '.join(digests)} "
     return f"{sealed}page {hashlib.sha256(sealed.encode('utf-8')).hexdigest()} -->\n"
 
 
 def page_of(page: str, run: Run) -> str:
-    """Return a page of another record of the same run, sealed as a page of this record."""
+    """Replace the seal of a page, made for another record of a run, by a seal for this record."""
     text, mark, _ = page.rpartition(f"\n<!-- {PAGE_MARK}")
     return sealed_page(text, [run]) if mark else page

@@ -1,7 +1,8 @@
-"""Export of orthoimages as a STAC collection: one item per GeoTIFF, with relative links.
+"""Export of orthoimages as a STAC collection with one item per GeoTIFF and relative links.
 
-STAC 1.1.0 with the extensions projection 2.0.0 and file 2.1.0. Only rasters in map coordinates are
-georeferenced; rasters in the plane of a wall become items without a geometry, as STAC allows.
+The export follows STAC 1.1.0 with the extensions projection 2.0.0 and file 2.1.0. Only rasters in
+map coordinates are georeferenced; rasters in the plane of a wall become items without a geometry,
+which STAC allows.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema
 _FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _GEOTIFF: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _ORTHO: Final = "_ortho.tif"
-# Files of an orthoimage, by the end of their names: key, media type and roles.
+# Map the end of a file name to the STAC asset: key, media type and roles.
 _BESIDE: Final = {
     "_ortho.tif": ("image", _GEOTIFF, ["data"]),
     "_ortho_mask.tif": ("mask", "image/tiff; application=geotiff", ["metadata"]),
@@ -35,16 +36,16 @@ _BESIDE: Final = {
 }
 _DESCRIBED: Final = ("painted_share", "expected_mm_median", "expected_mm_p95", "recommended")
 _EVERYWHERE: Final = (-180.0, -90.0, 180.0, 90.0)
-# Prefix of a SHA-256 in a multihash: its code and the length of 32 bytes.
+# In a multihash, this prefix states that the hash is a SHA-256 with 32 bytes.
 _MULTIHASH: Final = "1220"
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Ortho:
-    """An orthoimage that was copied.
+    """An orthoimage in the export folder.
 
     Attributes:
-        path: path in the export folder.
+        path: path relative to the export folder.
         address: address of its cell.
         place: position of the raster.
     """
@@ -55,19 +56,19 @@ class _Ortho:
 
     @property
     def item_path(self) -> PurePosixPath:
-        """Path of its item, other than `wall_0_ortho.json`, the sidecar with its position."""
+        """Path of the STAC item; `wall_0_ortho.json` is already the name of the sidecar."""
         return self.path.with_name(f"{self.path.stem}.item.json")
 
 
 def write_stac(run: Run, folder: Path) -> int:
-    """Copy the orthoimages of a run and write a collection with items; return their number.
+    """Copy the orthoimages of a run, write a STAC collection, and return the number of items.
 
     Args:
         run: the run, with its published files.
         folder: existing empty folder.
 
     Raises:
-        ArgumentError: the run published no orthoimage, or the files are missing.
+        ArgumentError: the run published no orthoimages, or their files are missing.
         RecordError: a published file was changed.
         StoreError: the disk cannot be written to.
     """
@@ -75,8 +76,8 @@ def write_stac(run: Run, folder: Path) -> int:
         f"{PRODUCTS_FOLDER}/{path.parent.name}/{path.name}": address
         for address, files in run.files.items()
         for path in files
-        # Omit repeats: they have the same content, and in a link, the # in their names would begin
-        # a fragment.
+        # Omit repeats: their content is the same, and the # in their file names would begin a
+        # fragment in a link.
         if run.cells[address].repeat == 0 and path.name.endswith(tuple(_BESIDE))
     }
     copied = copy_files(run.folder, folder, inside, run.record.published)

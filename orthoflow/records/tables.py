@@ -1,4 +1,4 @@
-"""Records as tables: CSV files, joined runs, diagnostics as JSON, and common points."""
+"""Tables from records: CSV files, joined runs, diagnostics as JSON, and common check points."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CommonPoints:
-    """Statistics of an inspection over the points that all comparable inspections found.
+    """Statistics of one inspection over the check points found by all comparable inspections.
 
     Attributes:
         cell: address of the inspection.
         step: step of the inspection.
         kind: class of the points; empty for all points.
-        n_found: number of points that this cell found.
-        n_common: number of points that all cells found.
+        n_found: number of points that this inspection found.
+        n_common: number of points that all inspections found.
         rms_u_mm: root mean square of the displacements along u over the common points.
-        rms_v_mm: root mean square of the displacements along v.
-        rms_mm: root mean square of the lengths of the displacements.
+        rms_v_mm: the same along v.
+        rms_mm: root mean square of the lengths of the displacements (u, v).
     """
 
     cell: str
@@ -60,15 +60,16 @@ class CommonPoints:
 
     @property
     def n_lost(self) -> int:
-        """Number of points of this cell that are not counted because another cell missed them."""
+        """Number of points that this inspection found but another one did not."""
         return self.n_found - self.n_common
 
 
 def common_points(run: Run) -> tuple[CommonPoints, ...]:
     """Compare the inspections of each step over their common points.
 
-    Inspections are compared per dataset, seed and repeat. Inspections without common points, such
-    as those that match features, and those whose products are not in the record are omitted.
+    Inspections are compared if they have the same dataset, seed and repeat. Inspections without
+    common points, such as those that match features, are omitted, and so are inspections whose
+    products are not in the record.
 
     Raises:
         RecordError: the record is damaged.
@@ -91,11 +92,11 @@ def common_points(run: Run) -> tuple[CommonPoints, ...]:
 def over_common_points(
     inspections: Mapping[str, Inspection], *, step: str = ""
 ) -> Iterator[CommonPoints]:
-    """Yield the statistics of inspections over the points that all of them found, by class.
+    """Yield the statistics of inspections over the points found by all of them, for each class.
 
     Args:
-        inspections: address of the cell -> inspection; points with the same coordinates and class
-            are the same.
+        inspections: address of the cell -> inspection. Points of two inspections are the same if
+            their coordinates and classes are equal.
         step: step of the cells.
     """
     places = {cell: _rows_of_points(found) for cell, found in inspections.items()}
@@ -135,15 +136,15 @@ Row: TypeAlias = Sequence[Value]
 
 
 def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
-    """Write the tables of a run as CSV files with headers, in full precision.
+    """Write the tables of a run as CSV files, with headers and in full precision.
 
     Args:
         run: the run.
         folder: existing folder.
 
     Returns:
-        The files: cells, metrics, parameters, inputs, products, environments; and statistics over
-        common check points, if several cells found them.
+        The paths of the files: cells, metrics, parameters, inputs, products and environments, and
+        also statistics over common check points if several inspections found such points.
     """
     tables = {
         "cells.csv": _cells(run.record),
@@ -215,7 +216,7 @@ def _environments(record: RunRecord) -> Iterator[Row]:
             yield (entry.id, package, version)
 
 
-# A method and its parameters as JSON, for a step with variants.
+# The method and parameters (as JSON) of a step with variants.
 Choice: TypeAlias = tuple[str, str]
 _BEHIND: Final = ("unit", "better", "step", "cell", "repeat", "runs", "environments")
 _RANGE: Final = ("lowest", "highest")
@@ -229,10 +230,10 @@ class JoinedCell:
         found: each run with its entry of the cell, in the order of the runs.
         choices: step with variants -> method and parameters used for this cell.
         settings: parameters (`step.name`), methods (`step.use`) and result versions
-            (`method.result_version`) of this and all earlier steps; for steps with variants, only
-            the result version.
+            (`method.result_version`) of this step and all upstream steps; only the result version
+            for steps with variants.
         dataset: name of the dataset; empty if the run has only one.
-        seed: seed of the workflow or of the sweep.
+        seed: seed of the workflow, or value of a sweep over seeds.
     """
 
     found: tuple[tuple[Run, RecordedCell], ...]
@@ -252,7 +253,7 @@ class JoinedCell:
         return len({cell.environment for _, cell in self.found})
 
     def values(self) -> Iterator[tuple[MetricRow, list[float]]]:
-        """Yield each metric of the first record, and its values in all records."""
+        """Yield each metric of the first record together with its values in all records."""
         rows = [cell_metrics(cell) for _, cell in self.found]
         first = {row.metric: row for found in reversed(rows) for row in found}
         for name in dict.fromkeys(row.metric for found in rows for row in found):
@@ -264,9 +265,10 @@ class JoinedCell:
 class RunSet:
     """Several runs whose cells are joined into one table.
 
-    Cells are the same if they and all cells upstream have the same method, result version,
-    parameters, seed and repeat, and the input files have the same content, whatever the names of
-    variants, inputs and datasets. Variants are named as in the first record that contains them.
+    Two cells are the same if they and their upstream cells have the same method, result version,
+    parameters, seed and repeat, and if the input files have the same content. The names of
+    variants, inputs and datasets may differ. Variants are named as in the first record that
+    contains them.
 
     Attributes:
         runs: the runs, in the order given.
@@ -286,7 +288,7 @@ class RunSet:
 
     @cached_property
     def cells(self) -> tuple[JoinedCell, ...]:
-        """Each cell that has a result in any of the runs, without duplicates."""
+        """The cells that have a result in any of the runs, without duplicates."""
         found: dict[str, list[tuple[Run, RecordedCell]]] = {}
         for run in self.runs:
             for cell in run.record.cells:
@@ -296,7 +298,10 @@ class RunSet:
 
     @cached_property
     def differing(self) -> tuple[str, ...]:
-        """Settings in which the runs differ, except differences between datasets of one run."""
+        """Names of the settings in which the runs differ.
+
+        Differences between datasets of one run do not count.
+        """
         in_runs: dict[str, dict[Path, set[Value]]] = defaultdict(lambda: defaultdict(set))
         by_dataset: dict[str, dict[str, set[Value]]] = defaultdict(lambda: defaultdict(set))
         used: dict[str, dict[Path, set[str]]] = defaultdict(lambda: defaultdict(set))
@@ -323,13 +328,13 @@ class RunSet:
         """Return one row per cell and metric.
 
         Returns:
-            Columns `run` (the first that contains the cell), `dataset`, `seed`, `variant.<step>`
-            for each step with variants, a column for each other setting in which the runs differ
-            (`wall.gsd_m`; `wall.use` is the method; missing if it does not apply), `method`,
-            `metric`, `value` as given in the first record, `unit`, `better`, `step`, `cell`
-            (address in the first record), `repeat`, `runs` and `environments` (numbers of records
-            that contain the cell, and of their environments), and `lowest` and `highest` (extreme
-            values in these records).
+            A table with these columns: `run` (the first run that contains the cell), `dataset` and
+            `seed`; `variant.<step>` for each step with variants; one column for each other setting
+            in which the runs differ, such as `wall.gsd_m`, or `wall.use` for the method (empty if
+            the setting does not apply); `method`, `metric`, `value` (in the first record), `unit`,
+            `better`, `step`, `cell` (address in the first record) and `repeat`; `runs` and
+            `environments` (numbers of records that contain the cell, and of environments in which
+            it was computed); and `lowest` and `highest` (extreme values in these records).
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -337,12 +342,12 @@ class RunSet:
         return pd.DataFrame(rows, columns=header)
 
     def statistics(self) -> pd.DataFrame:
-        """Return statistics over datasets, seeds and repeats of all records; cells count once.
+        """Return statistics over the datasets, seeds and repeats of all records.
 
         Returns:
-            One row per combination of variants, differing settings, step, method and metric, with
-            `n`, `median`, `mean`, `standard_deviation` (NaN for a single value), `lowest` and
-            `highest`.
+            A table with one row for each combination of variants, differing settings, step, method
+            and metric, and with the columns `n`, `median`, `mean`, `standard_deviation` (NaN for a
+            single value), `lowest` and `highest`. A cell that is in several records counts once.
         """
         names = [f"variant.{step}" for step in self.steps]
         keys = [*names, *self.differing, "step", "method", "metric", "unit", "better"]
@@ -382,7 +387,7 @@ class RunSet:
 
     @cached_property
     def _variant_names(self) -> dict[tuple[str, Choice], str]:
-        """Return the name of each choice, with its parameters where names are ambiguous."""
+        """Return the name of each choice, with differing parameters if the name is not unique."""
         first: dict[tuple[str, Choice], str] = {}
         for run in self.runs:
             for cell in run.record.cells:
@@ -419,7 +424,7 @@ class RunSet:
         known = self._identities.get((run.path, cell.address))
         if known is not None:
             return known
-        # This entry ends the recursion if cells of a forged record depend on themselves.
+        # This entry ends the recursion if a cell of a forged record depends on itself.
         self._identities[run.path, cell.address] = ""
         inputs: dict[str, JsonValue] = {}
         for port, given in cell.inputs.items():
@@ -452,12 +457,11 @@ def join_runs(runs: Sequence[Run]) -> RunSet:
 
 
 def _place(run: Run) -> str:
-    """Return the folder of a run, or the path of its record if it has another name."""
     return str(run.folder if run.path.name == RECORD_FILE else run.path)
 
 
 def _settings(cell: RecordedCell, *, is_varied: bool) -> Iterator[tuple[str, Value]]:
-    """Yield the settings of a cell; lists and the like as JSON."""
+    """Yield the settings of a cell; values that are neither text nor numbers as JSON."""
     yield f"{cell.method}.result_version", cell.result_version
     if not is_varied:
         yield f"{cell.step}.use", cell.method
@@ -471,7 +475,7 @@ def _choice(cell: RecordedCell) -> Choice:
 
 
 def _distinction(choice: Choice, others: Sequence[Choice]) -> str:
-    """Return how a choice differs from others with the same name; empty if there are none."""
+    """Return how a choice differs from others with the same name, for use as a suffix."""
     if len(set(others)) < 2:
         return ""
     params = json.loads(choice[1])
@@ -489,9 +493,9 @@ _WORD: Final = re.compile(r"(?<!^)(?=[A-Z])")
 
 
 def diagnostics_of(cell: CellOutcome, step: str, address: str) -> Iterator[dict[str, JsonValue]]:
-    """Yield the diagnostics of a cell, and the error if it failed.
+    """Yield the diagnostics of a cell, beginning with the error if the cell failed.
 
-    The code of an error is the name of its class in lower case: `InputError` is `input-error`.
+    The code of an error is derived from its class: `input-error` for `InputError`.
     """
     found = list(cell.diagnostics)
     if cell.status == "failed":

@@ -55,13 +55,13 @@ from orthoflow.records.seals import PAGE_MARK, SIGNATURE_SUFFIX
 from orthoflow.untrusted_text import first_few, parse_json
 from orthoflow.version import __version__
 
-# Keys and signatures have a few hundred bytes.
+# The files of keys and signatures contain only a few hundred bytes.
 _LARGEST_BYTES: Final = 64 << 10
 _LARGEST_METADATA: Final = 1 << 28
 
 
 class Signature(BaseModel):
-    """The content of a signature file, untrusted until it is checked.
+    """The content of a signature file, which must not be trusted before it is checked.
 
     Attributes:
         content_sha256: content digest of the signed record.
@@ -77,12 +77,12 @@ class Signature(BaseModel):
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the key, as printed by `ssh-keygen -l`."""
+        """Fingerprint of the key, in the format of `ssh-keygen -l`."""
         return _fingerprint(self.public_key)
 
 
 def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Signature:
-    """Sign the seal of a verified record; the signature is written next to the record.
+    """Sign the seal of a record that was verified, and write the signature next to the record.
 
     Args:
         path: the record file.
@@ -90,8 +90,8 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
         password: called if the key is protected by a password.
 
     Raises:
-        InputError: the file is not such a key, or the password is wrong.
-        ArgumentError: there is already a signature with another key.
+        InputError: `key_file` is not such a key, or the password is wrong.
+        ArgumentError: the record already has a signature made with another key.
         RecordError: the record is damaged.
         StoreError: the disk cannot be written to.
         PluginError: the library cryptography is not installed.
@@ -113,10 +113,10 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
 
 
 def read_signature(record: Path) -> Signature | None:
-    """Read the signature of a record without checking it; None if there is none.
+    """Read the signature of a record without checking it; return None if there is none.
 
     Raises:
-        RecordError: the file is not a signature.
+        RecordError: the signature file is invalid.
     """
     name = f"{record.name}{SIGNATURE_SUFFIX}"
     if not os.path.lexists(record.with_name(name)):
@@ -130,15 +130,16 @@ def read_signature(record: Path) -> Signature | None:
 
 
 def check_signature(record: Path, signer: Path) -> Signature:
-    """Return the signature of a verified record if it was made with the key of a signer.
+    """Check the signature of a record whose seal was verified, and return it.
 
     Args:
         record: the record file.
         signer: file with the public Ed25519 key of the signer, in OpenSSH format.
 
     Raises:
-        RecordError: the signature is missing, made with another key, or does not match the record.
-        InputError: the file is not such a key.
+        RecordError: the signature is missing, was made with another key, or does not match the
+            record.
+        InputError: `signer` is not such a key.
         PluginError: the library cryptography is not installed.
     """
     key = _read_key(signer)
@@ -186,9 +187,9 @@ def _openssh(key: Any) -> str:
     return str(key.public_bytes(encoding, form), "ascii")
 
 
-# `Any`: an optional library.
+# The type is `Any` because cryptography is an optional library.
 def _read_key(path: Path, password: Callable[[], str] | None = None) -> Any:
-    """Read an Ed25519 key in OpenSSH format: a private one if a password can be asked for."""
+    """Read an Ed25519 key in OpenSSH format; the key is private if `password` is given."""
     try:
         from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - optional
         from cryptography.hazmat.primitives import serialization  # noqa: PLC0415
@@ -212,7 +213,7 @@ def _read_key(path: Path, password: Callable[[], str] | None = None) -> Any:
             try:
                 key = serialization.load_ssh_private_key(data, None)
             except TypeError:
-                # The key is protected; an empty password would be treated as no password.
+                # The key is protected by a password; an empty password would be treated as none.
                 secret = password().encode("utf-8") or b"\0"
                 key = serialization.load_ssh_private_key(data, secret)
     except (OSError, ValueError, TypeError, UnsupportedAlgorithm) as error:
@@ -223,9 +224,9 @@ def _read_key(path: Path, password: Callable[[], str] | None = None) -> Any:
     return key
 
 
-# Kinds of contradictions within a record, which may date from when it was written.
+# These kinds of contradictions within a record may already have existed when it was written.
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
-# Prefix of metrics that repeat findings from the product of an inspection.
+# This prefix precedes the name of a finding in metrics that repeat the findings of an inspection.
 _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
 _WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
@@ -235,11 +236,12 @@ _WRONG: Final[dict[PublishedState, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Note:
-    """A remark about files next to a record; it does not make the record invalid.
+    """A remark about files next to a record, which does not make the record invalid.
 
     Attributes:
-        code: `missing` or `foreign` published files, a `page` that was changed or shows another
-            record, or a `signature` that was not checked.
+        code: `missing` for missing published files, `foreign` for files that the record does not
+            list, `page` for a page that was changed or shows another record, or `signature` for a
+            signature that was not checked.
         text: one sentence.
     """
 
@@ -254,18 +256,19 @@ class Verification:
     Attributes:
         path: the record file.
         findings: one sentence per difference; empty if nothing was changed.
-        wrong: summary of the findings; empty if there are none.
+        wrong: one sentence that summarizes the findings; empty if there are none.
         notes: files that could not be checked or do not belong to the record.
-        seal: digest that seals the record, 64 hexadecimal digits, as printed on sheets; empty if
-            the record itself was changed.
+        seal: digest that seals the record, as 64 hexadecimal digits, which is also printed on
+            sheets; empty if the record itself was changed.
         n_named: number of products that the record references only by digest.
         n_products: number of products in the record whose digest was checked.
         n_inputs: number of input files in the record whose digest was checked.
         n_published: number of unchanged published files.
         n_pages: number of unchanged report pages of this record.
-        n_others: number of unchanged figures and other files of a crate.
+        n_others: number of unchanged figures and of unchanged other files of a crate.
         unchecked: description of the files in the folder that cannot be checked.
-        signed_with: fingerprint of the signer's key; empty unless requested and valid.
+        signed_with: fingerprint of the signer's key; empty unless the check was requested and the
+            signature is valid.
     """
 
     path: Path
@@ -286,14 +289,14 @@ class Verification:
 def verify_run(
     path: str | Path, *, also_published: bool = True, signer: Path | None = None
 ) -> Verification:
-    """Check the seal, digests, cache keys and required fields of a record, and published files.
+    """Check the seal, digests, cache keys, required fields and published files of a record.
 
-    Missing published files only cause a note, because a record may be passed on alone.
+    Missing published files result only in a note, because a record may be passed on alone.
 
     Args:
-        path: a run folder, or the `run.h5` in it.
-        also_published: also check the files next to the record.
-        signer: file with the public key that the record must be signed with.
+        path: a run folder, or the `run.h5` in this folder.
+        also_published: whether to check also the files next to the record.
+        signer: file with the public key of the signer; the record must be signed with this key.
 
     Raises:
         ArgumentError: the path does not exist, or the folder contains no finished run.
@@ -327,7 +330,8 @@ def verify_run(
         notes += _published_notes(
             record_path, record, [file.path for file, state in checked if state == "missing"]
         )
-        # A record that was passed on alone may be next to unrelated files.
+        # If all published files are missing, the record was passed on alone and may be next to
+        # unrelated files.
         if "same" in states or "changed" in states or os.path.lexists(folder / METADATA_FILE):
             others, gone, n_others, unchecked = _check_others(read_run(record_path), tuple(pages))
             changed += others
@@ -357,9 +361,9 @@ def verify_run(
 
 
 def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
-    """Yield metrics of an inspection that contradict the findings in its product.
+    """Yield a sentence for each metric of an inspection that contradicts a finding in its product.
 
-    A metric is a finding of one wall or of all walls, or a finding with the wall's name as prefix.
+    The name of such a metric is the name of the finding, or the same with the wall as prefix.
     """
     places = [
         port
@@ -382,7 +386,7 @@ def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
 
 
 def _page_states(folder: Path, content_sha256: str) -> dict[str, bool]:
-    """Return, for each page next to a record, whether it is unchanged and shows this record."""
+    """Return page -> whether it is unchanged and shows the record, for all pages next to it."""
     names = [REPORT_FILE] if os.path.lexists(folder / REPORT_FILE) else []
     names += [f"{PAGES_FOLDER}/{name}" for name in sorted(files_below(folder, PAGES_FOLDER))]
     return {name: _is_own_page(folder, name, content_sha256) for name in names}
@@ -411,14 +415,16 @@ def _page_note(folder: Path, name: str) -> Note:
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
-    """Return the changes made to a record since it was sealed; empty if none were found.
+    """Return a sentence on changes of a record since it was sealed; empty if none were found.
 
-    This is fast because the arrays of products and the input files are not checked: reading a
-    product checks its digest (`Run.payloads`), and `verify_run` checks everything.
+    By default, this is fast because the arrays of products and the input files are not checked. The
+    digest of a product is checked when the product is read (`Run.payloads`), and `verify_run`
+    checks everything.
 
     Args:
         run: the run.
-        of_all: check everything, as is needed before the whole record is passed on.
+        of_all: check the arrays and input files, too, which is necessary before the record is
+            passed on.
     """
     findings = verify_record(run.path, with_arrays=of_all)
     places = [finding.place for finding in findings if finding.code not in _OWN_FAULTS]
@@ -431,7 +437,7 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
 
 
 def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str], list[Note]]:
-    """Return the fingerprint of a valid signature, problems with it, and notes."""
+    """Return the fingerprint of a valid signature, findings, and notes."""
     try:
         if signer is not None:
             return check_signature(record, signer).fingerprint, [], []
@@ -449,7 +455,6 @@ def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str],
 
 
 def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Iterator[Note]:
-    """Yield notes on missing published files, and on files that are not in the record."""
     n_published = len(record.published)
     if missing:
         text = (
@@ -457,7 +462,8 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
             f"{first_few(missing)}"
         )
         yield Note(code="missing", text=text)
-    # A record that was passed on alone may be next to unrelated files.
+    # If all published files are missing, the record was passed on alone and may be next to
+    # unrelated files.
     is_alone = bool(missing) and len(missing) == n_published
     if not is_alone and (unnamed := _unnamed(path, record)):
         text = f"the record does not list these files of {PRODUCTS_FOLDER}/: {first_few(unnamed)}"
@@ -469,8 +475,8 @@ def _check_others(
 ) -> tuple[list[str], list[Note], int, tuple[str, ...]]:
     """Check the files next to a record that are neither published files nor pages.
 
-    Figures and, in a crate, the workflow and the lists of packages repeat parts of the record; the
-    metadata of a crate contain digests of all its files.
+    Figures repeat parts of the record, as do the workflow and the lists of packages in a crate. The
+    metadata of a crate contain the digests of all its files.
 
     Returns:
         Findings, notes on missing files, the number of unchanged files, and a description of the
@@ -493,7 +499,7 @@ def _check_others(
         known[name] = PublishedFile(path=name, size_bytes=len(content), sha256=digest)
         states[name] = published_state(folder, known[name]), "the record"
     for name, file in (crate or {}).items():
-        # Avoid hashing large files twice.
+        # Avoid hashing large files a second time.
         if known.get(name) != file:
             states[name] = published_state(folder, file), METADATA_FILE
     findings += [
@@ -521,12 +527,12 @@ def _check_others(
 
 
 def _left_over(folder: Path, checked: Set[str], free: str) -> Iterator[str]:
-    """Yield the files of a folder that were not checked; folders with the number of their files.
+    """Yield the unchecked files of a folder; for a subfolder with several, their number.
 
     Args:
         folder: the folder.
         checked: paths of the checked files.
-        free: the part of the metadata of a crate that was not checked.
+        free: description of the part of a crate's metadata that was not checked.
     """
     tops: dict[str, list[str]] = {}
     for place, _, below in os.walk(folder):
@@ -543,11 +549,11 @@ def _left_over(folder: Path, checked: Set[str], free: str) -> Iterator[str]:
 
 
 def _figure_states(run: Run) -> dict[str, bool]:
-    """Return, for each figure file next to a record, whether it shows the recorded figure."""
+    """Return path -> whether the file shows the recorded figure, for figures next to a record."""
     try:
         figures = figure_files(run, run.cells)
     except RecordError:
-        # Figures with invalid names are never written to files.
+        # Figures are never written to files if a name is invalid.
         return {}
     found = {f"{FIGURES_FOLDER}/{path}": figure for path, figure in figures.items()}
     states = in_order(lambda item: _is_same_figure(run.folder, *item), found.items())
@@ -556,7 +562,7 @@ def _figure_states(run: Run) -> dict[str, bool]:
 
 
 def _is_same_figure(folder: Path, path: str, figure: RecordedFigure) -> bool | None:
-    """Return whether a file shows a figure, in any format; None if there is no such file."""
+    """Return whether a file shows a figure, even in another format; None without a file."""
     try:
         with open_below(folder, path) as stream:
             content = stream.read(LARGEST_PAGE_BYTES)
@@ -573,7 +579,6 @@ def _is_same_figure(folder: Path, path: str, figure: RecordedFigure) -> bool | N
 
 
 def _crate_metadata(folder: Path) -> Any:
-    """Return the metadata of a crate; None if the folder is not a crate."""
     try:
         with open_below(folder, METADATA_FILE) as stream:
             return parse_json(stream.read(_LARGEST_METADATA).decode())
@@ -582,7 +587,6 @@ def _crate_metadata(folder: Path) -> Any:
 
 
 def _crate_files(crate: Any) -> dict[str, PublishedFile]:
-    """Return the files in the metadata of a crate."""
     return {
         entity["@id"]: PublishedFile(
             path=entity["@id"],
@@ -590,7 +594,7 @@ def _crate_files(crate: Any) -> dict[str, PublishedFile]:
             sha256=str(entity["sha256"]),
         )
         for entity in crate["@graph"]
-        # The ids of input files outside the crate have the scheme `ni`.
+        # The ids of input files, which are not in the crate, have the scheme `ni`.
         if "sha256" in entity and not str(entity["@id"]).startswith("ni:")
     }
 
@@ -600,9 +604,10 @@ def _metadata_state(
     crate: Any,
     files: Sequence[PublishedFile],
 ) -> tuple[list[str], str]:
-    """Return a finding if the metadata differ from the record, and what was not checked.
+    """Return findings if the metadata differ from the record, and which part was not checked.
 
-    Another version may describe the same record with other entities.
+    Differences from metadata that another version wrote are no findings, because that version may
+    describe the same record with other entities.
     """
     from orthoflow.records.archive import metadata_differences  # noqa: PLC0415 - loads prov
 
@@ -617,7 +622,6 @@ def _metadata_state(
 
 
 def _unnamed(path: Path, record: RunRecord) -> list[str]:
-    """Return the files in `products/` that are not in a record, sorted."""
     named = {file.path for file in record.published}
     unnamed: set[str] = set()
     for place, _, below in os.walk(path.parent / PRODUCTS_FOLDER):

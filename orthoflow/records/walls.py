@@ -1,4 +1,4 @@
-"""Results of a run per wall: rasters, accuracy and openings, and which walls to deliver."""
+"""Results of a run for each wall (rasters, accuracy and openings), and which walls to deliver."""
 
 from __future__ import annotations
 
@@ -55,13 +55,14 @@ def delivered_walls(products: Path) -> tuple[WallDescription, ...]:
 
 
 def add_errors(folder: Path, address: str, cells: Sequence[RecordedCell]) -> None:
-    """Add the errors of a run that affect orthoimages to their sidecars, as `errors`.
+    """Add the errors of a run that affect orthoimages to the sidecar files, as `errors`.
 
-    These are diagnostics with the severity `error` from the cell and from cells upstream that do
-    not concern a single wall; errors on one wall are reflected in its covered share.
+    These are the diagnostics of the cell and its upstream cells that have the severity `error` and
+    do not concern a single wall. Errors that concern a single wall are omitted, because they reduce
+    its covered share.
 
     Args:
-        folder: published files of the cell.
+        folder: folder with the published files of the cell.
         address: address of the cell.
         cells: cells of the run.
     """
@@ -72,13 +73,13 @@ def add_errors(folder: Path, address: str, cells: Sequence[RecordedCell]) -> Non
         if group.worst.severity == "error" and not group.worst.subject
     ]
     for path in folder.glob("*_ortho.json") if errors else ():
-        # Any: values of JSON.
+        # JSON values may have any type.
         content: dict[str, Any] = read_sidecar(path)
         write_json(path, content | {"errors": errors})
 
 
 def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
-    """Write `walls.json` into the products of a run, if there are orthoimages.
+    """Write `walls.json` into the products folder of a run if there are orthoimages.
 
     If there are several combinations of variants, the last one is used, as for drawings.
 
@@ -124,7 +125,7 @@ def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
 def _with_sidecars(
     products: Path, cell: RecordedCell, pattern: re.Pattern[str]
 ) -> Iterator[tuple[int, Path, Mapping[str, object]]]:
-    """Yield wall number, published raster and sidecar for the rasters of a cell."""
+    """Yield wall number, path and sidecar for the rasters of a cell that match a pattern."""
     for path in sorted((products / cell_file_name(cell.address)).glob("*.json")):
         raster = path.with_suffix(".tif")
         if found := pattern.fullmatch(raster.name):
@@ -135,13 +136,13 @@ def _with_sidecars(
 
 
 def _rank(wall: WallDescription) -> tuple[bool, float, int]:
-    """Return a sort key: recommended walls first, then by covered area, largest first."""
+    """Return a sort key: recommended walls first, then by descending covered area."""
     return not wall.recommended, -(wall.area_m2 or 0.0) * (wall.painted_share or 0.0), wall.number
 
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
-# Accuracy figures of inspections for drawings: two metric names, the key of the phrase, and the
-# metric names of the number of items.
+# Accuracy statements on drawings: the names of two findings, the key of the phrase, and names of
+# findings that may contain the number of items.
 _ACCURACY: Final = (
     ("rmse_x_mm", "rmse_y_mm", "rmse", ("n_found", "n_pairs")),
     ("rmse_u_mm", "rmse_v_mm", "rmse", ()),
@@ -161,16 +162,16 @@ class WallResult:
     """The results of a run for one wall.
 
     Attributes:
-        number: number of the wall, as in its files.
+        number: number of the wall, as in the names of its files.
         name: name of the wall.
         about: description of the orthoimage; None if there is no orthoimage.
         plane_index: index of the plane in `planes.json`; None if unknown.
-        frame: frame of the largest raster.
-        rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, if present.
+        frame: wall frame of the largest raster.
+        rasters: `ortho`, `depth` or `intensity` -> GeoTIFF; missing rasters are omitted.
         accuracy: phrases on the expected error of the orthoimage, the noise of the plane, and the
-            inspections of this wall; each is based only on data from this wall.
+            inspections, based only on data from this wall.
         colours: how the colours of the photos were changed; None if there is no orthoimage.
-        intensity_source: `laser`, or `luminance` if the intensity is the grey value of the colours.
+        intensity_source: `laser`, or `luminance` if the intensity was computed from the colours.
     """
 
     number: int
@@ -186,12 +187,14 @@ class WallResult:
 
 @dataclass(frozen=True, kw_only=True)
 class UncountedPoints:
-    """Check points of a run, none of which is used.
+    """The case that none of the check points of a run is used.
 
     Attributes:
-        cell: address of the inspection that failed; empty if no inspection uses check points.
-        sentence: end of a sentence about unmeasured accuracy, with the reason.
-        phrase: the same for drawings, without the reason, for which there is no translation.
+        cell: address of the inspection that failed; empty if no inspection has check points as
+            input.
+        sentence: end of a sentence that states that the accuracy was not measured; contains the
+            reason.
+        phrase: phrase for drawings, without the reason, which cannot be translated.
     """
 
     cell: str
@@ -205,10 +208,11 @@ class RoomResults:
 
     Attributes:
         address: address of the cell with the orthoimages or rasters.
-        walls: walls with a raster, by number.
+        walls: walls with a raster, sorted by number.
         planes: all planes; None if the record has none.
-        checkpoints: surveyed points; None if there are none.
-        inspections: address -> displacements found in these orthoimages, with wall numbers.
+        checkpoints: surveyed check points; None if there are none.
+        inspections: address -> displacements that the inspection found in these orthoimages, with
+            wall numbers.
         openings: openings in these walls, sorted by wall number, then from left to right.
     """
 
@@ -230,7 +234,7 @@ class RoomResults:
 
 
 def uncounted_points(run: Run) -> UncountedPoints | None:
-    """Return why none of the check points of a run is used.
+    """Determine why none of the check points of a run is used.
 
     Returns:
         None if there are no check points, or if an inspection used some.
@@ -241,7 +245,8 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
         for given in cell.inputs.values()
         if given.type_name == CheckPoints.type_name
     ]
-    # Only check points from files count, as the user did not provide those of a simulated room.
+    # Only check points from files count, because the user did not provide those of a simulated
+    # room.
     read = [name for name, cell in run.cells.items() if cell.method.startswith("read.")]
     sources = [source.rpartition(".")[0] for _, source in looking]
     place = _upstream_product(run, tuple(sources or read), CheckPoints.type_name)
@@ -264,8 +269,9 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
 
     Args:
         run: a finished run, with the published files of its record.
-        cell: address of the cell with orthoimages or rasters of walls; by default the last cell
-            that produced orthoimages, otherwise the last that produced walls.
+        cell: address of the cell with orthoimages or wall rasters; by default the last cell that
+            produced orthoimages, or the last that produced wall rasters if there are no
+            orthoimages.
         wall: number of a single wall to return, in which case the files of other walls are not
             needed; if there is no such wall, all are returned.
 
@@ -282,7 +288,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         for name in upstream
         if {"orthoimages", "walls"} & {out.type_name for out in run.cells[name].outputs.values()}
     ]
-    # The chosen cell comes last, so that its own files replace those of cells upstream.
+    # Begin with the chosen cell, so that its files take precedence over those of upstream cells.
     for name in reversed(pictured):
         for path in published_files(run.folder, name):
             if found := _RASTER.fullmatch(path.name):
@@ -294,7 +300,8 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         )
     planes = _upstream_product(run, upstream, "planes")
     points = _upstream_product(run, (*upstream, *run.cells), "checkpoints")
-    # Rasters are created in the order of the planes, so an index in `Walls` is an index here.
+    # Rasters are created in the order of the planes, so an index into `Walls` is an index into this
+    # list.
     numbers = sorted(
         {number for name in pictured for number, kind in _rasters(run, name) if kind == "depth"}
     )
@@ -319,7 +326,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
 
 
 def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
-    """Return the rasters published by a cell: wall, kind -> path relative to the run folder."""
+    """Return (wall number, kind) -> path relative to the run folder, for the rasters of a cell."""
     folder = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/"
     return {
         (int(found[1]), found[2]): file.path
@@ -329,7 +336,10 @@ def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
 
 
 def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
-    """Refuse a missing published orthoimage; otherwise an older raster would be shown instead."""
+    """Raise an error if a published orthoimage is missing.
+
+    Otherwise, a raster of an upstream cell would be used instead.
+    """
     for (number, kind), path in _rasters(run, address).items():
         is_wanted = kind == "ortho" and wall in {None, number}
         if is_wanted and not (run.folder / path).exists():
@@ -340,7 +350,6 @@ def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
 
 
 def _openings(run: Run, upstream: tuple[str, ...]) -> tuple[Opening, ...]:
-    """Return the openings that the last cell found on the walls of the orthoimages."""
     walls = {
         output.digest
         for address in upstream
@@ -384,7 +393,6 @@ def _pictured(run: Run, cell: str | None) -> str:
 def _upstream_product(
     run: Run, addresses: tuple[str, ...], type_name: str
 ) -> tuple[str, str] | None:
-    """Return address and port of the first product of a type in the record."""
     for address in addresses:
         for port, output in run.cells[address].outputs.items():
             if output.type_name == type_name and output.embedded:
@@ -402,7 +410,6 @@ def _inspections(run: Run, address: str) -> Iterator[tuple[str, Inspection]]:
 
 
 def _numbered(inspection: Inspection, numbers: list[int]) -> Inspection:
-    """Return an inspection with wall numbers instead of indices in `Walls`."""
     number_of = dict(enumerate(numbers))
     walls = [number_of.get(place, -1) for place in inspection.wall.tolist()]
     return replace(
@@ -452,7 +459,6 @@ def _wall_result(
 
 
 def _check_kind(kind: str, path: Path) -> None:
-    """Refuse a raster whose content does not match its name."""
     with RasterParts(path) as raster:
         found = (raster.bands, raster.dtype)
     wanted = ((3, "uint8"), (3, "uint16")) if kind == "ortho" else ((1, "float32"),)
@@ -464,7 +470,7 @@ def _check_kind(kind: str, path: Path) -> None:
 
 
 def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) -> WallResult:
-    """Add findings of inspections, or a note that the orthoimage's accuracy is unknown."""
+    """Add results of inspections, or a phrase that the orthoimage's accuracy is unknown."""
     if not measured and "ortho" in wall.rasters:
         uncounted = uncounted_points(run)
         if uncounted is not None:
@@ -494,7 +500,7 @@ def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> Iterat
 
 
 def _colours(run: Run, address: str) -> Phrase:
-    """Return how the colours of photos or points were changed, according to the record."""
+    """Describe how the colours of photos or points were changed, according to the record."""
     cell = run.cells[address]
     whence = tuple(run.upstream(address))
     given = (one for before in whence for one in before.inputs.values())

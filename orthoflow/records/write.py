@@ -1,4 +1,4 @@
-"""Functions that write a run: first its published products, then the record, which completes it."""
+"""Functions that write a run: first the published files, then the record, which completes it."""
 
 from __future__ import annotations
 
@@ -87,27 +87,28 @@ def publish_products(
     files_of: Mapping[str, Mapping[str, Mapping[Path, str]]],
     run_id: str,
 ) -> tuple[PublishedFile, ...]:
-    """Fill `products/` of a run folder, replacing the files of an interrupted attempt.
+    """Write `products/` of a run folder, replacing files of an interrupted attempt.
 
     Args:
         run_folder: existing folder.
         cells: all cells of the run.
-        files_of: address -> output port -> files in the store, with the expected SHA-256 of each.
-        run_id: id of the run, inserted into the names of wall coordinate systems.
+        files_of: address -> output port -> file in the store -> expected SHA-256.
+        run_id: id of the run, which is inserted into the names of wall coordinate systems.
 
     Returns:
         The published files, sorted by path.
 
     Raises:
-        StoreError: a file cannot be copied, e.g. because the disk is full, or does not match its
-            digest.
+        StoreError: a file does not match its digest, or cannot be copied, e.g. because the disk is
+            full.
     """
     target = run_folder / PRODUCTS_FOLDER
     cells = tuple(cells)
     with writing_to(target):
         if target.is_symlink():
             target.unlink()
-        # Do not ignore other errors: files that remain would be published as part of this run.
+        # Do not ignore other errors, because files that remain would be published as part of this
+        # run.
         with suppress(FileNotFoundError):
             shutil.rmtree(target)
         target.mkdir(parents=True, exist_ok=True)
@@ -143,10 +144,10 @@ def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
 
 
 def _replaced(cells: Iterable[RecordedCell]) -> set[str]:
-    """Return, as `address.port`, outputs that a later cell replaces with one of the same type.
+    """Return the outputs, as `address.port`, that a later cell replaces by one of the same type.
 
-    An earlier output, such as planes whose sides are determined later, would contradict its
-    replacement. Products read from files are kept.
+    A replaced output, such as planes whose sides are determined later, would contradict its
+    replacement. Products read from files are not replaced.
     """
     made = {
         cell.address
@@ -171,18 +172,18 @@ def _publish_cell(
     files_of: Mapping[str, Mapping[Path, str]],
     run_id: str,
 ) -> None:
-    """Copy the files of a cell, by port, and insert the run id."""
+    """Copy the files of a cell and insert the run id into them."""
     folder.mkdir()
     taken = [METRICS_FILE]
     for port, files in files_of.items():
         for file, sha256 in files.items():
-            # Two outputs of one type publish files with the same names; prefix them with the port.
+            # Two outputs of the same type publish files with the same names, which are made unique
+            # by the port.
             marks = chain(("", f"{port}_"), (f"{port}_{number}_" for number in count(2)))
             names = (f"{mark}{file.name}" for mark in marks)
             name = next(name for name in names if not colliding([*taken, name]))
             taken.append(name)
-            # Copy instead of hard-linking, so that editing a published file does not change the
-            # store.
+            # Do not create hard links, so that editing a published file does not change the store.
             copy = path_below(folder, name)
             shutil.copyfile(file, copy)
             if (found := file_sha256(copy)) != sha256:
@@ -197,7 +198,7 @@ OUTLINE_FILE: Final = ".outline.json"
 def recorded_environments(
     results: Mapping[str, CellResult],
 ) -> tuple[RecordedEnvironment, ...]:
-    """Return the environments of results, without duplicates."""
+    """Return the environments in which results were computed, without duplicates."""
     given = (result.environment for result in results.values())
     return tuple({one.id: one for one in given if one is not None}.values())
 
@@ -214,10 +215,10 @@ def recorded_cell(
     """Return the record entry of a cell with its result.
 
     Args:
-        cell: the cell without a result.
+        cell: entry of the cell without a result.
         result: result of the cell in the store.
         store: store with the figures.
-        sources: source of each input port.
+        sources: input port -> source of the input.
         embedded: product types whose arrays are written into the record.
         cached_from: id of the earlier run that computed the result; empty if this run did.
 
@@ -252,7 +253,7 @@ def recorded_cell(
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4
-# `error_type` of cells that an unfinished run has not computed yet.
+# This is the `error_type` of cells that an unfinished run has not computed yet.
 NOT_YET: Final = "not-computed-yet"
 
 
@@ -268,7 +269,7 @@ def write_run(
 ) -> Run:
     """Write `products/` and `run.h5` of a run.
 
-    `run.h5` gets its name last, so that a folder that contains it is finished; in any other folder,
+    `run.h5` gets its name last. A folder that contains it is finished; in any other folder,
     repeating the command writes all files again.
 
     Args:
@@ -277,7 +278,8 @@ def write_run(
         workflow: workflow of the plan.
         run_folder: run folder, created if missing.
         store: store with the products and figures of the run.
-        embed: write all products, including large ones, and the input files into the record.
+        embed: whether to write all products, including large ones, and the input files into the
+            record.
         before_finish: called with the run before the record gets its name, e.g. to write the
             report.
 
@@ -287,12 +289,12 @@ def write_run(
     Raises:
         DamageError: an object that the record needs was damaged in the store and has been removed;
             resuming the run recomputes it.
-        StoreError: the disk cannot be written to, or could not be read or written by a step.
+        StoreError: the disk cannot be written to, or a step could not read from it or write to it.
         InputError: an input file to embed was changed during the run.
         ArgumentError: another run is using the folder.
     """
     for address, result in outcome.failed.items():
-        # The disk has failed, not the method.
+        # These errors mean that the disk has failed, not the method.
         if result.error_type in (StoreError.__name__, DamageError.__name__):
             raise StoreError(
                 f"{address} failed: {result.error_message}; finished steps are kept: to continue, "
@@ -304,7 +306,7 @@ def write_run(
             with writing_to(run_folder):
                 if before_finish is not None:
                     before_finish(read_run(unfinished))
-                # All files referenced in the record must be on the disk before the record gets its
+                # Flush all files to the disk before the record, which references them, gets its
                 # name.
                 sync_tree(run_folder)
                 finished = unfinished.replace(run_folder / RECORD_FILE)
@@ -331,7 +333,7 @@ def _publish(
     *,
     embed: bool,
 ) -> Path:
-    """Fill `products/` and write the record under its temporary name."""
+    """Write `products/`, and write the record under its temporary name."""
     record = build_record(outcome, plan, workflow, store, embed=embed)
     given = {
         file.sha256: place
@@ -361,7 +363,7 @@ def _publish(
 def files_of_outputs(
     results: Mapping[str, CellResult], store: Store
 ) -> dict[str, dict[str, Mapping[Path, str]]]:
-    """Return the published files of results: address -> port -> file in the store -> SHA-256."""
+    """Return address -> port -> file in the store -> SHA-256 for the published files."""
     return {
         address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
         for address, result in results.items()
@@ -371,9 +373,10 @@ def files_of_outputs(
 def begin_run(
     plan: RunPlan, workflow: Workflow, run_folder: Path, store: Store, run_id: str
 ) -> None:
-    """Write the outline of a run at its start: its record, with all cells skipped.
+    """Write the outline of a run at its start.
 
-    The outline is used to show the run before it is finished; see `open.open_unfinished`.
+    The outline contains the record with all cells skipped; `open.open_unfinished` uses it to show
+    the run before it is finished.
 
     Raises:
         StoreError: the disk cannot be written to.
@@ -398,7 +401,6 @@ def _sources(cell: Cell) -> dict[str, str]:
 
 
 def _embedded_types(plan: RunPlan, *, embed: bool = False) -> frozenset[str]:
-    """Return the product types whose arrays are written into the record."""
     specs = plan.products.items()
     return frozenset(name for name, one in specs if embed or resolve_name(one.target).embedded)
 
@@ -406,14 +408,14 @@ def _embedded_types(plan: RunPlan, *, embed: bool = False) -> frozenset[str]:
 def executed_and_written(
     execute: Callable[[], RunOutcome], write: Callable[[RunOutcome], Run]
 ) -> tuple[RunOutcome, Run]:
-    """Execute a run and write it; results that turn out to be damaged in the store are recomputed.
+    """Execute a run and write it; recompute results that turn out to be damaged in the store.
 
     Args:
         execute: function that resumes the run at each call, as `engine.scheduler.execute` does.
         write: function that calls `write_run`.
 
     Raises:
-        DamageError: results in the store are damaged repeatedly.
+        DamageError: results in the store were found to be damaged at every attempt.
     """
     for _ in range(_MOST_ATTEMPTS - 1):
         with suppress(DamageError):
@@ -436,7 +438,7 @@ def build_record(
     Raises:
         DamageError: a figure of the run is missing or damaged in the store.
     """
-    # Record deselected steps as an option, so that they do not count as different results.
+    # Record deselected steps as an option, so that they do not count as differences in results.
     overrides = (*workflow.overrides, *plan.options.words)
     workflow = dataclasses.replace(workflow, overrides=overrides)
     results = outcome.results
@@ -491,11 +493,12 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
     Args:
         run: the run.
         path: path of the new record, in an existing folder.
-        store: store with the products that the run's record references only by digest.
-        inputs: `NAME=PATH` as for `--input`; other input files are searched for by their content.
+        store: store that contains the products that the run's record references only by digest.
+        inputs: inputs as `NAME=PATH`, as for `--input`; other input files are searched by their
+            content.
 
     Returns:
-        The run, with the new record and its own files.
+        The run with the new record, and with the files of the original run.
 
     Raises:
         InputError: an input file is missing.
@@ -533,7 +536,7 @@ def _write_again(
     *,
     embed: bool = True,
 ) -> None:
-    """Write a record derived from that of a run, with products from there or from a store."""
+    """Write a modified record of a run, with products from its own record or from a store."""
     try:
         with writing_to(path.parent):
             write_record(
@@ -585,12 +588,12 @@ def _input_files(
 
 
 def write_part(part: Run, folder: Path, store: Store) -> Run:
-    """Write one dataset as a run folder whose record can be verified and replayed alone.
+    """Write one dataset as a run folder whose record can be verified and replayed by itself.
 
     Args:
         part: part from `parts_of`.
         folder: new folder for the record and the published files.
-        store: store with embedded products that are no longer in the run's record.
+        store: store that contains products missing in the record of the run.
 
     Raises:
         RecordError: the run is damaged.
@@ -620,10 +623,10 @@ _TYPES: Final = frozenset((Orthoimages.type_name, Walls.type_name))
 
 @contextmanager
 def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iterator[Run]:
-    """Yield a run with its published rasters.
+    """Yield a run together with its published rasters.
 
-    The files next to the record are used. If there are none, they are created from the walls and
-    orthoimages in the record, in a temporary folder that is removed after the block.
+    Files next to the record are used if there are any. Otherwise, they are created from the walls
+    and orthoimages in the record, in a temporary folder that is removed after the block.
 
     Args:
         run: the run.
@@ -654,7 +657,7 @@ def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iter
 
 
 def _made_again(run: Run, folder: Path) -> dict[str, dict[str, dict[Path, str]]]:
-    """Publish the files of products in a record: address -> port -> file -> SHA-256."""
+    """Publish the files of the products in a record; return address -> port -> file -> SHA-256."""
     from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     catalog = discover_catalog()
