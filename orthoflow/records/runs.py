@@ -253,10 +253,8 @@ class Run:
         record: everything in the record except the arrays of products.
         output: function that reads the output with a given address and port from the open record;
             if None, the record is opened for each output.
-        files_folder: folder of the run's files if it differs from the folder of the record, else
-            None.
-        home: run folder of an unfinished run, whose record is in another folder; None for other
-            runs.
+        files_folder: folder of the run's files, if it is not the folder of the record.
+        home: run folder of an unfinished run, whose record is in another folder.
         content_sha256: digest that seals the record; empty if it was not read from a file.
     """
 
@@ -728,10 +726,7 @@ def datasets_of(run: Run) -> tuple[str, ...]:
 
 
 def parts_of(run: Run) -> dict[str, Run]:
-    """Return dataset -> its part of a run, including cells shared by datasets.
-
-    Each part is a run, whose products are read from the record of the whole run.
-    """
+    """Return dataset -> its part of the run, as a run of its own with the same record file."""
     cells: dict[str, list[RecordedCell]] = {name: [] for name in datasets_of(run)}
     for cell in run.record.cells:
         for name in [cell.assignment[DATA]] if DATA in cell.assignment else cells:
