@@ -1,4 +1,4 @@
-"""The report of a run: results and their accuracy in one HTML file that needs no network."""
+"""The report of a run, which is one HTML file that needs no network."""
 
 from orthoflow.report.figures import write_figures
 from orthoflow.report.pages import write_page, write_report

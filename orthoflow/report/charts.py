@@ -1,4 +1,4 @@
-"""Matplotlib charts in a uniform style, as wide as a journal column, for pages and files."""
+"""Matplotlib charts in a uniform style, with the width of a journal column."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ChartFormat: TypeAlias = Literal["svg", "pdf", "png"]
-# In plan view, in metres: name, number and corners (4, 2) of a wall; name, position (2,) and
-# viewing direction (2,) of a photo.
+# Name, number and corners (4, 2) of a wall; name, position (2,) and viewing direction (2,) of a
+# photo. Coordinates are in metres in plan view.
 PlanWall: TypeAlias = tuple[str, int, NDArray[np.float64]]
 PlanPhoto: TypeAlias = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 
-# These colours can be distinguished with colour vision deficiency (Okabe and Ito 2008); in
-# greyscale prints, line styles can.
+# These colours can be distinguished by readers with colour vision deficiency (Okabe and Ito 2008).
+# The line styles can be distinguished in greyscale prints.
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#000000")
 _STROKES: Final = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _LOGARITHMIC_RATIO: Final = 20.0
-# An axis whose values begin near 0 starts at 0, because a truncated axis exaggerates differences.
+# If the smallest value is less than this share of the largest, the axis starts at 0, because a
+# truncated axis exaggerates differences.
 _NEAR_ZERO: Final = 0.6
-# Length of the arrow for a viewing direction as a share of the plan, and maximum number of photos
-# with names.
+# Length of the arrow for a viewing direction, as a share of the plan's size, and maximum number of
+# photos whose names are shown.
 _ARROW_SHARE: Final = 0.06
 _NAMED_PHOTOS: Final = 60
 _STYLE: Final = {"font.size": 8.0, "axes.grid": True}
@@ -41,13 +42,13 @@ _STYLE: Final = {"font.size": 8.0, "axes.grid": True}
 
 @dataclass(frozen=True, kw_only=True)
 class ChartPoint:
-    """A point of a line.
+    """A point of a line in a chart.
 
     Attributes:
         x: value on the horizontal axis.
         y: value on the vertical axis.
         spread: half the length of the error bar; NaN if there is no error bar.
-        is_filled: whether the marker is filled, as for the baseline.
+        is_filled: whether the marker is filled, which marks the baseline.
     """
 
     x: float
@@ -67,11 +68,11 @@ def line_chart(
     """Draw lines with error bars.
 
     Args:
-        lines: points in the order of x, by line name; at most `len(COLOURS)` lines can be
+        lines: name of the line -> points in the order of x; at most `len(COLOURS)` lines can be
             distinguished.
         below: label of the horizontal axis.
         beside: label of the vertical axis, with its unit.
-        bounds: limits of possible y values, e.g. 0 and 1 for shares.
+        bounds: lowest and highest possible y value, e.g. 0 and 1 for shares.
         suffix: file format.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - not needed for pages without charts
@@ -135,10 +136,10 @@ def plan_chart(
     """Draw a plan of walls and photos, with equal scales along both axes.
 
     Args:
-        walls: walls, drawn as lines with their names, in the colours of their planes.
-        photos: photos, drawn as dots with an arrow in the viewing direction, and with names if
-            there are few.
-        labels: labels of both axes.
+        walls: walls, drawn as lines in the colours of their planes, with their names.
+        photos: photos, drawn as dots with an arrow in the viewing direction; names are shown if
+            there are few photos.
+        labels: labels of the horizontal and vertical axes.
         suffix: file format.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - not needed for pages without charts
@@ -185,7 +186,7 @@ def _name(axes: Axes, name: str, place: NDArray[np.float64], *, colour: Any, abo
 
 
 def saved(figure: Figure, suffix: ChartFormat) -> bytes:
-    """Return the file of a figure, without a date, so that equal figures give equal bytes."""
+    """Encode a figure without a date, so that equal figures have equal bytes."""
     stream = io.BytesIO()
     undated: dict[str, dict[str, Any]] = {
         "svg": {"Date": None},

@@ -22,7 +22,7 @@ from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
-# Planes whose normals differ by more than this angle are different walls.
+# Planes are different walls if the angle between their normals is larger than this.
 _TURNED_DEG: Final = 10.0
 _LARGER: Final = 1.5
 _ROOMS_MOST: Final = 3
@@ -34,9 +34,8 @@ class Measured:
     """A metric of one combination.
 
     Attributes:
-        value: mean over the repeats; the mean of the absolute values if they are errors of both
-            signs.
-        spread: standard deviation over the repeats, NaN for a single value.
+        value: mean over the repeats; for errors of both signs, mean of the absolute values.
+        spread: standard deviation over the repeats; NaN for a single value.
         n_repeats: number of repeats with a value.
         n_all: number of finished repeats of the step, with or without a value.
         unit: `1` for counts and shares.
@@ -55,12 +54,12 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """A choice of one variant for each step with variants.
+    """A selection of one variant for each step with variants.
 
     Attributes:
         run: run to which the combination belongs.
-        assignment: variant by step; empty if the workflow has no variants.
-        cells: cells of the combination, in the order of the graph, each followed by its repeats.
+        assignment: step -> variant; empty if the workflow has no variants.
+        cells: cells of the combination in the order of the graph; repeats follow their cell.
         is_baseline: whether the combination is the workflow's baseline.
     """
 
@@ -76,7 +75,7 @@ class Combination:
 
     @property
     def failure(self) -> RecordedCell | None:
-        """The first cell that failed; cells that depend on it were skipped."""
+        """The first cell that failed; None if no cell failed."""
         failed = (cell for cell in self.cells if cell.status == "failed" and cell.repeat == 0)
         return next(failed, None)
 
@@ -87,7 +86,7 @@ class Combination:
 
     @property
     def n_failed_repeats(self) -> int:
-        """Number of failed cells among the repeats, without the first computation."""
+        """Number of repeats that failed, not counting the first computation of each cell."""
         return sum(cell.status == "failed" and cell.repeat > 0 for cell in self.cells)
 
     @property
@@ -97,7 +96,7 @@ class Combination:
         return tuple(cell for cell in first if cell.assignment or not self.assignment)
 
     def measured(self, step: str, metric: str) -> Measured | None:
-        """Return a metric of a step, or None if the step did not report it."""
+        """Return a metric of a step; None if the step did not report it."""
         found = [
             (row, cell.environment)
             for cell in self.cells
@@ -108,13 +107,13 @@ class Combination:
         if not found:
             return None
         values = np.array([row.value for row, _ in found])
-        # Errors of both signs would cancel in the mean, even if each of them is large.
+        # Errors of both signs would cancel in the mean even if all of them are large.
         is_of_sizes = bool(values.min() < 0.0 < values.max()) and found[0][0].better == "lower"
         if is_of_sizes:
             values = np.abs(values)
         return Measured(
             value=float(values.mean()),
-            # Differences from the first value make the spread of identical values exactly 0.
+            # The first value is subtracted so that the spread of identical values is exactly 0.
             spread=float((values - values[0]).std(ddof=1)) if len(values) > 1 else math.nan,
             n_repeats=len(values),
             n_all=sum(cell.step == step and cell.status == "ok" for cell in self.cells),
@@ -124,13 +123,16 @@ class Combination:
         )
 
     def n_items(self, step: str, counted_by: str) -> float:
-        """Return how many items a metric sums over (mean over repeats); NaN if not counted."""
+        """Return the number of items that a metric sums over, as mean over repeats.
+
+        The result is NaN if the items are not counted.
+        """
         count = self.measured(step, counted_by) if counted_by else None
         return math.nan if count is None else count.value
 
 
 def unequal_walls(combinations: Iterable[Combination]) -> str:
-    """Return a text listing the datasets in which the combinations' first walls differ, or "".
+    """List the datasets in which the first wall differs between combinations; "" if none.
 
     Which wall is the first depends on the detected planes, so metrics of the first wall may refer
     to different walls.
@@ -146,7 +148,8 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
             by_room.setdefault(room, []).append((one, wall))
     groups = []
     for shown in by_room.values():
-        # The wall of most combinations is the reference; the other combinations are reported.
+        # The wall that most combinations have is the reference, and the other combinations are
+        # listed.
         walls = [wall for _, wall in shown]
         usual = max(walls, key=lambda wall: sum(_may_be_one_wall(wall, other) for other in walls))
         odd = [
@@ -165,18 +168,21 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
     )
 
 
-# Metrics that identify the first wall.
+# These metrics identify the first wall.
 _FIRST_WALL: Final = ("omega_deg", "phi_deg", "area_m2")
 
 
 def _may_be_one_wall(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    """Return whether omega, phi and area may be of one wall with slightly different edges."""
+    """Return whether two tuples (omega, phi, area) may belong to the same wall.
+
+    Angles are in degrees and areas in square metres; the edges may differ slightly.
+    """
     is_turned = angle_between_deg(_normal(*one[:2]), _normal(*other[:2])) >= _TURNED_DEG
     return not is_turned and max(one[2], other[2]) <= _LARGER * min(one[2], other[2])
 
 
 def _normal(omega_deg: float, phi_deg: float) -> NDArray[np.float64]:
-    """Return the unit normal (3,) for `omega_phi_deg` (markiewicz2015, equation 3)."""
+    """Return the unit normal (3,) of a plane from its angles (markiewicz2015, equation 3)."""
     omega, phi = math.radians(omega_deg), math.radians(phi_deg)
     across = math.cos(phi)
     return np.array([across * math.cos(omega), across * math.sin(omega), math.sin(phi)])
@@ -187,26 +193,26 @@ def _wall_words(wall: tuple[float, ...]) -> str:
 
 
 def gives(cell: RecordedCell, *type_names: str) -> bool:
-    """Return whether a cell has an output of one of these types."""
+    """Return whether a cell has an output of one of the given types."""
     return any(product.type_name in type_names for product in cell.outputs.values())
 
 
 def is_check(cell: RecordedCell) -> bool:
-    """Return whether a cell only checks results of other steps (all outputs are inspections)."""
+    """Return whether a cell only checks other results, i.e. all its outputs are inspections."""
     types = {product.type_name for product in cell.outputs.values()}
     return types == {Inspection.type_name}
 
 
 def is_missing(cell: RecordedCell) -> bool:
-    """Return whether the run was interrupted before this cell was reached."""
+    """Return whether the run was interrupted before this cell ran."""
     return cell.error_type == NOT_YET
 
 
 def combinations_of(run: Run) -> tuple[Combination, ...]:
-    """Return every combination of variants in a run, with the baseline marked.
+    """Return all combinations of variants in a run.
 
-    A combination that is part of a larger one (`plane=ransac` of `plane=ransac, orient=pnp`) is
-    omitted.
+    A combination that is part of a larger one is omitted, such as `plane=ransac`, which is part of
+    `plane=ransac, orient=pnp`.
     """
     assignments = list(dict.fromkeys(tuple(cell.assignment.items()) for cell in run.record.cells))
     parts = [frozenset(items) for items in assignments]
@@ -222,7 +228,7 @@ def combinations_of(run: Run) -> tuple[Combination, ...]:
 def combination_of(
     run: Run, assignment: Mapping[str, str], baseline: Mapping[str, str]
 ) -> Combination:
-    """Return the combination of all cells that agree with the given variants."""
+    """Return the combination of all cells that depend on no variants other than those given."""
     return Combination(
         run=run,
         assignment=assignment,
@@ -234,7 +240,7 @@ def combination_of(
 
 
 def baseline_of(run: Run) -> Mapping[str, str]:
-    """Return the variants of the workflow's baseline; empty if there is no comparison."""
+    """Return step -> variant for the workflow's baseline; empty if the workflow has no baseline."""
     found = _comparison(run).get("baseline")
     if not isinstance(found, dict):
         return {}
@@ -242,14 +248,17 @@ def baseline_of(run: Run) -> Mapping[str, str]:
 
 
 def baseline_cells(run: Run) -> tuple[RecordedCell, ...]:
-    """Return the cells of the baseline, or of the first combination if none is declared."""
+    """Return the cells of the baseline, or of the first combination if there is no baseline."""
     found = combinations_of(run)
     chosen = next((one for one in found if one.is_baseline), found[0] if found else None)
     return tuple(cell for cell in chosen.cells if cell.repeat == 0) if chosen else ()
 
 
 def baseline_addresses(run: Run) -> tuple[str, ...]:
-    """Return the cells with figures next to the page: baseline cells and cells without variants."""
+    """Return the addresses of baseline cells and cells without variants.
+
+    The figures of these cells are written to files next to the page.
+    """
     baseline = {cell.address for cell in baseline_cells(run)}
     return tuple(
         address
@@ -259,13 +268,13 @@ def baseline_addresses(run: Run) -> tuple[str, ...]:
 
 
 class Way(NamedTuple):
-    """The cells that the page shows for one combination, i.e. for a row of the comparison.
+    """The cells that the page shows for one combination, which is one row of the comparison.
 
     Attributes:
         anchor: HTML anchor on the page.
         name: the variants as text.
-        cells: addresses of those cells of the combination that no row above and no section of the
-            page shows.
+        cells: addresses of the cells of the combination that are not already shown in a row above
+            or in another section of the page.
     """
 
     anchor: str
@@ -274,11 +283,11 @@ class Way(NamedTuple):
 
 
 def ways(run: Run, prefix: str) -> tuple[Way, ...]:
-    """Return the combinations of a run, each cell with the first combination that contains it.
+    """Return the combinations of a run; each cell belongs to the first one that contains it.
 
     Args:
         run: the run.
-        prefix: prefix of the anchors.
+        prefix: prefix of the HTML anchors.
     """
     shown = set(baseline_addresses(run))
     found = []
@@ -290,7 +299,10 @@ def ways(run: Run, prefix: str) -> tuple[Way, ...]:
 
 
 def improved_on(run: Run, addresses: Collection[str]) -> frozenset[str]:
-    """Return cells whose result is refined by a later step of the same kind (e.g. orientation)."""
+    """Return the cells whose results a later step of the same kind refines.
+
+    An example is an orientation that a later orientation refines.
+    """
     return frozenset(
         before.address
         for address in addresses
@@ -317,7 +329,7 @@ def _comparison(run: Run) -> Mapping[str, object]:
 
 
 def _is_baseline(assignment: Mapping[str, str], baseline: Mapping[str, str]) -> bool:
-    # The dataset is ignored, because each dataset has its own baseline.
+    # `baseline` does not contain the dataset, because each dataset has its own baseline.
     return bool(baseline) and all(
         baseline.get(step, variant) == variant for step, variant in assignment.items()
     )
@@ -328,9 +340,9 @@ class EnvironmentGroups:
     """Groups of equivalent environments.
 
     Attributes:
-        first: id of the first equivalent environment, by environment id.
-        words: description of each group, with its differences from the first group, by the id of
-            the group's first environment.
+        first: id of an environment -> id of the first equivalent environment.
+        words: id of the first environment of a group -> description of the group, with its
+            differences from the first group.
     """
 
     first: Mapping[str, str]
@@ -344,9 +356,9 @@ class EnvironmentGroups:
 def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
     """Group the environments in which all packages that the methods use are identical.
 
-    Only packages required by the distributions of the methods, or by orthoflow, are compared; if
-    one of these distributions is not installed, all packages are compared. A package found in only
-    one environment, such as a plugin installed between two runs, is ignored.
+    Only packages that orthoflow or the distributions of the methods require are compared; if one of
+    these distributions is not installed, all packages are compared. A package that only one of two
+    environments contains, such as a plugin installed between two runs, is ignored.
     """
     runs = tuple(runs)
     environments = {one.id: one for run in runs for one in run.record.environments}
@@ -358,8 +370,8 @@ def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
     known: dict[str, dict[str, str]] = {}
     for key, environment in environments.items():
         facts = _facts(environment, used)
-        # Compare with all members of a group: two of them may differ in a package that the first
-        # lacks.
+        # Compare with the packages of all members of a group, because the first member may lack a
+        # package in which the others differ.
         like = next((name for name, seen in known.items() if _agree(seen, facts)), key)
         first[key] = like
         known[like] = facts | known.get(like, {})
@@ -368,7 +380,7 @@ def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
 
 
 def environment_words(environment: RecordedEnvironment) -> str:
-    """Return a one-line description of an environment."""
+    """Describe an environment in one line."""
     commit = f", code at commit {environment.git_commit}" if environment.git_commit else ""
     return (
         f"Python {environment.python}, {environment.os}, {environment.cpu}, "
@@ -379,14 +391,14 @@ def environment_words(environment: RecordedEnvironment) -> str:
 def distinct_words(
     environments: Sequence[RecordedEnvironment], used: Collection[str] | None = None
 ) -> dict[str, str]:
-    """Return descriptions of environments, with the packages in which each differs from the first.
+    """Describe environments; packages are named if they differ from the first environment.
 
     Args:
-        environments: environments in the order of the descriptions.
+        environments: environments, the first of which is the reference.
         used: packages to compare; None for all.
 
     Returns:
-        Descriptions by environment id.
+        Environment id -> description.
     """
     return {
         one.id: environment_words(one)
@@ -397,7 +409,7 @@ def distinct_words(
 
 
 def _other_packages(own: Mapping[str, str], others: Mapping[str, str]) -> str:
-    """Return the packages in which an environment differs from another; empty if there are none."""
+    """Describe the packages in which an environment differs from the first; empty if none do."""
     texts = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
     texts += [f"no {name}" for name in others if name not in own]
     return f"; differs from the first in {first_few(texts)}" if texts else ""

@@ -1,4 +1,4 @@
-"""The table of combinations and their metrics, and the table of datasets."""
+"""Two tables on the report page: combinations with their metrics, and datasets."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
 _NOTHING: Final = "-"
-# Run times of short steps vary by this amount even on an idle machine.
+# Run times of short steps vary by this much even on an idle machine.
 _TIMED_S: Final = 0.1
 _MAX_DESCRIBED: Final = 12  # metrics shown if no quality metric differs
 _MAX_NAMED: Final = 3  # metrics listed in which a combination is best
-# Cost of the steps in which combinations differ; processor time hardly depends on machine load.
+# Costs of the steps in which combinations differ; unlike the elapsed time, processor time hardly
+# depends on the load of the machine.
 _SUMMED: Final = tuple(
     MetricRow(cell="", step="", method="", name=name, value=0.0, unit=unit, label=label,
               better="lower", headline=True)
@@ -56,18 +57,17 @@ _SUMMED: Final = tuple(
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A row of the table: one combination.
+    """A row of the comparison table, which shows one combination.
 
     Attributes:
-        run: label of the combination's run: workflow and id.
-        variants: variant of each step with variants; a dash if the combination does not include the
-            step.
-        name: variants as text, with the run if several runs are compared.
+        run: label of the combination's run, which contains the name of the workflow and the run id.
+        variants: variant for each step with variants; a dash for a step that the combination lacks.
+        name: variants as text, preceded by the run if the table compares several runs.
         is_baseline: whether the combination is the workflow's baseline.
-        failure: first failed cell and reason; empty if no cell failed.
-        missing: addresses of cells not reached before the run was interrupted.
+        failure: first failed cell and its error; empty if no cell failed.
+        missing: addresses of cells that had not run when the run was interrupted.
         values: one value per column.
-        remark: text on failed repeats.
+        remark: sentence on failed repeats; empty if there are none.
     """
 
     run: str
@@ -81,12 +81,12 @@ class Row:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Distinct letters for the environments and data of the row's values."""
+        """Letters for the environments and data of the row's values, without duplicates."""
         return tuple(dict.fromkeys(value.group for value in self.values if value.group))
 
     @property
     def shortfall(self) -> str:
-        """Short reason why time and memory are missing; empty if the row is complete."""
+        """Reason why time and memory are missing; empty if the row is complete."""
         return "failed" if self.failure else "not computed" if self.missing else ""
 
     def count(self, mark: Mark) -> int:
@@ -103,7 +103,7 @@ class ComparisonTable:
         columns: metrics, with processor time and memory last.
         rows: rows in the order of the runs and their graphs.
         shows_runs: whether the rows come from more than one run.
-        groups: environment and data by letter; empty if they are the same for all values.
+        groups: letter -> environment and data; empty if they are the same for all values.
     """
 
     steps: tuple[str, ...]
@@ -114,13 +114,16 @@ class ComparisonTable:
 
     @property
     def baseline(self) -> str:
-        """Name of the baseline; empty if there is not exactly one baseline."""
+        """Name of the baseline; empty if there is no baseline or more than one."""
         found = [row.name for row in self.rows if row.is_baseline]
         return found[0] if len(found) == 1 else ""
 
     @property
     def glance(self) -> tuple[Row, ...]:
-        """The rows, sorted by number of best values, then by number of values near the best."""
+        """The rows, sorted by descending number of best values, then of values near the best.
+
+        Rows with a shortfall come last.
+        """
 
         def place(row: Row) -> tuple[bool, int, int]:
             return bool(row.shortfall), -row.count(Mark.BEST), -row.count(Mark.NEAR)
@@ -128,7 +131,7 @@ class ComparisonTable:
         return tuple(sorted(self.rows, key=place))
 
     def best_in(self, row: Row) -> str:
-        """Return up to three metrics in which a row is clearly best."""
+        """Return the names of up to three metrics in which a row is clearly the best."""
         found = [
             ": ".join(filter(None, (column.step, column.titled)))
             for column, value in zip(self.columns, row.values, strict=True)
@@ -138,10 +141,10 @@ class ComparisonTable:
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
-    """Return the table of combinations of one or more runs; None if there is only one combination.
+    """Return the table of combinations of runs; None if there is only one combination.
 
-    Values are ranked only within the same environment and data; if environments or data differ,
-    letters distinguish them.
+    Values are ranked only among those with the same environment and data; if environments or data
+    differ, they are distinguished by letters.
     """
     combinations = [one for run in runs for one in combinations_of(run)]
     if len(combinations) < 2:
@@ -183,9 +186,10 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
 
 
 def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, ...]:
-    """Return the metrics that the workflows select, by default the quality metrics; no costs.
+    """Return the metrics that the workflows select; by default, the quality metrics.
 
-    If no quality metric differs, other metrics that differ are appended; they are not ranked.
+    If no quality metric differs between combinations, other metrics that differ are appended,
+    without being ranked. Costs are not appended.
     """
     first: dict[tuple[str, str], MetricRow] = {}
     for cell in (cell for one in combinations for cell in one.cells):
@@ -199,8 +203,7 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, 
     else:
         wanted = headline_keys(cell for one in combinations for cell in one.cells)
         if not any(_differs(key, combinations) for key in wanted):
-            # If several steps report a metric, the last one refines the results of the earlier
-            # ones.
+            # If several steps report a metric, the last of them refines the results of the others.
             last = {metric: (step, metric) for step, metric in first}
             order = {step: place for place, (step, _) in enumerate(first)}
             described = [
@@ -217,7 +220,7 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, 
 
 
 def _differs(key: tuple[str, str], combinations: Sequence[Combination]) -> bool:
-    """Return whether the combinations that have a metric have different values."""
+    """Return whether combinations differ in a metric by more than rounding."""
     values = [value.value for one in combinations if (value := one.measured(*key))]
     return any(not is_rounding(values[0], value) for value in values[1:])
 
@@ -226,7 +229,8 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
     found: dict[tuple[str, str], None] = {}
     for pattern in patterns:
         for step, metric in known:
-            # `*.wall_s` selects the time of every step; the table has a column for the sum.
+            # A pattern such as `*.cpu_s` selects a cost of every step, for which the table has its
+            # own column.
             is_summed = pattern.startswith("*.") and metric in COSTS
             if not is_summed and fnmatchcase(f"{step}.{metric}", pattern):
                 found[step, metric] = None
@@ -234,7 +238,10 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
 
 
 def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
-    """Return processor time and memory of the cells that depend on variants, if all are known."""
+    """Return processor time and memory of the cells that depend on variants.
+
+    Both are empty unless all cells have results.
+    """
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
     if one.failure or one.missing or not varied:
         return Value(), Value()
@@ -248,7 +255,7 @@ def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
 
 
 def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
-    """Return the label of each run: workflow, options that differ between runs, folder and id."""
+    """Return a label for each run, with workflow, differing options, folder and id."""
     shared = frozenset.intersection(*(frozenset(run.record.overrides) for run in runs))
     labels = {}
     for run in runs:
@@ -259,7 +266,7 @@ def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
 
 
 def measured_text(measured: Measured) -> str:
-    """Format a value, with its standard deviation if there are repeats."""
+    """Format a value, followed by its standard deviation if there are repeats."""
     if measured.n_repeats > 1:
         return number_with_spread(measured.value, measured.spread)
     return number(measured.value)
@@ -269,8 +276,8 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
     measured = one.measured(column.step, column.metric)
     if measured is None:
         return Value()
-    # A repeat that missed the wall has no error, so the remaining repeats look better than they
-    # are.
+    # State the number of repeats with a value, because repeats without one, such as those that
+    # missed the wall, may have been the worst.
     of_all = (
         f" ({measured.n_repeats} of {measured.n_all} repeats)"
         if measured.n_repeats < measured.n_all
@@ -288,7 +295,7 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
     )
 
 
-# Id of the first equivalent environment, and digests of the data.
+# Id of the first equivalent environment, and digests of the input data.
 _Origin: TypeAlias = tuple[str, tuple[str, ...]]
 # Path of the record, run id and dataset.
 _Place: TypeAlias = tuple[Path, str, str]
@@ -296,13 +303,13 @@ _Place: TypeAlias = tuple[Path, str, str]
 
 @dataclass(frozen=True, kw_only=True)
 class Origins:
-    """Letters for the environments and data with which values of combinations were computed.
+    """Letters for the environments in which, and the data from which, values were computed.
 
     Attributes:
         environments: groups of equivalent environments.
-        data: digests of the input data, by record, run and dataset.
-        letters: letters by environment and data; empty if all values have the same origin.
-        legend: descriptions by letter.
+        data: record, run and dataset -> digests of the input data.
+        letters: environment and data -> letter; empty if all values have the same origin.
+        legend: letter -> description.
     """
 
     environments: EnvironmentGroups
@@ -338,7 +345,7 @@ class Origins:
         return Origins(environments=groups, data=data, letters=letters, legend=legend)
 
     def letter(self, one: Combination, environment: str) -> str:
-        """Return the letter for a value's origin; empty if all values have the same origin."""
+        """Return the letter for the origin of a value; empty if all values have the same origin."""
         first = self.environments.first.get(environment, environment)
         return self.letters.get((first, self.data[_place(one)]), "")
 
@@ -348,11 +355,11 @@ def _place(one: Combination) -> _Place:
 
 
 def _data_of(record: RunRecord, data: str) -> tuple[str, ...]:
-    """Return the digests of input files and of simulated data."""
+    """Return the digests of a dataset's input files and simulated data."""
     digests = [
         file.sha256
         for given in record.inputs
-        # `scan@hall` is an input only of the dataset hall.
+        # An input such as `scan@hall` belongs only to the dataset hall.
         if given.name.partition("@")[2] in {"", data}
         for file in given.files
     ]
@@ -372,8 +379,7 @@ def _letter(index: int) -> str:
 
 
 _MOST_COLUMNS: Final = 6
-# Number of pixels in all pictures together; with many datasets, the pictures become too small to be
-# useful.
+# Total number of pixels in the pictures of all datasets.
 _PICTURES_PX: Final = 2_000_000
 _LARGEST_PX: Final = 220
 _SMALLEST_PX: Final = 64
@@ -385,12 +391,13 @@ class DatasetRow:
 
     Attributes:
         name: name of the dataset.
-        page: path of the dataset's own page, relative to this one; empty if there is no such page.
+        page: path of the dataset's own page, relative to this page; empty if the dataset has none.
         picture: data URI of the dataset's first orthoimage; empty if there is no orthoimage.
-        failed: failed cells and the reasons, without the cells skipped as a consequence.
-        missing: cells not reached before the run was interrupted.
+        failed: failed cells with their errors, without the cells that were skipped as a
+            consequence.
+        missing: cells that had not run when the run was interrupted.
         values: one value per column.
-        limit: most important diagnostic, and number of further ones, as text.
+        limit: text of the most important diagnostic, followed by the number of further ones.
     """
 
     name: str
@@ -407,7 +414,7 @@ class DatasetTable:
     """The datasets of a run.
 
     Attributes:
-        columns: step and metric of each column, with the metric's unit.
+        columns: step, and title of the metric with its unit, for each column.
         rows: rows in the order of the run.
         baseline: variants to which the values belong; empty if there are no variants.
     """
@@ -421,8 +428,8 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     """Return the table of the datasets of a run.
 
     Args:
-        parts: part of the run by dataset.
-        pages: each dataset's own page, relative to the page being written.
+        parts: dataset -> part of the run.
+        pages: dataset -> path of its own page, relative to the page being written.
     """
     own = {
         name: {cell.address for cell in part.record.cells if DATA in cell.assignment}
@@ -430,7 +437,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     }
     measured = {name: _measured(part, own[name]) for name, part in parts.items()}
     units = {key: row for values in measured.values() for key, row in values.items()}
-    # Use the columns of the comparison, which the workflow may have selected.
+    # Use the columns of the comparison, because the workflow may select them.
     columns = comparison_columns([one for part in parts.values() for one in combinations_of(part)])
     wanted = [(column.step, column.metric) for column in columns]
     chosen = [key for key in wanted if key in units][:_MOST_COLUMNS]
@@ -460,7 +467,7 @@ _Measured = Mapping[tuple[str, str], MetricRow]
 
 
 def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
-    """Return the baseline's metrics on this dataset, by step and metric."""
+    """Return (step, metric) -> row for the baseline's metrics on a dataset."""
     return {
         (row.step, row.metric): row
         for cell in baseline_cells(part)
@@ -480,7 +487,7 @@ def _dataset_value(measured: MetricRow | None) -> Value:
 
 
 def _limit(part: Run, own: AbstractSet[str]) -> str:
-    """Return the warnings of the baseline on this dataset; failures are listed separately."""
+    """Return the limitations of the baseline on a dataset, without failures."""
     baseline = {cell.address for cell in baseline_cells(part)} & own
     texts = [
         limit.text

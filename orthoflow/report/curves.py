@@ -1,4 +1,4 @@
-"""Metrics plotted against the values of a swept parameter."""
+"""Charts of metrics against the values of a swept parameter."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ from orthoflow.workflow.model import DATA
 _MOST_CURVES: Final = 12
 _LONGEST_NAME: Final = 120
 _MOST_LINES: Final = 6
-# Records are untrusted and may contain any number; differences between numbers larger than this are
-# meaningless.
+# Larger numbers are ignored: a record is untrusted and may contain any number, and the differences
+# between such numbers may overflow.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """One metric plotted against one parameter.
+    """A chart of one metric against one parameter.
 
     Attributes:
-        name: file name, composed of metric and parameter with their steps.
+        name: file name without suffix, which consists of the metric and the parameter, each with
+            its step.
         title: title with metric, step and parameter.
-        caption: explanation of the points and error bars.
-        lines: points by line name.
-        below: label of the parameter axis.
-        beside: label of the metric axis, with the unit.
-        bounds: limits of possible values of the metric.
+        caption: description of the points and error bars.
+        lines: name of the line -> points.
+        below: label of the horizontal axis (parameter).
+        beside: label of the vertical axis (metric), with the unit.
+        bounds: lowest and highest possible value of the metric.
     """
 
     name: str
@@ -66,10 +67,10 @@ class Curve:
 
 
 def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
-    """Return the curves of a run, over all datasets, as files by name."""
+    """Return file name -> content for the curves of a run over all its datasets."""
     parts = parts_of(run)
     drawn = curves([*parts.values()] if len(parts) > 1 else [run])
-    # Names of steps and metrics in a record may be invalid as file names.
+    # The names of steps and metrics in a record may be invalid as file names.
     names = (re.sub(r"[^\w.-]", "_", curve.name)[:_LONGEST_NAME] for curve in drawn)
     return {
         f"{index:02d}_{name}.{suffix}": curve.file(suffix)
@@ -78,28 +79,28 @@ def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
 
 
 def curves(parts: Sequence[Run]) -> tuple[Curve, ...]:
-    """Return curves of the compared metrics for every parameter that is swept.
+    """Return the curves of the compared metrics for all swept parameters.
 
-    A sweep is found from the cells, not from the workflow text: it consists of variants of a step
-    that call the same method and differ in one number.
+    Sweeps are found from the cells and not from the workflow text: a sweep consists of variants of
+    a step that call the same method and differ in one number.
 
     Args:
-        parts: the whole run, or one part per dataset; medians and spreads are computed over the
-            parts.
+        parts: the run, or one part per dataset; in the latter case, medians and spreads are
+            computed over the parts.
     """
     return tuple(islice(_curves(parts), _MOST_CURVES))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Variants of a step that differ in a numeric parameter, and possibly in others.
+    """Variants of a step that differ in a numeric parameter and possibly in other parameters.
 
     Attributes:
         step: name of the step.
         method: method of the variants, e.g. `plane.ransac`.
         parameter: name of the parameter.
-        values: value of the parameter by variant.
-        others: other parameters that differ, as text by variant.
+        values: variant -> value of the parameter.
+        others: variant -> other parameters that differ, as text.
     """
 
     step: str
@@ -110,14 +111,14 @@ class Sweep:
 
 
 def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
-    """Yield the sweeps among cells: sets of variants that differ in only one number."""
+    """Yield the sweeps found in the cells of a run; see `curves`."""
     by_method: dict[tuple[str, str], dict[str, RecordedCell]] = {}
     for cell in cells:
         variant = cell.assignment.get(cell.step)
         if variant is not None and cell.repeat == 0 and cell.status != "skipped":
             by_method.setdefault((cell.step, cell.method), {}).setdefault(variant, cell)
     for (step, method), variants in by_method.items():
-        # Only parameters that were set are compared, because defaults may depend on other
+        # Only explicitly set parameters are compared, because defaults may depend on other
         # parameters.
         names = sorted({name for cell in variants.values() for name in cell.params_set})
         differ = [
@@ -149,7 +150,7 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
 
 
 class _Value(NamedTuple):
-    """Value of one combination, and the spread over its repeats."""
+    """Value of one combination, and its standard deviation over repeats."""
 
     value: float
     spread: float
@@ -157,21 +158,21 @@ class _Value(NamedTuple):
     dataset: str
 
 
-# Values of the combinations by parameter value.
+# Parameter value -> values of the combinations.
 _Line = dict[float, list[_Value]]
 
 
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     combinations = [one for part in parts for one in combinations_of(part)]
     cells = [cell for part in parts for cell in part.record.cells]
-    # Sweeps of several methods share a chart, so that they can be compared.
+    # Sweeps of several methods share a chart so that the methods can be compared.
     swept: dict[tuple[str, str], list[Sweep]] = {}
     for sweep in sweeps(cells):
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     columns = comparison_columns(combinations)
     for column in sorted(columns, key=lambda one: not one.headline):
         for (step, parameter), group in swept.items():
-            # A method may report the parameter as a metric, and a plot against itself would be
+            # A method may report the swept parameter as a metric; plotting it against itself is
             # meaningless.
             is_behind = any(cell.step == column.step and step in cell.assignment for cell in cells)
             if (column.step, column.metric) == (step, parameter) or not is_behind:
@@ -189,10 +190,10 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
 def _lines(
     combinations: Sequence[Combination], sweep: Sweep, column: MetricRow
 ) -> dict[str, _Line]:
-    """Return a line per combination of other variants, over the datasets common to its points.
+    """Return one line for each combination of the other variants.
 
-    Otherwise, parameter values that fail on difficult datasets would look better, because these
-    datasets would be missing only there.
+    The points of a line use the same datasets. Otherwise, a parameter value that fails on difficult
+    datasets would look better than the others, because only its point would lack these datasets.
     """
     lines: dict[str, _Line] = {}
     for one in combinations:
@@ -220,7 +221,8 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
         for name, line in lines.items()
     }
     every = [point for points in drawn.values() for point in points]
-    # Absolute errors are never negative; metrics from 0 to 1 for which higher is better are shares.
+    # If lower is better and no value is negative, the metric is an absolute error. If higher is
+    # better and all values are between 0 and 1, it is a share.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
     notes = [_points_text(lines, column, n_datasets)]
@@ -242,7 +244,7 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
 def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: bool) -> ChartPoint:
     numbers = np.array([one.value for one in found])
     if column.better == "lower":
-        # Errors of both signs would cancel, and the most negative one would look best.
+        # Errors of both signs would cancel, and the most negative error would look best.
         numbers = np.abs(numbers)
     # With several datasets, the error bar shows the spread between datasets, not between repeats.
     spread = spread_of(numbers, column.unit) if is_over else found[0].spread
@@ -255,7 +257,7 @@ def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: boo
 
 
 def _points_text(lines: Mapping[str, _Line], column: MetricRow, n_datasets: int) -> str:
-    """Return sentences on points and error bars, with the number of datasets without failures."""
+    """Describe the points and error bars, and state the number of datasets that were used."""
     found = [values for line in lines.values() for values in line.values()]
     if n_datasets < 2:
         if any(math.isfinite(one.spread) for values in found for one in values):
@@ -278,8 +280,8 @@ class Varied:
 
     Attributes:
         steps: names of the steps with variants; `data` for datasets.
-        methods: method by step and variant, for steps with swept parameters.
-        swept: value by variant, for each swept parameter (step, parameter).
+        methods: step -> variant -> method, for steps with swept parameters.
+        swept: (step, parameter) -> variant -> value, for each swept parameter.
     """
 
     steps: tuple[str, ...]
@@ -288,7 +290,7 @@ class Varied:
 
     @classmethod
     def of(cls, run: Run) -> Varied:
-        """Determine from the cells of a run which steps and parameters vary."""
+        """Determine which steps and parameters vary in a run."""
         swept: dict[tuple[str, str], dict[str, float]] = {}
         for sweep in sweeps(run.record.cells):
             swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
@@ -301,7 +303,7 @@ class Varied:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns; names for steps are the same as in tables of several runs."""
+        """Names of the columns; those for steps are the same as in tables of several runs."""
         return (
             *("dataset" if step == DATA else f"variant.{step}" for step in self.steps),
             *(f"{step}.use" for step in self.methods),

@@ -1,4 +1,4 @@
-"""Differences between two runs, with equal differences grouped into one row."""
+"""Tables of the differences between two runs; equal differences are grouped into one row."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True)
 class DifferenceTable:
-    """Differences of one kind.
+    """Table of the differences of one kind, such as parameters.
 
     Attributes:
         title: name of the kind.
@@ -43,8 +43,9 @@ class DifferenceTable:
         n_different: number of compared values that differ.
         rows: values that differ or are present in only one run; equal rows are grouped.
         n_alone: number of values that are present in only one run.
-        n_rounded: number of values that differ only by rounding; they have no row.
-        whose: steps to which the table is restricted; empty for all.
+        n_rounded: number of values that differ only by rounding and have no row.
+        whose: phrase for the steps to which the table is restricted; empty if it contains all
+            steps.
     """
 
     title: str
@@ -67,7 +68,8 @@ def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
         _table("Steps", comparison.cells, str, step_of),
         _table("Parameters", parameters, _parameter_text, step_of, whose=of_shared),
         _table("Environment", comparison.environment, str),
-        # Time and memory are omitted, because they always differ and are in the comparison table.
+        # Time and memory are omitted, because they always differ and are shown in the comparison
+        # table.
         _table(
             "Metrics, without time and memory",
             comparison.measured,
@@ -90,16 +92,17 @@ def _table(
     change: Callable[[Pair[Side]], str] = lambda _pair: "",
     whose: str = "",
 ) -> DifferenceTable:
-    """Return the differences of one kind, with equal differences within a step grouped.
+    """Return the table for one kind of difference; equal differences of a step are grouped.
 
     Args:
         title: name of the kind.
         pairs: all values of both runs.
         text: function that formats the value of one run.
-        step_of: name of the step of each cell.
-        different: pairs to list, in this order; None for all pairs that differ.
-        change: function that formats the change between the runs.
-        whose: steps to which the table is restricted; empty for all.
+        step_of: address of a cell -> step.
+        different: pairs to list, in order; None for all pairs that differ.
+        change: function that describes the change between the runs.
+        whose: phrase for the steps to which the table is restricted; empty if it contains all
+            steps.
     """
     steps = step_of or {}
     shared = [pair for pair in pairs if pair.is_shared]
@@ -145,7 +148,7 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class RowGroup(Generic[Side]):
-    """Equal rows.
+    """Rows that are equal apart from their cells.
 
     Attributes:
         pair: values of the first row.
@@ -156,7 +159,7 @@ class RowGroup(Generic[Side]):
     n: int
 
     def label(self, step_of: Mapping[str, str]) -> str:
-        """Return the label: the address of a single cell, or a step and the number of cells.
+        """Return the label of the row: the cell, or the step and the number of equal rows.
 
         >>> steps = {"wall@a": "wall", "wall@b": "wall"}
         >>> rows = [Pair(cell=cell, name="cell_m", left=1, right=2) for cell in steps]
@@ -168,7 +171,7 @@ class RowGroup(Generic[Side]):
         if self.n == 1:
             return ".".join(part for part in (cell, name) if part)
         step = step_of.get(cell, cell)
-        # A row about the step itself has no further name.
+        # If the row is about the step itself, `name` equals the step or is empty.
         what = ".".join(dict.fromkeys(part for part in (step, name) if part))
         return f"{what}, {self.n} steps"
 
@@ -176,7 +179,7 @@ class RowGroup(Generic[Side]):
 def grouped_rows(
     pairs: Iterable[Pair[Side]], text: Callable[[Side], str], step_of: Mapping[str, str]
 ) -> list[RowGroup[Side]]:
-    """Group the pairs of each step that have equal texts, in the order of first occurrence."""
+    """Group pairs that have the same step, name and texts, in the order of first occurrence."""
     found: dict[Hashable, list[Pair[Side]]] = {}
     for pair in pairs:
         sides = (None if side is None else text(side) for side in (pair.left, pair.right))
@@ -188,17 +191,18 @@ def grouped_rows(
 def moved_first(
     pairs: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
 ) -> list[Pair[ComparedMetric]]:
-    """Sort by kind: headline metrics, other ranked metrics, unranked metrics, rounding.
+    """Sort pairs: headline metrics first, then other ranked metrics, then unranked metrics.
 
-    Within each group, the largest relative change comes first.
+    Within each of these groups, the largest relative change comes first. Differences by rounding
+    come last.
     """
     places = {step: place for place, step in enumerate(dict.fromkeys(step_of.values()))}
 
     def key(pair: Pair[ComparedMetric]) -> tuple[bool, int, float, int]:
         facts = pair.right or pair.left
         group = 2 if facts is None else 0 if facts.headline else 1 if facts.better else 2
-        # Later steps come first, because they refine the results of earlier ones, e.g. of
-        # orientations.
+        # Later steps come first, because they refine the results of earlier steps; an example is a
+        # second orientation.
         later = -places.get(step_of.get(pair.cell, pair.cell), 0)
         return pair.is_rounded, group, -_relative_change(pair), later
 
@@ -206,10 +210,10 @@ def moved_first(
 
 
 def _relative_change(pair: Pair[ComparedMetric]) -> float:
-    """Return the change relative to the larger value; 0 if only one run has the value."""
+    """Return the change relative to the larger absolute value; 0 if only one run has a value."""
     left, right = pair.left, pair.right
     if left is None or right is None or left.value == right.value:
         return 0.0
     change = abs(right.value - left.value) / max(abs(left.value), abs(right.value))
-    # A change from a number to NaN counts as the largest.
+    # A change between a number and NaN counts as the largest.
     return math.inf if math.isnan(change) else change

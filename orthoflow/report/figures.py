@@ -1,4 +1,4 @@
-"""Figures from the methods, on the page and as files, and the graph of a run."""
+"""Figures that methods drew, on the page and as files, and the graph of a run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _MAX_ABREAST: Final = 5  # boxes in a row
 _MAX_LETTERS: Final = 26
-# Line width and dashes make the states distinguishable without colour.
+# The states can be distinguished without colour, by line width and dashes.
 _FRAMES: Final[dict[str, dict[str, Any]]] = {
     "ok": {"edgecolor": "#5b6570", "facecolor": "#f3f5f7"},
     "cached": {"edgecolor": "#1c6b35", "facecolor": "#eaf5ec"},
@@ -36,11 +36,11 @@ _FRAMES: Final[dict[str, dict[str, Any]]] = {
 
 
 def run_graph(run: Run) -> nx.DiGraph[str]:
-    """Return the graph of the steps of a run, whose edges are products.
+    """Return a graph whose nodes are the steps of a run and whose edges are products.
 
-    Nodes have `state`, `about` (methods and time) and `row`. Each step is below all steps on which
-    it depends; wide levels are split into several rows, and skipped steps without connections come
-    last.
+    Nodes have the attributes `state`, `about` (methods and time), `row` and `column`. Each step is
+    below all steps on which it depends. Wide levels are split into several rows, and skipped steps
+    without connections come last.
     """
     import networkx as nx  # noqa: PLC0415 - takes 0.2 seconds
 
@@ -94,7 +94,7 @@ def graph_file(run: Run) -> bytes:
             (x0, y0), (x1, y1) = (
                 (nodes[node]["column"], nodes[node]["row"]) for node in (before, after)
             )
-            # Arrows that cross other rows are curved, so that they do not run behind boxes.
+            # Curve the arrows that cross other rows, so that they do not pass behind boxes.
             bulge = 0.25 if y1 - y0 > 1 else 0.0
             axes.annotate(
                 "",
@@ -155,7 +155,7 @@ _SMALL_BYTES: Final = 20_000  # smaller files are not scaled down
 
 @dataclass(frozen=True, kw_only=True)
 class FigureGroup:
-    """Figures of one cell."""
+    """The figures of one cell."""
 
     cell: str
     method: str
@@ -165,13 +165,13 @@ class FigureGroup:
 def figure_groups(
     run: Run, *, share: float = 1.0, with_files: bool = False
 ) -> tuple[FigureGroup, ...]:
-    """Return the figures of all cells except repeats; identical figures are returned once.
+    """Return the figures of all cells except repeats, without duplicates.
 
-    If the figures together exceed the size limit of a page, large ones are scaled down.
+    If the figures together exceed the size limit, the large ones are scaled down.
 
     Args:
         run: the run.
-        share: share of the size limit of a page that the figures may use.
+        share: the part of a page's size limit that the figures may use, from 0 to 1.
         with_files: whether the figures of `baseline_addresses` are also written to
             `FIGURES_FOLDER`.
     """
@@ -210,7 +210,7 @@ def figure_groups(
 def write_figures(
     run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "", as_pdf: bool = False
 ) -> int:
-    """Write the figures of cells to `folder/<cell>/` as PNG or JPEG files, and the run's graph.
+    """Write the figures of cells to `folder/<cell>/` as image files, and the graph of the run.
 
     Damaged pictures and SVG files, which may contain scripts, are omitted.
 
@@ -218,14 +218,15 @@ def write_figures(
         run: the run.
         folder: output folder, created if missing.
         addresses: addresses of the cells.
-        inside: subfolder of `folder` in which to write instead; it must not be a link.
+        inside: subfolder to write to instead of `folder`; it must not be a link.
         as_pdf: whether to write each picture as a PDF page at 300 dpi.
 
     Returns:
         The number of figures written.
 
     Raises:
-        RecordError: the name or type of a figure is not valid for a file; nothing is written.
+        RecordError: the name of a cell or figure is not allowed as a file name, or the type of a
+            figure has no suffix; nothing is written.
         StoreError: the folder cannot be written to.
     """
     named = figure_files(run, addresses)
@@ -239,7 +240,7 @@ def write_figures(
 
 
 def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
-    """Return the content of a figure's file; None if it is damaged or an SVG file."""
+    """Return the content of a figure's file; None if the figure is damaged or an SVG file."""
     if figure.media_type == "image/svg+xml":
         return None
     try:
@@ -254,11 +255,11 @@ def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
 
 
 def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:
-    """Return the figures, scaled down if they have too many bytes in total."""
+    """Scale figures down if their total size exceeds a limit."""
     n_bytes = sum(len(figure.data) for figure in figures)
     if n_bytes <= bytes_most:
         return figures
-    # The size in bytes is roughly proportional to the area.
+    # The size in bytes is roughly proportional to the number of pixels.
     side_px = round(LONGEST_SIDE_PX * math.sqrt(0.8 * max(0.0, bytes_most) / n_bytes))
     side_px = min(max(side_px, _LEAST_SIDE_PX), _MAX_SIDE_PX)
     return tuple(in_order(partial(_smaller, side_px=side_px), figures))
@@ -270,7 +271,7 @@ def _smaller(figure: RecordedFigure, side_px: int) -> RecordedFigure:
     try:
         data = shrunk_webp(figure.data, figure.name, longest_side_px=side_px)
     except InputError:
-        # Omit a picture that cannot be decoded, so that the page can still be written.
+        # Omit a picture that cannot be decoded; the page can still be written.
         return replace(figure, data=b"", caption=f"{figure.caption} (the picture is damaged)")
     is_smaller = len(data) < len(figure.data)
     return replace(figure, media_type="image/webp", data=data) if is_smaller else figure

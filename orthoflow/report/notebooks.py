@@ -49,13 +49,13 @@ class OpenedRun(Run):
     """A finished run, with tables, pictures and arrays for interactive use."""
 
     def metrics(self) -> pd.DataFrame:
-        """Return a table with a row for every metric of every cell.
+        """Return a table with one row for each metric of each cell.
 
         Returns:
-            Table with the columns `cell`, `step`, `method`, `dataset` (if there are several),
-            `variant.<step>` for each step with variants (missing if it does not apply to the cell),
-            the method of each step with swept parameters (`plane.use`), each swept parameter
-            (`plane.tolerance_m`, a number), `repeat`, `metric`, `value`, `unit`.
+            A table with these columns: `cell`, `step` and `method`; `dataset` if there are several;
+            `variant.<step>` for each step with variants (empty if the cell does not depend on it);
+            for each step with swept parameters, the method, such as `plane.use`, and the
+            parameters, such as `plane.tolerance_m`; and `repeat`, `metric`, `value` and `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second and is rarely needed
 
@@ -82,9 +82,9 @@ class OpenedRun(Run):
         """Return the report's table of statistics over all datasets; empty for a single dataset.
 
         Returns:
-            One row per metric and combination of variants, with median, difference from
-            `reference`, confidence interval of the difference, p, p after Holm's correction, and
-            effect.
+            A table with one row for each metric and combination of variants. It contains the
+            median, the difference from `reference`, the confidence interval of the difference, the
+            p-value before and after Holm's correction, and the effect.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second and is rarely needed
 
@@ -93,7 +93,7 @@ class OpenedRun(Run):
 
     @cached_property
     def figures(self) -> Figures:
-        """Return all figures from the methods, by `step/name`; notebooks display them."""
+        """Return all figures that the methods drew, by `step/name`; notebooks display them."""
         return Figures(
             {
                 f"{cell.address}/{figure.name}": ShownFigure(**vars(figure))
@@ -116,13 +116,13 @@ class OpenedRun(Run):
         Args:
             address: address of the cell; if `variants` are given, the name of the step suffices.
             port: name of the output.
-            store: folder of stored results, for products that the record references but does not
+            store: folder of the store, for products that the record references but does not
                 contain.
             repeat: number of the repeat, from 0.
-            variants: variant by name of a step; for the key `data`, the dataset.
+            variants: step -> variant, and `data` -> dataset.
 
         Raises:
-            ArgumentError: the run does not have this cell, or the cell does not have this output.
+            ArgumentError: the run has no such cell, or the cell has no such output.
             RecordError: neither the record nor the store contains the output, or the record is
                 damaged.
             PluginError: no installed plugin defines the type of the product.
@@ -155,13 +155,14 @@ class OpenedRun(Run):
 
         Args:
             number: number of the wall, as in the names of its files; None for the first one.
-            cell: address of the cell that made the orthoimage. None for the cell of the baseline
-                or, with a warning, of another combination if the baseline has no orthoimage.
+            cell: address of the cell that created the orthoimage. If None, a cell of the baseline
+                is used, or a cell of another combination, with a warning, if the baseline has no
+                orthoimage.
             data: name of the dataset, if the run has several; None for the first one.
 
         Raises:
-            ArgumentError: the run does not have this orthoimage; the message lists the available
-                ones.
+            ArgumentError: the run has no such orthoimage; the message lists the available
+                orthoimages.
         """
         part = self if data is None else self._part(data)
         places = dict(embedded_products(part, "orthoimages"))
@@ -184,7 +185,6 @@ class OpenedRun(Run):
         return WallImage(image=image, cell=chosen, file=files[0] if files else None)
 
     def _part(self, data: str) -> Run:
-        """Return the part of the run that belongs to a dataset."""
         parts = parts_of(self)
         if data not in parts:
             raise ArgumentError(
@@ -199,9 +199,8 @@ class OpenedRun(Run):
         """Compare this run with another one; see `RunComparison`.
 
         Args:
-            other: the other run, its folder or its record.
-            store: folder of stored results, for products that the records reference but do not
-                contain.
+            other: the other run, as an object or as the path of its folder or record.
+            store: folder of the store, for products that the records reference but do not contain.
 
         Raises:
             ArgumentError: the other run does not exist.
@@ -213,7 +212,7 @@ class OpenedRun(Run):
         return ShownComparison(**vars(compare_runs(self, opened, stores=stores_at(store))))
 
     def _way_to_logs(self) -> str:
-        """Return a hint on how to read the logs of failed steps; empty if no step failed."""
+        """Return a hint on how to read the log of the first failed step; empty if none failed."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed or not failed[0].log:
             return ""
@@ -234,12 +233,12 @@ class OpenedRun(Run):
 
 
 def open_run(path: str | Path) -> OpenedRun:
-    """Open a finished run, with a warning if the seal of its record is broken.
+    """Open a finished run; warn if the seal of its record is broken.
 
     Large arrays are verified when they are read; `OpenedRun.verify` checks everything.
 
     Args:
-        path: a run folder, or the `run.h5` in it.
+        path: a run folder, or the `run.h5` in this folder.
 
     Raises:
         ArgumentError: the path does not exist, or the folder does not contain a finished run.
@@ -252,7 +251,7 @@ def open_run(path: str | Path) -> OpenedRun:
 
 
 def open_runs(paths: Sequence[str | Path]) -> RunSet:
-    """Open several runs, whose metrics form one table; see `RunSet.metrics`.
+    """Open several runs, whose metrics are joined into one table; see `RunSet.metrics`.
 
     Args:
         paths: run folders, or their `run.h5` files.
@@ -292,7 +291,7 @@ class ShownComparison(RunComparison):
 
 
 class Figures(dict[str, "ShownFigure"]):
-    """Figures by name."""
+    """Mapping from names to figures, which notebooks can display."""
 
     def __missing__(self, name: str) -> ShownFigure:
         raise ArgumentError(
@@ -326,11 +325,11 @@ class ShownFigure(RecordedFigure):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class WallImage:
-    """An orthoimage that can be used as an array: `numpy.asarray` returns its `rgb`.
+    """An orthoimage that can be used as an array; `numpy.asarray` returns its `rgb`.
 
     Attributes:
-        image: product with colours, mask, sources and frame.
-        cell: address of the cell that made the orthoimage.
+        image: the orthoimage with its colours, mask, sources and frame.
+        cell: address of the cell that created the orthoimage.
         file: path of the GeoTIFF; None if the files of the run are not next to the record.
     """
 
@@ -345,12 +344,12 @@ class WallImage:
 
     @property
     def is_shown(self) -> NDArray[np.bool_]:
-        """Mask (rows, columns), True for cells with a colour, including filled cells."""
+        """Mask (rows, columns), which is True for cells with a colour, including filled cells."""
         return is_shown(self.image.mask)
 
     @property
     def frame(self) -> WallFrame:
-        """Frame that defines the cells' positions; `frame.world_from_wall` returns metres."""
+        """Frame that defines the positions of the cells; `frame.world_from_wall` returns metres."""
         return self.image.frame
 
     def __array__(
@@ -375,7 +374,7 @@ class WallImage:
         return _html("picture", data_uri(picture, "image/webp"), repr(self))
 
 
-# Any: the macro determines the types.
+# The type is `Any` because it depends on the macro.
 def _html(macro: str, *values: Any) -> str:
-    """Render a macro of the notebook template, which escapes the text of a record."""
+    """Render a macro of the notebook template; the template escapes text from records."""
     return str(getattr(environment().get_template("notebook.html.j2").module, macro)(*values))

@@ -1,4 +1,4 @@
-"""Drawings of ties with residuals and of displacements, on pictures of the walls."""
+"""Drawings of tie residuals and of displacements on pictures of the walls."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from orthoflow.report.pictures import (
 )
 
 _MAX_MARKS: Final = 600  # per drawing
-# Drawn lengths of a vector with the RMS length and of the reference vector, as shares of the longer
-# side.
+# Drawn lengths of a vector of RMS length and of the reference vector, as shares of the longer side
+# of the wall.
 _RMS_SHARE: Final = 0.025
 _REFERENCE_SHARE: Final = 0.08
 _STEP_M: Final = 1e-3  # for derivatives; changes a position in a photo by about one pixel
-# Marker and colour by kind, visible on light and dark pictures.
+# Kind of tie -> marker and colour; they are visible on light and dark pictures.
 _MARKERS: Final = {
     "control": ("o", "#3ee066"),
     "check": ("s", "#ffe11f"),
     "rejected": ("x", "#ff3b30"),
 }
 _OTHERS: Final = ("o", "#4db8ff")
-# World points (n, 3), vectors (n, 2) in metres along u and v, and kinds (n,).
+# World points (n, 3) in metres, vectors (n, 2) along u and v in metres, and kinds (n,).
 _Vectors: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.str_]]
 
 
@@ -47,10 +47,10 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
     Args:
         run: the run.
         walls: pictures of the run's walls, used as backgrounds.
-        share: share of the size limit of a page that the drawings may use.
+        share: the part of a page's size limit that the drawings may use, from 0 to 1.
     """
     cameras, inspections = (embedded_products(run, name) for name in ("cameras", "inspection"))
-    # First picture of each wall of a walls product, by the product's digest.
+    # Digest of a walls product -> wall -> first picture of the wall.
     known: dict[str, dict[int, Picture]] = {}
     for picture in walls:
         for product in run.cells[picture.cell].outputs.values():
@@ -74,7 +74,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
                     ),
                     f"Displacements in the orthoimage of {ground.name}, {address}",
                     side,
-                    # The metrics of the method exclude these points.
+                    # The metrics of the method do not include these points.
                     remark="points next to depth steps are included; ",
                 )
 
@@ -82,7 +82,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
 def _walls_before(
     run: Run, address: str, known: Mapping[str, Mapping[int, Picture]]
 ) -> Mapping[int, Picture]:
-    """Return the pictures of walls from the nearest upstream step of a cell."""
+    """Return wall -> picture, from the nearest upstream step of a cell."""
     for cell in run.upstream(address):
         for given in cell.inputs.values():
             if given.digest in known:
@@ -143,14 +143,14 @@ def residuals_on_wall(
     ]
     jacobian = np.stack(along, axis=2)
     found = np.full((len(points), 2), np.nan)
-    # If the wall is seen edge-on, there is no solution.
+    # There is no solution if the wall is seen edge-on.
     solvable = np.isfinite(jacobian).all(axis=(1, 2)) & (np.linalg.det(jacobian) != 0.0)
     found[solvable] = np.linalg.solve(jacobian[solvable], residual_px[solvable, :, None])[..., 0]
     return found
 
 
 def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float:
-    """Return a round magnification that makes the vectors visible."""
+    """Return the magnification, a round number, at which vectors (n, 2) in metres are visible."""
     known = lengths_m[np.isfinite(lengths_m).all(axis=1)]
     rms_m = float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else 0.0
     if rms_m == 0.0:
@@ -171,7 +171,7 @@ def _overlay(
     frame = frame_of(ground)
     magnification = magnification_for(frame, lengths_m[kinds != "rejected"])
     feet = frame.wall_from_world(points_world)[:, :2]
-    # Keep marks at regular intervals.
+    # If there are too many marks, draw a subset at regular intervals.
     chosen = np.unique(np.linspace(0, len(kinds) - 1, min(_MAX_MARKS, len(kinds))).astype(np.int64))
     longest = max(frame.width, frame.height)
     reference_mm = round_below(1e3 * _REFERENCE_SHARE * longest * frame.gsd_m / magnification)
@@ -207,9 +207,9 @@ def _drawn(
 
     Args:
         ground: background picture.
-        groups: indices of positions by kind.
-        feet: (n, 2) positions in cells.
-        vectors: (n, 2) vectors in cells.
+        groups: kind -> indices of its positions.
+        feet: (n, 2) positions (column, row) in cells.
+        vectors: (n, 2) vectors (column, row) in cells.
         reference: label of the reference vector, and length of this vector in cells.
         side: longer side of the drawing in pixels.
     """
@@ -224,8 +224,7 @@ def _drawn(
             marker, colour = _MARKERS.get(kind, _OTHERS)
             u, v = feet[members].T
             axes.scatter(u, v, s=1.2, marker=marker, color=colour, linewidths=0.5, label=kind)
-            # Residuals of rejected ties may be metres long, so these ties have a mark but no
-            # vector.
+            # The residuals of rejected ties may be metres long, so draw only a mark.
             if kind != "rejected":
                 ends = np.stack([feet[members], feet[members] + vectors[members]])
                 axes.plot(*ends.T.swapaxes(1, 2), color=colour, linewidth=0.6)

@@ -1,4 +1,4 @@
-"""Generation of the report page from templates and records."""
+"""Generation of report pages from templates and records."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from orthoflow.report.tables import plane_tables
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
 
-# Columns of the table of statistics over all datasets.
+# These columns of the statistics over all datasets are shown on the page.
 _OVER_SHOWN: Final = (
     *("combination", "datasets", "failed", "absent", "partly", "median", "spread"),
     *(
@@ -74,7 +74,7 @@ _NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
 def _part(every: Mapping[str, Sequence[Any]], addresses: Collection[str]) -> SimpleNamespace:
-    """Return those items (pictures, tables and cells by kind) that belong to the given cells."""
+    """Return the items, such as pictures and tables, that belong to the given cells."""
     return SimpleNamespace(
         **{
             kind: [one for one in ones if (getattr(one, "cell", "") or one.address) in addresses]
@@ -91,25 +91,25 @@ def write_page(
     broken_seals: Mapping[Path, str] = _NONE_BROKEN,
     note: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Write the report of one run, and its figures as PNG and SVG files in `figures/` next to it.
+    """Write the report of one run, and its figures as image files in `figures/` next to it.
 
     If the run has variants, only the figures of the baseline are written; `write_figures` writes
-    those of any cell. If the run has several datasets, each dataset has its own page in `pages/`,
-    to which the main page links.
+    the figures of any cell. If the run has several datasets, the main page links to a page for each
+    dataset in `pages/`.
 
     Args:
         run: the run.
         path: output file.
-        go_on: command that resumes the run, if it was interrupted.
-        broken_seals: reason why the seal is broken, by record.
-        note: function that is called with the name of each part of the report.
+        go_on: command that resumes the run if it was interrupted.
+        broken_seals: record -> reason why its seal is broken.
+        note: function that is called with the name of each part of the report before it is written.
 
     Raises:
         StoreError: a file cannot be written.
-        RecordError: the record is damaged, or the name of a figure is not valid for a file.
+        RecordError: the record is damaged, or the name of a figure is not allowed as a file name.
     """
     addresses = baseline_addresses(run)
-    # Check the names first, so that no page is written for a record with invalid names.
+    # Check the names first, so that no page is written if a name is invalid.
     figure_files(run, addresses)
     pages = pages_of(run)
     with run.held_open() as opened:
@@ -141,12 +141,13 @@ def write_report(
     """Write a self-contained HTML file about one or more runs.
 
     Args:
-        runs: runs opened with `orthoflow.open_run`; for two runs, the page also lists the
+        runs: runs opened with `orthoflow.open_run`; for two runs, the page also lists their
             differences.
         path: output file, which is replaced atomically.
-        go_on: command that resumes the run, if it was interrupted.
-        broken_seals: reason why the seal is broken, by record.
-        stores: stores with products that the records of two runs reference but do not contain.
+        go_on: command that resumes the run if it was interrupted.
+        broken_seals: record -> reason why its seal is broken.
+        stores: stores with products that the records of two compared runs reference but do not
+            contain.
 
     Raises:
         StoreError: the file cannot be written.
@@ -187,13 +188,13 @@ def _content(
 
 
 def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> SimpleNamespace:
-    """Return the template data of a run whose datasets have their own pages.
+    """Return the data for the template of a run whose datasets have their own pages.
 
     Args:
         run: the run.
-        prefix: prefix of the anchors.
+        prefix: prefix of the HTML anchors.
         folder: folder of the page.
-        pages: page of each dataset; empty if datasets have no pages.
+        pages: dataset -> path of its page; empty if datasets have no pages.
     """
     parts = parts_of(run)
     over = over_datasets(parts)
@@ -221,18 +222,19 @@ def _section(
     share: float = 1.0,
     with_files: bool = False,
 ) -> SimpleNamespace:
-    """Return the template data of one run.
+    """Return the data for the template of one run.
 
     Args:
         run: the run.
-        prefix: prefix of the anchors.
+        prefix: prefix of the HTML anchors.
         folder: folder of the page; paths of files are relative to it.
-        broken_seals: reason why the seal is broken, by record.
-        share: share of the size limit of a page that pictures may use.
+        broken_seals: record -> reason why its seal is broken.
+        share: the part of a page's size limit that pictures may use, from 0 to 1.
         with_files: whether files of the figures are written next to the page.
     """
     from_page = Path(os.path.relpath(run.folder, folder))
-    # Pictures of the baseline come first, because the metrics next to them belong to the baseline.
+    # Pictures of the baseline come first, because the metrics shown next to them are those of the
+    # baseline.
     baseline = {cell.address for cell in baseline_cells(run)}
     orthoimages, walls = (
         sorted(pictures(run, share=share), key=lambda picture: picture.cell not in baseline)
@@ -294,7 +296,7 @@ def _section(
 
 
 def _files(run: Run, from_page: Path) -> Mapping[str, Mapping[str, str]]:
-    """Return the paths of published files, relative to the page, by cell address and name."""
+    """Return cell address -> file name -> path relative to the page, for published files."""
     published = {file.path for file in run.record.published}
     found: dict[str, dict[str, str]] = defaultdict(dict)
     for address, paths in run.files.items():

@@ -36,15 +36,15 @@ from orthoflow.untrusted_text import Value, first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
-# With four datasets, p is at least 0.125, so no difference can be significant.
+# With four differences, p is at least 0.125, so none can be significant.
 _MIN_TESTED: Final = 5
-# Minimum number of methods for mean ranks; for two, the signed-rank test is more powerful.
+# Minimum number of methods for mean ranks; for two methods, the signed-rank test is more powerful.
 _MIN_RANKED: Final = 3
-# If all differences have the same sign, p is 0.031 for six datasets and 0.0625 for five.
+# If all differences have the same sign, p is 0.031 for six datasets but 0.0625 for five.
 _MIN_SHOWN: Final = 6
 _SHOWN_P: Final = 0.05
 _MAX_NAMED: Final = 6
-# Name and variant of each step with variants on which a step depends.
+# The steps with variants on which a step depends, as pairs of step and variant.
 _Variants: TypeAlias = tuple[tuple[str, str], ...]
 _Bases: TypeAlias = dict[_Variants, _Variants]
 _TEST: Final = f"p below {_SHOWN_P:g} after Holm's correction"
@@ -52,25 +52,25 @@ _TEST: Final = f"p below {_SHOWN_P:g} after Holm's correction"
 
 @dataclass(frozen=True, kw_only=True)
 class Paired:
-    """Comparison of a method with the reference on the datasets on which both have a value.
+    """Comparison of a method with the reference, over the datasets on which both have a value.
 
-    Differences due to rounding (`is_rounding`) count as zero, i.e. as neither better nor worse.
+    Differences due to rounding (`is_rounding`) count as neither better nor worse.
 
     Attributes:
         n: number of datasets on which both have a value.
         wins: number of datasets on which the method is better.
         losses: number of datasets on which the method is worse.
-        median: median difference in the metric's unit; negative if the method has smaller values.
-            Signed errors are compared by absolute value, and metrics for which 1 is the best value
-            by the logarithm of their ratio to 1. For yes/no metrics, this is the difference between
-            the shares.
+        median: median difference in the unit of the metric; negative if the method has smaller
+            values. Signed errors are compared by their absolute value. Metrics for which 1 is the
+            best value are compared by the absolute value of their logarithm. For yes/no metrics,
+            this is the difference between the shares of "yes".
         p: p-value of Wilcoxon's two-sided signed-rank test; NaN for fewer than five differences.
         effect: matched-pairs rank-biserial correlation, from -1 (worse on every dataset) to 1
             (better on every dataset); NaN if p is NaN.
-        interval: distribution-free confidence interval for the median difference, from order
+        interval: distribution-free confidence interval of the median difference, based on order
             statistics, with a confidence level of at least 95 %; NaN for fewer than six datasets
             and for shares.
-        p_holm: p corrected by Holm's method for all comparisons in the run; NaN if p is NaN.
+        p_holm: p-value corrected by Holm's method for all comparisons in the run; NaN if p is NaN.
     """
 
     n: int
@@ -85,24 +85,24 @@ class Paired:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOverDatasets:
-    """Results of the variants on which a step depends, on all datasets.
+    """Values of a metric over all datasets, for one selection of variants.
 
     Attributes:
-        variants: variant by step; empty if there are no variants.
-        compared_with: name of the variants with which these are compared: those of the baseline, or
-            of the baseline's methods with the same values of swept parameters; empty for the
-            baseline itself, the reference.
+        variants: step -> variant; empty if there are no variants.
+        compared_with: name of the variants with which these are compared, which are the variants of
+            the baseline, or variants with the baseline's methods and the same values of swept
+            parameters; empty for the baseline itself, which is the reference.
         n: number of datasets with a value.
-        n_failed: number of datasets that are not used because the step or an earlier one failed.
+        n_failed: number of datasets that are not used because this step or an upstream step failed.
         n_absent: number of datasets without a value, although no step failed.
         n_partly: number of datasets on which only some repeats have a value.
-        n_apart: number of datasets that cannot be paired because the environments or the numbers of
-            photos differ from those of the reference.
-        median: median over the datasets, computed from absolute values for signed errors; for
-            yes/no metrics, the share of "yes"; NaN if there are no values.
+        n_apart: number of datasets that cannot be paired because the environment or the number of
+            items, such as photos, differs from that of the reference.
+        median: median over the datasets (of absolute values for signed errors), or the share of
+            "yes" for yes/no metrics; NaN if there are no values.
         spread: 1.4826 times the median absolute deviation; NaN if there are no values, and for
             shares.
-        repeat_spread: median over the datasets of the standard deviation over repeats; NaN without
+        repeat_spread: standard deviation over repeats, as median over the datasets; NaN without
             repeats.
         paired: comparison with `compared_with`; None for the reference and for unranked metrics.
     """
@@ -131,8 +131,8 @@ class MeanRanks:
 
     Attributes:
         n: number of datasets on which all methods have a value.
-        ranks: mean rank by method, best (1) first.
-        p: p-value of Friedman's test of the hypothesis that all methods are equal.
+        ranks: method -> mean rank, beginning with the best; the best possible rank is 1.
+        p: p-value of Friedman's test; the null hypothesis is that all methods are equal.
         critical_difference: critical difference of mean ranks by Nemenyi's test at the 0.05 level;
             methods whose mean ranks differ by less are not significantly different.
     """
@@ -144,7 +144,10 @@ class MeanRanks:
 
     @property
     def leading(self) -> tuple[str, ...]:
-        """Best method and those not significantly different from it; all methods if p >= 0.05."""
+        """The best method, and the methods that do not differ significantly from it.
+
+        These are all methods if p >= 0.05.
+        """
         best = min(self.ranks.values())
         reach = self.critical_difference if self.p < _SHOWN_P else math.inf
         return tuple(name for name, rank in self.ranks.items() if rank - best < reach)
@@ -157,7 +160,8 @@ class MetricOverDatasets:
     Attributes:
         column: metadata of the metric.
         methods: results of the variants on which the step depends, in the order of the graph.
-        ranks: ranks of all methods; None for fewer than three methods or five datasets.
+        ranks: ranks of all methods; None if there are fewer than three methods or fewer than five
+            datasets.
     """
 
     column: MetricRow
@@ -171,9 +175,13 @@ class MetricOverDatasets:
 
     @property
     def lead(self) -> str:
-        """Text on the best and next best value and the significance of their difference, or ""."""
+        """Sentence on the best and second-best value, and whether they differ significantly.
+
+        It is empty if the metric is not ranked or fewer than two values can be compared.
+        """
         better, unit = self.column.better, self.column.unit
-        # Medians over fewer datasets may be better only because the difficult datasets are missing.
+        # A median over fewer datasets may be better only because the difficult datasets are
+        # missing.
         most = max(one.n for one in self.methods)
         known = [one for one in self.methods if one.n == most and math.isfinite(one.median)]
         if better not in BETTER or len(known) < 2:
@@ -197,19 +205,20 @@ class MetricOverDatasets:
 
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
-    """Compare the variants of a run over its datasets for every metric.
+    """Compare the variants of a run over its datasets, for each metric.
 
-    Values from different environments, or over different numbers of photos, are never paired.
+    Values from different environments, or over different numbers of items such as photos, are never
+    paired.
 
     Args:
-        parts: part of the run by dataset.
+        parts: dataset -> part of the run.
     """
     every = [one for part in parts.values() for one in combinations_of(part)]
     every = [one for one in every if DATA in one.assignment]
     if len(parts) < 2 or not every:
         return ()
     environments = group_environments(parts.values())
-    # Combinations by step, by variants on which the step depends, and by dataset.
+    # Step -> variants on which the step depends -> dataset -> combination.
     ways: dict[str, dict[_Variants, dict[str, Combination]]] = {}
     for name, part in parts.items():
         baseline = baseline_of(part)
@@ -227,10 +236,11 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
 
 
 def _bases(ways: Sequence[_Variants], varied: Varied, reference: _Variants) -> _Bases:
-    """Return the variants with which each set of variants is compared.
+    """Return variants -> the variants with which they are compared.
 
-    These are the variants of the reference's methods with the same values of swept parameters, so
-    that methods are compared at equal settings; if there are none, the reference.
+    To compare methods at equal settings, these are variants with the methods of the reference and
+    the same values of swept parameters. If there are none, the variants are compared with the
+    reference.
     """
     used, values = {}, {}
     for own in ways:
@@ -279,11 +289,12 @@ def _over(
     bases = _bases([*ways], varied, reference)
 
     def comparable(own: _Variants, base: _Variants) -> dict[str, tuple[Measured, Measured]]:
-        """Return pairs of comparable values of two sets of variants, by dataset."""
+        """Return dataset -> pair of comparable values of two sets of variants."""
         found = {}
         for name in measured[own].keys() & measured[base].keys():
             both = measured[own][name], measured[base][name]
-            # A larger error is not a worse result if it covers more photos.
+            # Do not compare errors over different numbers of items: a larger error over more photos
+            # is not a worse result.
             ours, theirs = (ways[key][name].n_items(step, column.counted_by) for key in (own, base))
             is_like = environments.are_comparable(*(one.environment for one in both))
             if is_like and not abs(ours - theirs) > 0.0:
@@ -296,7 +307,7 @@ def _over(
     for own, by_data in ways.items():
         values = np.array([value.value for value in measured[own].values()])
         if column.better == "lower":
-            # Use absolute values, because errors of both signs would cancel.
+            # Errors of both signs would cancel.
             values = np.abs(values)
         n_failed = sum(one.failure is not None for one in by_data.values())
         n_both = len(measured[own].keys() & measured[bases[own]].keys())
@@ -331,7 +342,7 @@ def _over(
 
 
 def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDatasets, ...]:
-    """Correct all p-values of a run together, because some of many are small by chance."""
+    """Correct all p-values of a run together, because some of many p-values are small by chance."""
     metrics = tuple(metrics)
     found = [one.paired.p for metric in metrics for one in metric.methods if one.paired]
     corrected = holm([p for p in found if math.isfinite(p)])
@@ -350,7 +361,7 @@ def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDataset
 
 
 def holm(values: Sequence[float]) -> dict[float, float]:
-    """Return the corrected p-value for each p-value of several tests, by Holm's method.
+    """Return p-value -> p-value corrected by Holm's method, for several tests.
 
     >>> holm([0.01, 0.04, 0.03])
     {0.01: 0.03, 0.03: 0.06, 0.04: 0.06}
@@ -366,8 +377,8 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
 
     Args:
         names: names of the methods, at least three.
-        badness_of: (datasets, methods) values, of which smaller ones are better. Values that differ
-            only by rounding (`is_rounding`) are ties, as in the paired comparisons.
+        badness_of: values (datasets, methods); smaller values are better. Values that differ only
+            by rounding (`is_rounding`) have the same rank.
     """
     from scipy.stats import (  # noqa: PLC0415 - takes half a second
         friedmanchisquare,
@@ -376,7 +387,8 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
     )
 
     n, k = badness_of.shape
-    # Friedman's test ranks the values again, so ties are made in the values.
+    # Friedman's test ranks the values itself, so make equal values of those that differ by
+    # rounding.
     badness_of = np.array([_with_ties(row) for row in badness_of])
     means = rankdata(badness_of, axis=1).mean(axis=0)
     is_level = bool((badness_of == badness_of[:, :1]).all())
@@ -390,7 +402,7 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
 
 
 def _with_ties(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Replace values that differ from the smallest of their group only by rounding by that one."""
+    """Replace each group of values that differ only by rounding by the smallest of the group."""
     tied = values.copy()
     order = np.argsort(values)
     for before, place in pairwise(order):
@@ -400,7 +412,7 @@ def _with_ties(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
-    """Summarise which variants are significantly better; empty if there is only one combination.
+    """Summarise which variants are significantly better; empty for a single combination.
 
     Args:
         over: the metrics.
@@ -411,8 +423,8 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     if not rows:
         return ""
     tested = [one.paired for _, one in rows if one.paired and math.isfinite(one.paired.p)]
-    # If all n differences have the same sign, p is 2 / 2^n. All comparisons are counted, because
-    # more of them can be tested with more datasets.
+    # If all n differences have the same sign, p is 2 / 2^n. All comparisons are counted, including
+    # those that can be tested only with more datasets.
     enough = 2 + math.floor(math.log2(len(rows) / _SHOWN_P))
     needed = f"at least {enough} datasets are needed for all comparisons ({len(rows)})"
     if not tested:
@@ -472,19 +484,20 @@ def _paired(pairs: Iterable[tuple[Measured, Measured]], column: MetricRow) -> Pa
     worse = []
     for both in pairs:
         own, other = (badness(one.value, column.better) for one in both)
-        # Without this, a rank test could treat rounding differences in six datasets as significant.
+        # Otherwise, a rank test could find differences by rounding on six datasets to be
+        # significant.
         if math.isfinite(own - other):
             worse.append(0.0 if is_rounding(own, other) else own - other)
     return paired_differences(np.array(worse), column.better, column.unit) if worse else None
 
 
 def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1") -> Paired:
-    """Return the statistics of paired differences.
+    """Compute the statistics of paired differences.
 
     Args:
-        worse: (n,) finite amounts by which the method is worse than the reference on each dataset;
-            0 if they are level; n is at least 1.
-        better: better direction of the metric, which defines the sign of the differences.
+        worse: (n,) finite amounts by which the method is worse than the reference on each dataset,
+            where n is at least 1; 0 if both are equally good.
+        better: better direction of the metric, which determines the sign of the median difference.
         unit: unit of the metric.
     """
     from scipy.stats import quantile_test, rankdata, wilcoxon  # noqa: PLC0415 - half a second
@@ -498,7 +511,7 @@ def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1")
         p = float(wilcoxon(moved).pvalue)
     low, high = math.nan, math.nan
     if not is_flag(unit):
-        # Any: scipy's stubs declare another class.
+        # The type is `Any` because scipy's stubs declare another class.
         tested: Any = quantile_test(sign * worse)
         low, high = tested.confidence_interval(1.0 - _SHOWN_P)
     return Paired(
@@ -541,7 +554,9 @@ _OVER: Final = (
 
 
 def over_table(over: Sequence[MetricOverDatasets]) -> Table:
-    """Return the statistics over all datasets, with a row per metric and combination.
+    """Return the statistics over all datasets as a table.
+
+    There is one row for each metric and combination.
 
     Unknown values, such as p for two datasets, are empty.
     """
@@ -576,5 +591,5 @@ def over_table(over: Sequence[MetricOverDatasets]) -> Table:
 
 
 def _known(value: float) -> float | None:
-    # Adding 0.0 turns -0.0, which occurs for metrics where higher is better, into 0.0.
+    # Adding 0.0 turns -0.0, which occurs for metrics for which higher is better, into 0.0.
     return None if math.isnan(value) else value + 0.0

@@ -1,4 +1,4 @@
-"""Tables and citations from a run for publications: CSV, LaTeX, Markdown and BibTeX."""
+"""Tables and citations for publications, as CSV, LaTeX, Markdown and BibTeX."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from orthoflow.report.tables import Column, Table, escaped_latex
 from orthoflow.untrusted_text import shown
 from orthoflow.workflow.model import DATA
 
-# With more combinations, they are rows instead of columns.
+# If there are more combinations, the table shows them as rows instead of columns.
 _FEW_COMBINATIONS: Final = 4
-# `Hoehle and Hoehle 2009, title, doi:10.1016/...`; only authors and year are required.
+# An example is `Hoehle and Hoehle 2009, title, doi:10.1016/...`; only authors and year are
+# required.
 _CITATION: Final = re.compile(
     r"(?P<authors>[^\d]+?),? (?P<year>(?:19|20)\d\d)\b[,:]?\s*(?P<rest>.*)"
 )
@@ -27,11 +28,11 @@ _URL: Final = re.compile(r",?\s*(https?://\S+)")
 
 
 def paper_files(run: Run) -> dict[str, str]:
-    """Return the files from a run for a publication, by name.
+    """Return file name -> content for a publication about a run.
 
-    `results` has a row per combination and dataset with the metrics that the comparison selects, or
-    else the headline metrics; `datasets` has the statistics over all datasets, if there are
-    several; `values.csv` has a row per value, with all digits.
+    The LaTeX and Markdown tables `results` contain the metrics that the comparison selects, by
+    default the headline metrics; `results.csv` contains one row per value, with all digits. If
+    there are several datasets, `datasets` contains the statistics over them.
     """
     files = {"results.csv": _values(run).csv()}
     tables = [_results(run)]
@@ -47,7 +48,7 @@ def paper_files(run: Run) -> dict[str, str]:
 
 
 def _values(run: Run) -> Table:
-    """Return a table with a row per combination and metric, including unit and better direction."""
+    """Return a table with one row for each combination and metric."""
     columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     names = (
@@ -74,7 +75,10 @@ def _values(run: Run) -> Table:
 
 
 def _results(run: Run) -> Table:
-    """Return the comparison, with metrics as rows if there are few combinations."""
+    """Return a table of metrics and combinations.
+
+    If there are few combinations, the metrics are rows; otherwise, they are columns.
+    """
     columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     texts = [
@@ -122,16 +126,16 @@ def _results(run: Run) -> Table:
 
 
 def _factors(combinations: Iterable[Combination]) -> tuple[str, ...]:
-    """Return the names of the factors, the dataset first."""
+    """Return the names of the factors, beginning with the dataset."""
     found = dict.fromkeys(step for one in combinations for step in one.assignment)
     return tuple(sorted(found, key=lambda factor: factor != DATA))
 
 
 def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
-    """Return citations as BibTeX entries, each with a note on the methods that use the source.
+    """Format citations as BibTeX entries, with notes on the methods that use the source.
 
     Args:
-        cited: by citation, the methods and what each of them uses from the source.
+        cited: citation -> methods, each with the part of the source that it uses.
 
     >>> print(bibtex({"Gruen 1985, Adaptive matching, doi:10.1/x": ["inspect.surf"]}), end="")
     @misc{gruen1985,
@@ -150,7 +154,7 @@ def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
         keys[key] = keys.get(key, -1) + 1
         suffix = chr(ord("a") + keys[key]) if keys[key] else ""
         lines = [
-            # DOIs and URLs are not escaped.
+            # DOIs and URLs must not be escaped.
             f"  {name} = {{{value if name in ('doi', 'url') else escaped_latex(value)}}},"
             for name, value in fields.items()
             if value
@@ -160,7 +164,7 @@ def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
 
 
 def _once(cited: Mapping[str, Sequence[str]]) -> list[dict[str, str]]:
-    """Return the fields of each entry; for the same DOI, the citation with the longest title."""
+    """Return the fields of each entry; citations with the same DOI are merged into one entry."""
     found: dict[str, dict[str, str]] = {}
     for text, methods in cited.items():
         fields = {**_fields(" ".join(shown(text).split())), "note": "; ".join(methods)}

@@ -1,4 +1,4 @@
-"""Plan views of walls and photo positions, with a table of the photos."""
+"""Plan view of walls and photo positions, with a table of the photos."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from orthoflow.untrusted_text import Value, first_few
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoPlan:
-    """Plan view of one orientation.
+    """Plan view of the result of one orientation.
 
     Attributes:
         walls: walls in plan view.
         photos: oriented photos in plan view.
-        caption: description, which names the photos that are missing.
-        cell: address of the orientation.
+        caption: description, which lists the photos that are not oriented.
+        cell: address of the cell of the orientation.
         table: quality of the orientation of each photo.
-        axes: labels of the scan's axes to the right and upwards.
+        axes: labels of the scan axes that point to the right and upwards in the plan.
     """
 
     walls: tuple[PlanWall, ...]
@@ -55,7 +55,7 @@ class PhotoPlan:
 
 
 def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
-    """Return the plan of the baseline's last orientation; None if no photo is oriented.
+    """Return the plan for the baseline's last orientation; None if no photo is oriented.
 
     Args:
         run: the run.
@@ -68,7 +68,7 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
         cameras = orientation.cameras
         oriented = [one for one in cameras if one.status == "ok"]
         if oriented:
-            # There are two pictures of each wall, intensity and depth.
+            # Each wall has two pictures, for intensity and depth, with the same frame.
             frames = {
                 picture.number: (picture.name, picture.frame)
                 for picture in walls
@@ -122,7 +122,7 @@ def _table(orientation: Cameras) -> Table:
 
 
 def _counts(ties: Ties | None, role: TieRole) -> dict[str, int]:
-    """Return the number of ties with a given role in each photo."""
+    """Return photo -> number of ties with the given role."""
     if ties is None:
         return {}
     counts = np.bincount(ties.photo[ties.role == role], minlength=len(ties.photo_names))
@@ -152,7 +152,7 @@ def _drawn(
     oriented: Sequence[Camera],
     walls: Mapping[int, tuple[str, WallFrame]],
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
-    """Return walls, by number, and photos in plan view."""
+    """Return walls and photos in plan view."""
     axes = basis_from_up(up)[:2].T
     viewing = {camera.photo: camera.viewing() for camera in oriented}
     return (
@@ -160,7 +160,7 @@ def _drawn(
             (name, number, np.asarray(frame.corners_world(), dtype=np.float64) @ axes)
             for number, (name, frame) in walls.items()
         ),
-        # The third axis of a camera is the viewing direction.
+        # The third row of the rotation matrix is the viewing direction.
         tuple(
             (name, one.centre_world @ axes, one.rotation[2] @ axes) for name, one in viewing.items()
         ),

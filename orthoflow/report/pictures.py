@@ -1,4 +1,4 @@
-"""Pictures on the page: small images of products, grouped by wall."""
+"""Pictures on the page, which are small images of products."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from orthoflow.untrusted_text import shown
 T = TypeVar("T", bound=Product)
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320
-# Number of pictures that a page can contain at full size; if there are more, each becomes smaller.
-# A picture with a longer side of 1000 px takes about 90 kB.
+# Number of pictures that a page can contain at full size; if there are more, all are scaled down. A
+# picture with a longer side of 1000 px takes about 90 kB.
 _FULL_PICTURES: Final = 24
-# The baseline's orthoimages are for close inspection, so they have as many cells as a page allows,
-# at about 0.15 bytes per cell.
+# The baseline's orthoimages are meant for close inspection, so they have as many cells as the size
+# limit of a page allows; a cell takes about 0.15 bytes.
 _CLOSE_CELLS: Final = 12_000_000
 
-# Maximum number of positions with depths per wall; they take about 40 kB on a page.
+# Maximum number of positions per wall for which the page contains depths; they take about 40 kB.
 _PLACES_MOST: Final = 8_000
 # Maximum length of the scale bar as a share of the picture's width.
 _BAR_SHARE: Final = 0.3
-# Colours of ColorBrewer's RdBu (Brewer 2003), from blue (behind the plane) through white (on it) to
-# red (in front); readable with red-green colour blindness.
+# ColorBrewer's colour map RdBu (Brewer 2003), from blue (behind the plane) through white (on the
+# plane) to red (in front of it), which readers with red-green colour blindness can distinguish.
 DIVERGING: Final = np.array(
     [[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]],
     dtype=np.float64,
@@ -55,7 +55,8 @@ _PLACES: Final = np.linspace(-1.0, 1.0, 255)
 _DIVERGING_TABLE: Final = np.rint(
     np.column_stack([np.interp(_PLACES, np.linspace(-1, 1, 5), one) for one in DIVERGING.T])
 ).astype(np.uint8)
-# Planes that two methods detect for the same wall differ by at most a few centimetres and a degree.
+# The planes that two methods detect for the same wall usually differ by at most a few centimetres
+# and one degree.
 _SAME_NORMAL_COSINE: Final = float(np.cos(np.radians(5.0)))
 _SAME_PLACE_SHARE: Final = 0.1  # of the longer side, between centres
 
@@ -67,18 +68,20 @@ class Picture:
     Attributes:
         uri: data URI of the image.
         title: title of the image.
-        caption: size of the image and shares of the cell states.
-        file: path of the full image relative to the run folder, or empty.
-        cell: address of the cell that made the image.
-        wall: index of the wall; -1 if the image is not a raster of a wall.
-        number: number of the wall as shown to users, i.e. the index of its plane in `planes.json`.
+        caption: description of the image, such as its size and the shares of the cell states.
+        file: path of the full-size image relative to the run folder; empty if there is no such
+            file.
+        cell: address of the cell that created the image.
+        wall: index of the wall in the product; -1 if the image is not a raster of a wall.
+        number: number of the wall as shown to users, which is the index of its plane in
+            `planes.json`.
         name: name of the wall.
         frame: frame of the raster; None if the image is not a raster of a wall.
         id: HTML id; empty if nothing refers to the image.
-        depths: for pictures of depth, `columns` and `rows` of a coarse grid, and `mm` row by row,
-            None if unknown.
-        depth_limit_m: depth shown in the last colour of the scale; the first colour shows the same
-            distance behind the plane.
+        depths: for pictures of depth, a coarse grid with its numbers of `columns` and `rows`, and
+            the depths in `mm` row by row (None if unknown).
+        depth_limit_m: depth in front of the plane that is shown in the last colour of the scale;
+            the first colour shows the same distance behind the plane.
         reading: one sentence on how to interpret the image and what indicates a problem.
     """
 
@@ -103,35 +106,35 @@ class Picture:
 
     @property
     def scale(self) -> tuple[str, float]:
-        """Length of the scale bar, a round number, and its share of the width in percent."""
+        """Length of the scale bar (a round number), and its share of the width in percent."""
         length_m = round_below(_BAR_SHARE * self.width_m)
         words = f"{length_m:g} m" if length_m >= 1.0 else f"{100.0 * length_m:g} cm"
         return words, 100.0 * length_m / self.width_m
 
     @property
     def layer(self) -> str:
-        """Title without the wall but with variants, which is the same for all walls of a cell."""
+        """Title without the wall, which is the same for all walls of a cell."""
         text = self.title.removeprefix(self.name).strip(" ,")
         return text if text and not text.startswith("(") else f"orthoimage {text}".strip()
 
 
 def data_uri(content: bytes, media_type: str) -> str:
-    """Return the content of a file as a data URI."""
+    """Encode the content of a file as a data URI."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def side_px(n_pictures: float) -> int:
-    """Return the longer side, in pixels, at which n pictures keep the page small."""
+    """Return the longer side in pixels at which this number of pictures fits on a page."""
     share = min(1.0, math.sqrt(_FULL_PICTURES / max(1, n_pictures)))
     return max(SHORTEST_SIDE_PX, round(LONGEST_SIDE_PX * share))
 
 
 def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
-    """Yield every orthoimage in the record; those that are identical in several cells once.
+    """Yield pictures of all orthoimages in the record, without duplicates.
 
     Args:
         run: the run.
-        share: share of the size limit of a page that the pictures may use.
+        share: the part of a page's size limit that the pictures may use, from 0 to 1.
     """
     n_products = len(embedded_products(run, "orthoimages"))
     baseline = {cell.address for cell in baseline_cells(run)}
@@ -144,7 +147,7 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
 
 
 def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> str:
-    """Return a thumbnail of the cells' first orthoimage as a data URI; empty if there is none."""
+    """Return a thumbnail of the first orthoimage of cells as a data URI; empty if there is none."""
     places = [cell for cell, _ in embedded_products(run, "orthoimages") if cell in addresses]
     for address, product in products_of(run, Orthoimages, places[-1:]):
         for image in product.images:
@@ -154,11 +157,11 @@ def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> 
 
 
 def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
-    """Yield intensity and depth pictures of every wall raster in the record; identical ones once.
+    """Yield intensity and depth pictures of all walls in the record, without duplicates.
 
     Args:
         run: the run.
-        share: share of the size limit of a page that the pictures may use.
+        share: the part of a page's size limit that the pictures may use, from 0 to 1.
     """
     n_products = len(embedded_products(run, "walls"))
     for address, product in products_of(run, Walls):
@@ -171,8 +174,8 @@ def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
         yield from _drawn(drawings, n_products=n_products / share)
 
 
-# Function that encodes the image with a given longer side in pixels, and the picture with its
-# frame.
+# A function that encodes the image with a given longer side in pixels, and the picture without
+# image data.
 _Drawing = tuple[Callable[[int], bytes], Picture]
 
 
@@ -184,7 +187,7 @@ def _drawn(
     Args:
         drawings: pictures of one product.
         n_products: number of products on the page.
-        close_cells: minimum number of cells of each picture, if the raster has them.
+        close_cells: minimum number of cells in each picture, unless the raster has fewer.
     """
     small_px = side_px(n_products * len(drawings))
 
@@ -221,7 +224,7 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
 
 
 def _states(image: Orthoimage) -> str:
-    """Return the shares of the cell states, which add up to 100 %."""
+    """Describe the shares of the cell states, which add up to 100 %."""
     words = {
         OrthoMask.PAINTED: "covered",
         OrthoMask.CONTRADICTED: "covered by a single photo that contradicts the scan",
@@ -275,7 +278,7 @@ def _intensity(
 
 
 def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Picture:
-    """Return a picture of `depth` or `intensity`, without image data, caption and reading."""
+    """Return a picture of `depth` or `intensity` without image data, caption and reading."""
     return Picture(
         uri="",
         title=_title(f"{wall.name}, {what}", address),
@@ -290,16 +293,16 @@ def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Pictur
 
 
 def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.uint8]:
-    """Return colours of depths from blue (-limit) to red (+limit); 0 and NaN are white."""
+    """Convert depths to colours from blue (-limit) to red (+limit); 0 and NaN become white."""
     place = np.clip(np.asarray(depth_m, dtype=np.float32) / np.float32(limit_m), -1.0, 1.0)
-    # One table look-up per cell is ten times as fast as interpolating colours.
+    # Looking up colours in a table is ten times as fast as interpolating them.
     index = np.rint(np.nan_to_num(place) * 127.0 + 127.0).astype(np.int16)
     coloured: NDArray[np.uint8] = _DIVERGING_TABLE[index]
     return coloured
 
 
 def frame_words(frame: WallFrame) -> str:
-    """Return size and resolution of a raster as text."""
+    """Describe the size and resolution of a raster."""
     return (
         f"{frame.width * frame.gsd_m:.2f} x {frame.height * frame.gsd_m:.2f} m at "
         f"{1000 * frame.gsd_m:g} mm, {frame.width} x {frame.height} cells"
@@ -307,9 +310,9 @@ def frame_words(frame: WallFrame) -> str:
 
 
 def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
-    """Return cells and ports whose product in the record has a given type; identical ones once.
+    """Return the cell and port of each product of a type in the record, without duplicates.
 
-    Repeats of a random method are omitted: they differ only in their metrics.
+    Repeats are omitted, because they are of interest only for their metrics.
     """
     found: dict[str, tuple[str, str]] = {}
     for address, cell in run.cells.items():
@@ -322,9 +325,10 @@ def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
 def products_of(
     run: Run, cls: type[T], addresses: Container[str] | None = None
 ) -> Iterator[tuple[str, T]]:
-    """Yield the products of a type in the record, each with the address of its cell.
+    """Yield the products of a type in the record, each preceded by the address of its cell.
 
-    One product is loaded at a time, since all products of a large building may exceed the memory.
+    Only one product is loaded at a time, because the products of a large building together may
+    exceed the memory.
 
     Args:
         run: the run.
@@ -359,7 +363,7 @@ def _percent(share: float) -> str:
 
 
 def coarse_depths(depth_m: NDArray[np.float32]) -> dict[str, object]:
-    """Return `columns`, `rows` and `mm` (depths at cell centres) of a coarse grid."""
+    """Sample depths in metres on a coarse grid; see `Picture.depths`."""
     height, width = depth_m.shape
     step = max(1.0, math.sqrt(width * height / _PLACES_MOST))
     columns, rows = max(1, round(width / step)), max(1, round(height / step))
@@ -373,7 +377,7 @@ def coarse_depths(depth_m: NDArray[np.float32]) -> dict[str, object]:
 def cursor_places(
     orthoimages: Sequence[Picture], walls: Sequence[Picture]
 ) -> list[dict[str, object]]:
-    """Return the frames of orthoimages and coarse depths, for the page's script.
+    """Return the frames of orthoimages and coarse depths, for the script of the page.
 
     Args:
         orthoimages: pictures of orthoimages.
@@ -406,16 +410,16 @@ def cursor_places(
 
 
 def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:
-    """Group pictures of the same part of a wall, for the page's script.
+    """Group pictures of the same part of a wall, for the script of the page.
 
     Args:
         pictures: orthoimages first, then rasters of walls.
         n_orthoimages: number of orthoimages; every group contains at least one.
 
     Returns:
-        For each group of two or more pictures: the name of the wall, the aspect ratio (width /
-            height) of the first picture, and each picture's id, titles, and rectangle in percent of
-            the first picture's sides.
+        For each group of two or more pictures, the name of the wall, the aspect ratio (width /
+        height) of the first picture, and the id, titles and rectangle of each picture; rectangles
+        are in percent of the width and height of the first picture.
     """
     groups: list[list[Picture]] = []
     for index, picture in enumerate(pictures):
@@ -455,7 +459,7 @@ def _placed(picture: Picture, reference: WallFrame) -> dict[str, object]:
 
 
 def frame_of(picture: Picture) -> WallFrame:
-    """Return the frame of a raster of a wall."""
+    """Return the frame of a picture, which must be a raster of a wall."""
     if picture.frame is None:
         raise ValueError(f"{picture.title} is not a raster of a wall")
     return picture.frame

@@ -30,12 +30,12 @@ def number(value: float, *, significant: int = 4) -> str:
     if digits >= 10:
         return f"{value:.3g}"
     printed = f"{value:.{digits}f}"
-    # Trailing zeros are removed only after a decimal point.
+    # Remove trailing zeros only after a decimal point.
     return printed.rstrip("0").rstrip(".") if digits else printed
 
 
 def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
-    """Format a number with its unit; shares and counts (unit 1) are formatted without a unit.
+    """Format a number with its unit; shares and counts (unit 1) have no unit.
 
     >>> number_with_unit(2.5, "mm"), number_with_unit(1.0, "yes/no"), number_with_unit(0.4, "1")
     ('2.5 mm', 'yes', '0.4')
@@ -47,7 +47,9 @@ def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
 
 
 def number_with_spread(value: float, spread: float) -> str:
-    """Format a mean to two digits of its standard deviation, unless that deviation is tiny.
+    """Format a mean and its standard deviation, rounded to two digits of the latter.
+
+    If the standard deviation is tiny, the mean has four digits.
 
     >>> number_with_spread(12.3456, 0.0123), number_with_spread(3.0, 0.0)
     ('12.346 ± 0.012', '3')
@@ -78,16 +80,17 @@ def seconds_in_words(seconds: float) -> str:
     return "{} min {:02d} s".format(*divmod(round(seconds), 60))
 
 
-# Differences smaller than this, relative to the best value, are ignored if the scatter is unknown,
-# i.e. if the values have no repeats or only identical ones. Times and memory scatter more from run
-# to run (docs/performance.md), even if the repeats of one run agree.
+# Relative differences from the best value below this share are ignored if the scatter is unknown,
+# i.e. if there are no repeats or all repeats are identical. For times and memory, the limits are
+# larger, because these scatter from run to run (docs/performance.md) even if the repeats of one run
+# agree.
 _LEVEL_SHARE: Final = 0.01
 _LEVEL_COST_SHARES: Final = {"s": 0.3, "MiB": 0.1}
 FLAG: Final = "yes/no"
 
 
 class Mark(Enum):
-    """Rank of a value among those with which it may be compared."""
+    """Rank of a value among the values with which it may be compared."""
 
     NONE = ""
     BEST = "best"
@@ -105,7 +108,7 @@ class Value:
         spread: standard deviation over repeats; NaN without repeats.
         mark: rank among the values of the group.
         group: letter for the environment and data; empty if they are the same for all values.
-        note: remark, e.g. the number of repeats.
+        note: remark, such as the number of repeats.
         n_items: number of items that the metric sums over; NaN if they are not counted.
     """
 
@@ -119,20 +122,19 @@ class Value:
 
 
 def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
-    """Mark the best value of each group, unless all values of the group are level.
+    """Mark the best value of each group, unless the values of the group cannot be distinguished.
 
-    Groups that contain a value from a single run are not ranked: with another machine or seed,
-    another value may be the best. A value is near the best if their difference does not exceed
-    their standard deviations combined in quadrature; without repeats, or with identical ones, the
-    limit is 1 % of the best (10 % for memory, 30 % for times), or rounding. If any value is near
-    the best, the best is also marked as near. A value that sums over fewer items than another in
-    its group is not ranked: a method that rejects difficult photos has smaller errors for the
-    remaining ones.
+    Groups that contain a value without repeats are not ranked, because another value may be the
+    best on another machine or with another seed. A value is near the best if their difference does
+    not exceed the root of the sum of their squared standard deviations. If the repeats are
+    identical, the limit is 1 % of the best value; it is at least 10 % for memory and 30 % for
+    times. If any value is near the best, the best is also marked as near. A value over fewer items
+    than another value of its group is not ranked, because a method that rejects difficult photos
+    has smaller errors for the remaining photos.
 
     Args:
         values: values of a column.
-        better: better direction, a key of `BETTER`; a metric with any other direction is not
-            ranked.
+        better: better direction, a key of `BETTER`; metrics with other directions are not ranked.
         unit: unit of the values.
     """
     if better not in BETTER:
@@ -156,14 +158,14 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
         if len(leading) == len(members):
             continue
         for index in leading:
-            # If several values share the best rank, none of them is marked as the best.
+            # If several values cannot be distinguished from the best, none is marked as the best.
             mark = Mark.NEAR if len(leading) > 1 else Mark.BEST
             marked[index] = replace(values[index], mark=mark)
     return marked
 
 
 def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
-    """Return whether a value cannot be distinguished from a better one."""
+    """Return whether a value cannot be distinguished from a better value."""
     if is_rounding(badness(one.sort, better), badness(other.sort, better)):
         return True
     known = [
@@ -178,21 +180,22 @@ def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
 
 
 def cost_share(unit: str) -> float:
-    """Return the relative scatter of times and memory from run to run; 0 for other units."""
+    """Return the relative scatter of times or memory from run to run; 0 for other units."""
     return _LEVEL_COST_SHARES.get(unit, 0.0)
 
 
-# Better directions that a method may declare (`MetricSpec.better`); other metrics are not ranked.
+# Better directions that a method may declare (`MetricSpec.better`); metrics without one are not
+# ranked.
 BETTER: Final = {"lower": "lower is better", "higher": "higher is better", "one": "1 is best"}
 
 
 def is_flag(unit: str) -> bool:
-    """Return whether a unit is the unit of yes/no metrics (1 or 0)."""
+    """Return whether a unit is that of yes/no metrics, whose values are 1 or 0."""
     return unit == FLAG
 
 
 def badness(value: float, better: str) -> float:
-    """Return a number that decreases as the value improves; signed errors count by absolute value.
+    """Return a number that is smaller for better values; signed errors count by absolute value.
 
     Raises:
         ValueError: the metric has no better direction.
@@ -209,8 +212,8 @@ def badness(value: float, better: str) -> float:
 def middle_of(values: NDArray[np.float64], unit: str) -> float:
     """Return the central value over several datasets; NaN if there are no values.
 
-    This is the median, but for yes/no metrics the mean, i.e. the share of "yes", because the median
-    would not depend on the size of a minority.
+    This is the median; for yes/no metrics, it is the mean, which is the share of "yes", because the
+    median would only be the answer of the majority.
     """
     if not values.size:
         return math.nan
@@ -220,6 +223,7 @@ def middle_of(values: NDArray[np.float64], unit: str) -> float:
 def spread_of(values: NDArray[np.float64], unit: str) -> float:
     """Return the spread of values over several datasets; NaN if there are no values.
 
-    Yes/no metrics have no spread, since the share of "yes" describes their distribution completely.
+    The spread of yes/no metrics is NaN, because the share of "yes" describes their distribution
+    completely.
     """
     return math.nan if is_flag(unit) or not values.size else median_deviation(values)

@@ -21,13 +21,13 @@ from orthoflow.report.rankings import BETTER, Mark, number, number_with_unit
 from orthoflow.untrusted_text import shown
 from orthoflow.version import __version__
 
-# Parentheses in DOIs are paired, as in doi:10.1007/3DRes.02(2011)3.
+# A DOI may contain pairs of parentheses, as in doi:10.1007/3DRes.02(2011)3.
 _DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
 
 
 @cache
 def environment() -> jinja2.Environment:
-    """Return the template environment, with functions and values common to all pages."""
+    """Return the Jinja environment with the functions and values that all pages use."""
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,
@@ -46,7 +46,7 @@ def environment() -> jinja2.Environment:
         "urlpath": quote,
         "shell": shlex.quote,
     }
-    # These files are part of the package and not templates, so braces have no special meaning.
+    # Insert these files unchanged; they are not templates, so braces have no special meaning.
     folder = files("orthoflow.report") / "templates"
     css, early, script = (
         folder.joinpath(name).read_text(encoding="utf-8")
@@ -69,7 +69,7 @@ def environment() -> jinja2.Environment:
 
 
 def _shown(value: object) -> object:
-    """Escape control characters, such as text direction marks; markup is already escaped."""
+    """Escape control characters, such as text direction marks, except in markup."""
     is_text = isinstance(value, str) and not isinstance(value, Markup)
     return shown(str(value), keep="\n\t") if is_text else value
 
@@ -81,7 +81,7 @@ def _hash_source(text: str) -> str:
 
 
 def cited(citation: str) -> Markup:
-    """Escape a citation and make its DOI a link, which uses the network only when clicked."""
+    """Escape a citation and turn its DOI into a link, which uses the network only when clicked."""
     return Markup(
         _DOI.sub(
             lambda found: (

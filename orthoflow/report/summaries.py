@@ -1,4 +1,4 @@
-"""Numbers and sentences on the page, derived from the record."""
+"""Summaries on the page: headline metrics, limitations, results and citations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A headline metric with label, value, cell and remark."""
+    """A headline metric, with its label, formatted value, cell and remark."""
 
     what: str
     value: str
@@ -40,7 +40,7 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A sentence on a limitation of the result, its cells, and whether they failed."""
+    """A sentence on a limitation of the result, the cells concerned, and whether they failed."""
 
     text: str
     cells: tuple[str, ...]
@@ -50,10 +50,10 @@ class Limit:
 def headline_keys(cells: Iterable[RecordedCell]) -> list[tuple[str, str]]:
     """Return step and name of each headline metric that the methods declare.
 
-    Steps that check results come first, then the other steps in reverse order; within a step,
-    metrics keep the order in which the method reports them. If several steps report the same
-    metric, only the last step is used, since it refines the results of earlier ones; metrics of
-    checks are all used.
+    Steps that check results come first, followed by the other steps in reverse order. Within a
+    step, metrics keep the order in which the method reports them. If several steps report the same
+    metric, only the last step is used, because it refines the results of the others; this does not
+    apply to steps that check results.
     """
     checks: dict[str, dict[str, None]] = {}
     others: dict[str, dict[str, None]] = {}
@@ -77,7 +77,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
     keys = [key for key in headline_keys(cells.values()) if key[1] in rows[key[0]]]
     chosen = [rows[step][metric] for step, metric in keys]
     found = []
-    # Yes/no metrics come first if they have the undesired value; otherwise, they are omitted.
+    # Yes/no metrics come first if the answer is no; otherwise, they are omitted.
     for row in sorted(chosen, key=lambda row: not is_flag(row.unit)):
         if is_flag(row.unit) and row.value:
             continue
@@ -95,7 +95,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
 
 
 def has_measured_lengths(run: Run) -> bool:
-    """Return whether a check in the baseline compared lengths, so that length errors are known."""
+    """Return whether the baseline contains a check with results in millimetres."""
     return any(
         metric.unit == "mm"
         for cell in baseline_cells(run)
@@ -105,7 +105,7 @@ def has_measured_lengths(run: Run) -> bool:
 
 
 def limits(run: Run) -> tuple[Limit, ...]:
-    """Return the limitations of the results: failures, unequal walls, and diagnostics.
+    """Return the limitations of the results, which are failures, unequal walls and diagnostics.
 
     Diagnostics that a later step resolved are omitted. The remaining ones are grouped by code,
     errors first; diagnostics that concern only planes without an orthoimage come last.
@@ -119,8 +119,8 @@ def limits(run: Run) -> tuple[Limit, ...]:
     imaged = {
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
-    # Later orientations report which photos are not oriented, so diagnostics of earlier ones are
-    # omitted.
+    # A later orientation reports which photos are not oriented, so the diagnostics of earlier
+    # orientations are omitted.
     oriented = [
         cell.address
         for cell in by_baseline
@@ -148,14 +148,17 @@ def limits(run: Run) -> tuple[Limit, ...]:
 
 
 def _is_of_others_than(numbers: Collection[str], group: DiagnosticGroup) -> bool:
-    """Return whether diagnostics concern planes, but none of `numbers`; False if that is empty."""
+    """Return whether diagnostics concern planes, but none of those with the given numbers.
+
+    The result is False if no numbers are given.
+    """
     about = (_PLANE.fullmatch(subject) for subject in (group.worst.subject, *group.subjects))
     named = [plane[1] for plane in about if plane]
     return bool(numbers and named) and not any(number in numbers for number in named)
 
 
 def results(run: Run) -> dict[str, tuple[str, ...]]:
-    """Return cell addresses by result: succeeded, failed, not reached or not selected."""
+    """Return result -> cell addresses; the results are ok, failed, skipped and not asked for."""
     found: dict[str, tuple[str, ...]] = {"ok": (), "failed": (), "skipped": (), "not asked for": ()}
     for cell in run.record.cells:
         which = "not asked for" if cell.error_type == NOT_ASKED_FOR else cell.status
@@ -164,13 +167,13 @@ def results(run: Run) -> dict[str, tuple[str, ...]]:
 
 
 def citations(run: Run) -> dict[str, tuple[str, ...]]:
-    """Return, by citation, the methods that cite it and what each uses from the source."""
+    """Return citation -> methods that cite it, each with the part of the source that it uses."""
     found: dict[str, dict[str, None]] = {}
     for cell in run.record.cells:
         if cell.status != "skipped":
             for citation in cell.citations:
-                # In `..., doi:... (4.4, Table 2)`, separate the section, so that each publication
-                # has one entry.
+                # Separate the cited section, as in `..., doi:... (4.4, Table 2)`, so that each
+                # publication has one entry.
                 placed = _PLACE.fullmatch(citation)
                 text, place = placed.groups() if placed else (citation, "")
                 method = f"{cell.method}: {place}" if place else cell.method

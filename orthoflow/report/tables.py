@@ -1,4 +1,4 @@
-"""Tables for pages and publications, and tables of the detected planes."""
+"""Tables for pages and publications, including tables of the detected planes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LATEX: Final = {
 
 
 def escaped_latex(text: str) -> str:
-    """Escape a text for LaTeX."""
+    """Escape text for use in LaTeX."""
     return "".join(_LATEX.get(sign, sign) for sign in shown(text))
 
 
@@ -34,7 +34,7 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        label: heading on pages, with unit and better direction.
+        label: heading on pages, which may contain the unit and better direction.
         name: heading in CSV files.
         is_numeric: whether the column is right-aligned and sorted numerically.
         digits: number of significant digits.
@@ -51,10 +51,10 @@ class Table:
     """A table that is shown on pages and written as CSV, LaTeX and Markdown.
 
     Attributes:
-        name: name of the table's files without suffix.
-        caption: caption of one sentence.
+        name: name of the table's files, without suffix.
+        caption: caption, as one sentence.
         columns: columns in order.
-        rows: rows of values; None if a field is empty.
+        rows: rows of values; a value is None if the field is empty.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Table:
         return csv_text([[column.name for column in self.columns], *self.rows])
 
     def latex(self) -> str:
-        """Return the table as LaTeX code for the package booktabs."""
+        """Return the table as LaTeX code, which uses the package booktabs."""
         head, *rows = (" & ".join(map(escaped_latex, row)) + r" \\" for row in self._texts())
         return "\n".join(
             (
@@ -97,7 +97,7 @@ class Table:
         )
 
     def markdown(self) -> str:
-        """Return the table as Markdown, with numbers right-aligned."""
+        """Return the table as Markdown, with right-aligned numbers."""
         head, *rows = self._texts()
         rule = ["---:" if column.is_numeric else "---" for column in self.columns]
         lines = [f"| {' | '.join(map(_markdown, row))} |" for row in (head, rule, *rows)]
@@ -115,13 +115,13 @@ def _markdown(text: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneTables:
-    """The planes of one cell.
+    """Tables of the planes from one cell.
 
     Attributes:
         cell: address of the cell.
-        viewpoint: text on how the viewing side of each plane was determined.
-        planes: table with a row per plane.
-        materials: table of the cloud's thickness by position and material.
+        viewpoint: description of how the viewing side of each plane was determined.
+        planes: table with one row per plane.
+        materials: table of the thickness of the point cloud by position and material.
         before: addresses of all cells upstream of `cell`.
     """
 
@@ -132,15 +132,15 @@ class PlaneTables:
     before: frozenset[str] = frozenset()
 
     def taken_further(self, tables: Iterable[PlaneTables]) -> bool:
-        """Return whether one of `tables` shows planes that a later step derived from these."""
+        """Return whether one of `tables` shows planes that another step derived from these."""
         return any(self.cell in table.before for table in tables)
 
 
 def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
-    """Return the tables of every cell with detected planes; identical products once."""
+    """Return the tables of all cells with detected planes; identical planes only once."""
     found = []
     for address, planes in products_of(run, Planes):
-        # Number of planes by the source of their viewing side.
+        # Source of the viewing side -> number of planes.
         counts = Counter(planes.side_source(index) for index in range(len(planes)))
         sources = [f"{source} ({count})" for source, count in counts.items()]
         found.append(
@@ -163,7 +163,7 @@ def _plane_table(planes: Planes) -> Table:
         omega, phi = omega_phi_deg(planes.normal[index], planes.up)
         first, second, _, last = planes.corners[index]
         wide_m, high_m = np.linalg.norm(last - first), np.linalg.norm(second - first)
-        # Planes that were given as input have no thickness.
+        # Planes that were read from input files have no thickness.
         thickness = planes.thickness[index] if planes.thickness else None
         spread = (None, None) if thickness is None else (thickness.sigma_m, thickness.scan_step_m)
         rows.append(
