@@ -1,1 +1,1 @@
-"""Methods of the kind `inspect`."""
+"""Methods of the kind `inspect`, which measure the errors of products."""

@@ -1,8 +1,8 @@
 """Comparison of an orthoimage and its wall with the truth, cell by cell.
 
-All cells of small walls are compared, and an evenly spread sample of the cells of large walls.
-Colours are rendered in whole blocks, since patches need neighbouring cells; visibility is tested on
-a regular lattice, which covers every area wider than its spacing.
+On small walls, all cells are compared; on large walls, an evenly spread sample. Colours are
+rendered in whole blocks, since patches need neighbouring cells. Visibility is tested on a regular
+lattice, which covers every area wider than the lattice spacing.
 """
 
 from __future__ import annotations
@@ -33,20 +33,21 @@ from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_sh
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
 
-# Neighbouring cells whose true depths differ by more than this form a depth step; errors there are
-# reported separately.
+# Neighbouring cells whose true depths differ by more than this form a depth step, near which errors
+# are reported separately.
 _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
-# Side of a block: a multiple of the patch size (32 cells), so large that little is lost at borders.
+# Side of a block. It is a multiple of the patch size (32 cells), and large enough that few cells
+# are lost at the border.
 BLOCK_CELLS: Final = 96
 # Maximum number of cells, on all walls together, for which colours are compared.
 _COLOUR_CELLS: Final = 250_000
 # Maximum number of cells, on all walls together, for which visibility is tested.
 _SEEN_CELLS: Final = 600_000
-# Maximum number of errors that are kept for all walls together (32 bytes each). The standard error
-# of the median of so many values is 1/2000 of their spread.
+# Maximum number of errors (32 bytes each) that are kept for all walls together. The standard error
+# of the median of so many values is 1/2000 of their standard deviation.
 _KEPT_ERRORS: Final = 1 << 23
-# Multiples of these numbers, modulo 1, are spread evenly (R2 sequence, Roberts 2018).
+# Multiples of these numbers, modulo 1, are evenly distributed (R2 sequence, Roberts 2018).
 _SPREAD: Final = (0.7548776662466927, 0.5698402909980532)
 _NAMES_BESIDE_TRACED: Final = {
     "rmse_u_mm": "patch_rmse_u_mm",
@@ -61,7 +62,7 @@ class Sampling:
     """Selection of the cells of an orthoimage that are compared.
 
     Attributes:
-        coloured: (rows, cols) bool, cells whose colour is compared.
+        coloured: (rows, cols) bool, cells whose colours are compared.
         lattice: (rows, cols) bool, cells whose visibility is tested.
     """
 
@@ -75,8 +76,8 @@ class SamplingRule:
 
     Attributes:
         colour_share: share of blocks whose colours are compared.
-        lattice_step: visibility is tested in every nth row and column.
-        error_step: every nth error of a depth or traced cell is kept.
+        lattice_step: n if visibility is tested in every nth row and column.
+        error_step: n if every nth error of a depth or traced cell is kept.
     """
 
     colour_share: float
@@ -85,7 +86,7 @@ class SamplingRule:
 
     @classmethod
     def of(cls, images: Sequence[Orthoimage]) -> SamplingRule:
-        """Choose densities that meet the limits for all images together."""
+        """Choose densities that limit the number of cells of all images together."""
         n_shown = sum(n_shown_of(image) for image in images)
         n_cells = sum(image.mask.size for image in images)
         return cls(
@@ -96,12 +97,12 @@ class SamplingRule:
 
 
 def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
-    """Choose cells of an image; blocks without coloured cells cannot be compared.
+    """Select the cells of an image that are compared; blocks without coloured cells are omitted.
 
     Args:
         image: orthoimage of a wall, or a band of it.
         rule: the sampling densities.
-        first_row: row of the wall where the band starts, a multiple of `BLOCK_CELLS`.
+        first_row: row of the wall at which the band starts, a multiple of `BLOCK_CELLS`.
     """
     shows = is_shown(image.mask)
     coloured = np.zeros(shows.shape, dtype=np.bool_)
@@ -124,19 +125,20 @@ def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
 
 @dataclass(frozen=True, kw_only=True)
 class WallSamples:
-    """Errors of one wall, or of several together.
+    """Errors of one wall, or of several walls together.
 
     Attributes:
         depth_m: (n,) measured minus true depth, away from true depth steps.
         sigma_m: (n,) predicted standard deviation of each depth; NaN if unknown.
-        step_depth_m: (m,) the same error within 2 cells of a true depth step.
-        colour: (c,) mean square error of each coloured cell over the three channels, away from
+        step_depth_m: (m,) measured minus true depth within 2 cells of a true depth step.
+        colour: (c,) mean squared error, over the three channels, of each coloured cell away from
             depth steps.
-        shift_m: (p, 2) displacement of patches along u and v, measured minus true position.
-        shift_cells: (p, 2) the same in cells.
+        shift_m: (p, 2) displacement of patches along u and v in metres, measured minus true
+            position.
+        shift_cells: (p, 2) the same displacement in cells.
         n_seen: number of tested cells whose true surface is visible from a station.
-        n_seen_painted: number of coloured cells among these.
-        n_seen_shown: number of coloured or filled cells among these.
+        n_seen_painted: number of these cells that are coloured.
+        n_seen_shown: number of these cells that are coloured or filled.
     """
 
     depth_m: NDArray[np.float64]
@@ -158,8 +160,8 @@ class WallErrors:
         samples: the errors for statistics.
         patches: patches whose displacement was measured.
         depth_m: (rows, cols) measured minus true depth, NaN where either is missing.
-        grey: (rows, cols) root mean square colour error, NaN where not compared.
-        steps: (rows, cols) cells within 2 cells of a true depth step.
+        grey: (rows, cols) RMS colour error, NaN where not compared.
+        steps: (rows, cols) mask of the cells within 2 cells of a true depth step.
     """
 
     samples: WallSamples
@@ -179,15 +181,16 @@ def wall_errors(
 ) -> WallErrors:
     """Compare an orthoimage and its wall, both in the frame of `true`, with the truth.
 
-    Depths are compared in all cells, colours and visibility in the chosen ones.
+    Depths are compared in all cells; colours and visibility are compared in the chosen cells.
 
     Args:
         image: the orthoimage.
         wall: the wall.
         true: the true orthoimage.
-        chosen: cells whose colour is compared, and cells with a visibility test.
-        inner: rows to compare, a multiple of the patch size; the other rows are a margin.
-        error_step: every nth depth error is kept.
+        chosen: cells whose colours are compared, and cells whose visibility is tested.
+        inner: rows to compare; their number is a multiple of the patch size, and the other rows are
+            a margin.
+        error_step: n if every nth depth error is kept.
     """
     known = true.rectangle >= 0
     steps = depth_step_band(true.depth_m)
@@ -221,11 +224,11 @@ def wall_errors(
 
 
 def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return a mask of cells within 2 cells of a true depth step or the border of the surface."""
+    """Return a mask of the cells within 2 cells of a depth step or the border of the surface."""
     import cv2
 
-    # Replace missing depths with a very large one, so that the border of the surface is a step,
-    # too.
+    # Replace missing depths with a very large depth, so that the border of the surface is also a
+    # step.
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(1e3))
     edge = np.zeros(depth.shape, dtype=np.uint8)
     down = np.abs(np.diff(depth, axis=0)) > _STEP_M
@@ -240,10 +243,10 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool) -> list[Finding]:
-    """Return metrics of the cells of one wall, or of all (wall -1); empty if there are none.
+    """Return the metrics of the cells of one wall, or of all walls (wall -1); empty if none.
 
-    Displacements of patches get a prefix if displacements are also computed from the cameras, which
-    is more accurate.
+    Metrics of patch displacements get a prefix if displacements are also computed from the cameras,
+    which is more accurate.
     """
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
     numbers = (
@@ -259,7 +262,7 @@ def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool
 def _square_errors(
     image: Orthoimage, true: TrueOrthoimage, chosen: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return mean square errors (rows, cols) over the channels; NaN in cells not chosen."""
+    """Return the mean squared error (rows, cols) over the channels; NaN in cells not chosen."""
     square = np.full(chosen.shape, np.nan)
     difference = eight_bits(image.rgb[chosen]).astype(np.float64) - true.rgb[chosen]
     square[chosen] = np.mean(difference**2, axis=1)
@@ -267,10 +270,10 @@ def _square_errors(
 
 
 def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
-    """Return displacements of patches, measured on known cells away from steps."""
+    """Measure the displacements of patches; only `known` cells are used."""
     painted = is_painted(image.mask)
     filled = image.mask == OrthoMask.FILLED
-    # Two centimetres is far beyond any plausible error.
+    # Displacements of two centimetres are far larger than any plausible error.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
     grey, true_grey = np.zeros(known.shape), np.zeros(known.shape)
     grey[known] = eight_bits(image.rgb[known]) @ REC_601
@@ -317,7 +320,7 @@ def _shift_numbers(samples: WallSamples) -> list[Number]:
 
 
 def _kept_shifts(samples: WallSamples) -> NDArray[np.bool_]:
-    """Return patches within 4 robust standard deviations (at least 1/4 cell) of the median."""
+    """Return a mask of the patches within 4 NMAD (at least 1/4 cell) of the median."""
     cells = samples.shift_cells
     if len(cells) == 0:
         return np.zeros(0, dtype=np.bool_)

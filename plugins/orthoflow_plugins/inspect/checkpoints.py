@@ -64,7 +64,7 @@ from orthoflow_plugins.inspect.point_doubts import (
 )
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
-# Maximum number of unused points to log.
+# Maximum number of unused points that are logged.
 _MAX_LOGGED: Final = 200
 MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
@@ -87,17 +87,19 @@ CAPPED_RULE: Final = DiagnosticSpec(
 class InspectCheckpoints(Method):
     """Measure the displacement of surveyed points in the orthoimages (skarlatos2012, Table 1).
 
-    A point is used if its position was measured (in cells or in metres, see `read.checkpoints`), if
-    a black and white quadrant target is recognised there, or, in a simulated room, if its
-    surroundings, rendered from the true scene, are found. Without orthoimages, the points are
-    searched for in the intensity of the walls. RMS and standard deviation are those of the lengths
-    of the residuals. A point is an outlier if its residual exceeds twice the RMS of all points
-    (`once`, the rule for comparisons) or of the remaining points (`iterated`, which removes at most
-    a quarter of the points; `iterated_capped` if it reaches that limit). Metrics of a class of
-    points (flat, vertical ...) have the class as a prefix. `x` points right along u, `y` down along
-    v; residuals are the shown minus the surveyed position. `length_error_..._share` are relative
-    errors of distances between points of a wall. Targets are also compared in 3D (`3d`), with their
-    positions on the plane through the depths around them.
+    A point is used if its position in the image was measured (in cells or in metres, see
+    `read.checkpoints`) or if a black and white quadrant target is recognised there. In a simulated
+    room, it is used if its surroundings, rendered from the true scene, are found in the image.
+    Without orthoimages, the points are searched for in the intensity of the walls. The RMS and the
+    standard deviation are computed from the lengths of the residuals. With the rule `once`, which
+    is meant for comparisons, a point is an outlier if its residual exceeds twice the RMS of all
+    points. With the rule `iterated`, it is an outlier if its residual exceeds twice the RMS of the
+    remaining points; this removes at most a quarter of the points (`iterated_capped` if it reaches
+    that limit). Metrics for a class of points (flat, vertical ...) have the name of the class as a
+    prefix. `x` points right along u, and `y` down along v. Residuals are shown minus surveyed
+    positions. `length_error_..._share` are relative errors of distances between points on a wall.
+    Targets are also compared in 3D (`3d`): their positions are measured on the plane that fits the
+    depths around them.
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
@@ -109,7 +111,6 @@ class InspectCheckpoints(Method):
         lower("rms_3d_mm", label="check points in space, RMS", headline=True, counted_by="n_3d"),
         MetricSpec("max_3d_mm", label="check points in space, largest error"),
         *(*CHECK_TABLE, *LENGTHS, *DISPLACEMENTS),
-        # Metrics of a class of points have the name of the class as a prefix.
         *prefixed((*CHECK_TABLE, *DISPLACEMENTS), "*_", "{0}"),
         *of_walls(IMAGE_QUALITY),
     )
@@ -121,7 +122,7 @@ class InspectCheckpoints(Method):
     )
 
     class Params(MethodParams):
-        """Search for points without a measured position."""
+        """Search for points whose position was not measured."""
 
         search_m: float = Field(0.03, gt=0.0, le=1.0, description="Search radius for a point.")
         target_radius_m: float = Field(
@@ -146,7 +147,7 @@ class InspectCheckpoints(Method):
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Find every point, then compute the statistics."""
+        """Find all points, then compute the statistics."""
         if is_own(inputs.checkpoints).all():
             raise MethodError(
                 "x, y, z of all check points were taken from the orthoimage in which they were "
@@ -179,7 +180,7 @@ class InspectCheckpoints(Method):
                 "(inspect.checkpoints)"
             )
         report_doubts(points, inputs.checkpoints, pictures, ctx)
-        # In a simulated room, some points are hidden on purpose.
+        # In simulated rooms, some points are hidden deliberately.
         if missed and not is_simulated:
             reasons = with_reasons(missed)
             ctx.report(MISSED, n_missed=len(missed), n_points=len(points), reasons=reasons)
@@ -317,7 +318,6 @@ def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) ->
 
 
 def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
-    """Report that the iterated outlier rule reached its cap."""
     capped = [item for item in findings if item.name.endswith(f"n_outliers_iterated{CAPPED}")]
     if capped:
         numbers = ", ".join(f"{item.name} {item.value:.0f}" for item in capped)

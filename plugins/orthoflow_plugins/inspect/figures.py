@@ -27,32 +27,32 @@ DEPTH_SPAN_MM: Final = 10.0
 COLOUR_SPAN_GREY: Final = 60.0
 DISPLACEMENT_SPAN_CELLS: Final = 1.0
 _LONGEST_PX: Final = 1000
-# In images with more cells than this, squares of cells are averaged before drawing.
+# In larger images, squares of cells are averaged before drawing.
 _WHOLE_CELLS: Final = 1 << 24
-# Drawn length of the 95th percentile of displacements, as a share of the longer image side.
+# Length at which the 95th percentile of displacements is drawn, relative to the longer image side.
 _ARROW_SHARE: Final = 0.06
 _NAMES_MOST: Final = 60
 _ARROWS_MOST: Final = 1500
 _ENLARGED_MOST: Final = 500.0
-# Colours for lengths up to the median, up to twice the median, and beyond.
+# Colours of arrows up to the median length, up to twice the median, and beyond.
 _ARROW_COLOURS: Final = ("#1a8a1a", "#d09000", "#d01c1c")
 
 
 def depth_error_map(depth_m: NDArray[np.float64], frame: WallFrame) -> bytes:
-    """Draw a map of depth errors: blue behind the true surface, red in front of it."""
+    """Draw a map of depth errors: blue behind the true surface, and red in front of it."""
     label = "measured minus true depth [mm]"
     high = DEPTH_SPAN_MM
     return map_chart(1e3 * depth_m, label, frame, low=-high, high=high, cmap="RdBu_r")
 
 
 def colour_error_map(error_grey: NDArray[np.float64], frame: WallFrame) -> bytes:
-    """Draw a map of colour errors, bright where large."""
+    """Draw a map of colour errors, in which large errors are bright."""
     label = "colour error [grey levels]"
     return map_chart(error_grey, label, frame, low=0.0, high=COLOUR_SPAN_GREY)
 
 
 def displacement_map(displacement_cells: NDArray[np.float64], frame: WallFrame) -> bytes:
-    """Draw a map of displacements (rows, cols), bright where large."""
+    """Draw a map of displacements (rows, cols), in which large displacements are bright."""
     high = DISPLACEMENT_SPAN_CELLS
     return map_chart(displacement_cells, "displacement [cells]", frame, low=0.0, high=high)
 
@@ -66,14 +66,14 @@ def vector_map(
 ) -> bytes:
     """Draw an orthoimage in pale grey, with arrows from true to shown positions.
 
-    Arrows are green up to the median length, yellow up to twice the median, and red beyond; a
-    reference arrow is drawn below the image. If there are many pairs, every nth is drawn.
+    Arrows are green up to the median length, yellow up to twice the median, and red beyond. A
+    reference arrow is drawn below the image. If there are many arrows, every nth is drawn.
 
     Args:
         image: the inspected orthoimage.
-        places: (n, 2) shown positions (column, row).
-        shift_cells: (n, 2) shown minus true positions.
-        names: n labels of the arrows, drawn unless there are many; empty for no labels.
+        places: (n, 2) shown positions (column, row) in cells.
+        shift_cells: (n, 2) shown minus true positions in cells.
+        names: n labels of the arrows, which are drawn unless there are many; empty for no labels.
     """
     import cv2
 
@@ -122,7 +122,7 @@ def vector_map(
 def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
     """Return grey levels, averaged over squares of cells if the image is large.
 
-    Incomplete squares at the right and bottom are omitted.
+    Incomplete squares at the right and bottom borders are omitted.
     """
     factor = 1
     if image.mask.size > _WHOLE_CELLS:
@@ -148,7 +148,7 @@ def draw_arrows(
     title: str,
     names: Sequence[str] = (),
 ) -> None:
-    """Draw displacements with `vector_map` as a figure of a step."""
+    """Report a figure of displacements, drawn by `vector_map`."""
     ctx.figure(
         name,
         partial(vector_map, image, places, shift_cells, names),
@@ -159,10 +159,11 @@ def draw_arrows(
 
 
 def enlargement(shift_cells: NDArray[np.float64], image: Orthoimage) -> float:
-    """Return the factor by which `vector_map` enlarges displacements (n, 2)."""
+    """Return the factor by which `vector_map` enlarges the displacements (n, 2)."""
     if not len(shift_cells):
         return 1.0
     usual = float(np.percentile(np.linalg.norm(shift_cells, axis=1), 95))
     wanted = _ARROW_SHARE * max(image.frame.shape) / max(usual, 1e-9)
-    # Use 1, 2 or 5 times a power of ten, so that figures to be compared mostly have the same scale.
+    # Use 1, 2 or 5 times a power of ten, so that figures mostly have the same scale and can be
+    # compared.
     return float(np.clip(1.0 / round_scale(1.0 / wanted), 1.0, _ENLARGED_MOST))

@@ -1,7 +1,7 @@
 """Statistics of displacements, and their report as metrics of an inspection.
 
 The statistics are those of markiewicz2015 and of Table 1 in skarlatos2012: lengths of residuals,
-outliers by two rules, and the RMS without outliers.
+outliers according to two rules, and the RMS without outliers.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ Number: TypeAlias = tuple[str, float, str]
 lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "higher"))
 
 _AXES: Final = ("x", "y")
-# Largest share of the points that the iterated rule may remove.
+# Maximum share of the points that the iterated rule may remove.
 _OUTLIERS_MOST: Final = 0.25
-# Larger cap, to find out whether the iterated rule would remove more points than the cap allows.
+# Higher limit, used to find out whether the iterated rule would remove more points without the cap.
 _MOST_WITHOUT_CAP: Final = 0.5
-# Minimum length of a distance between check points, as a share of the longest one. Shorter
-# distances depend more on single points than on the scale.
+# Minimum distance between check points, relative to the longest distance. Shorter distances depend
+# more on single points than on the scale.
 _LENGTH_LEAST_SHARE: Final = 0.25
-# If a wall has more points than this, every nth is used, since the number of pairs grows
+# If a wall has more points than this, every nth point is used, since the number of pairs grows
 # quadratically.
 _POINTS_MOST: Final = 1000
 # Suffix of the metrics of the iterated rule if it reached the cap.
 CAPPED: Final = "_capped"
-# Metrics of displacements, check points, and the orthoimage itself.
+# Metrics of displacements, of check points, and of the orthoimage itself.
 DISPLACEMENTS: Final = (
     lower("rmse_[xy]_mm", label="displacement along {0}, RMS"),
     lower("rmse_[xy]_cells", label="displacement along {0}, RMS"),
@@ -85,12 +85,12 @@ IMAGE_QUALITY: Final = (
     lower("stretch_share", label="cells smeared over steep relief"),
     lower("smear_share", label="cells smeared along edges"),
 )
-# Metrics that are reported for every wall; all others are only in the record.
+# Metrics that are reported for every wall; all others of single walls are only in the record.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 
 
 def findings_of(numbers: Iterable[Number], wall: int = -1, *, prefix: str = "") -> list[Finding]:
-    """Return metrics of a wall, or of all walls together (wall -1)."""
+    """Return the metrics of a wall, or of all walls together (wall -1)."""
     return [
         Finding(name=f"{prefix}{name}", value=float(value), unit=unit, wall=wall)
         for name, value, unit in numbers
@@ -100,17 +100,18 @@ def findings_of(numbers: Iterable[Number], wall: int = -1, *, prefix: str = "") 
 def displacement_findings(
     shift_m: NDArray[np.float64], gsd_m: float, wall: int, *, prefix: str = ""
 ) -> list[Finding]:
-    """Compute statistics of displacements (n, 2), shown minus true position.
+    """Compute statistics of displacements (n, 2), which are shown minus true positions.
 
-    `x` is along u, to the right, and `y` along v, down. The statistics are RMSE, mean, NMAD,
-    maximum, and the shares beyond twice the RMSE (markiewicz2015, Table 2; 4.6 % per axis for
-    normal errors, and never over 25 %).
+    `x` points right along u, and `y` points down along v. The statistics are the RMSE, the mean,
+    the NMAD, the maximum, and the share of displacements beyond twice the RMSE (markiewicz2015,
+    Table 2). For each axis, this share is 4.6 % if errors are normally distributed, and never over
+    25 %.
 
     Args:
         shift_m: displacements in metres, at least one.
         gsd_m: side of a cell, to convert to cells.
         wall: index of the wall, -1 for all walls together.
-        prefix: prefix of the names.
+        prefix: prefix of the metric names.
     """
     numbers: list[Number] = []
     shift_mm = 1e3 * shift_m
@@ -131,15 +132,15 @@ def displacement_findings(
 def check_findings(
     shift_m: NDArray[np.float64], gsd_m: float, *, prefix: str = ""
 ) -> list[Finding]:
-    """Compute statistics of displacements (n, 2) of check points, including those of Table 1.
+    """Compute statistics of displacements (n, 2) of check points (skarlatos2012, Table 1).
 
-    `rms_mm` and `sd_mm` are those of the lengths; `mean_shift_share` is the length of the mean
-    displacement divided by the RMS.
+    `rms_mm` and `sd_mm` are computed from the lengths of the displacements; `mean_shift_share` is
+    the length of the mean displacement divided by the RMS.
 
     Args:
-        shift_m: metres along u and v, shown minus surveyed position.
+        shift_m: shown minus surveyed positions along u and v, in metres.
         gsd_m: side of a cell.
-        prefix: prefix of the names, for a class of points.
+        prefix: prefix of the metric names, for a class of points.
     """
     length = np.linalg.norm(shift_m, axis=1)
     mean_shift = float(np.linalg.norm(shift_m.mean(axis=0)))
@@ -168,14 +169,14 @@ def check_findings(
 def length_findings(
     surveyed_m: NDArray[np.float64], shift_m: NDArray[np.float64], wall: NDArray[np.int32]
 ) -> list[Finding]:
-    """Compute relative errors of distances between check points (markiewicz2015, 5: 0.2 %).
+    """Compute relative errors of distances between check points (0.2 % in markiewicz2015, 5).
 
-    A distance is compared if both points are on the same wall and the distance is at least a
-    quarter of the longest one; the result is empty if there is no such distance.
+    Distances between points on the same wall are compared if they are at least a quarter of the
+    longest one. The result is empty if there is no such distance.
 
     Args:
-        surveyed_m: (n, 2) metres along u and v, surveyed positions.
-        shift_m: (n, 2) shown minus surveyed position.
+        surveyed_m: (n, 2) surveyed positions along u and v, in metres.
+        shift_m: (n, 2) shown minus surveyed positions, in metres.
         wall: (n,) index of the wall of each point.
     """
     errors = [np.empty(0)]
@@ -200,15 +201,16 @@ def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
 def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask (n,) of the lengths that exceed twice the RMS of all other lengths.
 
-    At most a quarter of the lengths are removed. If there are two kinds of points, such as points
-    at edges and points on flat parts, the iteration would continue until it has removed the worse
-    kind; `cap_binds` detects this. Comparisons should therefore use the rule that is applied once.
+    At most a quarter of the lengths are removed. Without this limit, if one kind of point is worse
+    than another, such as points at edges and points on flat parts, the iteration would remove all
+    points of the worse kind; `cap_binds` detects this. Comparisons should therefore use the rule
+    that is applied once.
     """
     return _iterated(length_m, _OUTLIERS_MOST)
 
 
 def cap_binds(length_m: NDArray[np.float64]) -> bool:
-    """Return whether the iterated rule stops at the cap."""
+    """Return whether the iterated rule stops because it reaches the maximum share of outliers."""
     n_most = math.floor(_OUTLIERS_MOST * len(length_m))
     n_capped, n_all = (
         count_true(_iterated(length_m, share)) for share in (_OUTLIERS_MOST, _MOST_WITHOUT_CAP)
@@ -217,7 +219,7 @@ def cap_binds(length_m: NDArray[np.float64]) -> bool:
 
 
 def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
-    """Return the metrics that `report` reports: for the main wall, for each wall and for all."""
+    """Return the metrics that `report` reports for the main wall, each wall and all walls."""
     of_each = [spec for spec in specs if fnmatch.filter(_OF_EACH_WALL, spec.name)]
     return (
         *specs,
@@ -227,12 +229,13 @@ def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
 
 
 def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[MetricSpec, ...]:
-    """Return copies of metrics for another subject; the copies are not headline metrics.
+    """Return copies of metrics, with other names and labels, that are not headline metrics.
 
     Args:
         specs: the metrics.
         prefix: prefix of the new names, possibly with wildcards.
-        what: suffix of the new labels; `{0}` is replaced by the text that the wildcard matches.
+        what: suffix of the new labels; `{0}` is replaced by the part of the name that the wildcard
+            matches.
     """
     n_wildcards = len(re.findall(r"\*|\[[^\]]+\]", prefix))
     return tuple(
@@ -248,7 +251,7 @@ def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[Metri
 
 
 def pooled(samples: Sequence[_Samples]) -> _Samples:
-    """Combine samples of several walls or bands: concatenate arrays and add counts."""
+    """Combine samples of several walls or bands by concatenating arrays and adding counts."""
     together: dict[str, Any] = {}
     for name, value in vars(samples[0]).items():
         parts = [getattr(item, name) for item in samples]
@@ -269,15 +272,15 @@ def rms(values: ArrayLike) -> float:
 def report(
     findings: Sequence[Finding], main: int, numbers: Mapping[int, int], ctx: StepContext
 ) -> None:
-    """Report findings as metrics: those of the main wall without a prefix.
+    """Report findings as metrics; those of the main wall get no prefix.
 
     Findings of all walls together get the prefix `all_`. Displacements and completeness of the
-    other walls get a prefix such as `wall_1_`, with the position of the plane in `planes.json`.
+    other walls get a prefix, such as `wall_1_`, with the index of the plane in `planes.json`.
 
     Args:
         findings: findings of walls, and of all walls together (wall -1).
         main: index of the main wall.
-        numbers: position of the plane of each wall, by index of the wall.
+        numbers: index of the plane in `planes.json`, by index of the wall.
         ctx: context that receives the metrics.
     """
     per_wall = {finding.name for finding in findings if finding.wall >= 0}
@@ -293,7 +296,7 @@ def report(
 
 
 def _lengths(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return distances between all pairs of positions (n, 2)."""
+    """Return the distances between all pairs of positions (n, 2)."""
     first, second = np.triu_indices(len(places_m), k=1)
     lengths: NDArray[np.float64] = np.linalg.norm(places_m[first] - places_m[second], axis=1)
     return lengths

@@ -2,11 +2,11 @@
 
 These are the completeness, the sharpness, and the shares of filled cells and of stretched areas.
 
-Sharpness is measured at edges in the image: their width, and the MTF that follows from their
-profile. A surface that a photo sees at a grazing angle covers few pixels, which are then stretched
-over many cells, as skarlatos2012 describes for vertical surfaces. The pixel of a cell follows from
-the wall's depths and the camera, so the distance between the pixels of neighbouring cells is known
-exactly, whatever the image shows.
+Sharpness is measured at edges in the image, by their width and by the MTF computed from their
+profile. If a photo shows a surface at a grazing angle, few pixels are stretched over many cells, as
+skarlatos2012 describes for vertical surfaces. The pixel from which a cell is coloured can be
+computed from the depths of the wall and the camera. The distance between the pixels of neighbouring
+cells is therefore known exactly, whatever the image shows.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from orthoflow.products import (
 from orthoflow_plugins.inspect.findings import findings_of
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
-# A pixel is stretched if it covers more cells than this in its longest direction.
+# A cell is stretched if a pixel covers more cells than this in its longest direction.
 _STRETCHED_CELLS: Final = 2.0
-# A pixel is smeared if it covers more cells than this.
+# A cell is smeared if a pixel covers more cells than this.
 _SMEARED_CELLS: Final = 5.0
 # Maximum number of cells per photo that are tested.
 _ASKED_MOST: Final = 200_000
@@ -45,12 +45,12 @@ _STEP_CELLS: Final = 0.25
 _ALONG: Final = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
 _PEAKS_MOST: Final = 4000
 _EDGES_MOST: Final = 400
-# An interpolated validity of at least this means that all cells involved are valid.
+# If the interpolated validity is at least this, all cells used in the interpolation are valid.
 _WHOLE: Final = 0.999
 _TILE_CELLS: Final = 2048
 _EDGES_LEAST: Final = 20
 _CONTRAST_GREY: Final = 30.0
-# On either side of an edge, grey levels may vary by this share of its contrast.
+# Maximum variation of grey levels on either side of an edge, relative to the contrast of the edge.
 _EVEN_SHARE: Final = 0.15
 _END_CELLS: Final = 3.0
 _LOW, _HIGH = 0.1, 0.9
@@ -58,13 +58,13 @@ _LOW, _HIGH = 0.1, 0.9
 
 @dataclass(frozen=True)
 class OrthoimageGrey(GreyCells):
-    """The grey levels of an orthoimage, 0 elsewhere."""
+    """The grey levels of an orthoimage, 0 in cells without a colour."""
 
     image: Orthoimage
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """The number of rows and the number of columns."""
         return self.image.frame.shape
 
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
@@ -80,7 +80,7 @@ def n_shown(image: Orthoimage) -> int:
 
 
 def completeness(image: Orthoimage, wall: Wall) -> Finding:
-    """Compute the share of the scanned surface that an image with the same grid shows."""
+    """Return the share of the scanned surface that an image with the same grid shows."""
     n_surface = n_both = 0
     for rows in row_bands(image.mask.shape):
         surface = np.isfinite(wall.depth_m[rows])
@@ -91,12 +91,12 @@ def completeness(image: Orthoimage, wall: Wall) -> Finding:
 
 
 def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
-    """Compute sharpness, and the shares of shown cells that are filled, stretched or smeared.
+    """Compute the sharpness, and the shares of shown cells that are filled, stretched or smeared.
 
     Args:
         image: the orthoimage.
-        wall: its wall, on the same grid.
-        cameras: cameras of its photos; if None, stretched areas are not computed.
+        wall: the wall, on the grid of the image.
+        cameras: cameras of the photos; if None, stretched areas are not computed.
     """
     share = count_cells(image.mask, OrthoMask.FILLED) / max(1, n_shown(image))
     return [
@@ -107,14 +107,14 @@ def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 
 
 def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
-    """Compute the 10 to 90 % width of edges, and the frequency at which the MTF is one half.
+    """Compute the 10-90 % width of edges, and the frequency at which the MTF is one half.
 
-    Profiles across the steepest edges between uniform areas are normalised and centred; their
+    Profiles across the steepest edges between uniform areas are normalised and centred. Their
     median is the edge spread function, and the spectrum of its derivative is the MTF (ISO 12233).
     The result is empty if there are fewer than 20 such edges.
 
     Args:
-        image: grey levels, and valid cells.
+        image: grey levels with a mask of valid cells.
         wall: index of the wall in the findings.
     """
     profiles = _edge_profiles(image)
@@ -136,14 +136,14 @@ def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
 def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
     """Compute the shares of stretched and smeared cells; empty if there are no cameras.
 
-    In stretched cells (`stretch_share`), a pixel of the photo covers more than two cells in some
-    direction; in smeared cells (`smear_share`), it covers more than five, or the surface is seen
-    from behind.
+    A cell is stretched (`stretch_share`) if a pixel of the photo covers more than two cells in some
+    direction. It is smeared (`smear_share`) if a pixel covers more than five cells, or if the photo
+    shows the surface from behind.
 
     Args:
         image: the orthoimage.
-        wall: its wall, on the same grid.
-        cameras: cameras of its photos.
+        wall: the wall, on the grid of the image.
+        cameras: cameras of the photos.
     """
     if cameras is None:
         return []
@@ -162,22 +162,23 @@ def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 def cells_per_pixel(
     image: Orthoimage, wall: Wall, camera: tuple[str, ViewingCamera]
 ) -> NDArray[np.float64]:
-    """Return the number of cells that a pixel covers in its longest direction, for one photo.
+    """Return the number of cells that a pixel of a photo covers in its longest direction.
 
     Args:
         image: the orthoimage.
-        wall: its wall, on the same grid.
+        wall: the wall, on the grid of the image.
         camera: name and camera of the photo.
 
     Returns:
-        (n,) cells per pixel for a sample of the cells coloured by the photo; infinite where the
-        surface is seen from behind.
+        (n,) cells per pixel, for a sample of the cells that are coloured from the photo; infinite
+        where the photo shows the surface from behind.
     """
     name, viewing = camera
     if name not in image.sources:
         return np.zeros(0)
     rows, columns = np.divmod(_asked_cells(image, wall, name), image.frame.width)
-    # Compute relative to the frame, because float64 loses precision with survey coordinates.
+    # Use coordinates relative to the frame, because float64 loses precision with survey
+    # coordinates.
     near = replace(image.frame, origin_world=np.zeros(3))
     moved = viewing.shifted(image.frame.origin_world)
     depth = wall.depth_m[rows, columns].astype(np.float64)
@@ -190,13 +191,13 @@ def cells_per_pixel(
     jacobian = np.stack(along, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = 1.0 / np.linalg.svd(np.nan_to_num(jacobian), compute_uv=False)[:, 1]
-        # A surface seen from the front has the same orientation in photo and wall.
+        # If the photo shows the front of the surface, the determinant is positive.
         spread[np.linalg.det(jacobian) <= 0.0] = np.inf
     return spread[np.isfinite(jacobian).all(axis=(1, 2))]
 
 
 def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
-    """Return every nth of the cells (row * width + column) that were coloured by a photo."""
+    """Return every nth cell (row * width + column) that is coloured from the photo."""
     source, width = image.sources.index(name), image.frame.width
 
     def painted(rows: slice) -> NDArray[np.bool_]:
@@ -215,15 +216,15 @@ def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
 
 
 def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
-    """Return profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
+    """Return profiles (n, steps) across edges, from 0 on the dark side to 1 on the bright side."""
     from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
-    # A tile of a few million cells has enough edges.
+    # A tile of a few million cells contains enough edges.
     image = cells.fullest_part(_TILE_CELLS)
-    # A single row or column has no gradient.
+    # The gradient of a single row or column is undefined.
     if not image.valid.any() or min(image.valid.shape) < 2:
         return np.zeros((0, _ALONG.size))
-    # Fill voids with the nearest value, so that they neither create edges nor affect profiles.
+    # Fill voids with the nearest value, so that they neither create edges nor distort profiles.
     grey = _closed(image)
     smooth = gaussian_filter(grey, 1.0)
     down, right = (np.asarray(part) for part in np.gradient(smooth))
@@ -251,7 +252,7 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
 
 
 def _closed(image: GreyImage) -> NDArray[np.float64]:
-    """Return grey levels with void cells set to the level of the nearest valid cell."""
+    """Return the grey levels, with void cells set to the level of the nearest valid cell."""
     from scipy.ndimage import distance_transform_edt
 
     grey = np.asarray(image.grey, dtype=np.float64)
@@ -265,9 +266,9 @@ def _closed(image: GreyImage) -> NDArray[np.float64]:
 
 
 def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return profiles shifted so that their edges are centred."""
-    # Computed from the area above the profile, the edge position depends on all samples and not
-    # just on the middle two.
+    """Shift profiles so that their edges are centred."""
+    # Compute the position of the edge from the area above the profile, so that it depends on all
+    # samples and not only on the middle two.
     reach = along[-1]
     offset = reach - np.sum(profiles[:, :-1] + profiles[:, 1:], axis=1) * 0.5 * _STEP_CELLS
     moved = [
@@ -278,7 +279,7 @@ def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArr
 
 
 def _width_cells(spread: NDArray[np.float64]) -> float:
-    """Return the 10 to 90 % width of an edge spread function."""
+    """Return the 10-90 % width, in cells, of an edge spread function."""
     steps = np.arange(len(spread))
     above = int(np.argmax(spread >= _HIGH))
     below = int(np.flatnonzero(spread[: above + 1] <= _LOW)[-1])
@@ -294,7 +295,7 @@ def _mtf50(spread: NDArray[np.float64]) -> float:
     spectrum = np.abs(np.fft.rfft(slope, n_padded))
     contrast = spectrum / spectrum[0]
     frequency = np.fft.rfftfreq(n_padded, _STEP_CELLS)
-    # For a step within one sample, the MTF stays above one half.
+    # If the edge is a step within one sample, the MTF is always above one half.
     place = int(np.argmax(contrast < 0.5)) or len(contrast) - 1
     return float(
         np.interp(-0.5, -contrast[place - 1 : place + 1], frequency[place - 1 : place + 1])
@@ -312,10 +313,10 @@ def _neighbours(
     depth: NDArray[np.float64],
     step: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Return the points on the surface one cell further in a direction (column, row).
+    """Return the surface points that are one `step` (column, row) away from the given cells.
 
-    The surface is extended with the smaller of the slopes on both sides, since the larger one may
-    be a depth step.
+    The surface is extrapolated with the smaller of the slopes on either side of the cell, since the
+    larger one may be a depth step.
     """
     rows, columns = (places[:, 1] - 0.5).astype(np.int64), (places[:, 0] - 0.5).astype(np.int64)
     after = _depth_at(wall, rows + step[1], columns + step[0]) - depth

@@ -1,4 +1,4 @@
-"""Pair SURF key points of two images on the same grid, and refine them with sub-pixel accuracy."""
+"""Matching of SURF key points between two images on the same grid, with sub-pixel refinement."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from orthoflow_plugins.inspect.patches import (
     unrefined,
 )
 
-# At most one key point is used per this many cells, since weaker key points are noise.
+# One key point is used per this many cells at most, since weaker key points are noise.
 _CELLS_PER_POINT: Final = 200
 _POINTS_LEAST, _POINTS_MOST = 500, 40_000
 _SCALES_DIFFER_MOST: Final = 1.5
 _PAIRS_AT_ONCE: Final = 1 << 16
 _RATIO_MOST: Final = 0.9
-# Half width of the box filter that normalises contrast; it is applied twice.
+# Half width of the box filter that normalises the contrast; the filter is applied twice.
 _LEVEL_REACH: Final = 12
 _LEAST_CONTRAST_GREY: Final = 2.0
 _LEAST_VALID_SHARE: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 0.5
-# A pair is accepted if enough of its nearest neighbours agree with it.
+# Number of nearest neighbours of a pair, enough of which must agree with the pair.
 _NEIGHBOURS: Final = 16
 _WITNESS_CELLS: Final = 8.0
 _AGREEING: Final = 2
 _AGREEING_SHARE: Final = 0.25
 _AGREE_CELLS: Final = 1.0
 _SURF_THRESHOLD: Final = 0.1
-# Larger images are processed in tiles with a margin for the support of the widest key points; a
+# Larger images are processed in tiles with a margin for the support of the largest key points; a
 # tile needs about 2 GB of memory.
 _WHOLE_CELLS: Final = 1 << 24
 _TILE_CELLS: Final = 3072
@@ -50,7 +50,7 @@ _RIM_CELLS: Final = 512
 
 @dataclass(frozen=True, kw_only=True)
 class _KeyPoints:
-    """SURF key points: positions (n, 2), scale (n,), sign of the Laplacian (n,), descriptors."""
+    """SURF key points: positions (n, 2), scales (n,), signs of the Laplacian (n,), descriptors."""
 
     places: NDArray[np.float64]
     scale: NDArray[np.float64]
@@ -61,19 +61,19 @@ class _KeyPoints:
 def find_key_pairs(
     shown: GreyCells, reference: GreyCells, *, radius_cells: float, threads: int = 1
 ) -> PatchShifts:
-    """Find pairs of key points within a radius.
+    """Find pairs of corresponding key points in two images.
 
     The local contrast of both images is normalised first, because laser and camera record different
-    brightness. Descriptors of key points with similar scale and the same sign are matched mutually.
-    Patches of 32 x 32 cells around each pair are then matched by least squares; a pair is dropped
-    if its patches do not correlate or if it disagrees with its neighbours. Large images are
-    processed tile by tile.
+    brightness. Two key points of similar scale and the same sign are paired if each has the best
+    descriptor for the other. Patches of 32 x 32 cells around each pair are then matched by least
+    squares. A pair is dropped if its patches do not correlate or if it disagrees with its
+    neighbours. Large images are processed tile by tile.
 
     Args:
         shown: the image to inspect.
         reference: the image to compare it with.
         radius_cells: maximum displacement.
-        threads: number of threads; it does not change the pairs.
+        threads: number of threads.
 
     Returns:
         The pairs as patches of the shown image, with their displacements from the reference.
@@ -98,7 +98,7 @@ def _pairs_of_tile(
     threads: int,
     is_whole: bool,
 ) -> PatchShifts:
-    """Find the pairs whose first point is in a tile, using the tile with its margin."""
+    """Find the pairs whose first point is in a tile; key points in the margin are also matched."""
     rows, columns = (
         slice(max(0, part.start - _RIM_CELLS), min(size, part.stop + _RIM_CELLS))
         for part, size in zip(tile, shown.shape, strict=True)
@@ -107,7 +107,7 @@ def _pairs_of_tile(
     images = [cells.cut((rows, columns)) for cells in (shown, reference)]
     first, second = in_order(_levelled, images, threads=threads)
     share = images[0].grey.size / math.prod(shown.shape)
-    # Processing two tiles at once would need too much memory.
+    # Process only one tile at a time, since two would need too much memory.
     key_points = partial(_key_points, n_most=round(share * _n_most(shown.shape)))
     one, other = in_order(key_points, (first, second), threads=threads if is_whole else 1)
     matches = _matches(one, other, radius_cells)
@@ -132,7 +132,7 @@ def _n_most(shape: tuple[int, int]) -> int:
 
 
 def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of pairs that agree with enough neighbours, unlike chance matches."""
+    """Return a mask of the pairs that agree with enough neighbours, unlike chance matches."""
     from scipy.spatial import cKDTree
 
     n_near = min(_NEIGHBOURS, len(places) - 1)
@@ -140,13 +140,13 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
         return np.zeros(len(places), dtype=np.bool_)
     away, near = cKDTree(places).query(places, k=n_near + 1)
     apart = np.linalg.norm(shift[near] - shift[:, None], axis=2)
-    # Very close pairs are the same point, found at several scales, and do not count as neighbours.
+    # Very close pairs are the same point at several scales, and do not count as neighbours.
     agrees = (apart <= _AGREE_CELLS) & (away > _WITNESS_CELLS)
-    # Repeated texture can make two or three neighbours wrong in the same way, but not a quarter of
-    # them.
+    # With repeated texture, two or three neighbours may be wrong in the same way, but not a quarter
+    # of all neighbours.
     needed = max(_AGREEING, _AGREEING_SHARE * n_near)
     agreed = np.ones(len(places), dtype=np.bool_)
-    # Repeat until only accepted pairs support each other.
+    # Repeat until accepted pairs are supported by accepted pairs only.
     while True:
         kept: NDArray[np.bool_] = np.count_nonzero(agrees & agreed[near], axis=1) >= needed
         if np.array_equal(kept, agreed):
@@ -155,7 +155,7 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
 
 
 def _levelled(image: GreyImage) -> GreyImage:
-    """Normalise to local mean 128 and standard deviation 40; invalid cells are 128."""
+    """Normalise to a local mean of 128 and standard deviation of 40; invalid cells are 128."""
     valid = image.valid.astype(np.float32)
     grey = np.where(image.valid, image.grey, 0.0).astype(np.float32)
     weight = np.maximum(_smooth(valid), np.float32(1e-6))
@@ -173,7 +173,7 @@ def _levelled(image: GreyImage) -> GreyImage:
 def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     import cv2
 
-    # Two passes of a box filter approximate a Gaussian; the cost does not depend on the width.
+    # Two passes of a box filter approximate a Gaussian at a cost that does not depend on its width.
     side = 2 * _LEVEL_REACH + 1
     once = cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
     twice = cv2.blur(once, (side, side), borderType=cv2.BORDER_CONSTANT)
@@ -181,11 +181,11 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _key_points(image: GreyImage, *, n_most: int) -> _KeyPoints:
-    """Return the strongest key points whose patch is inside the image and mostly valid."""
+    """Return the strongest key points with a patch that is in the image and mostly valid."""
     from mahotas.features import surf
 
-    # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 descriptor values;
-    # as in OpenCV, coordinates refer to the centres of cells.
+    # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 descriptor values. As
+    # in OpenCV, coordinates refer to the centres of cells.
     found = surf.surf(image.grey, threshold=_SURF_THRESHOLD, max_points=n_most)
     places = from_opencv(found[:, 1::-1])
     rows, columns = image.shape
@@ -212,7 +212,7 @@ def _patch_means(values: NDArray[np.float32], places: NDArray[np.float64]) -> ND
 
 
 def _matches(first: _KeyPoints, second: _KeyPoints, radius: float) -> NDArray[np.int64]:
-    """Return index pairs (m, 2) of mutually best descriptors that pass the ratio test."""
+    """Return index pairs (m, 2) of mutually best descriptors that also pass the ratio test."""
     from scipy.spatial import cKDTree
 
     nothing = np.zeros((0, 2), dtype=np.int64)
@@ -241,7 +241,7 @@ def _descriptor_distances(
     one: NDArray[np.int64],
     other: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return descriptor distances of pairs; computed in parts to limit memory."""
+    """Return the descriptor distances of pairs, computed in parts to limit memory."""
     apart = np.empty(len(one))
     for start in range(0, len(one), _PAIRS_AT_ONCE):
         part = slice(start, start + _PAIRS_AT_ONCE)
@@ -252,7 +252,7 @@ def _descriptor_distances(
 def _clear_winners(
     owner: NDArray[np.int64], apart: NDArray[np.float64], n_owners: int
 ) -> NDArray[np.bool_]:
-    """Return a mask of the pairs that are the best for their point and pass the ratio test."""
+    """Return a mask of the pairs that are the best of their point and pass the ratio test."""
     order = np.lexsort((apart, owner))
     starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
     nearest = np.full(n_owners, np.inf)

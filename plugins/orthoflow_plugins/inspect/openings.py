@@ -23,21 +23,21 @@ from orthoflow_plugins.inspect.findings import Number, findings_of, higher, lowe
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
-# Walls with more cells than this are sampled more coarsely, except along the borders of openings.
+# Larger walls are sampled more coarsely, except along the borders of openings.
 _MAX_SAMPLES: Final = 1 << 24
-# Maximum depth of a recess in the scene.
+# Maximum depth of a recess in the scene, in metres.
 _BEHIND_MOST_M: Final = 2.0
-# Cells around a recess are examined up to the first value, a distance in cells. The recess belongs
-# to the wall if at least the second value, as a share of these cells, is on the wall's face.
+# The first value is the width, in cells, of the rim around a recess. The recess belongs to the wall
+# if at least the second value, as a share of the cells of the rim, is on the face of the wall.
 _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
-# An outline matches an opening if their intersection over union (IoU) is at least this.
+# An outline matches an opening if the intersection over union (IoU) is at least this.
 _SAME_IOU: Final = 0.5
-# The true border is searched for this far on both sides of an outline.
+# Distance on either side of an outline within which the true border is searched for.
 _REACH_CELLS: Final = 10.0
 # Sampling interval of this search.
 _STEP_CELLS: Final = 1.0 / 16.0
-# Number of lines, perpendicular to a side, along which the border is searched for.
+# Number of lines perpendicular to a side along which the border is searched for.
 _LINES: Final = 33
 # Share of a side that is ignored at each end, because corners influence it.
 _ENDS_SHARE: Final = 0.1
@@ -46,11 +46,11 @@ _ENDS_SHARE: Final = 0.1
 class InspectOpenings(Method):
     """Compare outlines of openings with the recesses of a simulated scene.
 
-    True openings are the connected areas of a wall where rays perpendicular to it hit a surface
-    deep enough behind it. An outline matches an opening if their IoU is at least one half; to
-    compute it, walls with more than 17 million cells are sampled more coarsely. Each side that was
-    scanned is compared with the border of the recess along rays a sixteenth of a cell apart; an
-    error is positive if the outline is too large.
+    True openings are connected areas of a wall in which rays perpendicular to the wall hit a
+    surface that is deep enough behind its face. An outline matches an opening if their intersection
+    over union (IoU) is at least one half. To compute the IoU, walls with more than 17 million cells
+    are sampled more coarsely. Each scanned side is compared with the border of the recess along
+    rays a sixteenth of a cell apart. Errors are positive if the outline is too large.
     """
 
     id: ClassVar[str] = "inspect.openings"
@@ -102,7 +102,7 @@ class InspectOpenings(Method):
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Compare wall by wall."""
+        """Compare the openings of each wall."""
         from orthoflow.geometry.scene_views import SceneCameras
 
         places = {wall.plane_index: place for place, wall in enumerate(inputs.walls.walls)}
@@ -133,7 +133,7 @@ class _TrueWall:
     Attributes:
         slab: raster and depth range of the wall.
         place: index of the wall in `Walls`.
-        step: number of raster cells along the side of a cell of `labels`.
+        step: side of a cell of `labels`, in raster cells.
         labels: (rows, cols) number of the opening, from 1; 0 elsewhere.
         face_m: depth of the face of the wall.
         deep_m: smallest depth of an opening.
@@ -152,11 +152,10 @@ class _TrueWall:
 
     @property
     def frame(self) -> WallFrame:
-        """Frame of the raster."""
         return self.slab.frame
 
     def depths_m(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return depths (n,) of openings at positions (n, 2) = (column, row); NaN elsewhere."""
+        """Return the depths (n,) of openings at positions (n, 2) = (column, row); NaN elsewhere."""
         frame, front_m = self.frame, self.slab.front_m
         starts = frame.world_from_wall(places, front_m) - self.scene.origin
         hits = self.views.cast(starts, np.broadcast_to(-frame.normal_world, starts.shape))
@@ -168,7 +167,7 @@ class _TrueWall:
 
 @dataclass(frozen=True, kw_only=True)
 class _SideError:
-    """One side: its middle, its outward error, and its predicted standard deviation."""
+    """The middle of a side, its error (positive outwards), and its predicted standard deviation."""
 
     point_world: NDArray[np.float64]
     outwards: NDArray[np.float64]
@@ -178,7 +177,7 @@ class _SideError:
 
 @dataclass(frozen=True, kw_only=True)
 class _Verdict:
-    """The findings on one wall; `ious` has an entry per true opening, 0 if it was not found."""
+    """The findings for one wall; `ious` has one entry per true opening, 0 if it was not found."""
 
     place: int
     gsd_m: float
@@ -212,7 +211,7 @@ def _true_wall(
         judged=nowhere,
         cores=cores,
     )
-    # Rays that hit nothing have no depth.
+    # Rays that do not hit a surface have no depth.
     role = scene.role[true.rectangle]
     of_face = true.depth_m[(role == SurfaceRole.WALL) & (true.depth_m >= -slab.behind_m)]
     face_m = float(np.median(of_face)) if of_face.size else 0.0
@@ -235,16 +234,16 @@ def _true_wall(
 def _labelled(
     is_open: NDArray[np.bool_], is_face: NDArray[np.bool_], n_least: float
 ) -> NDArray[np.int32]:
-    """Number the open areas that are large enough and surrounded by the wall's face."""
+    """Number the open areas that are large enough and surrounded by the face of the wall."""
     import cv2
 
     n_areas, labels, boxes, _ = cv2.connectedComponentsWithStats(
         is_open.astype(np.uint8), connectivity=4
     )
-    # Exclude recesses of other walls that are visible beyond the edge of this one.
+    # Exclude recesses of other walls that are visible beyond the edge of this wall.
     about = np.ones((_RIM_CELLS, _RIM_CELLS), dtype=np.uint8)
     names = np.zeros(n_areas, dtype=np.int32)
-    # Label 0 is the background.
+    # The background has label 0.
     for label in 1 + np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= n_least):
         left, top, width, height, _ = boxes[label]
         part = (
@@ -304,12 +303,12 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
 def _side_error(
     wall: _TrueWall, begin: NDArray[np.float64], end: NDArray[np.float64], sigma_m: float
 ) -> _SideError | None:
-    """Measure the error of a side; return None if most lines across it meet no true border."""
+    """Measure the error of a side; None if most lines across the side cross no true border."""
     way = end - begin
     length = float(np.linalg.norm(way))
     if length <= 0.0:
         return None
-    # Outlines are counter-clockwise for the viewer; rows count downwards.
+    # Outlines are counter-clockwise for the viewer, and rows are counted downwards.
     outwards = np.array([-way[1], way[0]]) / length
     along = np.linspace(_ENDS_SHARE, 1.0 - _ENDS_SHARE, _LINES)
     offsets = np.arange(-_REACH_CELLS, _REACH_CELLS + _STEP_CELLS / 2, _STEP_CELLS)

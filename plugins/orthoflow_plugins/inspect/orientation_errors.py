@@ -1,7 +1,7 @@
-"""True errors of estimated cameras and their ties, which residuals cannot show.
+"""True errors of estimated cameras and their ties, which residuals cannot reveal.
 
-Cameras are compared with the true ones by position, angle and projection onto the wall; ties are
-compared with the scene points that their pixels actually show.
+Cameras are compared with the true cameras by position, by angle, and by projection onto the wall.
+Ties are compared with the scene points that their pixels actually show.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ _LEAST_COSINE: Final = 0.9
 _WRONG_SIGMAS: Final = 5.0
 # A tie is wrong if its error exceeds this many cells of the wall.
 _WRONG_CELLS: Final = 1.5
-# To find the wall that covers most of a photo, this number of rays is used along the photo's longer
-# side.
+# Number of rays along the longer side of a photo with which the wall that covers most of the photo
+# is found.
 _RAYS: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseError:
-    """The errors of one photo's orientation.
+    """The errors of the orientation of one photo.
 
     Attributes:
         photo: name of the photo.
-        status: `ok`, or the reason why the photo is not oriented; in this case, all other
-            attributes are None.
-        centre_m: distance between estimated and true projection centre.
-        rotation_deg: angle between estimated and true orientation.
-        wall_m: error of one coordinate on the walls, RMS over the visible area; None if the photo
-            shows no wall, infinite if the estimated camera does not show the wall.
+        status: `ok`, or the reason why the photo is not oriented; in that case, the errors are
+            None.
+        centre_m: distance in metres between the estimated and the true projection centre.
+        rotation_deg: angle between the estimated and the true orientation.
+        wall_m: error of one coordinate on the walls, as RMS over the visible area; None if the
+            photo shows no wall, infinite if the estimated camera does not show the wall.
         sigma_wall_m: predicted value of `wall_m`, or None.
     """
 
@@ -96,10 +96,10 @@ def true_camera(truth: Truth, photo: str) -> ViewingCamera:
 def pose_errors(
     cameras: Cameras, walls: Walls, truth: Truth, views: SceneCameras
 ) -> tuple[PoseError, ...]:
-    """Compare each photo's orientation with the truth, on the walls and within their buffers.
+    """Compare the orientation of each photo with the truth, on the walls and within their buffers.
 
     Raises:
-        MethodError: a photo is not one of the simulated ones.
+        MethodError: the truth does not contain a photo.
     """
     return tuple(
         PoseError(photo=camera.photo, status=camera.status)
@@ -110,7 +110,7 @@ def pose_errors(
 
 
 def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
-    """Compute statistics of all photos; maxima and medians cover oriented photos only."""
+    """Compute statistics of all photos; maxima and medians only include oriented photos."""
     good = [error for error in errors if error.status == "ok"]
     centres = [1e3 * error.centre_m for error in good if error.centre_m is not None]
     angles = [error.rotation_deg for error in good if error.rotation_deg is not None]
@@ -159,7 +159,7 @@ def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
 
 
 def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
-    """Compute the shares of wrong ties among all ties and among those that the orientation kept."""
+    """Compute the share of wrong ties among all ties, and among those that the orientation kept."""
     ties = cameras.ties
     if ties is None or not len(ties.photo) or not _of_these(ties, walls.walls):
         return []
@@ -176,10 +176,10 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
 
 
 def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
-    """Return distances (n,) of ties from the scene points that their pixels show, in wall cells.
+    """Return distances (n,), in wall cells, between ties and the points that their pixels show.
 
-    Distances are measured in the plane of the wall with the linearised true camera; they are
-    infinite if the true camera does not look towards the point.
+    Distances are measured in the plane of the wall with the linearised true camera. They are
+    infinite for points behind the true camera.
 
     Raises:
         MethodError: the truth does not contain a photo.
@@ -241,7 +241,7 @@ def _pose_error(
 
 
 def _angle_deg(rotation: NDArray[np.float64]) -> float:
-    """Return the angle of a rotation; the sine keeps the precision of small angles."""
+    """Return the angle of a rotation, computed from the sine, which is precise for small angles."""
     axis = np.array(
         [
             rotation[2, 1] - rotation[1, 2],
@@ -255,7 +255,12 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
 def _error_on_walls(
     found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
-    """Compare where the two cameras project a grid of pixels onto the true surfaces."""
+    """Compare where the two cameras project a grid of pixels onto the true surfaces.
+
+    Returns:
+        RMS of a coordinate in metres; None if the true camera shows no wall, infinite if the
+        estimated camera does not show the same surfaces.
+    """
     columns, rows = ((np.arange(n) + 0.5) / n for n in _GRID)
     grid = np.stack(np.meshgrid(columns * true.width, rows * true.height), axis=-1).reshape(-1, 2)
     seen = views.trace(true, grid)
@@ -273,12 +278,12 @@ def _error_on_walls(
     if np.any(facing * ahead <= 0.0):
         return math.inf
     off = camera.centre_world + (ahead / facing)[:, None] * rays - points
-    # The squared length includes two coordinates, so half of it is the mean of one.
+    # The squared length is the sum over two coordinates, so half of it is the mean square of one.
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)) / 2.0))
 
 
 def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]:
-    """Return a mask of points on a wall: in its raster and buffer, on a surface parallel to it."""
+    """Return a mask of the points in the raster and buffer of a wall on surfaces parallel to it."""
     on_walls = np.zeros(len(seen.points), dtype=np.bool_)
     hit = seen.rectangle >= 0
     for index in range(len(walls.walls)):
@@ -305,7 +310,7 @@ def _scaled(metres: float | None) -> float | None:
 
 
 def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the ties on the wall that covers most of their photo."""
+    """Return a mask (n,) of the ties on the wall that covers most of the photo."""
     most = [
         most_shown(true_camera(truth, name), walls.walls) if (ties.photo == index).any() else -1
         for index, name in enumerate(ties.photo_names)
@@ -314,5 +319,4 @@ def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
 
 
 def _of_these(ties: Ties, walls: tuple[Wall, ...]) -> bool:
-    """Return whether all wall indices of the ties are valid."""
     return int(ties.wall.min()) >= 0 and int(ties.wall.max()) < len(walls)

@@ -1,4 +1,4 @@
-"""Displacements between two images by least squares matching, accurate to 1/100 cell."""
+"""Displacements between two images by least-squares matching, accurate to 1/100 cell."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _LEAST_REGION: Final = 0.8
 _LEAST_WEIGHT: Final = 0.25
 _ROUNDS: Final = 12
 _AT_ONCE: Final = 2048
-# A patch that moves this far during the refinement was found at a wrong position.
+# A patch that moves farther than this during the refinement was located at a wrong position.
 _STRAYED_CELLS: Final = 2.0
 _CONVERGED_CELLS: Final = 0.002
-# Smoothing correlates neighbouring cells, so this many count as one independent observation.
+# Smoothing correlates neighbouring cells; this many cells count as one independent observation.
 _CELLS_PER_SAMPLE: Final = 4.0 * np.pi * _SMOOTH_CELLS**2
 _SIGMA_LIMIT_CELLS: Final = 0.15
 
 
 class GreyCells(ABC):
-    """A grey image with a mask of valid cells; its parts are computed on request."""
+    """A grey image with a mask of valid cells; parts are computed on request."""
 
     @property
     @abstractmethod
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """The number of rows and the number of columns."""
 
     @abstractmethod
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
@@ -46,7 +46,7 @@ class GreyCells(ABC):
         return self.cut((slice(0, self.shape[0]), slice(0, self.shape[1])))
 
     def fullest_part(self, side: int) -> GreyImage:
-        """Return the tile with the most valid cells, of at most `side` rows and columns."""
+        """Return the tile, of at most `side` rows and columns, with the most valid cells."""
 
         def n_valid(tile: tuple[slice, slice]) -> int:
             return int(np.count_nonzero(self.cut(tile).valid))
@@ -54,7 +54,7 @@ class GreyCells(ABC):
         return self.cut(max(tiles(self.shape, side), key=n_valid))
 
     def square(self, corner: NDArray[np.int64], side: int) -> GreyImage:
-        """Return a square from its first (column, row); cells outside the image are invalid."""
+        """Return a square that starts at (column, row); cells outside the image are invalid."""
         grey, valid = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
         first = np.clip(corner[::-1], 0, self.shape)
         end = np.clip(corner[::-1] + side, first, self.shape)
@@ -74,7 +74,7 @@ class GreyImage(GreyCells):
     Attributes:
         grey: (rows, cols) float64.
         valid: (rows, cols) bool, cells with a grey level.
-        region: (rows, cols) bool, the whole surface, including missing cells.
+        region: (rows, cols) bool, cells of the whole surface, including missing cells.
     """
 
     grey: NDArray[np.float64]
@@ -83,7 +83,7 @@ class GreyImage(GreyCells):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """The number of rows and the number of columns."""
         rows, columns = self.grey.shape
         return rows, columns
 
@@ -98,8 +98,8 @@ class IntensityGrey(GreyCells):
 
     Attributes:
         intensity: (rows, cols) float32 from 0 to 1, NaN where unknown.
-        of_roots: whether to use square roots, since laser intensities span several orders of
-            magnitude, and their roots are more similar to grey values of a photo.
+        of_roots: whether to use square roots of intensities. Laser intensities span several orders
+            of magnitude, and their roots are more similar to the grey values of a photo.
     """
 
     intensity: NDArray[np.float32]
@@ -107,7 +107,7 @@ class IntensityGrey(GreyCells):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """The number of rows and the number of columns."""
         rows, columns = self.intensity.shape
         return rows, columns
 
@@ -124,7 +124,7 @@ class IntensityGrey(GreyCells):
 
 
 def tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
-    """Cut a raster into tiles of at most `side` rows and columns, row by row."""
+    """Divide a raster into tiles of at most `side` rows and columns, in row order."""
     for row in range(0, shape[0], side):
         for column in range(0, shape[1], side):
             yield (
@@ -139,7 +139,7 @@ class PatchShifts(Rows):
 
     Attributes:
         centre: (p, 2) float64 column and row of the patch centre.
-        shift: (p, 2) float64 displacement along u and v in cells, shown minus true position.
+        shift: (p, 2) float64 displacement along u and v, in cells, shown minus true position.
         sigma: (p, 2) float64 standard deviation of `shift` in cells.
         found: (p, 2) float64 displacement in cells before the refinement.
         correlation: (p,) float64 correlation coefficient of the patches; NaN before the refinement.
@@ -152,7 +152,7 @@ class PatchShifts(Rows):
     correlation: NDArray[np.float64]
 
     def within(self, rows: slice) -> PatchShifts:
-        """Return the patches whose centres are in a band of rows, relative to its first row."""
+        """Return the patches in a band, with rows counted from the start of the band."""
         first = rows.start or 0
         end = np.inf if rows.stop is None else rows.stop
         own = (self.centre[:, 1] >= first) & (self.centre[:, 1] < end)
@@ -172,7 +172,7 @@ def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchS
 
 
 class _Patches(NamedTuple):
-    """Cells of patches, as arrays (p, 32 * 32)."""
+    """Cells of patches, as arrays with shape (p, 32 * 32)."""
 
     rows: NDArray[np.float64]
     columns: NDArray[np.float64]
@@ -181,16 +181,17 @@ class _Patches(NamedTuple):
 
 
 def measure_shifts(shown: GreyImage, true: GreyImage, *, reach_cells: int) -> PatchShifts:
-    """Measure where the content of `true` appears in `shown`, patch by patch.
+    """Measure the displacement of `shown` relative to `true`, patch by patch.
 
-    A patch has 32 x 32 cells. It is first located to a whole cell by the smallest mean square
-    difference, then refined by Gauss-Newton steps for shift and brightness. Patches are omitted if
-    they have too few valid cells, do not converge, or have a standard deviation over 0.15 cells.
+    A patch has 32 x 32 cells. Its position is first found in whole cells, by the smallest mean
+    squared difference, and then refined by Gauss-Newton steps for shift and brightness. Patches are
+    omitted if they have too few valid cells, if they do not converge, or if their standard
+    deviation exceeds 0.15 cells.
 
     Args:
         shown: the image to inspect.
         true: the reference image.
-        reach_cells: maximum displacement.
+        reach_cells: maximum displacement in cells.
     """
     first, second = _smoothed(shown), _smoothed(true)
     start = _whole_cell_shifts(first, second, reach_cells)
@@ -208,18 +209,18 @@ def refine_shifts(
     focus_cells: float = math.inf,
     threads: int = 1,
 ) -> PatchShifts:
-    """Refine displacements that are known to within a cell or two, patch by patch.
+    """Refine displacements that are known to within one or two cells, patch by patch.
 
     Args:
-        shown: the image to inspect, with about the contrast of the reference.
+        shown: the image to inspect, with about the same contrast as the reference.
         true: the reference image.
         start: patches that are fully inside the image, with approximate displacements.
         sigma_most_cells: patches with a larger standard deviation are omitted.
-        focus_cells: standard deviation of the Gaussian weight around the patch centre.
+        focus_cells: standard deviation, in cells, of the Gaussian weight around the patch centre.
         threads: number of threads.
 
     Returns:
-        The patches that converge within two cells of the start.
+        The patches that converge within two cells of their approximate displacement.
     """
     if not len(start.centre):
         return start
@@ -237,10 +238,10 @@ def refine_shifts(
 
 
 def _smoothed(image: GreyImage) -> GreyImage:
-    """Smooth with a Gaussian of one cell, using only valid cells.
+    """Smooth with a Gaussian whose standard deviation is one cell, using only valid cells.
 
-    Cells at the border of the region become invalid, since their neighbours are only on one side,
-    so the mean would be biased. Scattered holes do not matter.
+    Cells at the border of the region become invalid: their neighbours are only on one side, so
+    their mean would be biased. Scattered holes have no such effect.
     """
     inside = _gauss(image.region) > _LEAST_REGION
     weight = _gauss(image.valid)
@@ -256,11 +257,11 @@ def _gauss(values: NDArray[np.float64] | NDArray[np.bool_]) -> NDArray[np.float6
 
 
 def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchShifts:
-    """Locate each patch with enough valid cells to a whole cell."""
+    """Find the position of each patch with enough valid cells, in whole cells."""
     row, column = np.nonzero(_patch_counts(shown.valid) >= _LEAST_SHARE * PATCH_CELLS**2)
     grey = _windows(shown.grey, row, column, 0)
     valid = _windows(shown.valid, row, column, 0)
-    # Cells outside the image are invalid.
+    # Cells outside the image count as invalid.
     true_grey = _windows(np.pad(true.grey, reach), row, column, reach)
     true_valid = _windows(np.pad(true.valid, reach), row, column, reach)
     best, shift = np.full(len(row), np.inf), np.zeros((len(row), 2))
@@ -300,7 +301,7 @@ _Value = TypeVar("_Value", bound=np.generic)
 def _windows(
     values: NDArray[_Value], row: NDArray[np.int64], column: NDArray[np.int64], rim: int
 ) -> NDArray[_Value]:
-    """Return patches (p, n, n) with a margin around each; `values` includes the margin."""
+    """Return patches (p, n, n), each with a margin; `values` includes the margin."""
     side = PATCH_CELLS + 2 * rim
     cells = np.arange(side)
     rows = row[:, None, None] * PATCH_CELLS + cells[:, None]
@@ -346,7 +347,7 @@ def _refined(
         weight = part.weight * inside
         step[active], sigma[active] = _normal_step(design, part.grey - expected, weight)
         correlation[active] = correlations(part.grey, expected, weight)
-        # Move by at most half a cell, the range of the linear model.
+        # Limit each step to half a cell, within which the linear model is valid.
         shift[active] += np.clip(step[active], -0.5, 0.5)
     good = (
         (np.abs(step).max(axis=1) < 5.0 * _CONVERGED_CELLS)
@@ -377,7 +378,7 @@ def correlations(
 class _Sampler:
     """The true image, interpolated by cubic B-splines (Unser 1999), with a mask of valid cells.
 
-    All cells of a patch have the same fractional position, so four weights per axis are enough.
+    All cells of a patch have the same fractional position, so four weights per axis are sufficient.
     """
 
     def __init__(self, true: GreyImage) -> None:
@@ -389,7 +390,7 @@ class _Sampler:
     def at(
         self, patches: _Patches, shift: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return expected grey (p, n), its derivatives (p, n, 3), and valid cells (p, n)."""
+        """Return expected grey levels (p, n), derivatives (p, n, 3) and a mask of valid cells."""
         first = np.column_stack([patches.rows[:, 0], patches.columns[:, 0]]) - shift[:, ::-1]
         whole = np.floor(first)
         part = first - whole
@@ -399,14 +400,14 @@ class _Sampler:
         expected, slope_u = (_filtered(rows, weights, 2) for weights in right)
         slope_v = _filtered(row_slopes, right[0], 2)
         flat = (len(shift), -1)
-        # The derivative of true(x - shift) with respect to the shift is the negative gradient.
+        # The derivative of true(x - shift) by the shift is the negative gradient.
         design = np.empty((*expected.reshape(flat).shape, 3))
         design[..., 0], design[..., 1] = -slope_u.reshape(flat), -slope_v.reshape(flat)
         design[..., 2] = 1.0
         return expected.reshape(flat), design, valid.reshape(flat)
 
     def _windows(self, corner: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return coefficients (p, 35, 35) around patches, and valid cells (p, 32, 32).
+        """Return coefficients (p, 35, 35) around patches, and a mask (p, 32, 32) of valid cells.
 
         An interpolated cell is valid if its four neighbours are valid.
         """
@@ -423,7 +424,7 @@ class _Sampler:
 
 
 def _spline_weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return weights (2, p, 4) of four coefficients for the value and for its derivative."""
+    """Return weights (2, p, 4) of four coefficients, for the value and for its derivative."""
     t = part
     s = 1.0 - t
     value = [s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3]
@@ -449,7 +450,7 @@ def _filtered(
 def _normal_step(
     design: NDArray[np.float64], residual: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Solve the normal equations of all patches: steps (p, 2) and standard deviations (p, 2)."""
+    """Return the steps (p, 2) and standard deviations (p, 2) of all patches."""
     weighted = design * weight[:, :, None]
     normal = np.einsum("pni,pnj->pij", weighted, design) + 1e-9 * np.eye(3)
     right = np.einsum("pni,pn->pi", weighted, residual)

@@ -21,13 +21,13 @@ _SAME_DIRECTION_DEG: Final = 2.0
 
 
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
-    """Return orthoimages whose `wall` is an index into these walls.
+    """Set the `wall` of orthoimages to the index of their wall among the given walls.
 
-    Orthoimages from other programs, and those of walls rasterised in another step, refer only to a
-    plane.
+    Orthoimages from other programs, and those of walls that were rasterised in another step, only
+    refer to a plane.
 
     Raises:
-        MethodError: there is no such wall.
+        MethodError: none of the walls is on the plane of an orthoimage.
     """
     places = {wall.plane_index: index for index, wall in enumerate(walls.walls)}
     placed = []
@@ -57,13 +57,13 @@ def wall_of(image: Orthoimage, walls: Walls, allocate: Allocate = in_memory) -> 
     """Return the wall of an orthoimage from `on_walls`, resampled to the grid of the image.
 
     Orthoimages from other programs have different grids. Each of their cells takes the values of
-    the nearest cell of the wall, with the depth relative to the plane of the image; the intensity
+    the nearest cell of the wall, with the depth relative to the plane of the image. The intensity
     is interpolated between the four nearest cells.
 
     Args:
         image: the orthoimage.
         walls: all walls.
-        allocate: function that allocates the resampled arrays by name.
+        allocate: function that allocates the resampled arrays.
 
     Raises:
         MethodError: the image is not on the wall.
@@ -93,7 +93,7 @@ def _laid_onto(image: Orthoimage, wall: Wall, allocate: Allocate) -> Wall:
 
     frame = image.frame
     columns = np.arange(frame.width) + 0.5
-    # Fields of the wall, and their values outside of it.
+    # Fields of the wall, each with its value outside the wall.
     given: dict[str, tuple[NDArray[Any], float]] = {
         "depth_m": (wall.depth_m, np.nan),
         "sigma_m": (wall.sigma_m, np.nan),

@@ -1,4 +1,4 @@
-"""Errors of planes and scores of their labels, from a comparison with the truth."""
+"""Errors of planes, and scores of point labels, from a comparison with the truth."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from orthoflow_plugins.inspect.findings import Number, findings_of
 
 _FOUND_ANGLE_DEG: Final = 1.0
 _FOUND_OFFSET_M: Final = 0.015
-# Maximum differences between a wall and the true plane that it matches.
+# Maximum differences between the plane of a wall and the true plane that it matches.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
-# Names of label scores in metrics and in texts.
+# Names of label scores in metrics and in labels.
 LABEL_SCORES: Final = {"precision": "precision", "recall": "recall", "f1": "F1", "iou": "IoU"}
 MAIN_MISSED: Final = DiagnosticSpec(
     code="main-wall-missed",
@@ -53,9 +53,9 @@ def inspect_planes(
 ) -> Inspection:
     """Compare planes, and labels if given, with the truth.
 
-    Metrics without a prefix describe the main wall, which is the first plane of the truth; `worst_`
-    is the largest error of all true planes that were found; `label_..._mean` is the mean over all
-    true planes.
+    Metrics without a prefix describe the main wall, which is the first plane of the truth. Metrics
+    with the prefix `worst_` are the largest errors of all true planes that were found, and
+    `label_..._mean` are means over all true planes.
     """
     nearest = [
         _nearest(
@@ -103,7 +103,7 @@ def inspect_planes(
 
 
 def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Finding]:
-    """Add the scores of the main wall under names without the plane's name."""
+    """Add the scores of the main wall under names that omit the name of the plane."""
     if not scores:
         return []
     values = {item.name: item.value for item in scores}
@@ -114,7 +114,7 @@ def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Fi
 
 
 def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
-    """Return the errors of the plane of one wall; empty if it matches no true plane."""
+    """Return the errors of the plane of one wall; empty if the plane matches no true plane."""
     distances = (_plane_distance(plane, true, index) for index in range(len(true)))
     nearest = _nearest(distances, angle_deg=_SAME_ANGLE_DEG, offset_m=_SAME_OFFSET_M)
     return [] if nearest is None else findings_of(nearest.numbers(), wall)
@@ -132,7 +132,7 @@ def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def found_planes(planes: Planes, true: Planes) -> list[Finding]:
-    """Count the true planes that were found within 1 deg and 15 mm."""
+    """Count the true planes that were found with errors of at most 1 deg and 15 mm."""
     n_found = sum(
         any(d.is_within(_FOUND_ANGLE_DEG, _FOUND_OFFSET_M) for d in _distances(planes, true, index))
         for index in range(len(true))
@@ -143,9 +143,9 @@ def found_planes(planes: Planes, true: Planes) -> list[Finding]:
 def label_findings(
     labels: PointLabels, cloud: PointCloud | None, truth: Truth, ctx: StepContext
 ) -> list[Finding]:
-    """Compute precision, recall, F1 and IoU of the labels per true plane, matched one to one.
+    """Compute precision, recall, F1 and IoU of labels for true planes, matched one to one.
 
-    The result is empty if the points to which the labels belong are unknown. Points that a filter
+    The result is empty if it is unknown to which points the labels belong. Points that a filter
     removed before the detection are ignored.
 
     Args:
@@ -194,18 +194,19 @@ def label_findings(
 
 @dataclass(frozen=True, kw_only=True)
 class _PlaneDistance:
-    """Differences between a plane and a true one.
+    """Differences between a detected and a true plane.
 
     Attributes:
-        angle_deg: angle between the normals.
-        offset_m: distance at the centroid of the true rectangle, positive towards the viewer.
+        angle_deg: angle between the normals of both planes.
+        offset_m: distance of the detected plane from the centroid of the true rectangle, positive
+            towards the viewer.
     """
 
     angle_deg: float
     offset_m: float
 
     def is_within(self, angle_deg: float, offset_m: float) -> bool:
-        """Return whether angle and offset are within limits."""
+        """Return whether both differences are within the limits."""
         return self.angle_deg <= angle_deg and abs(self.offset_m) <= offset_m
 
     def numbers(self, suffix: str = "") -> list[Number]:
@@ -222,7 +223,6 @@ class _PlaneDistance:
 
 
 def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
-    """Compare a plane with a true plane."""
     centroid = true.corners[index].mean(axis=0)
     return _PlaneDistance(
         angle_deg=angle_between_deg(found.normal, true.normal[index]),
@@ -231,14 +231,13 @@ def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
 
 
 def _distances(found: Planes, true: Planes, index: int) -> list[_PlaneDistance]:
-    """Return the differences between all detected planes and a true plane."""
     return [_plane_distance(found.plane(k), true, index) for k in range(len(found))]
 
 
 def _nearest(
     distances: Iterable[_PlaneDistance], *, angle_deg: float, offset_m: float
 ) -> _PlaneDistance | None:
-    """Return the smallest difference within the limits."""
+    """Return the smallest difference that is within the limits, or None."""
     near = (distance for distance in distances if distance.is_within(angle_deg, offset_m))
     return min(near, key=lambda distance: distance.score, default=None)
 
@@ -246,7 +245,7 @@ def _nearest(
 def _joint_counts(
     found: NDArray[np.int16], true: NDArray[np.int16], n_true: int
 ) -> NDArray[np.int64]:
-    """Return the numbers of points by (true label + 1, detected label + 1)."""
+    """Return a table of point counts, indexed by true label + 1 and detected label + 1."""
     n_found = int(found.max(initial=-1)) + 2
     joint = (true.astype(np.int64) + 1) * n_found + (found.astype(np.int64) + 1)
     return np.bincount(joint, minlength=(n_true + 1) * n_found).reshape(n_true + 1, n_found)

@@ -1,4 +1,4 @@
-"""Check points that no image shows, or that are in another unit or system."""
+"""Diagnostics for check points that no image shows, or that have another unit or system."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from orthoflow.products import CheckPoints, Walls
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
-# Number of unused points listed in a message.
+# Maximum number of unused points that a message lists.
 _NAMED: Final = 4
-# From this distance on, messages use metres.
+# Messages give longer distances in metres, shorter ones in millimetres.
 _NEAR_M: Final = 1.0
 OWN_POINTS: Final = DiagnosticSpec(
     code="check-points-of-the-image",
@@ -34,7 +34,7 @@ FAR_POINTS: Final = DiagnosticSpec(
 
 
 def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
-    """Return a mask (n,) of points whose surveyed coordinates equal the clicked ones."""
+    """Return a mask (n,) of points whose surveyed coordinates equal the coordinates clicked."""
     if surveyed.shown_world is None:
         return np.zeros(len(surveyed.names), dtype=np.bool_)
     return np.asarray((surveyed.shown_world == surveyed.points_world).all(axis=1), dtype=np.bool_)
@@ -51,8 +51,8 @@ def report_doubts(
     Args:
         points: expected and shown position of each point.
         surveyed: the check points.
-        pictures: the images that show them.
-        ctx: receives diagnostics.
+        pictures: the images that show check points.
+        ctx: context that receives the diagnostics.
     """
     if n_own := int(np.count_nonzero(is_own(surveyed))):
         ctx.report(OWN_POINTS, n=n_own, n_points=len(points))
@@ -65,7 +65,7 @@ def report_doubts(
 
 
 def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
-    """Return a point's distance from its wall; 0 if this is at most the length of the wall."""
+    """Return the distance in metres from a wall's raster; 0 if below the length of the wall."""
     if picture is None:
         return 0.0
     frame = picture.frame
@@ -82,14 +82,14 @@ def missed_points(
     *,
     is_simulated: bool = False,
 ) -> dict[str, str]:
-    """Return the reasons why points are not used, by name, in the order of the survey.
+    """Return why points are not used, by name, in the order of the survey.
 
     Args:
         points: expected and shown position of each point.
         surveyed: the check points.
-        pictures: the images that were searched; at least one.
+        pictures: the images that were searched, at least one.
         walls: the walls of these images.
-        is_simulated: whether points were searched for with the true scene and not as targets.
+        is_simulated: whether points were searched for by means of the true scene, not as targets.
     """
     sought = "nothing similar" if is_simulated else "no black and white quadrant target"
     names = {picture.wall: picture.image.name for picture in pictures}
@@ -110,14 +110,14 @@ def missed_points(
 
 
 def with_reasons(missed: Mapping[str, str]) -> str:
-    """List the first few results of `missed_points` with their reasons."""
+    """Format the first few results of `missed_points` with their reasons."""
     named = [f"{name} ({reason})" for name, reason in list(missed.items())[:_NAMED]]
     more = f" and {len(missed) - _NAMED} more, see the log" if len(missed) > _NAMED else ""
     return f"{', '.join(named)}{more}"
 
 
 def _beside(surveyed: CheckPoints, index: int, picture: Picture, walls: Walls) -> tuple[float, str]:
-    """Return how far a point is outside an image, in metres, and the reason in words."""
+    """Return how far a point is outside an image, in metres, and a description of its position."""
     frame, slab = picture.frame, walls.slab(picture.wall)
     column, row, depth_m = frame.wall_from_world(surveyed.points_world[index][None])[0]
     off_m = {

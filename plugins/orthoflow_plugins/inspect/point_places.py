@@ -1,4 +1,4 @@
-"""Find check points in images: by measurements, as targets, or by means of the true scene."""
+"""Positions of check points in images: measured, found as targets, or by the true scene."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from orthoflow_plugins.inspect.targets import find_crossing
 
 How = Literal["measured", "target", "truth", "not found", "outside"]
 
-# Width of the Gaussian weight, so that the patch around a point counts, not the texture farther
-# away.
+# Standard deviation of the Gaussian weight, which reduces the influence of texture far from the
+# point.
 _FOCUS_CELLS: Final = 5.0
 _LEAST_VALID: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 1.0
-# Targets are not quite flat, so the depth of the centre is computed within this share of the
-# radius.
+# Targets are not quite flat, so the depth of the centre is computed from depths within this share
+# of the radius.
 _DEPTH_SHARE: Final = 0.5
 
 
@@ -44,8 +44,8 @@ class ShownPoint:
         how: how the point was found, or why it was not found.
         wall: index of the wall in `Walls`; -1 if the point is on no wall.
         expected: (2,) column and row of the surveyed position; NaN if the point is on no wall.
-        place: (2,) column and row where the image shows the point; NaN if not found.
-        point_world: (3,) metres, the point of the surface at `place`; NaN if unknown.
+        place: (2,) column and row at which the image shows the point; NaN if not found.
+        point_world: (3,) surface point at `place`, in metres; NaN if unknown.
     """
 
     how: How
@@ -63,7 +63,7 @@ class Picture:
         wall: index of the wall in `Walls`.
         frame: grid of the cells.
         grey: grey levels of the cells.
-        surface: the wall on the same grid.
+        surface: the wall, on the grid of the image.
         image: background of the figure of residuals.
     """
 
@@ -84,7 +84,7 @@ class PointFinder:
         walls: walls of the images.
         truth: truth of a simulated room, or None to search for targets.
         search_m: search radius.
-        target_radius_m: radius of the targets, or of their inner part if only this is used.
+        target_radius_m: radius of the targets, or of their inner part if only that part is used.
     """
 
     pictures: Sequence[Picture]
@@ -95,7 +95,7 @@ class PointFinder:
     target_radius_m: float
 
     def find(self, index: int) -> ShownPoint:
-        """Return where an image shows a point, and how it was found."""
+        """Find the position at which an image shows a point."""
         points = self.checkpoints
         world = points.points_world[index]
         wall = int(points.wall[index])
@@ -116,7 +116,7 @@ class PointFinder:
         return self._target(picture, expected)
 
     def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
-        """Return the image of the wall with a given number, or of the wall nearest to the point."""
+        """Return the image of the wall with a given number, or of the wall nearest to a point."""
         best, nearest = None, np.inf
         for picture in self.pictures:
             if wall is not None and picture.image.number == wall:
@@ -181,7 +181,7 @@ def find_by_truth(
         search_cells: search radius.
 
     Returns:
-        (2,) column and row, or None if no position correlates.
+        (2,) column and row, or None if the correlation is too low everywhere.
     """
     from orthoflow.geometry.scene_views import render
 
@@ -203,7 +203,7 @@ def find_by_truth(
     whole = _whole_shift(shown, reference, rim, search_cells)
     if whole is None:
         return None
-    # Centre the patch on the shown position, so that the displacement is that of the point.
+    # Centre the patch on the shown position, so that its displacement is that of the point.
     centre = np.full(2, side // 2) + whole
     found = refine_shifts(
         shown,
@@ -220,10 +220,10 @@ def find_by_truth(
 def point_on_surface(
     wall: Wall, place: NDArray[np.float64], radius_m: float
 ) -> NDArray[np.float64] | None:
-    """Return the world point (3,) of a position on the plane through nearby depths, or None.
+    """Return the world point (3,) of a position, on the plane that fits nearby depths, or None.
 
-    The plane is fitted robustly, because a target on its holder is flat even if the wall around it
-    is not.
+    The plane is fitted robustly, because a target on a holder is flat even if the wall around it is
+    not.
     """
     radius = radius_m / wall.frame.gsd_m
     low = np.maximum(np.floor(place - radius).astype(np.int64), 0)
@@ -251,7 +251,7 @@ def point_on_surface(
 def _whole_shift(
     shown: GreyImage, true: GreyImage, rim: int, search: int
 ) -> NDArray[np.int64] | None:
-    """Return the displacement (right, down) of the middle of `true` in `shown`, in whole cells."""
+    """Return the displacement (right, down), in whole cells, of the middle of `true` in `shown`."""
     middle = slice(rim, rim + PATCH_CELLS)
     down, right = np.mgrid[:PATCH_CELLS, :PATCH_CELLS] - 0.5 * (PATCH_CELLS - 1)
     focus = np.exp(-0.5 * (down**2 + right**2) / _FOCUS_CELLS**2)

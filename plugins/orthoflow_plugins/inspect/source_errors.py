@@ -1,4 +1,4 @@
-"""True errors of cells coloured from photos.
+"""True errors of cells that were coloured from photos.
 
 Each cell is compared with the scene point that its source pixel actually shows.
 """
@@ -21,25 +21,25 @@ from orthoflow_plugins.inspect.orientation_errors import true_camera
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
-# A cell is wrong if its colour comes from a scene point farther away than this.
+# A cell is wrong if its colour shows a scene point farther away than this.
 _FAR_CELLS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceErrors:
-    """The true origin of the colours of a wall's cells.
+    """The true origin of the colours of the cells of a wall.
 
     Attributes:
         frame: grid of the cells.
-        displacement_m: (rows, cols, 2) position of the cell minus that of the scene point that its
-            source pixel shows, along u and v; NaN if no oriented photo coloured the cell or the
-            pixel shows no surface.
-        traced: (rows, cols) bool, cells coloured by an oriented photo.
-        expected_m: (rows, cols) predicted error of the orthoimage; None if it has no prediction.
+        displacement_m: (rows, cols, 2) position of the cell minus position of the scene point that
+            its source pixel shows, along u and v in metres; NaN if the cell was not coloured from
+            an oriented photo or if the pixel shows no surface.
+        traced: (rows, cols) bool, cells coloured from an oriented photo.
+        expected_m: (rows, cols) predicted error of the orthoimage; None if there is no prediction.
         ghosts: (rows, cols) bool, cells whose source pixel shows a free-standing object.
-        n_seen_by_both: number of tested cells whose true surface is visible from a station and in a
-            photo.
-        n_seen_painted: number of coloured cells among these.
+        n_seen_by_both: number of tested cells whose true surface is visible both from a station and
+            in a photo.
+        n_seen_painted: number of these cells that are coloured.
     """
 
     frame: WallFrame
@@ -54,8 +54,8 @@ class SourceErrors:
         """Return the errors that are used for statistics.
 
         Args:
-            steps: (rows, cols) cells within 2 cells of a true depth step.
-            error_step: every nth displacement is kept.
+            steps: (rows, cols) mask of the cells within 2 cells of a true depth step.
+            error_step: n if every nth displacement is kept.
         """
         known = self.traced & np.isfinite(self.displacement_m).all(axis=2)
         counted = known & ~self.ghosts
@@ -81,19 +81,20 @@ class SourceErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceSamples:
-    """Errors of traced cells for statistics, of one wall or of several together.
+    """Errors of traced cells, of one wall or of several walls together, for statistics.
 
     Attributes:
-        away_m: (n, 2) displacements along u and v of cells that show no free-standing object, away
-            from true depth steps.
-        step_m: (m, 2) the same within 2 cells of a true depth step.
-        n_traced: cells coloured by an oriented photo.
+        away_m: (n, 2) displacements along u and v, in metres, of cells that show no free-standing
+            object and are away from true depth steps.
+        step_m: (m, 2) displacements of such cells within 2 cells of a true depth step.
+        n_traced: number of cells coloured from an oriented photo.
         n_far: number of traced cells whose source pixel shows a point more than 3 cells away, or no
             surface.
         n_ghosts: number of traced cells whose source pixel shows a free-standing object.
-        n_stated: number of coordinates away from steps with a predicted error.
-        n_within_1_sigma: number of coordinates whose error is at most the predicted one.
-        n_within_2_sigma: number of coordinates whose error is at most twice the predicted one.
+        n_stated: number of coordinates that are away from steps and have a predicted error.
+        n_within_1_sigma: number of these coordinates whose error is at most the predicted error.
+        n_within_2_sigma: number of these coordinates whose error is at most twice the predicted
+            error.
         n_seen_by_both: as in `SourceErrors`.
         n_seen_painted: as in `SourceErrors`.
     """
@@ -119,23 +120,24 @@ def trace_sources(
     truth: Truth,
     views: SceneCameras,
 ) -> SourceErrors:
-    """Trace every cell that was coloured by a photo to the scene point that its pixel shows.
+    """Find the scene point that the source pixel of each cell coloured from a photo shows.
 
-    The cell's point on the measured surface is projected with the estimated camera, as when the
-    orthoimage was made; the ray of that pixel through the true camera meets the true scene, and the
-    position of this intersection on the wall is compared with the position of the cell.
+    The point of the cell on the measured surface is projected with the estimated camera, as in the
+    computation of the orthoimage. The ray through this pixel of the true camera is intersected with
+    the true scene. The position of the intersection on the wall is compared with the position of
+    the cell.
 
     Args:
         image: the orthoimage.
-        wall: its wall.
+        wall: the wall of the orthoimage.
         true: the true orthoimage.
-        lattice: (rows, cols) cells with a visibility test.
+        lattice: (rows, cols) bool, cells whose visibility is tested.
         cameras: the estimated cameras.
         truth: the simulated room.
         views: the scene, prepared for many rays.
 
     Raises:
-        MethodError: a photo is not one of the simulated ones.
+        MethodError: the truth does not contain a photo.
     """
     known = {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
     displacement = np.full((*image.frame.shape, 2), np.nan)
@@ -170,7 +172,7 @@ def trace_sources(
 
 
 def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
-    """Compute statistics of one wall or of all (wall -1); empty if no photo coloured a cell.
+    """Compute statistics of one wall or of all walls (wall -1); empty without traced cells.
 
     The statistics cover all cells that show no free-standing object; cells within 2 cells of true
     depth steps are reported separately.
@@ -209,14 +211,14 @@ def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
 
 
 def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
-    """Return the frame relative to the scene's origin, where float64 keeps its precision."""
+    """Return the frame relative to the origin of the scene, where float64 keeps its precision."""
     return replace(frame, origin_world=frame.origin_world - truth.scene.origin)
 
 
 def _seen_by_photos(
     true: TrueOrthoimage, asked: NDArray[np.bool_], truth: Truth, views: SceneCameras
 ) -> NDArray[np.bool_]:
-    """Return a mask of tested cells whose true surface any photo shows, oriented or not."""
+    """Return a mask of the tested cells whose true surface any photo shows, oriented or not."""
     rows, columns = np.nonzero(asked)
     places = np.column_stack([columns + 0.5, rows + 0.5])
     depths = true.depth_m[rows, columns].astype(np.float64)

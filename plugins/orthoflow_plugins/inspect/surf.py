@@ -50,14 +50,15 @@ from orthoflow_plugins.inspect.key_pairs import find_key_pairs
 from orthoflow_plugins.inspect.patches import GreyImage, IntensityGrey, PatchShifts, unrefined
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
-# To find the accuracy of the comparison, the intensity is compared with a copy shifted by this
+# The accuracy of the comparison is measured by comparing the intensity with a copy shifted by this
 # much.
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
-# Maximum side of the tile that is compared for this purpose.
+# Maximum side of the tile that is compared with a shifted copy.
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
 _NO_PAIRS: Final = unrefined(*np.zeros((2, 0, 2)))
-# Radius within which the counterpart of a key point is searched for, large enough for gross errors.
+# Radius within which the counterpart of a key point is searched for; it is large enough for gross
+# errors.
 _RADIUS_CELLS: Final = 40.0
 UNFIT: Final = DiagnosticSpec(
     code="surf-not-inspected",
@@ -67,20 +68,20 @@ UNFIT: Final = DiagnosticSpec(
 
 
 class InspectSurf(Method):
-    """Measure displacements of an orthoimage from the laser's intensity of the same wall.
+    """Measure displacements between an orthoimage and the laser intensity of the same wall.
 
     This is the inspection of markiewicz2015: SURF key points of both images are paired, and the
-    displacements of the pairs are the errors (Table 2), drawn as a map (Figure 25). Both images
-    have the same grid, so the counterpart of a key point is searched for only within a radius. Each
-    pair is then refined by least squares, because SURF alone is accurate to about a cell, which is
-    as large as the errors to be measured. A comparison of the intensity with a shifted copy of
-    itself shows the best accuracy that can be reached (`floor_`). `x` points right along u, `y`
-    down along v; displacements are the position in the orthoimage minus that in the intensity.
-    Metrics without a prefix describe the first wall, `all_` all walls together, and `surf_` the
-    pairs before the refinement.
+    displacements of the pairs are the errors (Table 2), which are drawn as a map (Figure 25). Both
+    images have the same grid, so the counterpart of a key point is searched for only within a
+    radius. Each pair is then refined by least squares, because SURF alone is accurate to about a
+    cell, which is as large as the errors to be measured. A comparison of the intensity with a
+    shifted copy of itself gives the best possible accuracy (`floor_`). `x` points right along u,
+    and `y` down along v. Displacements are positions in the orthoimage minus positions in the
+    intensity. Metrics without a prefix describe the first wall, those with `all_` describe all
+    walls together, and those with `surf_` describe the pairs before the refinement.
 
     Without laser intensity, the comparison is meaningless, since the colours of the scan may come
-    from the same photos. It is then refused, or skipped with a warning.
+    from the same photos. It then fails, or is skipped with a warning.
     """
 
     id: ClassVar[str] = "inspect.surf"
@@ -113,7 +114,7 @@ class InspectSurf(Method):
     )
 
     class Params(MethodParams):
-        """Treatment of meaningless comparisons."""
+        """Handling of meaningless comparisons."""
 
         unfit: Literal["refuse", "warn"] = Field(
             "refuse",
@@ -122,7 +123,7 @@ class InspectSurf(Method):
         )
 
     class In(Ports):
-        """The orthoimages, their walls, and the cameras to find stretched areas."""
+        """The orthoimages, their walls, and cameras, which are needed to find stretched areas."""
 
         orthoimages: Orthoimages
         walls: Walls
@@ -134,7 +135,7 @@ class InspectSurf(Method):
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Compare wall by wall, then combine all walls."""
+        """Compare each wall, then compute the results for all walls together."""
         images = on_walls(inputs.orthoimages, inputs.walls).images
         if not images:
             raise MethodError("there is no orthoimage to inspect")
@@ -168,7 +169,7 @@ class InspectSurf(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Verdict:
-    """Pairs of one wall, and pairs of its intensity with itself."""
+    """Pairs of one wall, and pairs of the intensity with its shifted copy."""
 
     image: Orthoimage
     pairs: PatchShifts = _NO_PAIRS
@@ -176,7 +177,6 @@ class _Verdict:
     quality: tuple[Finding, ...] = ()
 
     def findings(self) -> list[Finding]:
-        """Return the wall's metrics."""
         wall = self.image.wall
         gsd_m = self.image.frame.gsd_m
         n_pairs = findings_of([("n_pairs", len(self.pairs), "1")], wall)
@@ -207,7 +207,7 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
 
 
 def _compared(image: Orthoimage, wall: Wall, cameras: Cameras | None, threads: int) -> _Verdict:
-    """Return the pairs of a wall; all other results are computed only if there are enough pairs."""
+    """Return the pairs of a wall; other results are only computed if there are enough pairs."""
     if wall.intensity is None:
         raise MethodError(f"{wall.name} has no intensity to compare with")
     if not n_shown(image):
@@ -230,14 +230,14 @@ def _compared(image: Orthoimage, wall: Wall, cameras: Cameras | None, threads: i
 
 
 def _set_aside(intensity: GreyImage) -> GreyImage:
-    """Return a shifted copy with which the errors of the comparison are measured."""
+    """Return a shifted copy of the intensity, which reveals the errors of the comparison."""
     import cv2
 
     right, down = _FLOOR_SHIFT_CELLS
     rows, columns = intensity.grey.shape
     move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
-    # Linear interpolation would smooth one of the two images, whereas cubic interpolation keeps
-    # most of the detail.
+    # Cubic interpolation keeps most of the detail, whereas linear interpolation would smooth the
+    # shifted image.
     grey = cv2.warpAffine(
         intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
     )

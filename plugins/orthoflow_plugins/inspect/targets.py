@@ -1,4 +1,4 @@
-"""Find centres of black and white quadrant targets, accurate to a few hundredths of a cell."""
+"""Centres of black and white quadrant targets, accurate to a few hundredths of a cell."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 _ROUNDS: Final = 20
 _CONVERGED_CELLS: Final = 1e-3
 _LEAST_VALID_SHARE: Final = 0.5
-# Minimum correlation of a target with itself rotated by 180 deg, and with its negative rotated by
-# 90 deg.
+# Minimum correlation between a target and its copy rotated by 180 deg, and between a target and its
+# negative rotated by 90 deg.
 _LEAST_ALIKE: Final = 0.6
 _SMOOTH_CELLS: Final = 1.2
 _LEAST_WEIGHT: Final = 0.2
@@ -25,16 +25,16 @@ def find_crossing(
 ) -> NDArray[np.float64] | None:
     """Find the centre of a target near a position.
 
-    The centre is a saddle point of the smoothed image, first located to a cell where the
-    determinant of the Hessian is lowest. It is then moved by least squares until the image is
-    symmetric under a rotation by 180 degrees about it; all four edges contribute, and their
-    directions do not matter.
+    The centre is a saddle point of the smoothed image. Its cell is found first, as the one with the
+    lowest determinant of the Hessian. The centre is then moved by least squares until the image is
+    symmetric under a rotation by 180 degrees about this point. All four edges contribute, and their
+    directions are irrelevant.
 
     Args:
         picture: grey levels with valid cells.
-        near: (2,) column and row.
+        near: (2,) column and row of the position.
         search_cells: search radius.
-        radius_cells: radius of the target, or of the part to use.
+        radius_cells: radius of the target, or of its inner part if only that part is used.
 
     Returns:
         (2,) float64 column and row where the quadrants meet, or None if there is no target.
@@ -54,16 +54,16 @@ def find_crossing(
 
 
 def _window(picture: GreyCells, corner: NDArray[np.int64], side: int) -> GreyImage:
-    """Return a square with voids filled from their surroundings; invalid beyond the border."""
+    """Return a square with voids filled from their surroundings; invalid outside the image."""
     part = picture.square(corner, side)
     return _closed(np.where(part.valid, part.grey, 0.0), part.valid)
 
 
 def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
-    """Smooth an image by fitting a plane to the valid cells around each cell.
+    """Smooth an image by fitting a plane to the valid grey levels around each cell.
 
-    A mean would be biased towards the side of an edge with fewer holes (Knutsson and
-    Westin 1993, normalised convolution of first order).
+    A mean would be biased towards the side of an edge with fewer holes (Knutsson and Westin 1993,
+    normalised convolution of first order).
     """
     from scipy.ndimage import correlate1d
 
@@ -84,7 +84,7 @@ def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
     right_side = np.stack([moment(weight * grey, *order) for order in orders], axis=-1)
     total = normal[..., 0, 0]
     enough = total > _LEAST_WEIGHT * gauss.sum() ** 2
-    # Regularise, so that cells far from all valid cells remain solvable.
+    # Regularise, so that the equations can be solved far from all valid cells.
     normal += 1e-6 * np.eye(3)
     level = np.linalg.solve(normal, right_side[..., None])[..., 0, 0]
     return GreyImage(grey=np.where(enough, level, 0.0), valid=enough, region=valid)

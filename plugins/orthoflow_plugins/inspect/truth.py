@@ -1,4 +1,4 @@
-"""`inspect.truth`: compare a run's products with the truth of a simulated scene."""
+"""`inspect.truth`: compare the products of a run with the truth of a simulated scene."""
 
 from __future__ import annotations
 
@@ -90,13 +90,11 @@ if TYPE_CHECKING:
 _TRACED_POINTS: Final = 4000
 # The true colour of a cell is the mean over n x n rays.
 _SUPERSAMPLE: Final = 3
-# Walls with more cells than this are compared in bands of this size; a band needs about 1 GB of
-# memory.
+# Larger walls are compared in bands of this many cells; a band needs about 1 GB of memory.
 _BAND_CELLS: Final = 1 << 23
-# Figures of large walls show every nth row and column, so that about this many remain along the
+# Figures of large walls show every nth row and column, such that about this many remain along the
 # longer side.
 _DRAWN_CELLS: Final = 1800
-# Metrics of each wall.
 _OF_WALLS: Final = (
     lower("rmse_[uv]_mm", label="error along {0}, RMS", headline=True),
     MetricSpec("mean_[uv]_mm", label="shift along {0}, mean"),
@@ -144,7 +142,7 @@ _OF_WALLS: Final = (
         label="cells whose error is within twice the predicted standard deviation",
     ),
 )
-# Metrics of planes, which do not need orthoimages.
+# Metrics of planes, which can be computed without orthoimages.
 _OF_PLANES: Final = (
     lower("plane_angle_deg", label="direction error of the main plane", headline=True),
     lower("plane_offset_mm", label="position error of the main plane", headline=True),
@@ -166,32 +164,32 @@ NOT_TRACED: Final = DiagnosticSpec(
 
 
 def _needing(ports: tuple[str, ...], *specs: MetricSpec) -> tuple[MetricSpec, ...]:
-    """Return metrics that are reported only if these ports are connected."""
+    """Return the metrics that are only reported if these ports are connected."""
     return tuple(replace(spec, needs=ports) for spec in specs)
 
 
 class InspectTruth(Method):
-    """Compare with the truth of a simulated scene, cell by cell and patch by patch.
+    """Compare products with the truth of a simulated scene, cell by cell and patch by patch.
 
-    The true orthoimage is rendered in the frame of each wall; it shows the first surface within the
+    The true orthoimage is rendered in the frame of each wall. It shows the first surface within the
     buffer, seen perpendicular to the wall. Depths and colours are compared away from true depth
-    steps; a band of 2 cells along the steps is reported separately. Displacements come from patches
-    of 32 x 32 covered cells, matched to the truth by least squares. Metrics without a prefix
-    describe the first wall, and those with `all_` all walls together. On large walls, colours and
-    patches are compared in evenly spread blocks of 96 x 96 cells, and visibility is tested on a
-    regular lattice of cells; depths and displacements that follow from cameras are compared in
-    every cell. If there are more than eight million errors, statistics are computed from an evenly
-    spread sample.
+    steps; a band of 2 cells along the steps is reported separately. Displacements are measured in
+    patches of 32 x 32 covered cells, which are matched to the truth by least squares. Metrics
+    without a prefix describe the first wall, and those with `all_` describe all walls together. On
+    large walls, colours and patches are compared in evenly spread blocks of 96 x 96 cells, and
+    visibility is tested on a regular lattice of cells; depths, and displacements computed from
+    cameras, are compared in every cell. If there are more than eight million errors, statistics are
+    computed from an evenly spread sample.
 
-    With cameras, each photo's orientation is compared with the true one, and the displacement of
-    each cell coloured by a photo is computed exactly. For this, the cell's point on the measured
-    surface is projected with the estimated camera, and the ray of that pixel through the true
+    With cameras, the orientation of each photo is compared with the true one, and the displacement
+    of each cell coloured from a photo is computed exactly. For this, the point of the cell on the
+    measured surface is projected with the estimated camera. The ray through this pixel of the true
     camera meets the true scene at the point whose colour the cell shows. Displacements of patches
-    then have the prefix `patch_`. The ties stored with the cameras are compared, too. A tie is
-    wrong if it is more than 1.5 cells of the wall from the scene point that its pixel shows.
+    then have the prefix `patch_`. The ties stored with the cameras are also compared. A tie is
+    wrong if it is more than 1.5 cells of the wall away from the scene point that its pixel shows.
     `match_wrong_share` is the share of wrong ties among all ties, `tie_wrong_share` is the share
-    among those that the orientation kept, and `match_wrong_share_own_wall` is the share among those
-    on the wall that covers most of their photo.
+    among the ties that the orientation kept, and `match_wrong_share_own_wall` is the share among
+    the ties on the wall that covers most of their photo.
 
     Without orthoimages, only planes and labels are compared, which is sufficient for plane
     detectors.
@@ -279,12 +277,12 @@ class InspectTruth(Method):
         cameras: Cameras | None = None
 
     class Out(Ports):
-        """The errors found."""
+        """The measured errors."""
 
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Compare the photos, then each wall, then all walls together."""
+        """Compare the photos, each wall, and all walls together."""
         if inputs.cloud is not None:
             inputs.cloud.require_points(2)
         if inputs.orthoimages is None or inputs.walls is None:
@@ -336,12 +334,13 @@ class _Verdict:
         samples: errors of depths, colours and patches.
         sources: errors of traced cells; None if no photo coloured a cell.
         patches: patches whose displacement was measured.
-        depth_m: measured minus true depth in every `_draw_step`-th row and column, for the figure.
-        grey: root mean square colour error of the same cells.
-        length_m: length of the displacement of the same cells.
+        depth_m: measured minus true depth in every nth row and column, for the figure; n is given
+            by `_draw_step`.
+        grey: RMS colour error of the same cells.
+        length_m: length of the displacement of the same cells, in metres.
         cells: (n, 2) row and column of a sample of the traced cells.
-        cell_shift_m: (n, 2) displacements of these cells along u and v.
-        quality: findings that need no truth.
+        cell_shift_m: (n, 2) displacements of these cells along u and v, in metres.
+        quality: findings that do not depend on the truth.
     """
 
     samples: WallSamples
@@ -377,7 +376,6 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
 
 
 def _warn_of_untraced(images: Orthoimages, cameras: Cameras | None, ctx: StepContext) -> None:
-    """Report sources whose cells cannot be traced because their photo is not oriented."""
     if cameras is None:
         return
     known = {camera.photo for camera in cameras.cameras if camera.status == "ok"}
@@ -397,7 +395,7 @@ def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Judge:
-    """Compares walls one by one; `views` is None if there are no cameras."""
+    """Comparison of walls, one by one; `views` is None if there are no cameras."""
 
     inputs: InspectTruth.In
     walls: Walls
@@ -406,7 +404,7 @@ class _Judge:
     ctx: StepContext
 
     def verdict_on(self, image: Orthoimage) -> _Verdict:
-        """Compare one wall; large walls are compared in bands of whole blocks, with a margin."""
+        """Compare one wall; large walls are compared in bands of whole blocks with a margin."""
         wall = wall_of(image, self.walls, in_files(self.ctx, f"{image.wall}.laid"))
         n_painted = sum(count_cells(image.mask, state) for state in PAINTED_STATES)
         cell_step = max(1, n_painted // _TRACED_POINTS)
@@ -426,13 +424,13 @@ class _Judge:
         )
 
     def _of_band(self, image: Orthoimage, wall: Wall, band: Band, cell_step: int) -> _Verdict:
-        """Compare a band of rows; the size of the result is limited, however large the wall is.
+        """Compare a band of rows; the size of the result does not depend on the size of the wall.
 
         Args:
             image: orthoimage of the whole wall.
-            wall: the wall, on the same grid.
+            wall: the wall, on the grid of the image.
             band: rows to compare.
-            cell_step: every nth traced cell is kept.
+            cell_step: n if every nth traced cell is kept.
         """
         part, surface = raster_rows(image, band.around), raster_rows(wall, band.around)
         chosen = sampling(part, self.rule, band.around.start)
@@ -524,7 +522,7 @@ def _inspection(
     findings: list[Finding],
     details: dict[str, JsonValue],
 ) -> Inspection:
-    """Collect the displacements of all patches and of a few thousand traced cells."""
+    """Collect the displacements of all patches, and of a few thousand traced cells."""
     walls, points, shifts, kinds = [], [], [], []
     for image, item in zip(orthoimages.images, verdicts, strict=True):
         places = np.concatenate([item.patches.centre, item.cells[:, ::-1] + 0.5])
@@ -546,7 +544,7 @@ def _inspection(
 
 
 def _draw_step(image: Orthoimage) -> int:
-    """Return n if the figures show every nth row and column; 1 unless the wall is large."""
+    """Return n if figures show every nth row and column; 1 unless the wall is large."""
     return max(1, max(image.frame.shape) // _DRAWN_CELLS) if _is_large(image) else 1
 
 
@@ -555,7 +553,7 @@ def _is_large(image: Orthoimage) -> bool:
 
 
 def _bands(image: Orthoimage) -> Iterator[Band]:
-    """Yield bands of whole blocks with a margin of one block; a small image is a single band."""
+    """Yield bands of whole blocks, with a margin of one block; a small image is one band."""
     height, width = image.frame.shape
     rows = height
     if _is_large(image):
