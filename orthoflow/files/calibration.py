@@ -10,9 +10,9 @@ cameras:
 ```
 
 The first entry that matches a photo is used. For `model: fisheye` (`cv2.fisheye`), the distortion
-is k1, k2, k3, k4, and `field_of_view_deg` is the full angle to use, 180 by default. In the file,
-the centre of the first pixel is (0, 0); internally it is (0.5, 0.5). Only this module converts
-between the two.
+is k1, k2, k3, k4, and `field_of_view_deg` is the full angle that is used, by default 180. In the
+file, the centre of the first pixel is (0, 0); internally it is (0.5, 0.5). Only this module
+converts between the two.
 """
 
 from __future__ import annotations
@@ -222,8 +222,6 @@ class _Lens(BaseModel):
 
 
 class _File(BaseModel):
-    """The whole file."""
-
     model_config = ConfigDict(extra="forbid", strict=True)
 
     cameras: Annotated[dict[str, _Lens], Field(min_length=1)]

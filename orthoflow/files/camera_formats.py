@@ -109,10 +109,10 @@ def _colmap_models(paths: Sequence[Path]) -> list[list[Path]]:
 def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
     """Return the photo names of a Bundler file, from a list in the same folder.
 
-    Each line of the list is a photo name, which may contain spaces or be quoted, optionally
-    followed by 0 and a focal length in pixels. Only lists with one line per camera are used. A list
-    with the name of the Bundler file has priority over `list.txt`; if neither exists, all lists of
-    photos must have the same content.
+    Each line of the list contains a photo name, which may contain spaces or be quoted, and
+    optionally 0 and a focal length in pixels. Only lists with one line per camera are used. A list
+    with the same name as the Bundler file has priority over `list.txt`; if neither exists, all
+    lists of photos must have the same content.
     """
     n_cameras = bundler_count(path)
     lists = {
@@ -204,7 +204,7 @@ def bundler_count(path: Path) -> int:
     """Return the number of cameras according to the header of a Bundler file.
 
     Raises:
-        InputError: the header has no such number.
+        InputError: the header does not contain the number.
     """
     words = list(islice(_words_of(path), 2))
     counts = numbers_of(words, path, "the counts of cameras and points")
@@ -253,7 +253,7 @@ def _words_of(path: Path) -> Iterator[str]:
 
 
 def _head_of(lines: Sequence[str]) -> tuple[int, list[str]] | None:
-    """Return line index and columns of a RealityCapture list's header; None if there is none."""
+    """Return the line index and the columns of a RealityCapture list's header, or None."""
     for number, line in enumerate(lines):
         columns = [word.strip().lower() for word in _SEPARATORS.split(line.lstrip("# \ufeff"))]
         if {"name", "heading"} <= set(columns):

@@ -36,7 +36,7 @@ from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
 from orthoflow.untrusted_text import open_file, reading
 
-# Our names for COLMAP's parameters, where they differ, in models that OpenCV's includes.
+# Our names for COLMAP's parameters, where they differ, for models that are part of OpenCV's.
 _NAMES: Final = {"k": "k1"}
 _BROWN: Final = frozenset(
     {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
@@ -142,7 +142,7 @@ def _pycolmap(purpose: str) -> Any:
 
 
 def _kept_ties(ties: Ties | None, photo: str) -> NDArray[np.float64]:
-    """Return a photo's ties that the orientation kept (n, 6): pixel, position, residual length."""
+    """Return the kept ties of a photo (n, 6): u, v, x, y, z and length of the residual."""
     if ties is None or photo not in ties.photo_names:
         return np.empty((0, 6))
     mine = (ties.photo == ties.photo_names.index(photo)) & (ties.role != TieRole.REJECTED)
@@ -212,7 +212,8 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
 def _require_whole(path: Path) -> None:
     """Refuse a binary file that is truncated or declares more items than its size allows.
 
-    pycolmap allocates memory for the declared number of items, and reads past the end of the file.
+    pycolmap would allocate memory for the declared number of items, and read past the end of the
+    file.
     """
     end_of = {"images": _end_of_image, "rigs": _end_of_rig, "frames": _end_of_frame}
     content, at = path.read_bytes(), 8
@@ -247,7 +248,7 @@ def _end_of_rig(content: bytes, at: int) -> int:
 
 
 def _whole_names(images: Path) -> dict[int, str]:
-    """Return photo names by image number, read from a text file; pycolmap cuts them at spaces."""
+    """Return photo names by image number from a text file; pycolmap truncates them at spaces."""
     names: dict[int, str] = {}
     with open_file(images) as content:
         stream = TextIOWrapper(content, encoding="utf-8", errors="replace")
@@ -264,7 +265,6 @@ def _whole_names(images: Path) -> dict[int, str]:
 def _given(
     image: Any, whole_name: str, lens: Intrinsics | WideLens | str, note: str, *, path: Path
 ) -> GivenCamera:
-    """Return the orientation of an image."""
     name = photo_path(whole_name)
     if isinstance(lens, str):
         return GivenCamera(name=name, reason=lens)

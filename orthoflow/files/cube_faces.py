@@ -47,7 +47,7 @@ _ANGLES_TRIED: Final = 2000
 
 
 def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
-    """Return the directions (height, width, 3) of a face's pixels in its own axes, with z = 1."""
+    """Return directions (height, width, 3) of a face's pixels in the axes of the face; z is 1."""
     right = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
     down = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
     across, along = np.meshgrid(right, down)
@@ -55,7 +55,7 @@ def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
 
 
 def face_in(name: str) -> tuple[str, str] | None:
-    """Return stem and face of a photo name that may be a cube face; None otherwise.
+    """Split the photo name of a cube face into its stem and the face; return None for other names.
 
     >>> face_in("hall_left.png"), face_in("left.png")
     (('hall', 'left'), None)
@@ -261,7 +261,7 @@ def _lens_of_face(side: int, ends: tuple[int, int, int, int]) -> Intrinsics:
 
 
 def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
-    """Return the lens of the part of a face within the outermost visible directions plus a margin.
+    """Return the lens of the part of a face that contains all visible directions, plus a margin.
 
     At its centre, the face has the resolution of the photo.
     """
@@ -328,7 +328,7 @@ class CubeFace:
         return np.asarray(found, dtype=whole.dtype)
 
     def _pixels(self) -> NDArray[np.float64]:
-        """Return the position (height, width, 2) in the wide photo of each pixel of the face."""
+        """Return the positions (height, width, 2) of the face's pixels in the wide photo."""
         return self.whole.project(face_rays(self.lens) @ FACES[self.face])
 
 

@@ -68,7 +68,7 @@ class _Collected:
         self.found.append((position, f"{path}: {message}" if path else message))
 
 
-# pydantic's error code -> expected value, in terms of YAML or JSON instead of Python. Our own
+# Expected value by pydantic's error code, in terms of YAML or JSON instead of Python. Our own
 # validators raise custom errors with a `form`.
 _FORMS: Final[Mapping[str, str]] = {
     "bool_type": "true or false",
@@ -184,7 +184,6 @@ def _shown(value: JsonValue) -> str:
 
 
 def _list_form(model: type[BaseModel], name: str) -> str:
-    """Return an example of how to write a list parameter; empty for other parameters."""
     schema = model.model_json_schema()
     form = type_text(schema.get("properties", {}).get(name, {}), schema.get("$defs", {}))
     return form if "[" in form else ""
@@ -222,20 +221,17 @@ def _unknown_key(name: str, known: Sequence[str], value: JsonValue, owner: str) 
 
 
 def _keys_at(model: type[BaseModel], loc: Location) -> list[str]:
-    """Return the keys of the models at a location."""
     models = _models_in(_annotations_at(model, loc))
     return [info.alias or name for one in models for name, info in one.model_fields.items()]
 
 
 def _literals_at(model: type[BaseModel], loc: Location) -> list[str]:
-    """Return the literal words allowed at a location."""
     parts = _parts_of(_annotations_at(model, loc))
     literals = (part for part in parts if typing.get_origin(part) is typing.Literal)
     return [str(word) for one in literals for word in typing.get_args(one)]
 
 
 def _annotations_at(model: type[BaseModel], loc: Location) -> list[object]:
-    """Return the types at a location; if its last parts are not fields, those that contain it."""
     found: list[object] = [model]
     for part in loc:
         fields: list[object] = [
@@ -303,7 +299,7 @@ def meant_number(parameter: str, text: object) -> str:
 
 
 def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
-    """Return a hint naming the parameter that takes this quantity in another unit; else empty.
+    """Return a hint on the parameter for this quantity in another unit; empty if there is none.
 
     >>> meant_parameter("gsd_mm", ["gsd_m", "crs"], 50)
     ' (it is gsd_m, in metres: gsd_m: 0.05)'

@@ -51,7 +51,7 @@ _STYLE: Final[Mapping[Any, Any]] = {
     "legend.frameon": False,
     "legend.fontsize": 7.0,
     "savefig.dpi": DPI,
-    # Equal data give equal bytes, and text in PDF can be searched.
+    # Identical data give identical bytes, and text in PDF files can be searched.
     "svg.hashsalt": "orthoflow",
     "pdf.fonttype": 42,
     "text.parse_math": False,
@@ -93,7 +93,7 @@ def styled(settings: Mapping[Any, Any]) -> Iterator[None]:
 
 @contextmanager
 def in_column_style() -> Iterator[None]:
-    """Use the style for several panels or pictures with axes; also serves as a decorator."""
+    """Use the style for several panels or for pictures with axes; also works as a decorator."""
     with styled(_PANELS):
         yield
 
@@ -108,10 +108,10 @@ def column_figure(height_inches: float) -> Figure:
 def picture_figure(
     picture: NDArray[np.uint8], *, extra_inches: float = 0.0, frame: WallFrame | None = None
 ) -> tuple[Figure, Axes]:
-    """Return a figure that shows a picture, and its axes.
+    """Return a figure that shows a picture, and the axes of the figure.
 
-    The axes are in pixels of the picture or, with a frame, in columns and rows of the wall's
-    raster, and labelled in metres as in its files.
+    Without a frame, coordinates on the axes are pixels of the picture. With a frame, they are
+    columns and rows of the wall's raster, and labels are in metres as in its files.
 
     Args:
         picture: (rows, cols) grey or (rows, cols, 3) RGB.
@@ -203,8 +203,8 @@ def round_scale(value: float) -> float:
     return float(f"{step * power:.6g}")
 
 
-# Saturation and value of successive hues, which differ by the golden ratio: this separates the
-# first twenty colours best.
+# Successive hues differ by the golden ratio, and have these saturations and values in turn. This
+# separates the first twenty colours best.
 _HUE_STEP: Final = 0.618033988749895
 _SHADES: Final = ((0.9, 0.8), (0.8, 0.55), (0.45, 0.9))
 

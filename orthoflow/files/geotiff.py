@@ -1,8 +1,8 @@
 """GeoTIFF files in the plane of a wall: single-band rasters and cloud-optimised orthoimages.
 
-The coordinates are local, in metres, pixel-is-area. For walls, X runs along the wall from its left
-edge and Y is the height; for floors and ceilings, X and Y are x and y of the world. Rasters of
-horizontal planes can be in map coordinates instead (easting, northing). `WallFrame.raster_axes`
+The coordinates are local and in metres; pixels are areas. For walls, X runs along the wall from its
+left edge and Y is the height; for floors and ceilings, X and Y are x and y of the world. Rasters of
+horizontal planes can be in map coordinates (easting and northing) instead. `WallFrame.raster_axes`
 defines which of these applies. Identical rasters give identical bytes.
 """
 
@@ -67,7 +67,7 @@ _COG_OPTIONS: Final[dict[str, object]] = {
     "predictor": "YES",
     "blocksize": TILE_PX,
     # The driver creates the overviews, because explicit odd factors with a mask crashed older
-    # builds.
+    # builds of GDAL.
     "overviews": "AUTO",
     "resampling": "AVERAGE",
 }
@@ -185,11 +185,6 @@ def epsg_wkt(epsg: int) -> str:
 
 
 def _map_crs(crs: str) -> CRS:
-    """Return the coordinate system of a map.
-
-    Raises:
-        InputError: the coordinate system does not exist.
-    """
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
@@ -538,7 +533,6 @@ def _write(
     tags: Mapping[str, str],
     icc_profile: bytes | None = None,
 ) -> None:
-    """Write (rows, cols, bands) values to a tiled GeoTIFF, a row of tiles at a time."""
     import rasterio
     from rasterio.enums import ColorInterp
 
@@ -559,7 +553,7 @@ def _write(
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert errors from GDAL or the disk while a file is written into one that names the file.
+    """Convert GDAL and disk errors that occur in the block into errors that name the file.
 
     Raises:
         StoreError: the file cannot be written.
@@ -595,8 +589,8 @@ def quiet() -> Iterator[None]:
 def let_go_of_untrusted_text() -> None:
     """Suppress tracebacks if rasterio cannot decode a file's bytes in a message from GDAL.
 
-    The error occurs in a callback, which cannot raise it, so Python prints it through both hooks.
-    GDAL's own error about the file is raised afterwards.
+    The error occurs in a callback, which cannot raise it, so Python prints it through
+    `sys.unraisablehook` or `sys.excepthook`. GDAL's own error about the file is raised afterwards.
     """
     log_unraisable, show_exception = sys.unraisablehook, sys.excepthook
 

@@ -170,7 +170,7 @@ def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
 def lens_of_terms(
     terms: Mapping[str, float], width: int, height: int, *, is_fisheye: bool = False
 ) -> tuple[Intrinsics | FisheyeLens, float]:
-    """Return the lens for another program's parameters, approximated if our model lacks some.
+    """Return the lens for another program's parameters, approximated if our models lack some.
 
     Args:
         terms: `fx`, `fy`, `cx`, `cy` and `skew` in pixels; `k1` to `k4`, `p1` and `p2` as in

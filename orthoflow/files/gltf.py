@@ -100,8 +100,6 @@ def write_page(path: Path, model: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Document:
-    """A glTF document that is being built, with its binary data."""
-
     data: bytearray = field(default_factory=bytearray)
     views: list[JsonValue] = field(default_factory=list)
     accessors: list[JsonValue] = field(default_factory=list)
@@ -152,7 +150,6 @@ class _Document:
         return len(self.nodes)
 
     def finished(self, root: dict[str, JsonValue]) -> bytes:
-        """Return the file."""
         n_images = len(self.images)
         sampler = {"magFilter": _LINEAR, "minFilter": _TRILINEAR}
         document: dict[str, JsonValue] = {

@@ -71,7 +71,7 @@ def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
 
 
 def decode_levels(encoded: bytes, name: str = "image") -> Colours:
-    """Decode like `decode_image`, but to uint16 if a PNG or TIFF file has more than 8 bits.
+    """Decode like `decode_image`, but to uint16 if a PNG or TIFF has more than 8 bits per channel.
 
     Raises:
         InputError: the same conditions as for `decode_image`.
@@ -80,7 +80,6 @@ def decode_levels(encoded: bytes, name: str = "image") -> Colours:
 
 
 def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
-    """Decode an image to RGB; a 16-bit PNG is reduced to 8 bits unless `is_deep`."""
     import cv2
 
     problem = unreadable(encoded)

@@ -226,7 +226,7 @@ class _Similarity:
 def _pose(
     element: ET.Element, places: Sequence[str], path: Path, whose: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotation and translation of an element; the translation may have any of `places`."""
+    """Return the rotation and translation of an element; `places` are names for the translation."""
     rotation, shift = np.eye(3), np.zeros(3)
     if words := element.findtext("rotation", "").split():
         rotation = rotation_of(_some(words, 9, path, "rotation", whose), path, whose)
@@ -288,7 +288,6 @@ class _Sensor:
 
 
 def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
-    """Return width and height in pixels."""
     size = owner.find("resolution")
     words = [] if size is None else [size.get("width", ""), size.get("height", "")]
     values = numbers_of(words, path, f"the size of sensor {label}")

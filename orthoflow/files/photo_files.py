@@ -33,9 +33,8 @@ if TYPE_CHECKING:
 READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
 HOW_TO_DEVELOP: Final = "develop it first to 16-bit TIFF or JPEG, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
-# Such a photo has 800 MB as RGB, twice the size of the largest sensors; a 100 kB PNG can declare
-# more.
-#: pixels declared by a photo, before it is decoded
+# As RGB, a photo of this size takes 800 MB; it has twice as many pixels as the largest sensors. A
+# PNG of 100 kB can declare more. pixels declared by a photo, before it is decoded
 MOST_PIXELS: Final = 1 << 28
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
@@ -131,7 +130,6 @@ def _media_format(encoded: bytes) -> str:
 
 
 def _raw_in_tiff(encoded: bytes) -> str | None:
-    """Return the name of a camera raw format based on TIFF, or None."""
     if encoded[8:10] == b"CR":
         return "camera raw (Canon CR2)"
     pages = tiff_pages(encoded)
@@ -277,7 +275,7 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
     with _tiff_page(encoded, start) as page:
         is_stated = ColorInterp.alpha in page.colorinterp
         # Some programs do not declare the meaning of the last of two or four bands. If all values
-        # of this band are 0 or the maximum, it is an alpha band, not e.g. infrared.
+        # of this band are 0 or the maximum, it is an alpha band rather than, for example, infrared.
         band = page.colorinterp.index(ColorInterp.alpha) + 1 if is_stated else page.count
         if is_stated or (band in (2, 4) and page.dtypes[0] in ("uint8", "uint16")):
             alpha = page.read(band)
@@ -285,7 +283,8 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
             if is_stated or np.isin(alpha, (0, full)).all():
                 opaque = alpha > full // 2
         if opaque is None and page.nodata is not None:
-            # This evaluates GDAL's nodata tag, which e.g. marks the margins of undistorted photos.
+            # This evaluates GDAL's nodata tag, which marks, for example, the margins of undistorted
+            # photos.
             opaque = page.dataset_mask() > 0
     for at in masks:
         with _tiff_page(encoded, at) as page:
@@ -323,7 +322,6 @@ def opened(encoded: bytes) -> Iterator[Image | None]:
 
 
 def _register_heic() -> None:
-    """Register the HEIC plugin with Pillow if it is installed."""
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
@@ -543,7 +541,7 @@ _CONTRADICTION: Final = 1.15
 
 @dataclass(frozen=True, kw_only=True)
 class Exif:
-    """The EXIF data of a photo; missing values are None or an empty text.
+    """The EXIF data of a photo; missing values are None or empty strings.
 
     Attributes:
         orientation: 1..8, rotation and reflection of the stored array for display.
@@ -730,7 +728,7 @@ def _text(value: object) -> str:
     """Return the text of a tag up to its first NUL; empty if missing, too long or a number."""
     if not isinstance(value, str) or len(value) >= _MAX_TEXT:
         return ""
-    # Pillow decodes texts as Latin-1, but EXIF texts are ASCII.
+    # Pillow decodes strings as Latin-1, but EXIF strings are ASCII.
     plain = value.encode("latin-1", "replace").decode("ascii", "replace")
     return plain.split("\0")[0].strip()
 

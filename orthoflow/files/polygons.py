@@ -43,7 +43,7 @@ class NamedPolygon:
 
 
 def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
-    """Read a GeoJSON FeatureCollection of polygons, each with a text in the property `name`.
+    """Read a GeoJSON FeatureCollection of polygons, each of which has a name in one property.
 
     Args:
         path: the file.

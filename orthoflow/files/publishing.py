@@ -309,9 +309,9 @@ def publish_ties(product: Ties, folder: Path, digest: str) -> None:
 def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
     """Write `cameras.json` and other results of the orientation.
 
-    These are `calibration.yaml` with the estimated lenses, for orienting other photos from the same
-    cameras, `ties.csv` with the residuals if the ties were kept, and `residuals.csv` with the table
-    of residuals.
+    The other files are `calibration.yaml` with the estimated lenses, which can be used to orient
+    other photos from the same cameras; `ties.csv` with the residuals, if the ties were kept; and
+    `residuals.csv` with the table of residuals.
     """
     write_json(
         folder / "cameras.json",
@@ -341,7 +341,7 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
 
 
 def _table_text(rows: Sequence[ResidualRow]) -> str:
-    """Return rows as CSV; missing values are empty. The axes of walls are also called u and v."""
+    """Return rows as CSV; `axis` becomes `photo_axis`, because walls also have axes u and v."""
     columns = [
         "photo_axis" if column.name == "axis" else column.name for column in fields(ResidualRow)
     ]
@@ -358,17 +358,6 @@ def _publish_raster(
     tags: Mapping[str, str],
     digest: str,
 ) -> None:
-    """Write a float raster of a wall, with its sidecar and preview.
-
-    Args:
-        stem: path without suffix.
-        values: (rows, cols) values of the raster.
-        wall: wall of the raster.
-        about: further content of the sidecar.
-        content: description of the values.
-        tags: tags of the GeoTIFF, such as the unit of the values.
-        digest: digest of the product.
-    """
     all_tags = raster_tags(wall.frame, digest=digest, name=wall.name, content=content, extra=tags)
     write_raster(
         stem.with_suffix(".tif"),
@@ -398,7 +387,6 @@ def _cells_of(image: Orthoimage, shown: NDArray[np.bool_]) -> Cells:
 
 
 def _write_preview(path: Path, picture: bytes, frame: WallFrame) -> None:
-    """Write the preview of a raster, and a world file with the same position."""
     rows, columns = cells_per_preview_px(frame.shape)
     text = world_file_text(GridPlace.of(frame), rows=rows, columns=columns)
     write_bytes(path, picture)

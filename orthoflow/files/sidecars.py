@@ -330,7 +330,7 @@ def raster_tags(
 def mask_meanings(
     meanings: Mapping[SurfaceMask, str] | Mapping[OrthoMask, str] | Mapping[LayerMask, str],
 ) -> JsonValue:
-    """Return the meanings of mask values, with the values as text, since JSON keys are texts."""
+    """Return the meanings of mask values by the value as a string, since JSON keys are strings."""
     return {str(int(value)): text for value, text in meanings.items()}
 
 
@@ -446,7 +446,7 @@ class OrthoFile:
 
 
 def ortho_files(paths: Iterable[Path]) -> tuple[OrthoFile, ...]:
-    """Open the orthoimages among some files, ordered by wall.
+    """Open the orthoimages among the given files, ordered by wall.
 
     Raises:
         InputError: an orthoimage or its sidecar cannot be read.

@@ -209,11 +209,9 @@ class _Table:
     problems: list[str] = field(default_factory=list)
 
     def add(self, line: int, message: str) -> None:
-        """Add a problem."""
         self.problems.append(f"{self.path.name}:{line}: {message}")
 
     def check(self) -> None:
-        """Raise an error with all problems, if there are any."""
         left_out = len(self.problems) - _MAX_PROBLEMS
         more = [f"... and {left_out} more problems"] if left_out > 0 else []
         if self.problems:

@@ -18,7 +18,7 @@ _MIN_PAINTED_SHARE: Final = 0.5
 
 
 class WallDescription(BaseModel):
-    """A wall and its orthoimage: size, covered share, expected error, recommendation.
+    """A wall and its orthoimage: size, covered share, expected error and recommendation.
 
     Attributes:
         number: number of the wall, i.e. the index of its plane in `planes.json`.

@@ -197,11 +197,8 @@ _CORE_SCHEMA: Final = (
 
 
 class _CoreResolver(VersionedResolver):
-    """A resolver that determines the type of plain scalars by the core schema."""
-
     # Any: as in ruamel.yaml.
     def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
-        """Return the tag of a node without an explicit tag."""
         if kind is ScalarNode and implicit[0]:
             for name, form in _CORE_SCHEMA:
                 if form.fullmatch(value):
@@ -213,7 +210,6 @@ class _QuickScanner(Scanner):
     """A scanner that remains fast if many brackets are open."""
 
     def stale_possible_simple_keys(self) -> None:
-        """Discard the candidates that can no longer be keys."""
         line, index = self.reader.line, self.reader.index
         for key in self.possible_simple_keys.values():
             if key.line != line or index - key.index > _LONGEST_KEY:
@@ -236,11 +232,6 @@ class _LimitedParser(Parser):
 
     # Any: as in ruamel.yaml.
     def get_event(self) -> Any:
-        """Return the next event.
-
-        Raises:
-            _UnreadableError: the document is too large or nested too deeply.
-        """
         event = super().get_event()
         if isinstance(event, MappingEndEvent | SequenceEndEvent):
             self.depth -= 1
@@ -391,7 +382,6 @@ class _Converter:
         )
 
     def _join(self, before: Node, behind: Node, at: Location) -> Node:
-        """Report the decimal comma, and return the intended number."""
         meant = f"{before.value}.{behind.value}"
         self._report(
             before,

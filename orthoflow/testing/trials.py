@@ -59,8 +59,6 @@ class TrialRun:
 
 @dataclass(kw_only=True)
 class _WatchedContext(StepContext):
-    """A context that records all progress fractions."""
-
     fractions: list[float] = field(default_factory=list)
     draws: bool = True
 

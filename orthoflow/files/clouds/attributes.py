@@ -1,6 +1,6 @@
 """Preparation of points for writing in blocks: selection, colours, planes and normals.
 
-`cloud.json`, next to the file of points, describes the points, their colours and their fields.
+`cloud.json`, next to the point file, describes the points, their colours and their fields.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import JsonValue, Planes, PointCloud, PointLabels
 
 Colouring: TypeAlias = Literal["photos", "rgb", "intensity", "plane", "deviation"]
-# Points per block: ten copies need a few hundred megabytes.
+# Points per block; ten copies of a block need a few hundred megabytes.
 BLOCK: Final = 1 << 20
 _SCALE_PERCENT: Final = 99.0
 _NOTHING: Final = np.zeros(0, dtype=np.float32)
@@ -81,7 +81,8 @@ class AttributedCloud:
     def scale_m(self) -> float:
         """Return the deviation shown in full colour: the 99th percentile, rounded up to 1-2-5.
 
-        It is estimated from selected points in short sections all over the cloud.
+        The value is in metres, and is estimated from points in short sections spread over the
+        cloud.
         """
         found = [
             deviations[self._chosen(piece, None)]
@@ -135,10 +136,10 @@ class AttributedCloud:
     def columns(self) -> np.dtype[np.void]:
         """Return the columns that are available for this cloud.
 
-        World coordinates in metres; unit normals towards the viewer, 0 0 0 where there is no
-        surface; colours; intensity 0..1; scan number; plane number, or -1; deviation from the plane
-        in metres, positive towards the viewer, or NaN; number of the photo that provides the
-        colour, or -1.
+        These are world coordinates in metres; unit normals towards the viewer, 0 0 0 where there is
+        no surface; colours; intensity, 0 to 1; scan number; plane number, or -1; deviation from the
+        plane in metres, positive towards the viewer, or NaN; and number of the photo that provides
+        the colour, or -1.
         """
         photos, is_labelled = self.photo_colours, self.labels is not None
         is_known = {
@@ -213,7 +214,7 @@ class AttributedCloud:
         return found
 
     def _deviations(self, part: slice) -> NDArray[np.float32] | None:
-        """Return signed distances (n,) from the wall's plane, or from each point's plane."""
+        """Return signed distances (n,), metres, from the plane of the wall or of each point."""
         if self.wall is not None:
             plane = self.wall.frame.plane
             distances = self.cloud.points_world(part) @ plane.normal - plane.offset_m
@@ -257,7 +258,7 @@ class AttributedCloud:
         scan: NDArray[np.uint16] | None,
         plane: NDArray[np.int16] | None,
     ) -> NDArray[np.float32]:
-        """Return signs (n,) that turn normals towards the scanner, like the plane's, or upwards."""
+        """Return signs (n,) that turn normals to the scanner, to the plane's normal, or upwards."""
         stations = self.cloud.stations
         towards = np.broadcast_to(self.cloud.up, world.shape)
         if self.station(0) is not None and stations is not None:
@@ -316,7 +317,7 @@ def plane_colours(
 
     Args:
         plane: (n,) number of the plane, or -1.
-        palette: (p + 1, 3) `plane_colour` of -1, 0, 1 ...
+        palette: (p + 1, 3) results of `plane_colour` for -1, 0, 1 and so on.
         grey: (n,) brightness of the points, 0..1.
     """
     shade = _DARKEST + (1.0 - _DARKEST) * grey
@@ -361,7 +362,7 @@ def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
 
 
 def grey_range(cloud: PointCloud) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of brightness, from sections all over the cloud."""
+    """Return the 1st and 99th percentile of brightness, from sections spread over the cloud."""
     if (cloud.intensity is None and cloud.rgb is None) or not len(cloud):
         return 0.0, 1.0
     sample = np.concatenate([greys(cloud, piece) for piece in sampled_pieces(len(cloud))])
@@ -370,7 +371,7 @@ def grey_range(cloud: PointCloud) -> tuple[float, float]:
 
 
 def sampled_pieces(n_points: int) -> list[slice]:
-    """Return short disjoint sections all over a cloud; a small cloud is covered completely."""
+    """Return short, disjoint sections spread over a cloud; they cover a small cloud completely."""
     firsts = range(0, n_points, max(_PIECE, n_points // _PIECES))
     return [slice(k, min(k + _PIECE, n_points)) for k in firsts]
 

@@ -66,13 +66,12 @@ class _Waiting:
 
     @property
     def groups(self) -> NDArray[np.int64]:
-        """Return the group of each cell of the root's grid."""
         return (np.cumsum(self.counts) - self.counts) // _IN_MEMORY_POINTS
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Nodes:
-    """Runs of points, each from a single node, coarse nodes first; a node has one run per group.
+    """Runs of points, from coarse to fine nodes; a run belongs to one node and to one group.
 
     Attributes:
         key: (r,) uint64 level of the node, followed by 42 bits of its position along the curve.
@@ -208,7 +207,6 @@ def _ancestors(codes: NDArray[np.uint64], level: int) -> NDArray[np.uint64]:
 
 
 def _nodes(waiting: _Waiting) -> _Nodes:
-    """Sort the points of each group by node."""
     counts, order = waiting.counts, waiting.order
     totals = [counts.reshape(8**level, -1).sum(axis=1) for level in range(_GRID_BITS + 1)]
     sizes = np.bincount(waiting.groups, weights=counts).astype(np.int64)
@@ -264,7 +262,6 @@ def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> N
 
 
 def _points_of(waiting: _Waiting, nodes: _Nodes) -> Iterator[NDArray[np.int64]]:
-    """Yield the points of each node."""
     begins = np.flatnonzero(np.append(True, np.diff(nodes.key) != 0))
     for begin, end in itertools.pairwise([*begins.tolist(), len(nodes.key)]):
         runs = zip(nodes.first[begin:end], nodes.count[begin:end], strict=True)

@@ -24,7 +24,7 @@ _VOXELS_MOST: Final = 1_000_000
 _COARSER: Final = 3
 _ALONE_FEWER_THAN: Final = 10
 _POINTS_LEAST: Final = 6
-# Maximum ratio of the variance across the surface to the variance along its narrower side.
+# On a surface, the smallest principal variance is less than this share of the second smallest.
 _FLAT: Final = 0.25
 _AT_ONCE: Final = 1 << 20
 # A voxel index has 21 bits per axis.
@@ -86,7 +86,7 @@ def _keys(
 def _moments(
     cloud: PointCloud, low: NDArray[np.float64], side_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return sorted voxel keys, and the count, sums and sums of products of the points in each."""
+    """Return sorted voxel keys, and the count, sums and sums of products of a voxel's points."""
     keys = np.zeros(0, dtype=np.int64)
     moments = np.zeros((0, 10))
     for first in range(0, len(cloud), _AT_ONCE):

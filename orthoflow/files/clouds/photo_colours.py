@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 UNSEEN_GREY: Final = 128
 # Points up to this distance behind the nearest one are also visible.
 _TOLERANCE_M: Final = 0.05
-# Lens models are less accurate near a photo's border, where the quality decreases to 0; width of
-# this zone relative to the photo's shorter side.
+# Width of the border zone of a photo, relative to the photo's shorter side. Lens models are less
+# accurate there, so the quality decreases to 0.
 _BORDER_SHARE: Final = 0.05
-# OpenCV requires images with fewer than 32,767 rows.
+# OpenCV's remap requires images with fewer than 32,767 rows.
 _REMAPPED_AT_ONCE: Final = 30_000
 _PROJECTED_AT_ONCE: Final = 1 << 19
 _SAMPLED_MOST: Final = 200_000
@@ -58,9 +58,9 @@ def colour_points(
 ) -> None:
     """Assign each point the colour of the photo that shows it best.
 
-    A point is visible unless a nearer point of the cloud hides it; outliers are ignored. If several
-    photos see it, the one with the most pixels per metre is used, with a lower weight near its
-    border; the colour is interpolated between four pixels.
+    A point is visible unless a nearer point of the cloud hides it; outliers are ignored. If it is
+    visible in several photos, the one with the most pixels per metre is used, but with a lower
+    weight near the border of a photo. The colour is interpolated between four pixels.
 
     Args:
         cloud: the points.
@@ -96,15 +96,9 @@ def _colour(
     colours: PointColours,
     place: int,
 ) -> None:
-    """Colour the points for which a photo has a higher quality than the previous ones.
+    """Colour the points for which a photo has the highest quality so far.
 
-    Args:
-        cloud: the points; they are projected in blocks.
-        photo: the photo.
-        camera: camera of the photo, relative to the cloud's origin.
-        buffer: depth buffer of the camera.
-        colours: colours from the previous photos, updated in place.
-        place: number of the photo.
+    `camera` is relative to the cloud's origin; `colours` are updated in place.
     """
     import cv2
 

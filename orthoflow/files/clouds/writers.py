@@ -1,6 +1,6 @@
 """Writers of clouds, block by block: LAZ 1.4, binary PLY with double coordinates, and E57.
 
-LAZ stores the scan number as the point source, and plane, deviation, normals and photo number as
+LAZ stores the scan number as the point source ID, and plane, deviation, normals and photo number as
 extra bytes. E57 has a Data3D with a pose for each scan, and extensions for normals, plane and
 deviation. PLY is written without a library, because libraries need all points at once or do not
 support custom fields.
@@ -159,8 +159,6 @@ _E57_NAMES: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class _Writer:
-    """An E57 file that is being written."""
-
     # Any: libE57 has no types.
     libe57: Any
     image: Any
@@ -179,9 +177,9 @@ class _Writer:
 def write_e57(path: Path, attributed: AttributedCloud) -> int:
     """Write the selected points scan by scan, block by block, and return their number.
 
-    The pose of a scan is its station if this is known, with the axes of the world, because the
-    cloud does not contain the rotation of the instrument. Otherwise, it is the cloud's origin.
-    Points are relative to the pose, so survey coordinates keep all digits.
+    The pose of a scan has the axes of the world, because the cloud does not contain the rotation of
+    the instrument. Its position is the station or, if that is unknown, the cloud's origin. Points
+    are relative to the pose, so survey coordinates keep all digits.
 
     Raises:
         PluginError: pye57 cannot be imported.
@@ -196,7 +194,6 @@ def write_e57(path: Path, attributed: AttributedCloud) -> int:
 
 
 def _write_head(writer: _Writer, attributed: AttributedCloud) -> Any:
-    """Write the root elements, with a fixed date, and return the empty list of scans."""
     libe57, image = writer.libe57, writer.image
     for prefix, uri in {"": libe57.E57_V1_0_URI, **EXTENSIONS}.items():
         image.extensionsAdd(prefix, uri)

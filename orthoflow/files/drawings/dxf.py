@@ -62,7 +62,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
     """Write a wall in the coordinates of its GeoTIFF, with its orthoimage to scale.
 
     The layers are those of `LAYERS` for elevations. Openings are rectangles or arches if these fit;
-    a text gives their deviation from the detected outline. Marks are blocks with attributes.
+    a label states their deviation from the detected outline. Marks are blocks with attributes.
 
     Raises:
         StoreError: the file cannot be written.
@@ -178,7 +178,6 @@ def _add_dimension_style(document: Drawing, text_m: float) -> None:
 
 
 def _add_blocks(document: Drawing) -> None:
-    """Define the marks: a surveyed point with its name, and a level with its height."""
     size = 0.4 * _TEXT_M
     point = document.blocks.new(_POINT_BLOCK)
     point.add_line((-size, 0), (size, 0))
@@ -192,7 +191,6 @@ def _add_blocks(document: Drawing) -> None:
 
 
 def _add_grid(space: Modelspace, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-    """Add lines at round coordinates, each labelled outside the picture."""
     longest = float((high - low).max())
     step = nice_step(longest / _MOST_LINES)
     for axis in (0, 1):
@@ -207,7 +205,6 @@ def _add_grid(space: Modelspace, low: NDArray[np.float64], high: NDArray[np.floa
 
 
 def _add_level(space: Modelspace, x: float, height_m: float) -> None:
-    """Add a height mark to the right of the picture."""
     mark = space.add_blockref(
         _LEVEL_BLOCK, (x + 2 * _TEXT_M, height_m), dxfattribs={"layer": "A-ANNO-LEVL"}
     )
@@ -219,7 +216,6 @@ def _add_level(space: Modelspace, x: float, height_m: float) -> None:
 def _add_opening(
     space: Modelspace, outline_m: NDArray[np.float64], sigma_m: float | None, words: str
 ) -> None:
-    """Add an opening as a regular form, with its size and deviation from the detected outline."""
     regular = regular_opening(outline_m, sigma_m)
     _add_polygon(space, regular.outline_m, "A-ELEV-OPNG")
     low, high = regular.outline_m.min(axis=0), regular.outline_m.max(axis=0)
@@ -247,7 +243,6 @@ def _add_dimension(
 
 
 def _add_placed_wall(document: Drawing, space: Modelspace, wall: DrawnWall) -> None:
-    """Add a wall's coordinate system, and the wall's picture at its position in the room."""
     frame = wall.frame
     axes = {"origin": frame.origin_world, "xaxis": frame.u_world, "yaxis": -frame.v_world}
     document.ucs.add(
@@ -355,7 +350,7 @@ def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> Re
         outline_m: (n, 2) X and Y on an upright wall, counter-clockwise.
         sigma_m: standard deviation of the positions of its sides, None if unknown.
 
-    A form is accepted if 95 % of the outline is within three sigma, or 20 mm if this is more.
+    A form is accepted if 95 % of the outline is within three sigma or 20 mm, whichever is larger.
     """
     limit_m = max(_TOLERANCE_M, 3.0 * (sigma_m or 0.0))
     samples, directions = _sampled(outline_m)
@@ -422,7 +417,6 @@ def _arches(
 
 
 def _distances(points: NDArray[np.float64], outline: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return distances (n,) of points from a closed outline."""
     nearest = np.full(len(points), np.inf)
     for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         side = end - begin

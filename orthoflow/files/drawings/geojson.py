@@ -36,7 +36,7 @@ _SEAM_CELLS_MOST: Final = 16_000_000
 
 
 def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
-    """Write a wall in the coordinates of its GeoTIFF: raster, rectangle, edges, points."""
+    """Write a wall in the coordinates of its GeoTIFF."""
     own: dict[str, JsonValue] = {"wall": wall.number, "name": wall.name}
     features = [_polygon(wall.place_m(wall.frame.corners_world()), {"kind": "frame", **own})]
     if lines is not None:
@@ -76,7 +76,7 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
 
 
 def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> None:
-    """Write a room in scan coordinates: planes, edges, corners, outline, openings."""
+    """Write a room in scan coordinates: planes, edges, corners, outline and openings."""
     features = [
         _polygon(corners, {"kind": "rectangle", "plane": index, "name": lines.planes.names[index]})
         for index, corners in enumerate(lines.planes.corners)
@@ -146,7 +146,6 @@ def _points(names: Iterable[str], places: NDArray[np.float64]) -> list[Feature]:
 
 
 def _polygon(corners: NDArray[np.float64], about: Mapping[str, JsonValue]) -> Feature:
-    """Return a polygon as a closed ring, as GeoJSON requires."""
     return _feature("Polygon", np.vstack([corners, corners[:1]])[None], about)
 
 
@@ -217,7 +216,6 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
 
 
 def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
-    """Return the offset in X of each wall."""
     found: dict[str, float] = {}
     right = 0.0
     for layer in layers:

@@ -25,8 +25,8 @@ from orthoflow.geometry.outlines import (
 )
 from orthoflow.products import CheckPoints, Opening, Planes
 
-# All pairs and some triples are compared, and a record may contain any number of planes.
-#: planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
+# All pairs and some triples of planes are compared, and a record may contain any number of them.
+# planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
 MOST_PLANES: Final = 200
 #: connected parts of these planes
 MOST_PARTS: Final = 20_000
@@ -59,7 +59,7 @@ class KeyPlan:
 
 
 def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
-    """Return planes with the rectangles of their parts; a plane without parts keeps its own.
+    """Return the planes with the rectangles of their parts; without parts, their own rectangles.
 
     Raises:
         InputError: there are more than `MOST_PLANES` planes or `MOST_PARTS` parts.
@@ -98,7 +98,7 @@ def _check_counts(planes: Planes) -> None:
 
 
 def key_plan(planes: Planes, frame: WallFrame, number: int = -1) -> KeyPlan:
-    """Draw planes from above, and mark the position of a raster."""
+    """Return a plan of planes, seen from above, that marks the position of a raster."""
     corners = frame.corners_world()
     is_map = is_map_crs(frame.map_crs)
     if abs(float(frame.normal_world @ planes.up)) > math.cos(math.radians(60.0)):
@@ -125,7 +125,7 @@ def marked_plan(
     *,
     is_map: bool = False,
 ) -> KeyPlan:
-    """Draw planes from above, and mark a wall by its two ends or a horizontal plane by its corners.
+    """Return a plan of planes, seen from above, that marks a wall or a horizontal plane.
 
     Args:
         planes: planes of the room.
@@ -194,12 +194,12 @@ class RoomLines:
 
     @cached_property
     def edges(self) -> tuple[Edge, ...]:
-        """Return the intersections of two planes."""
+        """Return the edges of the room, in each of which two planes intersect."""
         return edges_between(self.surfaces)
 
     @cached_property
     def corners(self) -> tuple[Corner, ...]:
-        """Return the intersections of three planes."""
+        """Return the corners of the room, in each of which three planes intersect."""
         return corners_between(self.surfaces, self.edges)
 
     @cached_property

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 POINTS_PER_MM: Final = 72.0 / 25.4
 FONT: Final = "DejaVuSans"
-# Line widths of ISO 128-2, in which successive widths differ by about the square root of two.
+# Line widths of ISO 128-2, each of which is about the square root of two times the previous one.
 FINE_MM: Final = 0.13
 THIN_MM: Final = 0.25
 MEDIUM_MM: Final = 0.35
@@ -250,7 +250,6 @@ def register_fonts() -> frozenset[int]:
 
 
 def _runs(text: str, *, is_bold: bool) -> Iterator[tuple[str, str]]:
-    """Split a text into runs of letters with the same font."""
     usual = f"{FONT}-Bold" if is_bold else FONT
     known = register_fonts()
     for font, letters in groupby(

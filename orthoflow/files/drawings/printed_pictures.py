@@ -1,6 +1,6 @@
 """Pictures of walls: rasters for print and CAD, contours, elevations, and relief.
 
-Rasters are read in parts to limit the memory.
+Rasters are read in parts to limit the memory that is needed.
 """
 
 from __future__ import annotations
@@ -331,9 +331,9 @@ def write_cad_picture(raster: Path, path: Path) -> None:
             copy(aside, path, driver="PNG", ZLEVEL="4")
 
 
-# An area outlined on a picture: its text, whose parts, separated by ", ", are written inside on
-# separate lines if there is room; and its outline (n, 2) in metres right and down from the top-left
-# corner of the picture.
+# An area outlined on a picture: its label, and its outline (n, 2) in metres to the right and down
+# from the top-left corner of the picture. If there is room, the parts of the label, which are
+# separated by ", ", are written on separate lines inside the area.
 Area = tuple[str, NDArray[np.float64]]
 _MIDDLE: Final = [(1.0, 2.0), (13.0, 2.0)]
 _BOX: Final = [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)]
@@ -423,7 +423,6 @@ def _draw_contours(placed: Placed, raster: Path, *, is_flipped: bool, language: 
 
 
 def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
-    """Outline openings, clipped to the picture."""
     left, bottom, right, top = placed.edges_mm
     with placed.clipped() as canvas:
         for text, outline_m in areas:
@@ -523,7 +522,7 @@ def elevation(
     Args:
         walls: walls from left to right.
         up: (3,) unit vector in scan coordinates.
-        text: texts on the sheets.
+        text: text on the sheets.
         scale: denominator n of the scale 1 : n.
         language: language of labels.
     """
@@ -634,7 +633,7 @@ def shaded(
 
 
 def _slope(depths: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Return the change per cell: mean of both sides, one side next to a hole, or else zero."""
+    """Return the change per cell: the mean of two sides, a single side next to a hole, or zero."""
     steps = np.diff(depths, axis=axis)
     before = np.concatenate([np.full_like(depths.take([0], axis), np.nan), steps], axis=axis)
     behind = np.concatenate([steps, np.full_like(depths.take([0], axis), np.nan)], axis=axis)
@@ -673,7 +672,6 @@ def write_relief(depth: Path, path: Path, light: Light) -> None:
 
 
 def _noise_m(source: RasterParts) -> float:
-    """Return the standard deviation of the noise of depths in the middle rows of the raster."""
     rows, columns = source.shape
     top, bottom = max(0, rows // 2 - _SAMPLED_ROWS), min(rows, rows // 2 + _SAMPLED_ROWS)
     box = (0.0, float(top), float(columns), float(bottom))
@@ -702,7 +700,6 @@ def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
 def _contours(
     depth: Path, frame: WallFrame, interval_m: float
 ) -> list[tuple[float, NDArray[np.float64]]]:
-    """Return contours in X and Y (n, 2) of the raster's GeoTIFF."""
     size_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
     found = contours(depth, whole_of(size_m), scale=_CONTOUR_SCALE, interval_m=interval_m)
     return [(level, frame.raster_from_wall(points / frame.gsd_m)) for level, points in found]

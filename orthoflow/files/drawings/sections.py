@@ -142,7 +142,7 @@ class Section:
 
 
 def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
-    """Return a horizontal cut at a height above the lowest large floor, or above 0 without one."""
+    """Return a horizontal cut, `height_m` above the lowest large floor or, without one, above 0."""
     e1, e2, up = basis_from_up(planes.up)
     area = _areas_m2(planes)
     level = planes.normal @ up > math.cos(math.radians(_LEAST_ANGLE_DEG))
@@ -267,7 +267,6 @@ def _drawn(
     plane: NDArray[np.int64],
     slab_m: float,
 ) -> tuple[list[CutLine], list[NDArray[np.float64]]]:
-    """Return the cut lines and the gaps in them."""
     traces = {}
     for index, surface in enumerate(surfaces_of(planes)):
         trace = _trace(cut, planes, index)
@@ -348,7 +347,6 @@ def _crossed(cut: Cut, rectangle_world: NDArray[np.float64], trace: _Trace) -> _
 
 
 def _joined(spans: Iterable[_Span], gap_m: float) -> list[_Span]:
-    """Merge sorted spans that overlap or nearly meet."""
     found: list[_Span] = []
     for begin, end in sorted(spans):
         if found and begin - found[-1][1] <= gap_m:
@@ -359,7 +357,6 @@ def _joined(spans: Iterable[_Span], gap_m: float) -> list[_Span]:
 
 
 def _shared(span: _Span, others: Sequence[_Span]) -> list[_Span]:
-    """Return the parts of a span that are covered by others."""
     parts = [(max(span[0], begin), min(span[1], end)) for begin, end in others]
     return [part for part in parts if part[1] > part[0]]
 
@@ -406,7 +403,6 @@ def _with_thickness(lines: Sequence[CutLine]) -> Iterator[CutLine]:
 
 
 def _beyond(cut: Cut, planes: Planes, openings: Sequence[Opening]) -> NDArray[np.float64]:
-    """Return edges of the room and outlines of openings behind the cut."""
     ends = [edge.ends_world for edge in edges_between(surfaces_of(planes))]
     for opening in openings:
         corners = opening.outline_world
@@ -427,7 +423,6 @@ def _beyond(cut: Cut, planes: Planes, openings: Sequence[Opening]) -> NDArray[np
 def _unexplained(
     places: NDArray[np.float64], lines: Sequence[CutLine], slab_m: float
 ) -> NDArray[np.float64]:
-    """Return the points that are not near any line."""
     free = np.ones(len(places), dtype=bool)
     for line in lines:
         direction = (line.ends_m[1] - line.ends_m[0]) / max(line.length_m, 1e-9)
@@ -517,13 +512,13 @@ def section_sheet(
     grid: float,
     crs: str | None = None,
 ) -> Drawing:
-    """Return the sheet of a plan or section, with the texts of the run.
+    """Return the sheet of a plan or section.
 
     Args:
         stem: name of the sheet's files without suffix.
         drawing: the plan or section.
         planes: planes of the room, for the key plan.
-        text: texts of the run.
+        text: text on the sheet.
         grid: spacing of the grid crosses; 0 for no crosses.
         crs: coordinate system of the scan, None if it is not a map.
     """
@@ -563,7 +558,6 @@ def write_section(folder: Path, name: str, drawing: SectionDrawing) -> None:
 
 
 def _draw(drawing: SectionDrawing, placed: Placed) -> None:
-    """Draw the document of a plan or section on a picture."""
     from ezdxf.addons.drawing import recorder
 
     left, _, _, top = drawing.bounds_m
@@ -655,7 +649,7 @@ def _add_solid(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None
     begin, end = cut.ends_m
     outline = [begin, end, end + deep_m * cut.behind, begin + deep_m * cut.behind]
     hatch = space.add_hatch(dxfattribs={"layer": "A-SECT-PATT"})
-    # Lines of the pattern are 3.175 units apart; they shall be 1.3 mm apart on paper.
+    # Lines of the pattern are 3.175 units apart, but must be 1.3 mm apart on paper.
     hatch.set_pattern_fill("ANSI31", scale=drawing.mm(1.3) / 3.175)
     hatch.paths.add_polyline_path([tuple(place) for place in outline], is_closed=True)
 

@@ -69,12 +69,10 @@ class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
         self.high_mm, self.draw_mm, self.can_grow = high_mm, draw, can_grow
 
     def wrap(self, wide: float, _high: float) -> tuple[float, float]:
-        """Return the size of the flowable in points."""
         self.width = wide
         return wide, self.high_mm * pens.POINTS_PER_MM
 
     def draw(self) -> None:
-        """Draw the content."""
         self.draw_mm(self.canv, self.width / pens.POINTS_PER_MM)
 
 
@@ -207,7 +205,6 @@ def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
 
 
 def _scale_bar(drawing: Drawing) -> _Picture:
-    """Return a scale bar: black and white segments of round length, with both ends labelled."""
     mm_per_unit = 1e3 * drawing.unit_m / drawing.scale
     length = round_below(_SEGMENT_MM / mm_per_unit)
     segment = length * mm_per_unit
@@ -295,7 +292,6 @@ def _plan(
 
 
 def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64], Any]:
-    """Return a plan of the room with the number of the marked wall."""
     arrows = [] if plan.arrow is None else [plan.arrow]
     lines = [*plan.walls, *plan.outlines, plan.marked, *arrows]
 
@@ -369,7 +365,6 @@ def _title_block(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
 
 
 def _revisions(drawing: Drawing, wide_mm: float) -> Any:
-    """Return the table of revisions, the newest on top."""
     rows = [
         [pens.paragraph(text) for text in (one.mark, one.date, one.text, one.by)]
         for one in reversed(drawing.text.block.revisions)
@@ -478,7 +473,6 @@ def _bold(text: str) -> Any:
 
 
 def _small(text: str) -> Any:
-    """Return the name of a field in small grey text above its value."""
     return pens.paragraph(text, colour=pens.GREY)
 
 
@@ -493,7 +487,6 @@ def _logo(path: str, most_mm: float) -> Any:
 
 
 def _seal(drawing: Drawing, wide_mm: float) -> Any:
-    """Return the digest of the record as a QR code and as text."""
     from reportlab.graphics.barcode.qr import QrCodeWidget
     from reportlab.graphics.shapes import Drawing
 

@@ -266,7 +266,6 @@ _MOST_LOGO_BYTES: Final = 4_000_000
 
 
 def _checked_text(value: object) -> object:
-    """Convert numbers to text, and reject text that does not fit on a sheet."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)
     if isinstance(value, str) and len(value) > MOST_LETTERS:
@@ -427,7 +426,7 @@ class Axes:
 
 @dataclass(frozen=True, kw_only=True)
 class SheetText:
-    """Texts on every sheet of a drawing.
+    """Text on every sheet of a drawing.
 
     Attributes:
         name: name of the wall or cut.
@@ -453,7 +452,7 @@ class Drawing:
         size_m: width and height.
         pictures: pictures by the name of their content; all have the size `size_m`.
         axes: coordinates beside the pictures.
-        text: texts on every sheet.
+        text: text on every sheet.
         scale: denominator n of the scale 1 : n.
         plan: key plan, or None.
         grid: spacing of the grid crosses in `unit`; 0 for no crosses.
@@ -514,7 +513,11 @@ def axes_of(frame: WallFrame) -> Axes:
 
 
 def up_words(up: NDArray[np.float64]) -> str:
-    """Return the up direction as text: a signed axis of the scan or, if oblique, a vector."""
+    """Return the up direction as text.
+
+    This is the signed axis of the scan, such as `-z`, or the components of the vector if it is not
+    parallel to an axis.
+    """
     if up.shape != (3,):
         return "?"
     if float(np.abs(up).max()) < 1.0 - 1e-9:

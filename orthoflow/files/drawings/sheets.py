@@ -47,7 +47,7 @@ def write_sheet(path: Path, drawing: Drawing, sheet: Sheet, furniture: Furniture
 
     Raises:
         StoreError: the file cannot be written.
-        InputError: no font contains a letter of the texts.
+        InputError: no font contains a letter of the text.
     """
     stream = BytesIO()
     size_mm = (sheet.paper.width_mm, sheet.paper.height_mm)
@@ -66,7 +66,6 @@ def write_sheet(path: Path, drawing: Drawing, sheet: Sheet, furniture: Furniture
 
 
 def _draw_around(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
-    """Draw the frame of a picture, crosses, coordinates, heights, match lines and north arrow."""
     canvas = placed.canvas
     left, bottom, right, top = placed.edges_mm
     if drawing.grid > 0.0:
@@ -87,7 +86,6 @@ def _draw_around(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
 
 
 def _draw_grid(placed: Placed, drawing: Drawing) -> None:
-    """Draw crosses at round coordinates, and as many coordinates beside the frame as fit."""
     canvas, part = placed.canvas, placed.view.part
     left, bottom, right, top = placed.edges_mm
     columns: dict[float, float] = {}
@@ -167,7 +165,6 @@ def _marks(
 
 
 def _draw_heights(placed: Placed, drawing: Drawing) -> None:
-    """Draw height marks to the right of the picture, moved apart if they would overlap."""
     canvas, part = placed.canvas, placed.view.part
     _, bottom, right, top = placed.edges_mm
     start, slope = drawing.axes.down
@@ -194,7 +191,6 @@ def _draw_heights(placed: Placed, drawing: Drawing) -> None:
 
 
 def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
-    """Draw dash-dotted match lines, each with the number of the adjacent sheet."""
     own = np.array(placed.view.part.corners_m)[[0, 2]]
     for number, part in sheet.numbered:
         other = np.array(part.corners_m)[[0, 2]]
@@ -276,7 +272,6 @@ def _ways(drawing: Drawing, papers: Sequence[Paper]) -> Iterator[Paper]:
 
 
 def _on_one(drawing: Drawing, papers: Sequence[Paper], *, is_brief: bool = False) -> LaidOut | None:
-    """Return one sheet with all pictures of a wall, on the first paper on which they fit."""
     content = (tuple(drawing.pictures), whole_of(drawing.size_m))
     for paper in _ways(drawing, papers):
         if views := placed(*content, paper, drawing.scale):

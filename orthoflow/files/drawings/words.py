@@ -1,4 +1,4 @@
-"""Texts of drawings in the supported languages; `labels.txt` contains them."""
+"""Labels of drawings in the supported languages, from `labels.txt`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _labels() -> dict[str, tuple[str, ...]]:
 
 
 def label(key: str, language: Language = "en", **values: object) -> str:
-    """Return a text in a language, with values filled in, and numbers in that language's format.
+    """Return a label in a language, with its values inserted and numbers in the language's format.
 
     >>> label("section", "de"), label("n_pairs", "de", count="1,234")
     ('Schnitt', 'Paare: 1.234')
@@ -60,8 +60,8 @@ class Phrase:
     """A statement that can be written in any of the languages.
 
     Attributes:
-        key: key of the text.
-        values: values to fill into the text.
+        key: key of the label.
+        values: values to insert into the label.
         asides: phrases added in parentheses.
     """
 
@@ -70,7 +70,7 @@ class Phrase:
     asides: tuple[Phrase, ...] = ()
 
     def text(self, language: Language = "en") -> str:
-        """Return the text in a language."""
+        """Return the statement in a language."""
         text = label(self.key, language, **self.values)
         more = ", ".join(item.text(language) for item in self.asides)
         return f"{text} ({more})" if more else text

@@ -76,8 +76,6 @@ _LEVELS_MOST: Final = 32
 
 
 class _Chunk(NamedTuple):
-    """A chunk of a file: its offset, size and number of points."""
-
     offset: int
     n_bytes: int
     n_points: int
@@ -146,7 +144,7 @@ def open_las(
 
 
 def _count_points(path: Path, header: Any, notes: list[str]) -> int:
-    """Return the declared number of points, or an uncompressed file's actual one if larger."""
+    """Return the declared number of points, or the actual one of an uncompressed file if larger."""
     stated = int(header.point_count)
     if header.are_points_compressed:
         return stated

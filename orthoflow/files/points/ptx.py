@@ -78,16 +78,13 @@ class _Part:
 
     @property
     def is_whole(self) -> bool:
-        """Return whether there is a line for each position of the grid."""
         return self.n_points == self.n_places
 
     @property
     def columns(self) -> Columns:
-        """Meaning of the columns, derived from the number of columns."""
         return Columns(names=tuple(_COLUMNS[self.layout.n_columns].split()))
 
     def scan(self) -> Scan:
-        """Return the metadata of the scan."""
         scan = self.columns.scan(station=self.pose[1])
         if self.is_whole:
             scan.fields |= {"grid"}

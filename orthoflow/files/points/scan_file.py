@@ -67,8 +67,8 @@ class PointBlock:
         points: (n, 3) float64 in the file's unit; may contain NaN and infinities.
         scan: index of the scan in its file.
         n_read: number of points read from the file for this block, including omitted ones.
-        left_out: number of omitted points by cause: `invalid`, `no_return`, `withheld`,
-            `synthetic`, `other_class`.
+        left_out: number of omitted points by cause: `invalid`, `no_return`, `withheld`, `synthetic`
+            or `other_class`.
         intensity: (n,) float32 on the file's own scale, NaN if invalid; None if not available.
         rgb: (n, 3) on the file's own scale and of its type; None if not available.
         has_rgb: (n,) True for points with a valid colour; None if all colours are valid.

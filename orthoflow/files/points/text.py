@@ -286,7 +286,7 @@ def is_comment(line: bytes) -> bool:
 
 
 def find_layout(line: str, sample: Sequence[str] = ()) -> Layout | None:
-    """Return the layout of a line; None if it has fewer than three numbers or mostly texts.
+    """Return the layout of a line; None if it has fewer than three numbers or mostly other words.
 
     Numbers may be quoted, as in CSV files.
 

@@ -58,7 +58,7 @@ _GEO_UNITS: Final = {
     1025: 0.001,
     1033: 0.01,
 }
-# A longer text is not a coordinate system, and pyproj would take long to parse it.
+# Longer text is not a coordinate system, and pyproj would take long to parse it.
 _LONGEST_CRS: Final = 100_000
 
 
@@ -85,7 +85,7 @@ def unit_of_name(name: str, source: str) -> StatedUnit:
 
 
 def unit_of_word(text: str) -> str | None:
-    """Return the unit's name if a text, such as `[ft]`, is a unit; None otherwise."""
+    """Return the name of the unit for a word such as `[ft]`; None if the word is not a unit."""
     found = _ANY.fullmatch(text.strip(" []()._-"))
     return None if found is None else _name(found)
 

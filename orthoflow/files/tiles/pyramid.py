@@ -1,9 +1,10 @@
 """A tile pyramid of an orthoimage, in the Deep Zoom format.
 
-`NAME.dzi` contains the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles. The last level has
-full resolution, each lower level half the resolution of the next, and level 0 is one pixel. Tiles
-are transparent where the orthoimage is empty. The page next to the tiles can be panned and zoomed,
-and measures distances; it is a single file that needs neither a server nor external resources.
+`NAME.dzi` contains the size, and `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles. The last level
+has full resolution, each lower level has half the resolution of the next, and level 0 is one pixel.
+Tiles are transparent where the orthoimage is empty. The page next to the tiles can be panned and
+zoomed, and measures distances; it is a single file that needs neither a server nor external
+resources.
 """
 
 from __future__ import annotations
