@@ -34,7 +34,8 @@ READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "
 HOW_TO_DEVELOP: Final = "develop it first to 16-bit TIFF or JPEG, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
 # As RGB, a photo of this size takes 800 MB; it has twice as many pixels as the largest sensors. A
-# PNG of 100 kB can declare more. pixels declared by a photo, before it is decoded
+# PNG of 100 kB can declare more.
+#: pixels declared by a photo, before it is decoded
 MOST_PIXELS: Final = 1 << 28
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"

@@ -98,7 +98,7 @@ def publish_cloud(product: PointCloud, folder: Path, digest: str) -> None:
 
 
 def publish_planes(product: Planes, folder: Path, digest: str) -> None:
-    """Write `planes.json`: the planes in order of support, largest first."""
+    """Write `planes.json`: the planes in descending order of their numbers of points."""
     planes: list[JsonValue] = []
     for index in range(len(product)):
         omega, phi = omega_phi_deg(product.normal[index], product.up)
@@ -126,7 +126,7 @@ def publish_planes(product: Planes, folder: Path, digest: str) -> None:
 
 
 def publish_surfaces(product: Surfaces, folder: Path, digest: str) -> None:
-    """Write `surfaces.json`: the curved surfaces in order of support, largest first."""
+    """Write `surfaces.json`: curved surfaces in descending order of their numbers of points."""
     surfaces: list[JsonValue] = []
     for surface in product.surfaces:
         shape = surface.shape

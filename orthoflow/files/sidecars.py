@@ -64,7 +64,7 @@ _GEOTIFF: Final[dict[RasterAxes, str]] = {
 _FROM_PLANE: Final = (
     "origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world"
 )
-# The angle has the sign of the radius in this formula, negative if `concave` is false.
+# In this formula, the angle has the sign of the radius, which is negative if `concave` is false.
 _FROM_CYLINDER: Final = (
     "origin_world + gsd_m * {straight} * {axis} + (r - depth_m) * sin(angle) * {tangent} + (r - "
     "(r - depth_m) * cos(angle)) * normal_world with r = {sign}radius_m and angle = gsd_m * {bent} "
@@ -108,10 +108,10 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
 
 
 def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
-    """Return the shape of the surface of a raster, and axis and radius of a cylinder.
+    """Return the shape of a raster's surface; for a cylinder, also its axis and radius.
 
-    The zero direction points from the axis to the left or top edge of the raster, where the arc
-    begins. The axes of the frame are those at its top-left corner.
+    The zero direction points from the axis to the edge of the raster, left or top, where the arc
+    begins. The frame's vectors u, v and normal are those at its top-left corner.
     """
     if (bend := frame.bend) is None:
         return {"chart": "plane"}
@@ -142,10 +142,10 @@ def _world_from_raster(bend: Bend | None) -> str:
 
 
 def _bend_of(content: Mapping[str, object], name: str) -> Bend | None:
-    """Return the curvature that a sidecar states.
+    """Return the curvature given in a sidecar; None for a plane.
 
     Raises:
-        InputError: the raster is on a surface that cannot be read.
+        InputError: the shape of the surface is unknown or incomplete.
     """
     chart = content.get("chart", "plane")
     if chart == "plane":

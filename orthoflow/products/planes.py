@@ -267,11 +267,11 @@ class Planes(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class PointLabels(Product):
-    """The plane, or the curved surface, of each point of a cloud.
+    """The plane or curved surface of each point of a cloud.
 
     Attributes:
-        plane_index: (n,) int16 index in `Planes`, or in `Surfaces` of the same step; -1 if the
-            point is on none.
+        plane_index: (n,) int16 index in the `Planes` or the `Surfaces` of the same step; -1 if the
+            point is on none of them.
     """
 
     type_name: ClassVar[str] = "labels"

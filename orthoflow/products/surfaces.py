@@ -15,7 +15,7 @@ from orthoflow.geometry.surfaces import Cone, Cylinder
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
-# Kind of a surface, the first part of its name.
+# Kind of a surface, which is the first part of its name.
 SurfaceKind = Literal["vault", "apse", "tower", "column", "cylinder", "cone"]
 
 _VERTICAL_DEG: Final = 20.0
@@ -26,9 +26,9 @@ _FULL_TURN: Final = 2.0 * math.pi
 def surface_kind(shape: Cylinder | Cone, up: NDArray[np.float64]) -> SurfaceKind:
     """Return the kind of a surface by the direction of its axis, its side and its radius.
 
-    A cylinder that is concave is an apse if its axis is vertical to 20 degrees, and a vault if it
-    is horizontal to 20 degrees. A convex and vertical one is a column up to a radius of 0.75 m, and
-    a tower above.
+    A concave cylinder is an apse if its axis is within 20 degrees of vertical, and a vault if its
+    axis is within 20 degrees of horizontal. A convex cylinder with a vertical axis is a column if
+    its radius is at most 0.75 m, and otherwise a tower.
     """
     if isinstance(shape, Cone):
         return "cone"
@@ -46,18 +46,19 @@ class Surface:
 
     Attributes:
         name: kind (`surface_kind`) and index of the surface, such as `vault 0` or `column 2`.
-        shape: the whole cylinder or cone. The point of a cylinder's axis is at the middle of the
+        shape: the whole cylinder or cone. The point on a cylinder's axis is at the middle of the
             surface's points. The axis of a cylinder points upwards if it is at most 45 degrees from
-            vertical, otherwise towards the positive e1 (e2 if it is nearer) of `basis_from_up`.
+            vertical, and otherwise towards e1 or e2 of `basis_from_up`, whichever is nearer.
         covariance: (7, 7) float64 covariance of (point, axis, radius) or (apex, axis, half angle),
             metres and radians.
         n_points: number of points on the surface.
         rms_m: root mean square distance of these points.
-        zero_world: (3,) unit vector perpendicular to the axis, the direction of angle 0 (see
+        zero_world: (3,) unit vector perpendicular to the axis, in the direction of angle 0 (see
             `geometry.surfaces.zero_direction`).
-        along_m: range of the points along the axis, from the cylinder's point or the cone's apex.
-        arc_rad: range of the points' angles around the axis, by the right-hand rule from
-            `zero_world`; it begins between -pi and pi and is at most one turn long.
+        along_m: smallest and largest coordinate of the points along the axis, relative to the point
+            of the cylinder or the apex of the cone.
+        arc_rad: smallest and largest angle of the points around the axis, counted from `zero_world`
+            by the right-hand rule; the range begins between -pi and pi and is at most one turn.
     """
 
     name: str
@@ -71,18 +72,18 @@ class Surface:
 
     @property
     def is_closed(self) -> bool:
-        """Whether points surround the whole axis; otherwise an arc of it is open or hidden."""
+        """Whether there are points all around the axis; otherwise, an arc is open or hidden."""
         return self.arc_rad[1] - self.arc_rad[0] >= _FULL_TURN - 1e-9
 
     @property
     def sigma_axis_deg(self) -> float:
-        """Largest standard deviation, over all directions, of the axis's direction."""
+        """Largest standard deviation of the direction of the axis, in any direction."""
         largest = float(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 
     @property
     def sigma_radius_m(self) -> float:
-        """Standard deviation of a cylinder's radius; of a cone, at the middle of its points."""
+        """Standard deviation of the radius; for a cone, of that in the middle of its points."""
         sigma = math.sqrt(max(0.0, float(self.covariance[6, 6])))
         if isinstance(self.shape, Cylinder):
             return sigma
@@ -97,7 +98,7 @@ class Surfaces(Product):
     Attributes:
         surfaces: the surfaces.
         up: (3,) float64 unit vector of the cloud.
-        details: further JSON results, for users only.
+        details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "surfaces"
@@ -140,7 +141,8 @@ class Surfaces(Product):
         """See `Product.check_against`.
 
         Raises:
-            ProductError: a covariance, direction, range, number of points or deviation is invalid.
+            ProductError: a covariance, direction, range, number of points or RMS distance is
+                invalid.
         """
         n_all = [len(other) for other in others.values() if isinstance(other, PointCloud)]
         for index, surface in enumerate(self.surfaces):

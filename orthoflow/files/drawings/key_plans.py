@@ -26,7 +26,7 @@ from orthoflow.geometry.outlines import (
 from orthoflow.products import CheckPoints, Opening, Planes
 
 # All pairs and some triples of planes are compared, and a record may contain any number of them.
-# planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
+#: planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
 MOST_PLANES: Final = 200
 #: connected parts of these planes
 MOST_PARTS: Final = 20_000
