@@ -1,1 +1,1 @@
-"""The record format of orthoflow, which needs only h5py, numpy and pydantic."""
+"""The record format of orthoflow. This package needs only h5py, NumPy and Pydantic."""

@@ -1,6 +1,6 @@
-"""Products as named arrays: digests, HDF5 groups, and differences between two products.
+"""Products as named arrays: digests, HDF5 groups, and differences between products.
 
-The digest of a product does not depend on how the product is stored.
+The digest of a product does not depend on the way in which the product is stored.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from orthoflow_provenance.paths import check_name
 PRODUCT_GROUP: Final = "product"
 _BLOCK_BYTES: Final = 8 << 20
 _CHUNK_BYTES: Final = 1 << 20
-# Compression or memory mapping is of no use for smaller arrays.
+# Smaller arrays are neither compressed nor memory-mapped, because this would save nothing.
 _SMALL_BYTES: Final = 4096
 _EXACT: Final = 0.0
 _ALONE: Final = "it exists in only one of the products"
-# Tolerance for floats in the metadata, which describe a product but are not the product itself: the
-# last digits depend on the version of numerical libraries.
+# Tolerance for floats in the metadata, whose last digits depend on the versions of numerical
+# libraries.
 _STATED_SHARE: Final = 1e-6
 _UNITS: Final = ("mm", "m", "px", "deg")
 
@@ -60,15 +60,15 @@ Tolerances: TypeAlias = Mapping[str, tuple[float, str]]
 
 @dataclass(frozen=True, kw_only=True)
 class StoredPayload:
-    """A product that was read; implements `PayloadLike`.
+    """A product read from a file; implements `PayloadLike`.
 
     Attributes:
         type_name: name of the product type.
         encoding_version: version of the type's encoding.
-        metadata: JSON with everything that is not an array.
-        arrays: name -> read-only array; mapped ones are views of a `numpy.memmap`.
+        metadata: JSON object with everything that is not an array.
+        arrays: read-only arrays by name; memory-mapped arrays are views of a `numpy.memmap`.
         mapped: whether arrays are stored contiguously and uncompressed.
-        digest: digest stored with the product; check it with `payload_digest`.
+        digest: digest stored with the product; compare it with `payload_digest`.
     """
 
     type_name: str
@@ -81,16 +81,16 @@ class StoredPayload:
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayDifference:
-    """An array or metadata value that differs between two products.
+    """An array or a metadata value that differs between two products.
 
     Attributes:
         name: name of the array, or path of the metadata value.
-        largest: largest absolute difference in `unit`; infinite if values cannot be subtracted
-            (different shapes or types, missing values, NaN instead of a number).
+        largest: largest absolute difference in `unit`; infinite if values cannot be subtracted,
+            because shapes or types differ, a value is missing, or only one of two numbers is NaN.
         limit: largest allowed difference.
-        unit: unit of both.
+        unit: unit of `largest` and `limit`.
         n_values: number of values that differ by more than the limit.
-        problem: one sentence.
+        problem: description of the difference, one sentence.
     """
 
     name: str
@@ -102,16 +102,17 @@ class ArrayDifference:
 
 
 def payload_digest(payload: PayloadLike) -> str:
-    """Return the digest of a product: type, encoding version, metadata, and all arrays.
+    """Return the digest of the type, encoding version, metadata and arrays of a product.
 
-    Arrays contribute dtype, shape and bytes. They are hashed in threads; memory-mapped arrays are
-    not copied.
+    The digest of an array covers its dtype, shape and bytes. Arrays are hashed in threads;
+    memory-mapped arrays are not copied.
 
     Returns:
-        `sha256:` and 64 hexadecimal digits.
+        `sha256:`, followed by 64 hexadecimal digits.
 
     Raises:
-        RecordFormatError: the metadata is not JSON, or the type of an array cannot be stored.
+        RecordFormatError: the metadata cannot be represented as JSON, or the type of an array is
+            not part of the format.
     """
 
     def fingerprint(name: str) -> list[JsonValue]:
@@ -121,7 +122,8 @@ def payload_digest(payload: PayloadLike) -> str:
         content = np.ascontiguousarray(array, dtype=wanted).reshape(-1).view(np.uint8)
         return [wanted.str, [*array.shape], hashlib.sha256(content.data).hexdigest()]
 
-    # Start with the largest array, so that no thread has to finish it alone at the end.
+    # Start with the largest array; otherwise, one thread might still hash it when all others have
+    # finished.
     names = sorted(payload.arrays, key=lambda name: -payload.arrays[name].nbytes)
     with ThreadPoolExecutor() as threads:
         fingerprints = dict(zip(names, threads.map(fingerprint, names), strict=True))
@@ -137,7 +139,7 @@ def payload_digest(payload: PayloadLike) -> str:
 
 
 def check_storable(dtype: np.dtype[np.generic]) -> None:
-    """Refuse array types that are not part of the format.
+    """Check that the type of an array is part of the format.
 
     Raises:
         RecordFormatError: the type is not bool, an integer of up to 8 bytes, or a float of 2, 4 or
@@ -152,17 +154,18 @@ def check_storable(dtype: np.dtype[np.generic]) -> None:
 
 
 def write_product_file(path: Path, payload: PayloadLike) -> str:
-    """Write a product to its own file, and sync it to the disk.
+    """Write a product to a separate file, and sync the file to disk.
 
-    The digest is computed in other threads while the arrays are written. Only arrays that are not
-    contiguous are copied.
+    The digest is computed in other threads while the arrays are written. Arrays are copied only if
+    they are not contiguous.
 
     Returns:
         The digest of the product.
 
     Raises:
         RecordFormatError: the product has names or types that are not part of the format.
-        OSError: the file cannot be written, e.g. because the disk is full; it is removed.
+        OSError: the file cannot be written, for example because the disk is full. In this case, the
+            incomplete file is removed.
     """
     _check_payload(payload)
     with ThreadPoolExecutor(max_workers=1) as thread:
@@ -179,10 +182,11 @@ def read_product_file(path: Path) -> StoredPayload:
     """Read a file written by `write_product_file`.
 
     Args:
-        path: the file; it must not be moved or changed while mapped arrays are in use.
+        path: the file; it must not be moved or changed while its memory-mapped arrays are in use.
 
     Raises:
-        RecordFormatError: the file is damaged, or of another or newer format.
+        RecordFormatError: the file is damaged, or has another format or a newer version of the
+            format.
         OSError: the file cannot be opened.
     """
     with safe_open(path, PRODUCT_FORMAT) as file:
@@ -210,7 +214,7 @@ def read_payload(group: h5py.Group) -> StoredPayload:
 
 
 def array_datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Yield names and datasets of a product's arrays, sorted by name, without reading them.
+    """Yield the names and datasets of a product's arrays, sorted by name, without reading the data.
 
     Raises:
         RecordFormatError: the group is damaged.
@@ -229,18 +233,20 @@ def array_datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
 def measure_payloads(
     left: PayloadLike, right: PayloadLike, tolerances: Tolerances
 ) -> tuple[ArrayDifference, ...]:
-    """Measure the differences between two products; arrays are read block by block.
+    """Compare two products, reading arrays block by block.
 
     Args:
         left: the first product.
         right: the second product.
-        tolerances: field -> (limit, unit). A field is the last part of a name that is not a number:
-            `depth_m` for the array `walls/0/depth_m`; likewise for numbers in the metadata. Other
-            fields must be equal, except that floats in the metadata may differ by a millionth of
-            the larger value, or by 1e-6 for values below 1. NaN equals NaN.
+        tolerances: limit and unit of a field, by the name of the field. The name of a field is the
+            last part of an array's name or of the path of a metadata value that is not a number,
+            such as `depth_m` in `walls/0/depth_m`. Other fields must be equal, except that floats
+            in the metadata may differ by a millionth of the larger value, or by 1e-6 if it is below
+            1. NaN equals NaN.
 
     Returns:
-        All differences by name, including those within the limits; empty if the products are equal.
+        All differences, sorted by name, including those within the limits; empty if the products
+        are equal.
     """
     if (left.type_name, left.encoding_version) != (right.type_name, right.encoding_version):
         problem = (
@@ -331,8 +337,8 @@ def _create_contiguous(
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
     properties.set_obj_track_times(False)
-    # Early allocation: the offset exists as soon as the dataset does. Never fill: no zeros are
-    # written before the data.
+    # With early allocation, the offset in the file is known when the dataset has been created.
+    # Without fill values, HDF5 writes no zeros before the data.
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     space = h5py.h5s.create_simple(shape) if shape else h5py.h5s.create(h5py.h5s.SCALAR)
@@ -343,7 +349,7 @@ def _create_contiguous(
 
 
 def _chunk_shape(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
-    """Divide along the first axis first, into chunks of whole rows of about 1 MB."""
+    """Return the shape of a chunk of about 1 MB, which contains whole rows if possible."""
     chunk = list(shape)
     for axis in range(len(chunk)):
         others = itemsize * math.prod(chunk) // chunk[axis]
@@ -357,7 +363,8 @@ def _read_array(dataset: h5py.Dataset) -> NDArray[np.generic]:
         offset is not None
         and dataset.nbytes >= _SMALL_BYTES
         and dataset.dtype.isnative
-        # Misaligned arrays, which other programs may write, are slower than a copy.
+        # Copy misaligned arrays, which other programs may write, because computing with them is
+        # slower than copying.
         and offset % dataset.dtype.itemsize == 0
     )
     if is_mappable:
@@ -408,9 +415,9 @@ def _array_differences(
 
 
 def _distances(left: NDArray[np.generic], right: NDArray[np.generic]) -> NDArray[np.float64]:
-    """Return absolute differences, infinite if only one value is NaN; never overflows."""
+    """Return absolute differences without overflow; infinite where only one value is NaN."""
     if left.dtype.kind in "iu" and left.dtype.itemsize == 8:
-        # Above 2^53, neighbouring integers are the same float64.
+        # Compare exactly: above 2^53, different integers may convert to the same float64.
         larger, smaller = np.maximum(left, right), np.minimum(left, right)
         gaps: NDArray[np.uint64] = larger.view(np.uint64) - smaller.view(np.uint64)
         return gaps.astype(np.float64)
@@ -465,7 +472,7 @@ def _tolerance(name: str, tolerances: Tolerances) -> tuple[float, str]:
 
 
 def _field(name: str) -> str:
-    """Return the last part of a name that is not a number."""
+    """Return the last part of a name that is not a number, such as `depth_m`."""
     parts = (part for part in reversed(name.split("/")) if not part.isdigit())
     return next(parts, "")
 

@@ -1,8 +1,9 @@
-"""The content of a record, as dataclasses and as one JSON document.
+"""The content of a record, as dataclasses and as a JSON document.
 
-This is the only declaration of metric, figure, cell and record: methods, store and record use these
-types or extend them with their own fields. Pydantic reads and writes the document by field, so a
-field added here is recorded, and new fields of `Costs` are also shown with the others.
+Metrics, figures, cells and records are declared only here. Methods, the store and the record use
+these types or derive types with additional fields. Pydantic reads and writes all fields of the
+dataclasses, so a field that is added here is also recorded, and a new field of `Costs` is also
+displayed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ PRODUCT_FORMAT: Final = "orthoflow-product"
 FORMAT_VERSION: Final = "1.0"
 DIGEST_PREFIX: Final = "sha256:"
 
-# Allowed media types of figures -> suffix of their files.
+# Suffixes of figure files, by media type; other media types are not allowed.
 FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
     "image/png": ".png",
     "image/svg+xml": ".svg",
@@ -39,29 +40,29 @@ if TYPE_CHECKING:
         bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
     )
 else:
-    # Pydantic cannot resolve a recursive alias; the content is checked as JSON elsewhere.
+    # The type is Any, because Pydantic cannot resolve a recursive alias. Other code checks that
+    # values are JSON.
     JsonValue = Any
 CellStatus = Literal["ok", "failed", "skipped"]
 
 
 class RecordFormatError(ValueError):
-    """A file or value does not conform to the record format: damaged, not allowed or incomplete.
+    """A file or value does not conform to the record format: it is damaged, invalid or incomplete.
 
-    The message is one sentence with what was found, what was expected, where, and the remedy if
-    there is one.
+    The message states what was found, what was expected and where, and how to fix it if possible.
     """
 
 
 class UnknownFormatError(RecordFormatError):
-    """The file is from another program or of another format version, so it cannot be checked."""
+    """The file has another format or format version, so it cannot be checked."""
 
 
 class LockedFileError(RecordFormatError):
-    """The file is open for writing elsewhere, or was left open by a crash."""
+    """The file is open for writing in another process, or was not closed because of a crash."""
 
 
 class InputFileError(RecordFormatError):
-    """An input file to be embedded is missing or differs from the file that was digested."""
+    """An input file to embed is missing, or was changed after its digest had been computed."""
 
 
 class UnsafeFileError(RecordFormatError):
@@ -70,12 +71,12 @@ class UnsafeFileError(RecordFormatError):
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """Label, unit and direction of a measured number.
+    """Label, unit and better direction of a measured quantity.
 
     Attributes:
-        label: name in tables, without the unit.
-        unit: unit as in metrics.
-        better: which values are better, as in metrics.
+        label: name in tables, without unit.
+        unit: unit, as in `Metric`.
+        better: values that are better, as in `Metric`.
     """
 
     label: str
@@ -84,7 +85,7 @@ class Quantity:
 
 
 class PayloadLike(Protocol):
-    """A product as named arrays and JSON, such as `orthoflow.products.Payload`."""
+    """A product as named arrays and JSON; `orthoflow.products.Payload` is an example."""
 
     @property
     def type_name(self) -> str:
@@ -96,7 +97,7 @@ class PayloadLike(Protocol):
 
     @property
     def metadata(self) -> Mapping[str, JsonValue]:
-        """Everything that is not an array."""
+        """JSON object with everything that is not an array."""
 
     @property
     def arrays(self) -> Mapping[str, NDArray[np.generic]]:
@@ -109,19 +110,19 @@ class PayloadLike(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """A number with its unit.
+    """A measured number with its unit.
 
     Attributes:
-        name: name of the metric, ending with its unit if it has one.
-        value: finite value.
+        name: name of the metric; it ends with the unit if there is one.
+        value: value; finite.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
-        label: name in tables, if the method declares one; otherwise empty.
-        better: which values are better: `lower`, `higher` or `one`; empty if there is no better
-            direction.
-        description: further explanation, one sentence.
+        label: name in tables if the method declares one; otherwise empty.
+        better: values that are better: `lower`, `higher` or `one` (closest to 1); empty if no
+            values are better.
+        description: additional explanation, one sentence.
         headline: whether the metric describes the quality of the result.
-        counted_by: metric of the same step with the number of items summarised; values over
-            different numbers of items are not comparable.
+        counted_by: name of the metric of the same step that contains the number of summarised
+            items. Values for different numbers of items are not comparable.
     """
 
     name: str
@@ -136,19 +137,20 @@ class Metric:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedDiagnostic:
-    """A warning, error or note as data.
+    """A warning, error or note, including the data from which its text was formatted.
 
     Attributes:
-        code: stable name, e.g. `scan-without-colour`.
+        code: stable name, such as `scan-without-colour`.
         severity: `error`, `warning` or `note`.
-        subject: the item concerned, e.g. `scan 0`.
-        values: numbers and names in the text.
-        text: one sentence.
-        remedy: what to do; empty if nothing can be done.
-        rank_by: name of the value that selects the worst of several diagnostics; the largest value
-            is the worst, or the smallest if the name is prefixed with `-`.
-        settled_by: methods or codes of later steps that resolve it.
-        is_summary: whether it summarises the step.
+        subject: the affected item, such as `scan 0`.
+        values: numbers and names that are used in the text.
+        text: description of the problem, one sentence.
+        remedy: what the user can do; empty if nothing.
+        rank_by: name of the value that determines the worst of several diagnostics. The largest
+            value is the worst, or the smallest if the name has the prefix `-`.
+        settled_by: methods of later steps, or codes of their diagnostics, that make this diagnostic
+            obsolete.
+        is_summary: whether the diagnostic summarises the step.
     """
 
     code: str
@@ -164,11 +166,11 @@ class RecordedDiagnostic:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """Name, caption and type of a figure.
+    """Name, caption and media type of a figure.
 
     Attributes:
-        name: name given by the method.
-        caption: one sentence.
+        name: name that the method gives to the figure.
+        caption: caption, one sentence.
         media_type: `image/png`, `image/webp` or `image/svg+xml`.
     """
 
@@ -182,7 +184,7 @@ class RecordedFigure(Figure):
     """A figure in a record.
 
     Attributes:
-        data: bytes of the file.
+        data: bytes of the image file.
     """
 
     data: bytes = field(repr=False)
@@ -190,12 +192,12 @@ class RecordedFigure(Figure):
 
 @dataclass(frozen=True, kw_only=True)
 class ProductRef:
-    """Reference to a product by its content.
+    """Reference to a product, or to the files of a workflow input, by the digest of the content.
 
     Attributes:
-        type_name: product type; `files` for a workflow input.
+        type_name: name of the product type; `files` for a workflow input.
         encoding_version: version of the type's encoding; 0 for files.
-        digest: `sha256:` and 64 hexadecimal digits, of the logical content.
+        digest: digest of the content: `sha256:`, followed by 64 hexadecimal digits.
     """
 
     type_name: str
@@ -208,8 +210,8 @@ class RecordedProduct(ProductRef):
     """An output or input of a cell.
 
     Attributes:
-        source: `address.port` or `inputs.name` for inputs; empty for outputs.
-        embedded: whether the arrays are in the record (outputs only).
+        source: source of an input, `address.port` or `inputs.name`; empty for outputs.
+        embedded: whether the arrays are in the record; only for outputs.
     """
 
     source: str = ""
@@ -218,7 +220,7 @@ class RecordedProduct(ProductRef):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFile:
-    """An input file, without its folder."""
+    """An input file; its folder is not recorded."""
 
     name: str
     size_bytes: int
@@ -227,11 +229,11 @@ class RecordedFile:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedInput:
-    """A workflow input; without files if it is optional and was not given.
+    """A workflow input. It has no files if it is optional and was not given.
 
     Attributes:
-        name: name in the workflow.
-        files: files sorted by name.
+        name: name of the input in the workflow.
+        files: files, sorted by name.
         embedded: whether the bytes of the files are in the record.
     """
 
@@ -247,7 +249,7 @@ class PublishedFile:
     Attributes:
         path: path relative to the folder of the record, with `/` as separator.
         size_bytes: size of the file.
-        sha256: SHA-256 of its bytes in hexadecimal digits.
+        sha256: SHA-256 of the file in hexadecimal digits.
     """
 
     path: str
@@ -260,15 +262,15 @@ class RecordedEnvironment:
     """The environment in which a cell ran.
 
     Attributes:
-        id: digest of the other fields; used as reference in cells.
+        id: digest of the other fields, to which cells refer.
         python: version of Python.
         os: operating system and release.
         cpu: model name of the processor.
         cores: number of logical processors.
-        threads: number of threads of the cell.
-        git_commit: commit of orthoflow if run from a checkout, with `+changes` if modified;
-            otherwise empty.
-        packages: distribution name -> version.
+        threads: number of threads that the cell was allowed to use.
+        git_commit: commit of orthoflow, followed by `+changes` if files were modified; empty if
+            orthoflow was not run from a checkout.
+        packages: versions of the installed distributions, by name.
     """
 
     id: str
@@ -286,12 +288,12 @@ class MethodIdentity:
     """The code that computed a result.
 
     Attributes:
-        method: method id.
+        method: id of the method.
         distribution: name of the distribution that contains the method.
         distribution_version: version of the distribution.
         result_version: version number of the method's results.
-        determinism: exact, seeded or loose.
-        citations: publications of the method.
+        determinism: `exact`, `seeded` or `loose`.
+        citations: publications that describe the method.
     """
 
     method: str = ""
@@ -304,21 +306,21 @@ class MethodIdentity:
 
 @dataclass(frozen=True, kw_only=True)
 class Costs:
-    """Cost of one execution of a method; in a record, of the run that computed the result.
+    """Cost of an execution of a method, in the run that computed the result.
 
     Values that were not measured are None.
 
     Attributes:
-        wall_s: elapsed seconds of the method, without `compile_s`, or including it if `compile_s`
-            is None.
-        cpu_s: processor seconds of the step's process in this time, with `compile_s` treated in the
-            same way, and without drawing of figures; used for rankings.
+        wall_s: elapsed seconds of the method, excluding `compile_s`. If `compile_s` is None, the
+            time for loading and compiling is included.
+        cpu_s: processor seconds of the step's process during the method, excluding loading and
+            compiling as in `wall_s`, and excluding the drawing of figures; used for rankings.
         peak_rss_mib: peak memory of the step's process.
-        stored_mib: size in the store of products, published files and figures; the store keeps
-            content shared by several cells only once. None also for cells without a result.
-        compile_s: elapsed seconds in which the step's process loaded modules and compiled kernels,
-            before, during and after the call; not used for rankings, because it depends on earlier
-            steps.
+        stored_mib: size of products, published files and figures in the store. The store contains
+            the content shared by several cells only once. None also for cells without a result.
+        compile_s: elapsed seconds for loading modules and compiling kernels in the step's process,
+            before, during and after the execution; not used for rankings, because it depends on
+            earlier steps.
     """
 
     wall_s: Annotated[float, Quantity(label="time", unit="s", better="lower")] = 0.0
@@ -336,22 +338,23 @@ COSTS: Final[Mapping[str, Quantity]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CellOutcome(MethodIdentity, Costs):
-    """The outcome of a cell, as kept in the store and repeated in the record of a run.
+    """The outcome of a cell, as in the store and in the record of a run.
 
     Attributes:
-        status: ok, failed or skipped.
-        error_type: class of the error; empty if ok; for skipped cells, `not-asked-for` if optional
-            data was not given, otherwise empty.
-        error_message: one sentence; for skipped cells, the reason.
-        key: cache key, SHA-256 in hexadecimal digits; empty if it was never known.
-        key_preimage: canonical JSON whose SHA-256 is the key.
+        status: `ok`, `failed` or `skipped`.
+        error_type: class of the error if the cell failed; `not-asked-for` if the cell was skipped
+            because optional data was not given; otherwise empty.
+        error_message: description of the error, or the reason why the cell was skipped; one
+            sentence.
+        key: cache key, a SHA-256 in hexadecimal digits; empty if it was never computed.
+        key_preimage: canonical JSON text whose SHA-256 is the key.
         seed: seed of the random generator; None if the method uses none.
-        started: ISO 8601, UTC; for cached cells, from the run that computed them.
-        ended: ISO 8601, UTC; as `started`.
+        started: start time, ISO 8601 in UTC; for cached cells, that of the run that computed them.
+        ended: end time, ISO 8601 in UTC; for cached cells, that of the run that computed them.
         metrics: metrics reported by the method.
-        warnings: texts of the warnings, which limit the use of the result.
-        diagnostics: warnings and notes as data.
-        log: text of the log.
+        warnings: texts of the warnings about limitations of the result.
+        diagnostics: warnings, errors and notes, including their data.
+        log: log of the cell.
     """
 
     status: CellStatus
@@ -373,17 +376,19 @@ class RecordedCell(CellOutcome):
     """A cell of a run: one execution of a method.
 
     Attributes:
-        address: `step` or `step@step=variant,...`, followed by `#n` for repeats after the first.
+        address: `step` or `step@step=variant,...`, followed by `#n` for all repeats except the
+            first.
         step: name of the step.
-        assignment: step -> variant, in graph order.
-        repeat: index of the repeat, 0 for the first.
-        params: all parameters, resolved.
-        params_set: parameters set in the workflow or on the command line, as written.
+        assignment: variants by step, in the order of the graph.
+        repeat: index of the repeat; 0 for the first.
+        params: all parameters of the method, including default values.
+        params_set: parameters that were set in the workflow or on the command line, with the values
+            as written.
         environment: id of the environment.
-        cached_from: id of the run that computed it; empty if this run did.
-        figures: figures of the method.
-        inputs: port -> product.
-        outputs: port -> product.
+        cached_from: id of the run that computed the cell; empty if it is this run.
+        figures: figures that the method drew.
+        inputs: input products by port.
+        outputs: output products by port.
     """
 
     address: str
@@ -399,7 +404,7 @@ class RecordedCell(CellOutcome):
     outputs: Mapping[str, RecordedProduct] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        # Logs and parameters are too long to print in one line.
+        # Omit logs and parameters, which are too long for one line.
         metrics, figures = len(self.metrics), len(self.figures)
         return (
             f"<RecordedCell {self.address!r}: {self.method}, {self.status}, {self.wall_s:.3g} s, "
@@ -409,23 +414,24 @@ class RecordedCell(CellOutcome):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunRecord:
-    """A whole record, except the arrays of products.
+    """The content of a record, except the arrays of products.
 
     Attributes:
-        run_id: unique id, without further meaning.
+        run_id: unique id; it contains no other information.
         name: name of the workflow.
-        created_by: program and version, e.g. `orthoflow 0.1.0`.
+        created_by: program and version, such as `orthoflow 0.1.0`.
         status: `ok`, or `failed` if any cell failed.
-        started: ISO 8601, UTC.
-        ended: ISO 8601, UTC.
+        started: start time, ISO 8601 in UTC.
+        ended: end time, ISO 8601 in UTC.
         seed: seed of the workflow.
         workflow_source: text of the workflow file.
-        workflow_resolved: workflow as JSON with all overrides applied.
-        overrides: `--set` and other options that changed the workflow or selected steps, as given.
+        workflow_resolved: workflow as JSON, after all overrides.
+        overrides: `--set` and other options that changed the workflow or selected steps, as given
+            on the command line.
         inputs: inputs of the workflow.
-        environments: environments of the cells, without duplicates.
+        environments: the different environments of the cells.
         cells: cells in the order of the graph.
-        published: files next to the record, for other programs.
+        published: files that the run wrote for other programs, next to the record.
     """
 
     run_id: str
@@ -466,14 +472,15 @@ def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
     )
 
 
-# `Any`: keyword arguments of a constructor with annotated parameters.
+# The type is Any, because the values are passed as keyword arguments to constructors whose
+# parameters have different types.
 def shared_fields(source: object, part: type) -> dict[str, Any]:
-    """Return the fields of an object that belong to one of its base classes, as keywords."""
+    """Return the fields that an object inherits from a base class, as keyword arguments."""
     return {item.name: getattr(source, item.name) for item in fields(part)}
 
 
 def to_json(record: RunRecord) -> dict[str, Any]:
-    """Return the document of a record: one object per dataclass, with digests instead of bytes.
+    """Return the document of a record: an object for each dataclass, with digests instead of bytes.
 
     Raises:
         RecordFormatError: the record contains values that JSON cannot represent.
@@ -493,15 +500,14 @@ def to_json(record: RunRecord) -> dict[str, Any]:
 
 
 def from_json(text: str, contents: Callable[[str], bytes]) -> RunRecord:
-    """Read a document.
+    """Read a record from its document.
 
     Args:
         text: JSON text of a document from `to_json`.
-        contents: SHA-256 -> bytes, for bytes that were replaced by digests.
+        contents: the bytes that the document replaces by digests, by their SHA-256.
 
     Raises:
-        RecordFormatError: the text is not JSON, or a field is missing, unknown, or has another
-            type.
+        RecordFormatError: the text is not JSON, or a field is missing, unknown or of another type.
     """
     document = parse_json(text, "the document")
     codec = _codec()
@@ -533,10 +539,10 @@ def _codec() -> TypeAdapter[RunRecord]:
 
 
 def parse_json(text: str, place: str) -> JsonValue:
-    """Parse strict JSON: without NaN, infinity and excessive nesting.
+    """Parse strict JSON, in which NaN, infinity and deep nesting are not allowed.
 
     Raises:
-        RecordFormatError: the text is not valid JSON in this sense.
+        RecordFormatError: the text is not strict JSON.
     """
 
     def refuse(constant: str) -> JsonValue:
@@ -552,13 +558,13 @@ def parse_json(text: str, place: str) -> JsonValue:
 def canonical_json(value: object) -> str:
     """Return the canonical JSON text of a value, for digests.
 
-    Keys are sorted by code point; there is no white space, no escapes beyond those required by
-    JSON, and floats have the shortest digits that restore them. `1`, `1.0` and `-0.0` remain
-    distinct, as do `true` and `1`.
+    Keys are sorted by code point. There is no white space, only characters that JSON requires to be
+    escaped are escaped, and floats have the fewest digits from which they can be restored. `1`,
+    `1.0` and `-0.0` remain distinct, and so do `true` and `1`.
 
     Raises:
-        RecordFormatError: the value contains NaN, infinity, keys that are not text, unpaired
-            surrogates, or a type that is not JSON.
+        RecordFormatError: the value contains NaN, infinity, keys that are not strings, unpaired
+            surrogates, or types that JSON does not have.
 
     >>> canonical_json({"b": 1.0, "a": [True, None, "é"]})
     '{"a":[true,null,"é"],"b":1.0}'
@@ -580,16 +586,16 @@ def canonical_json(value: object) -> str:
 
 
 def sha256_text(text: str) -> str:
-    """Return the SHA-256 of a text in UTF-8 as 64 hexadecimal digits."""
+    """Return the SHA-256 of a string, encoded in UTF-8, as 64 hexadecimal digits."""
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def plain_json(value: object, place: str = "") -> JsonValue:
-    """Copy a value as plain JSON types, since subclasses could print themselves differently.
+    """Copy a value as basic JSON types, since subclasses could be formatted differently.
 
     Raises:
-        RecordFormatError: the value contains NaN, infinity, keys that are not text, or a type that
-            is not JSON.
+        RecordFormatError: the value contains NaN, infinity, keys that are not strings, or types
+            that JSON does not have.
     """
     if value is None or isinstance(value, bool):
         return value

@@ -1,8 +1,9 @@
-"""HDF5 files: robust writing when the disk is full, and safe opening of untrusted files.
+"""Robust writing of HDF5 files when the disk is full, and safe opening of untrusted files.
 
-HDF5 cannot close a file after a write error: the library keeps it open, reports errors again in
-destructors, and may crash the process at exit. HDF5 therefore writes to a file object that never
-fails; it remembers the first error, which is raised after HDF5 has closed the file.
+After a write error, the HDF5 library cannot close the file: it keeps the file open, reports the
+error again in destructors, and may crash the process at exit. HDF5 therefore writes to a file
+object whose operations never fail. This object stores the first error, which is raised after HDF5
+has closed the file.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from orthoflow_provenance.document import (
 )
 from orthoflow_provenance.paths import check_name
 
-# All exceptions that h5py raises for damaged files, depending on the position of the damage.
+# Exceptions that h5py may raise for damaged files; the type depends on the position of the damage.
 HDF5_ERRORS: Final = (
     OSError,
     RuntimeError,
@@ -39,28 +40,32 @@ HDF5_ERRORS: Final = (
     MemoryError,
     SystemError,
 )
-# Readable by HDF5 1.10 and newer, in which all internal structures of HDF5 have checksums.
+# This version of the file format can be read by HDF5 1.10 and newer. Its internal structures have
+# checksums.
 _LIBRARY_VERSIONS: Final = (h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
-# Arrays large enough for mapping start at a multiple of this, so that mapped arrays are aligned.
+# Arrays that are large enough for memory mapping start at a multiple of this offset, so that they
+# are aligned.
 _ALIGNMENT_BYTES: Final = 64
 _ALIGNED_FROM_BYTES: Final = 2048
-# After a write error, data blocks are discarded, but HDF5 must be able to reread its structures.
+# After a write error, larger blocks (data) are discarded, but smaller blocks are kept in memory,
+# because HDF5 must be able to read its internal structures again.
 _KEPT_AFTER_FAILURE_BYTES: Final = 64 << 10
 
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
-# Superblock of version 2 and 3: its size, and the flags for files opened for writing.
+# Size of superblocks of versions 2 and 3, and the flags that mark a file as open for writing.
 _SUPERBLOCK_BYTES: Final = 36
 _WRITER_MARKS: Final = 0b101
 _DEEPEST: Final = 32
-# Upper limit for valid files: deflate compresses by a factor of at most 1032.
+# Maximum ratio of declared to stored bytes in valid files: deflate compresses by a factor of at
+# most 1032.
 _LARGEST_RATIO: Final = 1100
 _LARGEST_CHUNK_BYTES: Final = 64 << 20
 _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
 _LONGEST_NAME: Final = 256
-# Compression of such small data is pointless, and larger data could expand to excessive sizes.
+# Maximum size of compressed texts, tables and figures; larger ones could expand to excessive sizes.
 _PACKED_BYTES_MOST: Final = 4 << 20
-# Objects are groups, datasets and attributes; a cell with its products has about 50.
-#: groups, datasets and attributes of a record (more limits in `provenance/SPEC.md`, section 2)
+# Maximum number of groups, datasets and attributes in a record; a cell with its products has about
+# 50 (for other limits, see `provenance/SPEC.md`, section 2).
 MAX_OBJECTS: Final = 1_000_000
 _FILTERS: Final = {
     h5py.h5z.FILTER_SHUFFLE: "shuffle",
@@ -72,7 +77,7 @@ _PLAIN_CLASSES: Final = frozenset({h5py.h5t.INTEGER, h5py.h5t.FLOAT})
 
 @contextmanager
 def reading(place: str) -> Iterator[None]:
-    """Convert any HDF5 error while reading an object into one sentence.
+    """Convert HDF5 errors that occur while an object is read to errors that name the object.
 
     Raises:
         RecordFormatError: reading failed.
@@ -89,9 +94,9 @@ def reading(place: str) -> Iterator[None]:
 
 
 def fixed_text(text: str) -> NDArray[np.bytes_]:
-    """Return a text as stored in HDF5: fixed-length UTF-8, without NUL and unpaired surrogates.
+    """Return a string as stored in HDF5: fixed-length UTF-8, without NUL and unpaired surrogates.
 
-    Variable-length text is stored in the global heap of HDF5, the only structure without a
+    Variable-length strings would be stored in the global heap, the only HDF5 structure without a
     checksum, where a single changed byte can make the library loop forever.
     """
     data = text.replace("\0", "").encode("utf-8", "replace")
@@ -99,23 +104,23 @@ def fixed_text(text: str) -> NDArray[np.bytes_]:
 
 
 def set_attributes(item: h5py.Group | h5py.Dataset, **values: str | float) -> None:
-    """Write scalar attributes: fixed-length text, integers as int64, other numbers as float64."""
+    """Write scalar attributes: fixed-length strings, integers as int64, others as float64."""
     for name, value in values.items():
         item.attrs[name] = attribute_value(value)
 
 
 def attribute_value(value: str | float) -> NDArray[np.generic]:
-    """Return an attribute value as it is stored."""
+    """Return the value of an attribute as it is stored."""
     if isinstance(value, str):
         return fixed_text(value)
     return np.array(value, dtype="<i8" if isinstance(value, int) else "<f8")
 
 
 def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
-    """Read a text attribute.
+    """Read an attribute that is a string.
 
     Raises:
-        RecordFormatError: the attribute is missing or not text.
+        RecordFormatError: the attribute is missing or not a string.
     """
     value = _attribute(item, name)
     if not isinstance(value, bytes):
@@ -138,15 +143,15 @@ def int_attribute(item: h5py.Group | h5py.Dataset, name: str) -> int:
 
 
 def write_array(group: h5py.Group, name: str, data: NDArray[np.generic]) -> h5py.Dataset:
-    """Write text, a table or bytes as a contiguous dataset without time stamps."""
+    """Write a string, a table or bytes as a contiguous dataset without timestamps."""
     return group.create_dataset(name, data=data, track_times=False)
 
 
 def read_text(group: h5py.Group, name: str) -> str:
-    """Read a text of any length.
+    """Read a dataset that is a string.
 
     Raises:
-        RecordFormatError: the dataset is missing, damaged or not text.
+        RecordFormatError: the dataset is missing, damaged or not a string.
     """
     dataset = dataset_of(group, name)
     value = read_whole(dataset)
@@ -156,7 +161,7 @@ def read_text(group: h5py.Group, name: str) -> str:
 
 
 def open_group(parent: h5py.Group, name: str) -> h5py.Group:
-    """Open a sub-group.
+    """Open a subgroup.
 
     Raises:
         RecordFormatError: there is no group with this name.
@@ -173,7 +178,7 @@ def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
     return _child(group, name, h5py.Dataset, "dataset")
 
 
-# `Any`: h5py has no type annotations.
+# The type is Any, because h5py has no type annotations.
 def _child(parent: h5py.Group, name: str, kind: type, what: str) -> Any:
     with reading(f"{parent.name.rstrip('/')}/{name}"):
         found = parent.get(name)
@@ -183,11 +188,10 @@ def _child(parent: h5py.Group, name: str, kind: type, what: str) -> Any:
 
 
 def read_whole(dataset: h5py.Dataset) -> object:
-    """Read a dataset (text, table or figure) as a whole.
+    """Read all data of a dataset with a string, a table or a figure.
 
     Raises:
-        RecordFormatError: the dataset is damaged, or expands to far more than its stored size
-            allows.
+        RecordFormatError: the dataset is damaged, or is compressed although it is large.
     """
     with reading(dataset.name):
         if dataset.nbytes > max(_PACKED_BYTES_MOST, dataset.id.get_storage_size()):
@@ -203,19 +207,19 @@ class FileSink:
     """A file object for HDF5 whose write operations never raise an error.
 
     Attributes:
-        failure: the first error of the operating system; None if there was none.
+        failure: the first error that the operating system reported; None if there was none.
     """
 
     def __init__(self, path: Path) -> None:
-        # Do not follow links: the target, another file, would be truncated.
+        # Do not follow links, because this would truncate the target, which is another file.
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
         self._descriptor = os.open(path, flags, 0o666)
-        # Offset and bytes of the blocks that could not be written after the first error, in order.
+        # Offsets and bytes of the blocks that were not written because of an error, in order.
         self._kept: list[tuple[int, bytes]] = []
         self.failure: OSError | None = None
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move the position; HDF5 also uses this to get the size."""
+        """Set the position, and return it; HDF5 also uses this function to determine the size."""
         if whence == os.SEEK_END:
             ends = (start + len(data) for start, data in self._kept)
             offset += max(os.fstat(self._descriptor).st_size, *ends, 0)
@@ -241,7 +245,7 @@ class FileSink:
         return len(view)
 
     def readinto(self, buffer: memoryview) -> int:
-        """Read at the position; bytes that were never written are zero."""
+        """Read at the position; bytes beyond the end of the file are zero."""
         view = memoryview(buffer).cast("B")
         position = self.tell()
         stored = os.read(self._descriptor, len(view))
@@ -264,10 +268,10 @@ class FileSink:
         return size
 
     def flush(self) -> None:
-        """Do nothing, because `close` syncs the data to the disk."""
+        """Do nothing, because `close` syncs the data to disk."""
 
     def close(self) -> None:
-        """Sync the data to the disk and close the file.
+        """Sync the data to disk and close the file.
 
         Raises:
             OSError: this or an earlier operation failed.
@@ -283,12 +287,12 @@ class FileSink:
 
 @contextmanager
 def create_file(path: Path) -> Iterator[h5py.File]:
-    """Create an HDF5 file and sync it to the disk; an existing file is overwritten.
+    """Create an HDF5 file, and sync it to disk on closing; an existing file is overwritten.
 
-    An incomplete file is removed.
+    If an error occurs, the incomplete file is removed.
 
     Raises:
-        OSError: the file cannot be created or written, e.g. because the disk is full.
+        OSError: the file cannot be created or written, for example because the disk is full.
     """
     sink = FileSink(path)
     try:
@@ -299,7 +303,8 @@ def create_file(path: Path) -> Iterator[h5py.File]:
             finally:
                 file.close()
         finally:
-            # The first error of the disk is the cause, whatever HDF5 raised because of it.
+            # Raise the first error of the operating system instead of the HDF5 errors that it
+            # caused.
             sink.close()
     except BaseException:
         path.unlink(missing_ok=True)
@@ -307,7 +312,7 @@ def create_file(path: Path) -> Iterator[h5py.File]:
 
 
 def create_group(parent: h5py.Group, name: str) -> h5py.Group:
-    """Create a group without time stamps, so that equal content results in equal files."""
+    """Create a group without timestamps, so that equal content gives equal files."""
     properties = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
     properties.set_obj_track_times(False)
     return h5py.Group(h5py.h5g.create(parent.id, name.encode("utf-8"), gcpl=properties))
@@ -315,16 +320,17 @@ def create_group(parent: h5py.Group, name: str) -> h5py.Group:
 
 @contextmanager
 def safe_open(path: Path, format_name: str) -> Iterator[h5py.File]:
-    """Open a file of a format for reading, after checking all objects in it.
+    """Open a file with a given format for reading, after checking all objects in it.
 
     Raises:
-        UnknownFormatError: the file is not an HDF5 file, or is from another program or of another
+        UnknownFormatError: the file is not an HDF5 file, or it has another format or another
             version of the format.
-        LockedFileError: the file is open for writing elsewhere, or was left open by a crash.
-        RecordFormatError: the file is damaged, or contains links other than hard links, an object
-            with two paths or an invalid name, external or virtual storage, filters other than
-            shuffle, gzip and fletcher32, types outside the format, or datasets that expand to far
-            more than the file could contain.
+        LockedFileError: the file is open for writing in another process, or was not closed because
+            of a crash.
+        RecordFormatError: the file is damaged or contains something that the format does not allow:
+            links other than hard links, objects with two paths or an invalid name, external or
+            virtual storage, filters other than shuffle, gzip and fletcher32, other data types, or
+            datasets that expand to far more than the file could contain.
         OSError: the file cannot be opened.
     """
     _check_superblock(path)
@@ -361,7 +367,7 @@ def bytes_behind_end(path: Path) -> int:
 
 
 def _require_format(file: h5py.File, file_name: str, name: str) -> None:
-    """Refuse a file from another program or of another version of the format."""
+    """Check the format of a file and the version of the format."""
     with reading(file_name):
         found, version = (_short_text(file, one) for one in ("format", "format_version"))
     if found is None or version is None:
@@ -379,7 +385,7 @@ def _require_format(file: h5py.File, file_name: str, name: str) -> None:
 
 
 def _short_text(file: h5py.File, name: str) -> str | None:
-    """Read an unchecked attribute; return None unless it is a short fixed-length text."""
+    """Read an attribute of an unchecked file; None unless it is a short fixed-length string."""
     if not h5py.h5a.exists(file.id, name.encode()):
         return None
     attribute = h5py.h5a.open(file.id, name.encode())
@@ -403,7 +409,7 @@ class _Inspection:
         Raises:
             RecordFormatError: an object is not allowed.
         """
-        # Low-level identifiers are used because h5py's high-level objects take three times as long.
+        # Use low-level identifiers, because h5py's high-level objects take three times as long.
         pending: list[tuple[h5py.h5g.GroupID, str, int]] = [(self._file.id, "/", 0)]
         self._visit_once(self._file.id, "/")
         while pending:
@@ -427,7 +433,7 @@ class _Inspection:
         self, group: h5py.h5g.GroupID, name: bytes, place: str
     ) -> h5py.h5g.GroupID | h5py.h5d.DatasetID:
         try:
-            # Other programs would interpret `..` in a path as the parent group.
+            # Reject names such as `..`, which other programs would interpret as the parent group.
             check_name(name.decode("utf-8"), "the object")
         except RecordFormatError as error:
             raise self._refusal(place, f"is not a path in a record: {error}") from error
@@ -442,7 +448,8 @@ class _Inspection:
         return child
 
     def _visit_once(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
-        # Objects with several paths allow loops and trees that grow without limit from a few bytes.
+        # If objects could have several paths, a few bytes could describe loops, and trees of any
+        # size.
         info = h5py.h5o.get_info(item)
         identity = (int(info.fileno), int(info.addr))
         is_known = identity in self._seen
@@ -494,7 +501,7 @@ class _Inspection:
 
 
 def _is_allowed(kind: h5py.h5t.TypeID) -> bool:
-    """Return whether values are stored in the dataset itself: numbers, bool, fixed text, rows."""
+    """Return whether a type is allowed: numbers, bool, fixed-length strings, and rows of these."""
     type_class = kind.get_class()
     if type_class == h5py.h5t.COMPOUND:
         return all(_is_plain(kind.get_member_type(index)) for index in range(kind.get_nmembers()))

@@ -1,6 +1,6 @@
-"""Safe access to files with untrusted names: never outside a folder, and only regular files.
+"""Safe access to files with untrusted names: only regular files, and only inside a given folder.
 
-All names from records, crates, archives and plugins are converted to paths here.
+Names from records, crates, archives and plugins are converted to paths only by this module.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from typing import BinaryIO, Final
 from orthoflow_provenance.document import RecordFormatError, UnsafeFileError
 
 _LETTER: Final = r"""[^\s/'"<>|,;:()\[\]{}\\]"""
-# An absolute path of at least two parts that does not continue a word, a relative path or a URL.
+# Matches an absolute path with at least two parts that is not the end of a word, a relative path or
+# a URL.
 _PATH: Final = re.compile(
     rf"(?<![\w.:/~*?\\-]) (?:file://)? / (?:{_LETTER}+/)+ (?P<last>{_LETTER}*)", re.VERBOSE
 )
 LONGEST_NAME_BYTES: Final = 255
 LONGEST_PATH_BYTES: Final = 4095
-# Windows treats these names as devices, with any suffix, on every drive and in every folder.
+# Windows treats these names as devices in every folder, also if a suffix is added.
 _DEVICES: Final = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])[ ]*(\..*)?", re.IGNORECASE | re.DOTALL
 )
@@ -34,14 +35,14 @@ _FILE_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def holds_control(text: str) -> bool:
-    """Return whether a text has control characters, line separators or unpaired surrogates."""
+    """Return whether a string has control characters, line separators or unpaired surrogates."""
     return not text.isprintable() and any(
         unicodedata.category(letter) in {"Cc", "Cs", "Zl", "Zp"} for letter in text
     )
 
 
 def check_name(name: str, what: str) -> str:
-    """Refuse names that cannot be the name of an HDF5 link or one line in the seal.
+    """Check that a name can be the name of an HDF5 link.
 
     Raises:
         RecordFormatError: the name is empty, `.` or `..`, or contains `/` or a control character.
@@ -70,7 +71,7 @@ _PROBLEMS: Final[tuple[tuple[str, Callable[[str], object]], ...]] = (
 
 
 def name_problem(name: str) -> str:
-    """Return why a name is not allowed as a file or folder name on all systems; empty if it is.
+    """Return why a name is not valid for files and folders on all systems; empty if it is valid.
 
     >>> name_problem("hall.e57"), name_problem(".."), name_problem("a/b")
     ('', 'is . or ..', 'contains / or a backslash')
@@ -79,7 +80,7 @@ def name_problem(name: str) -> str:
 
 
 def path_problem(path: str) -> str:
-    """Return why a relative path with `/` is not allowed inside a folder; empty if it is.
+    """Return why a relative path with `/` is not valid inside a folder; empty if it is valid.
 
     >>> path_problem("products/wall/a.tif"), path_problem("/etc/x"), path_problem("a/../b")
     ('', 'is absolute', 'has a part that is . or ..')
@@ -99,11 +100,11 @@ def path_problem(path: str) -> str:
 
 
 def path_below(folder: Path, path: str) -> Path:
-    """Return the path of a file in a folder, given by an untrusted relative path.
+    """Return the path of a file in a folder, given an untrusted relative path.
 
     Raises:
-        UnsafeFileError: the path leads out of the folder or is not allowed on all systems:
-            absolute, with `..`, empty, with control characters or reserved names, or too long.
+        UnsafeFileError: the path leads out of the folder or is not valid on all systems, because it
+            is absolute, empty or too long, or contains `..`, control characters or reserved names.
     """
     if problem := path_problem(path):
         raise UnsafeFileError(f"{path!r} {problem}, so it cannot be a file name here")
@@ -111,7 +112,7 @@ def path_below(folder: Path, path: str) -> Path:
 
 
 def colliding(paths: Iterable[str]) -> str:
-    """Return the first path that some system does not distinguish from an earlier one, or "".
+    """Return the first path that equals an earlier one on some systems; empty if there is none.
 
     >>> colliding(["a.png", "b.png", "A.png"])
     'A.png'
@@ -126,11 +127,12 @@ def colliding(paths: Iterable[str]) -> str:
 
 
 def open_below(folder: Path, path: str) -> BufferedReader:
-    """Open a regular file in a folder for reading, without following links.
+    """Open a regular file in a folder for reading; links are not followed.
 
     Raises:
-        UnsafeFileError: the path leads out of the folder, or to a link, a folder or a device.
-        OSError: there is no such file, or it cannot be read.
+        UnsafeFileError: the path leads out of the folder, or it is that of a link, a folder or a
+            device.
+        OSError: the file does not exist or cannot be read.
     """
     target = _without_links(folder, path)
     # Check before opening, because opening a device may have side effects.
@@ -146,12 +148,12 @@ def open_below(folder: Path, path: str) -> BufferedReader:
 
 @contextmanager
 def create_below(folder: Path, path: str) -> Iterator[BinaryIO]:
-    """Write a file in a folder without following links; it gets its name when it is complete.
+    """Write a file in a folder; it gets its name when it is complete, and links are not followed.
 
-    Missing folders are created. An existing file or link with the name is replaced.
+    Missing folders are created. An existing file or link with this name is replaced.
 
     Raises:
-        UnsafeFileError: the path leads out of the folder, or one of its folders is a link.
+        UnsafeFileError: the path leads out of the folder, or contains a folder that is a link.
         OSError: the file cannot be written.
     """
     target = _without_links(folder, path)
@@ -168,9 +170,9 @@ def create_below(folder: Path, path: str) -> Iterator[BinaryIO]:
 
 
 def files_below(folder: Path, path: str) -> tuple[str, ...]:
-    """Return the paths of regular files in a subfolder; empty if there is no such folder.
+    """Return the paths of the regular files in a subfolder; empty if the subfolder does not exist.
 
-    Links, and files whose names are not allowed in a record, are omitted.
+    Links are omitted, and so are files whose names are not allowed in a record.
 
     Raises:
         OSError: the folder cannot be read.
@@ -187,7 +189,7 @@ def files_below(folder: Path, path: str) -> tuple[str, ...]:
 
 
 def _without_links(folder: Path, path: str) -> Path:
-    """Return `path_below`, and refuse links among the folders; `folder` itself may be a link."""
+    """Return `path_below`, after checking that no folder below `folder` is a link."""
     target = path_below(folder, path)
     for part in reversed(target.parents):
         if len(part.parts) > len(folder.parts) and part.is_symlink():
@@ -204,12 +206,13 @@ def _check_regular(found: os.stat_result, path: str) -> None:
 
 
 def without_folders(text: str, folders: Sequence[Path] = ()) -> str:
-    """Reduce absolute paths in a text to their last part.
+    """Shorten absolute paths in a string to their last part.
 
     Args:
         text: a log, a message or a command-line option.
-        folders: folders to remove literally first, for names with spaces, whose end no pattern can
-            find; the home directory and the working directory are always included.
+        folders: folders to remove by exact search before absolute paths are shortened. This is
+            necessary for names with spaces, because a pattern cannot find their end. The home
+            directory and the working directory are always included.
 
     >>> without_folders("cannot read /home/jane/scans/hall.e57: 1/2 of it is missing")
     'cannot read hall.e57: 1/2 of it is missing'
@@ -222,7 +225,7 @@ def without_folders(text: str, folders: Sequence[Path] = ()) -> str:
 
 def _own_folders() -> set[str]:
     folders = {str(Path.cwd())}
-    # If the home directory is unknown, no text can contain it.
+    # If the home directory is unknown, it cannot be removed.
     with suppress(RuntimeError):
         folders.add(str(Path.home()))
     return folders

@@ -1,8 +1,8 @@
-"""The record of a run as one HDF5 file: the document, the contents it references, and the seal.
+"""The record of a run as an HDF5 file: the document, the contents it references, and the seal.
 
-`/document` is the record. It references products and the bytes of files by digest. Other groups
-repeat parts of it for users of HDFView and h5py: a group per cell, and a table of metrics. `/seal`
-is the digest of the whole file.
+`/document` contains the record as JSON. It references products and the bytes of files by their
+digests. Other objects repeat parts of the document for users of HDFView and h5py: a group for each
+cell, and a table of metrics. `/seal` is the digest of the whole file.
 """
 
 from __future__ import annotations
@@ -70,17 +70,18 @@ FILES: Final = "files"
 CELLS: Final = "cells"
 _UNSEALED: Final = "0" * 64
 _BLOCK_BYTES: Final = 16 << 20
-# Attributes are for quick reading; longer values are only in the document.
+# Attributes are meant for quick inspection, so longer values are truncated; the document contains
+# them in full.
 _LONGEST_ATTRIBUTE: Final = 1000
 _PLAIN: Final = (str, int, float, bool)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """An object in a record as it is expected.
+    """Expected content of an object in a record.
 
     Attributes:
-        attributes: all attributes of the object.
+        attributes: values of all attributes by name.
         data: content of a dataset; None for a group.
     """
 
@@ -90,11 +91,11 @@ class Node:
 
 @dataclass(frozen=True, kw_only=True)
 class OpenRecord:
-    """An open record.
+    """A record that is open for reading.
 
     Attributes:
-        record: everything except the arrays.
-        content_sha256: SHA-256 of the document as stored, 64 hexadecimal digits.
+        record: content of the record, except the arrays.
+        content_sha256: SHA-256 of the document as stored, as 64 hexadecimal digits.
         file: the HDF5 file.
     """
 
@@ -103,11 +104,11 @@ class OpenRecord:
     file: h5py.File
 
     def payload(self, address: str, port: str) -> StoredPayload:
-        """Read an output of a cell; arrays of mapped products stay valid after closing.
+        """Read an output of a cell; its memory-mapped arrays remain valid after closing the record.
 
         Raises:
-            RecordFormatError: there is no such output, it is not embedded, it is damaged, or it
-                does not match its digest.
+            RecordFormatError: the output does not exist, is not embedded, is damaged, or does not
+                match its digest.
         """
         cells = {cell.address: cell for cell in self.record.cells}
         try:
@@ -116,7 +117,7 @@ class OpenRecord:
             raise RecordFormatError(f"the record has no output {address}.{port}") from error
         group = open_group(self.file, product_path(output.digest))
         payload = read_payload(group)
-        # Check it here, because the caller may not have checked the seal of the file.
+        # Check the digest here, because the caller may not have checked the seal of the file.
         if (found := payload_digest(payload)) != output.digest:
             raise RecordFormatError(
                 f"{group.name} has the digest {found}, but the record states {output.digest}: the "
@@ -137,22 +138,24 @@ def write_record(
     """Write a record under a temporary name, and rename it when it is complete.
 
     Args:
-        path: path of the record, usually `run.h5`, in an existing folder.
-        record: everything except the arrays.
-        product_file: digest -> file written by `write_product_file`, or None if there is none.
-        embed: embed the arrays of all outputs, not only of those marked `embedded`.
-        input_file: SHA-256 -> file with this digest, for the inputs marked `embedded`.
-        earlier: another record of this run, from which outputs embedded in it are copied.
+        path: path of the record, usually `run.h5`; the folder must exist.
+        record: content of the record, except the arrays.
+        product_file: function that returns the file of a product, written by `write_product_file`,
+            from the digest; None if there is no such file.
+        embed: whether to embed the arrays of all outputs instead of only those marked `embedded`.
+        input_file: function that returns the file with a given SHA-256; used for inputs marked
+            `embedded`.
+        earlier: another record of this run; the outputs embedded in it are copied.
 
     Returns:
-        The content digest, 64 hexadecimal digits.
+        The SHA-256 of the document, as 64 hexadecimal digits.
 
     Raises:
-        RecordFormatError: a name is not allowed in a record, or a product to embed is missing,
-            damaged or does not match.
-        InputFileError: an input file to embed is missing or does not match.
-        OSError: the file cannot be written, e.g. because the disk is full; an existing file at
-            `path` is not changed.
+        RecordFormatError: a name is not allowed in a record, or a product to embed is missing, is
+            damaged or does not match its digest.
+        InputFileError: an input file to embed is missing or does not match its digest.
+        OSError: the file cannot be written, for example because the disk is full. An existing file
+            at `path` is not changed.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     written = _as_written(record, embed=embed)
@@ -183,10 +186,11 @@ def write_record(
 
 
 def read_record(path: Path) -> RunRecord:
-    """Read everything in a record except the arrays.
+    """Read the content of a record, except the arrays.
 
     Raises:
-        RecordFormatError: the file is not a record, damaged, incomplete, or of another format.
+        RecordFormatError: the file is not a record of this format version, or is damaged or
+            incomplete.
         OSError: the file cannot be opened.
     """
     with open_record(path) as opened:
@@ -198,7 +202,8 @@ def open_record(path: Path) -> Iterator[OpenRecord]:
     """Open a record for reading.
 
     Raises:
-        RecordFormatError: the file is not a record, damaged, incomplete, or of another format.
+        RecordFormatError: the file is not a record of this format version, or is damaged or
+            incomplete.
         OSError: the file cannot be opened.
     """
     with safe_open(path, RUN_FORMAT) as file:
@@ -208,7 +213,7 @@ def open_record(path: Path) -> Iterator[OpenRecord]:
 
 
 def record_of(file: h5py.File) -> RunRecord:
-    """Read the document of a file whose format has been checked.
+    """Read the record from the document of a file whose format has been checked.
 
     Raises:
         RecordFormatError: a required part is missing or damaged.
@@ -227,9 +232,9 @@ def document_text(record: RunRecord) -> str:
 
 
 def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
-    """Return the objects that repeat parts of a record for human readers: path -> node.
+    """Return, by path, the objects that the document determines: those that repeat parts of it.
 
-    Parents come before their children. Products, files and the seal are not included.
+    Parents precede their children. Products, files and the seal are not included.
 
     Args:
         record: the record.
@@ -256,7 +261,7 @@ def product_path(digest: str) -> str:
     """Return the path of a product in a record, given its digest.
 
     Raises:
-        RecordFormatError: the text is not a digest.
+        RecordFormatError: the string is not a digest.
     """
     scheme, _, digits = digest.partition(":")
     if f"{scheme}:" != DIGEST_PREFIX or not is_sha256(digits):
@@ -265,16 +270,16 @@ def product_path(digest: str) -> str:
 
 
 def is_sha256(text: str) -> bool:
-    """Return whether a text is 64 lower-case hexadecimal digits."""
+    """Return whether a string consists of 64 lower-case hexadecimal digits."""
     return len(text) == 64 and not set(text) - set("0123456789abcdef")
 
 
 def file_sha256(path: Path, offset: int) -> str:
-    """Return the SHA-256 of a record file, with the seal replaced by zero digits.
+    """Return the SHA-256 of a record file in which the digits of the seal are replaced by zeros.
 
     Args:
         path: the file.
-        offset: offset of the 64 bytes of the seal.
+        offset: position of the 64 bytes of the seal in the file.
     """
     digest, position = hashlib.sha256(), 0
     with path.open("rb") as stream:
@@ -290,20 +295,20 @@ def file_sha256(path: Path, offset: int) -> str:
 def extract_files(
     path: Path, inputs: tuple[RecordedInput, ...], folder: Path
 ) -> Mapping[str, tuple[Path, ...]]:
-    """Write the embedded input files of a record into a folder, under their names.
+    """Write the embedded input files of a record to a folder, with their original names.
 
     Args:
         path: the record.
         inputs: inputs of the record.
-        folder: the folder, created if missing; each file is in a separate subfolder, because names
-            may not be unique.
+        folder: the folder; created if missing. Each file is written to a separate subfolder,
+            because several files may have the same name.
 
     Returns:
-        Input -> files, in the order of the record; inputs that are not embedded are omitted.
+        The files of each input, by the name of the input, in the order of the record. Inputs that
+        are not embedded are omitted.
 
     Raises:
-        RecordFormatError: a file is damaged, does not match the record, or has a name that is not
-            allowed as a file name.
+        RecordFormatError: a file is damaged, does not match the record, or has an invalid name.
         OSError: a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -317,7 +322,7 @@ def extract_files(
 
 def _as_written(record: RunRecord, *, embed: bool) -> RunRecord:
     def clean(text: str) -> str:
-        # NUL is not possible in HDF5 text, nor are unpaired surrogates in UTF-8.
+        # HDF5 strings cannot contain NUL, and UTF-8 cannot contain unpaired surrogates.
         return without_folders(text.replace("\0", "").encode("utf-8", "replace").decode("utf-8"))
 
     cells = tuple(
@@ -346,7 +351,7 @@ def _as_written(record: RunRecord, *, embed: bool) -> RunRecord:
 
 
 def _check_names(record: RunRecord) -> None:
-    """Refuse names that cannot be the name of an HDF5 link, and duplicate names."""
+    """Check that names can be names of HDF5 links, and that addresses are unique."""
     addresses: set[str] = set()
     for cell in record.cells:
         if cell.address in addresses:
@@ -378,12 +383,12 @@ def _node(
 
 
 def plain_fields(entry: object) -> dict[str, str | float]:
-    """Return the numbers and short texts among the fields of a dataclass."""
+    """Return the fields of a dataclass that are numbers or strings; long strings are truncated."""
     found: dict[str, str | float] = {}
     for item in dataclasses.fields(entry):  # type: ignore[arg-type] # any dataclass
         value = getattr(entry, item.name)
         if item.name == "seed":
-            # A seed may exceed the integer types of HDF5, so it is stored as text.
+            # A seed may be too large for the integer types of HDF5, so it is stored as a string.
             value = "" if value is None else str(value)
         if isinstance(value, _PLAIN) and not item.name.startswith(("workflow_", "key_", "log")):
             found[item.name] = value[:_LONGEST_ATTRIBUTE] if isinstance(value, str) else value
@@ -415,10 +420,10 @@ def _metrics_table(record: RunRecord) -> NDArray[np.generic]:
 
 
 def _table(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> NDArray[np.generic]:
-    """Return rows as a flat table.
+    """Return rows as a structured array.
 
     Args:
-        columns: name -> numpy type; empty for text, which is as wide as needed.
+        columns: NumPy types by name; an empty type means strings of the required length.
         rows: a value for each column.
     """
     kinds: list[tuple[str, Any]] = []
@@ -467,7 +472,7 @@ def _copy_product(products: h5py.Group, digest: str, source: h5py.Group) -> None
     if stored != digest:
         name = Path(source.file.filename).name
         raise RecordFormatError(f"{name} must contain the product {digest}, got {stored}")
-    # Copies chunks unchanged; decompressing and compressing again would take ten times as long.
+    # This copies chunks unchanged; decompressing and compressing them would take ten times as long.
     source.file.copy(source, products, name=digest.removeprefix(DIGEST_PREFIX))
 
 
@@ -482,10 +487,10 @@ def _embed_file(files: h5py.Group, input_name: str, file: RecordedFile, path: Pa
         f"{file.sha256[:12]}..., but has been changed since it was read"
     )
     if not path.is_file():
-        # Do not open it: reading from a pipe would block.
+        # Do not open other objects: reading from a pipe would block.
         raise another
-    # Not chunked or compressed: photos and scans are already compressed, and digests protect the
-    # bytes.
+    # Use neither chunks nor compression, because photos and scans are already compressed. Checksums
+    # are not needed, because the document contains the digest.
     dataset = files.create_dataset(
         file.sha256, shape=(file.size_bytes,), dtype=np.uint8, track_times=False
     )
@@ -523,7 +528,7 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
     for index, file in enumerate(entry.files):
         check_name(file.sha256, "the file")
         dataset = dataset_of(files, file.sha256)
-        # Check before writing, because the record determines how much disk space is used.
+        # Check before writing, because the untrusted record determines how much disk space is used.
         if dataset.dtype != np.uint8 or dataset.shape != (file.size_bytes,):
             raise RecordFormatError(
                 f"{dataset.name} must be the {file.size_bytes} bytes of {file.name!r}, got "
@@ -541,11 +546,11 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
 
 
 def dataset_sha256(dataset: h5py.Dataset, also: Callable[[bytes], object] = len) -> str:
-    """Return the SHA-256 of a dataset of bytes, read block by block.
+    """Return the SHA-256 of a dataset of bytes, which is read block by block.
 
     Args:
         dataset: one-dimensional dataset of uint8.
-        also: called with each block.
+        also: function that is also called with each block.
 
     Raises:
         RecordFormatError: the dataset is damaged.

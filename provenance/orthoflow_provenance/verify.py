@@ -1,4 +1,4 @@
-"""Consistency checks of a record: the seal, all digests, all objects and all required fields."""
+"""Checks of a record: the seal, all digests, all objects and all required fields."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ class Finding(NamedTuple):
     """A problem found in a record.
 
     Attributes:
-        code: kind of problem: `foreign` or `locked` for files that cannot be checked, otherwise
+        code: kind of problem: `foreign` or `locked` if the file cannot be checked; otherwise
             `damaged`, `seal`, `appended`, `document`, `object`, `product`, `file`, `field`, `name`,
             `key` or `reference`.
         place: path in the file, with `@` before the name of an attribute.
-        problem: one sentence.
+        problem: description of the problem, one sentence.
     """
 
     code: str
@@ -78,12 +78,12 @@ class Finding(NamedTuple):
 
 
 def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...]:
-    """Check a record; any problem of the file becomes a finding, never an exception.
+    """Check a record; problems of the file are returned as findings, never raised as exceptions.
 
     Args:
         path: the record.
-        with_arrays: also check the seal of the file and the arrays of products; otherwise only the
-            document, the objects that repeat it, and figures are read.
+        with_arrays: whether to check also the seal of the file, the arrays of products, and input
+            files; otherwise, only the document, the objects that repeat it, and figures are read.
 
     Returns:
         All findings, in the order of the checks; empty if the record is intact and unchanged.
@@ -91,7 +91,7 @@ def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...
     try:
         with safe_open(path, RUN_FORMAT) as file:
             found = list(_document_findings(file, with_arrays=with_arrays))
-            # Check the seal last, because the other checks give the exact position of a change.
+            # Check the seal last, because the other checks can name the object that was changed.
             found += _seal_findings(file, path) if with_arrays else ()
             return tuple(found)
     except RecordFormatError as error:
@@ -106,7 +106,7 @@ def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Findin
         text = read_text(file, DOCUMENT)
         record = record_of(file)
         nodes = expected_nodes(record, text)
-        # `Any`: its form has been checked by the reader.
+        # The type is Any; the reader has checked the structure of the document.
         document: Any = parse_json(text, f"/{DOCUMENT}")
         contents = _contents(document)
     except RecordFormatError as error:
@@ -149,7 +149,7 @@ def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
 def _object_findings(
     file: h5py.File, record: RunRecord, nodes: Mapping[str, Node], contents: Container[str]
 ) -> Iterator[Finding]:
-    """Compare all objects that are not referenced by digest with the document."""
+    """Compare the objects that are not referenced by a digest with the document."""
     places = {product_path(digest).rpartition("/")[2] for digest in _embedded(record)}
     known = {*nodes, f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
     missing = set(known)
@@ -177,7 +177,7 @@ def _object_findings(
 def _object_problem(
     item: h5py.Group | h5py.Dataset, node: Node | None, attributes: Collection[str]
 ) -> str:
-    """Return how an object differs from a node, or from an object with any content."""
+    """Return how an object differs from a node; without a node, check only attribute names."""
     with reading(item.name):
         if isinstance(item, h5py.Group) and item.id.get_create_plist().get_link_creation_order():
             return "tracks the creation order of its links, which records do not"
@@ -219,7 +219,7 @@ def _objects(file: h5py.File) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]
 
 
 def _embedded(record: RunRecord) -> dict[str, str]:
-    """Return digest -> type of the products whose arrays are in the record."""
+    """Return the types of the products whose arrays are in the record, by digest."""
     return {
         output.digest: output.type_name
         for cell in record.cells
@@ -229,7 +229,7 @@ def _embedded(record: RunRecord) -> dict[str, str]:
 
 
 def _contents(document: Mapping[str, Any]) -> dict[str, int | None]:
-    """Return SHA-256 -> size, None for figures, of all contents of a document in `/files`."""
+    """Return the sizes of the contents of `/files`, by SHA-256; None for figures."""
     return {
         **{figure["data"]: None for cell in document["cells"] for figure in cell["figures"]},
         **{
@@ -243,7 +243,7 @@ def _contents(document: Mapping[str, Any]) -> dict[str, int | None]:
 def _content_findings(
     file: h5py.File, contents: Mapping[str, int | None], *, with_arrays: bool
 ) -> Iterator[Finding]:
-    """Check the files that the document references by digest; large ones only with the arrays."""
+    """Check the contents of `/files`; without `with_arrays`, only the sizes of input files."""
     for sha256, size_bytes in contents.items():
         problem = "does not contain the bytes that the document states"
         try:
@@ -295,7 +295,7 @@ def _name_findings(record: RunRecord) -> Iterator[Finding]:
         yield from _file_findings(place, entry.files)
     for cell in record.cells:
         place = f"/{CELLS}/{cell.address}"
-        # File names use only the beginning of long addresses.
+        # File names contain only the beginning of long addresses.
         named += [(place, cell.address[:_LETTERS_MOST]), (f"{place}@step", cell.step)]
         named += [(f"{place}/outputs/{port}", port) for port in cell.outputs]
         for figure in cell.figures:
@@ -349,7 +349,7 @@ def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
 
 
 def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Iterator[Finding]:
-    """Check that digests are valid, and that each input matches the output of its source."""
+    """Check that digests are valid, and that each input has the digest of its source."""
     for folder, products in (("inputs", cell.inputs), ("outputs", cell.outputs)):
         for port, product in products.items():
             place, digest = f"/{CELLS}/{cell.address}/{folder}/{port}", product.digest

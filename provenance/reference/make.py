@@ -1,10 +1,10 @@
-"""Makes the reference records: small runs of toy methods, as every later version must read them.
+"""Make the reference records: small runs of toy methods, which every later version must read.
 
     python provenance/reference/make.py embedded     # or studio, comparison
 
-The methods are those of tests/workshop. What depends on the machine and the hour (environment,
-times, run ids) is replaced by constants, so that a record made again differs only where the format
-or the digest of the unreleased code does.
+The methods are those of tests/workshop. Values that depend on the machine or the time (environment,
+times and run ids) are replaced by constants, so that a new record differs only if the format or the
+digest of the unreleased code differs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ HERE: Final = Path(__file__).resolve().parent
 MINUTE: Final = "2026-01-02T03:04:"
 
 
-# Record -> its workflow, the settings, and whether the record contains everything.
+# For each record: its workflow, the settings, and whether the record contains all products and
+# inputs.
 RECORDS: Final = {
     "studio": ("studio", ("paint.grey=131",), False),
     "comparison": ("comparison", (), False),
@@ -29,7 +30,7 @@ RECORDS: Final = {
 
 
 def make(name: str) -> Path:
-    """Run the workflow of a record and write the record beside it."""
+    """Run the workflow of a record, and write the record to the same folder."""
     from orthoflow_provenance.document import RecordedEnvironment
     from orthoflow_provenance.record import write_record
 
