@@ -1,4 +1,4 @@
-"""Hooks of the built-in plugin: kinds, product types and methods, given as import strings."""
+"""Hooks of the built-in plugin: kinds, product types, and methods as import strings."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Final
 
 from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec, ProductSpec, hookimpl
 
-# Summary of each method by module and class. The id of a method is the name of its module, with
+# Summaries of the methods, by module and class. The id of a method is the name of its module, with
 # hyphens instead of underscores.
 _METHODS: Final = {
     "read.scan:ReadScan": "a cloud from E57, LAS/LAZ, PLY, PCD, PTX or text scans",
@@ -63,7 +63,7 @@ _METHODS: Final = {
     "inspect.checkpoints:InspectCheckpoints": "compare orthoimages with surveyed points: "
     "residuals, outliers, classes",
 }
-# Ids that differ from the name of the module.
+# Ids that differ from the names of the modules.
 _IDS: Final = {
     "match.sides": "face.photos",
     "orient.bundle": "orient.colmap-bundle",
@@ -167,7 +167,7 @@ def _ports(named_as_their_products: str, **others: str) -> dict[str, str]:
 
 @hookimpl
 def orthoflow_products() -> list[ProductSpec]:
-    """Return the built-in product types with the functions that publish their files."""
+    """Return the built-in product types, with the functions that write their published files."""
     return [
         _product(
             "cloud",

@@ -21,12 +21,12 @@ from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 class ColourPhotos(Method):
     """Assign each point the colour of the photo that shows it best.
 
-    A point is visible unless a nearer point of the cloud hides it; outliers are ignored (the depth
-    buffer of `ortho.dsm-backward`). If several photos show the point, the one with the most pixels
-    per metre is used, with a lower weight near the border of a photo; the colour is interpolated
-    between four pixels. This makes it possible to create direct orthoimages
-    (`ortho.pointcloud-direct`) from the same photos as those used by the other methods, even if the
-    cloud has no colours.
+    A point is visible unless a nearer point of the cloud hides it; outliers are ignored (as in the
+    depth buffer of `ortho.dsm-backward`). If several photos show a point, the photo with the most
+    pixels per metre is used, with a lower weight near the border of a photo. The colour is
+    interpolated between four pixels. With this method, direct orthoimages
+    (`ortho.pointcloud-direct`) can be computed from the same photos as those of other methods, even
+    if the cloud has no colours.
     """
 
     id: ClassVar[str] = "colour.photos"
@@ -44,7 +44,7 @@ class ColourPhotos(Method):
     )
 
     class Params(MethodParams):
-        """The colour of points that no photo sees."""
+        """Colour of the points that no photo shows."""
 
         unseen: Literal["drop", "grey"] = Field(
             "drop",
@@ -53,7 +53,7 @@ class ColourPhotos(Method):
         )
 
     class In(Ports):
-        """The cloud, the photos and their orientation."""
+        """The cloud, the photos and their orientations."""
 
         cloud: PointCloud
         photos: Photos
@@ -65,7 +65,7 @@ class ColourPhotos(Method):
         cloud: PointCloud
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Colour photo by photo, keeping the best colour of each point."""
+        """Process the photos one by one, keeping the best colour of each point."""
         inputs.cloud.require_points(2)
         oriented = {camera.photo: camera for camera in inputs.cameras.cameras}
         chosen = [

@@ -1,4 +1,4 @@
-"""`dense.sgm`: point cloud from oriented photos by semi-global matching."""
+"""`dense.sgm`: a point cloud from oriented photos by semi-global matching."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix
 from orthoflow.products import Cameras, Photo, Photos, PointCloud
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
-# Limit of the angle between base and rows. The rows of a rectified pair are parallel to its base,
-# so photos one above the other cannot be paired.
+# Maximum angle between the base and the rows of a photo. The rows of a rectified pair are parallel
+# to its base, so photos taken one above the other cannot be paired.
 _ALONG_ROWS: Final = np.cos(np.radians(30.0))
-# Minimum angle between the base and the optical axis.
+# Minimum angle between the base and the optical axes.
 _SIDEWAYS: Final = np.sin(np.radians(25.0))
 # Maximum angle between the optical axes.
 _SAME_VIEW: Final = np.cos(np.radians(30.0))
-# Parallax as a share of the photo width. Image blocks are usually flown with 70 % overlap; with
-# less than 50 %, photos look too different, and with a very short base, depths are inaccurate.
+# Best parallax, as a share of the photo width. Image blocks usually have 70 % overlap. With less
+# than 50 %, photos look too different to be matched, and with a very short base, depths are
+# inaccurate.
 _BEST_PARALLAX: Final = 0.3
 _LEAST_PARALLAX: Final = 0.05
 _MOST_PARALLAX: Final = 0.5
@@ -34,7 +35,7 @@ _LARGE_STEP: Final = 32 * 3 * _BLOCK_PX**2
 
 
 class _View(NamedTuple):
-    """An oriented photo."""
+    """A photo and its camera."""
 
     photo: Photo
     camera: ViewingCamera
@@ -43,11 +44,12 @@ class _View(NamedTuple):
 class DenseSgm(Method):
     """Compute surface points from pairs of neighbouring oriented photos (OpenCV's SGM).
 
-    Each photo is paired with the photo to its right that has a similar viewing direction and an
-    overlap closest to 70 %. The base must be within 30 deg of the photo's rows and at least 25 deg
-    off its axis, the axes within 30 deg of each other, and the overlap 50 to 95 %. Points take the
-    colour of the left photo. Each pair becomes one scan, whose station is the projection centre of
-    the left photo. Photos one above the other are not matched.
+    Each photo is paired with the photo to its right that has a similar viewing direction and whose
+    overlap is closest to 70 %. The angle between the base and the photo's rows must be at most 30
+    degrees, that between the base and the optical axis at least 25 degrees, that between the two
+    optical axes at most 30 degrees, and the overlap 50 to 95 %. Points get the colour of the left
+    photo. The points of each pair are one scan, whose station is the projection centre of the left
+    photo. Photos taken one above the other are not matched.
     """
 
     id: ClassVar[str] = "dense.sgm"
@@ -89,18 +91,18 @@ class DenseSgm(Method):
             return self
 
     class In(Ports):
-        """The photos and their orientation."""
+        """The photos and their orientations."""
 
         photos: Photos
         cameras: Cameras
 
     class Out(Ports):
-        """The points of all pairs."""
+        """The points from all pairs."""
 
         cloud: PointCloud
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Choose pairs, match each, and join their points."""
+        """Choose pairs of photos, match each pair, and join the points."""
         views = _oriented(inputs)
         distance_m = float(np.sqrt(params.nearest_m * params.farthest_m))
         neighbours = [(left, _right_of(left, views, distance_m)) for left in views]
@@ -159,13 +161,13 @@ def _oriented(inputs: DenseSgm.In) -> list[_View]:
 
 
 def _right_of(left: _View, views: list[_View], distance_m: float) -> _View | None:
-    """Return the photo to the right with the best overlap for matching, or None."""
+    """Return the photo to the right with the best overlap for matching; None if there is none."""
     lens, axes = left.camera, left.camera.rotation
     found: list[tuple[float, int]] = []
     for place, other in enumerate(views):
         base = axes @ (other.camera.centre_world - lens.centre_world)
         sideways = float(np.hypot(base[0], base[1]))
-        # Displacement of a surface between the two photos, relative to the photo width.
+        # Displacement of the surface between the two photos, as a share of the photo width.
         parallax = lens.fx * sideways / distance_m / lens.width
         if (
             _LEAST_PARALLAX <= parallax <= _MOST_PARALLAX
@@ -181,7 +183,7 @@ def _right_of(left: _View, views: list[_View], distance_m: float) -> _View | Non
 def _matched(
     left: _View, right: _View, params: DenseSgm.Params
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], int]:
-    """Match a pair.
+    """Match a pair of photos.
 
     Returns:
         Points (n, 3) in world coordinates, their colours (n, 3), and the number of pixels tried.
@@ -206,7 +208,8 @@ def _matched(
     ]
     reach = abs(p2[0, 3])
     most, least = (int(reach / distance) for distance in (params.nearest_m, params.farthest_m))
-    # OpenCV requires a multiple of 16; it must be small enough to leave pixels to match.
+    # OpenCV requires a multiple of 16. The number must be small enough that some pixels remain to
+    # be matched.
     n_disparities = 16 * min(-(-(most - least) // 16), (size[0] - least - _BLOCK_PX) // 16 - 1)
     if n_disparities < 16:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8), size[0] * size[1]

@@ -15,20 +15,21 @@ from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, Poin
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 _AT_ONCE: Final = 1 << 20
-# Points are considered mirrored if their mirror image fits this many times better.
+# Points are considered mirrored if the residuals of their mirror image are smaller by this factor.
 _MIRRORED_TIMES: Final = 10.0
-# Points count as collinear if their second-largest spread is less than this share of the largest.
+# Points are considered collinear if the second-largest of their principal spreads is below this
+# share of the largest.
 _LINE_SHARE: Final = 1e-6
 
 
 class RegisterSimilarity(Method):
     """Fit translation, rotation and scale to pairs of points, and transform the cloud.
 
-    This is the seven-parameter transformation of skarlatos2012. `points` are positions in the
-    cloud's coordinates, and `control` are the surveyed positions; points with the same name form a
-    pair. All pairs have the same weight. `sigma0_mm` is the standard deviation of one coordinate;
-    `left_out_rms_mm` is computed from the distance between each control point and its position
-    predicted from the other pairs, so no pair influences its own distance. The transformed cloud
+    This is the seven-parameter transformation of skarlatos2012. `points` contains positions in the
+    coordinates of the cloud, and `control` contains the surveyed positions. Points with the same
+    name form a pair, and all pairs have the same weight. `sigma0_mm` is the standard deviation of a
+    coordinate. `left_out_rms_mm` is the RMS distance between each control point and its position
+    predicted from the other pairs, so that no pair affects its own distance. The transformed cloud
     has the up direction of the control points.
     """
 
@@ -54,7 +55,7 @@ class RegisterSimilarity(Method):
     )
 
     class Params(MethodParams):
-        """Choice of the transformation."""
+        """Parameters of the transformation."""
 
         with_scale: bool = Field(
             default=True,
@@ -78,7 +79,7 @@ class RegisterSimilarity(Method):
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Match the points by name, fit the transformation and apply it."""
+        """Pair the points by name, fit the transformation and apply it to the cloud."""
         inputs.cloud.require_points(2)
         names = [name for name in inputs.points.names if name in inputs.control.names]
         source, target = (
@@ -121,7 +122,7 @@ class Similarity:
 
     Attributes:
         scale: dimensionless, positive.
-        rotation: (3, 3) float64, det +1.
+        rotation: (3, 3) float64, determinant +1.
         translation: (3,) float64 metres.
     """
 
@@ -140,12 +141,12 @@ def fit_similarity(
     """Fit target_from_source by least squares with equal weights (Umeyama 1991).
 
     Args:
-        points_source: (n, 3) metres, n >= 3, not on one line.
-        points_target: (n, 3) metres, the same points.
+        points_source: (n, 3) metres, n >= 3, not collinear.
+        points_target: (n, 3) metres, the same points in the same order.
         with_scale: whether to fit seven parameters; otherwise, six are fitted and the scale is 1.
 
     Raises:
-        GeometryError: there are too few points, or they are on one line.
+        GeometryError: there are too few points, or they are collinear.
     """
     if len(points_source) < 3 or points_source.shape != points_target.shape:
         raise GeometryError(
@@ -177,10 +178,10 @@ def _require_same_hand(
     *,
     with_scale: bool,
 ) -> None:
-    """Refuse lists that are mirror images: their fit is poor, and the fitted scale is wrong.
+    """Check that the points are not mirrored; the fit would be poor, and the scale wrong.
 
     Raises:
-        GeometryError: the fit is far better if one of the lists is mirrored.
+        GeometryError: the fit is far better if the source points are mirrored.
     """
     if len(source) < 4:
         return
@@ -199,7 +200,7 @@ def _require_same_hand(
 def _left_out(
     source: NDArray[np.float64], target: NDArray[np.float64], *, with_scale: bool
 ) -> NDArray[np.float64]:
-    """Return distances (n,) of points from their predictions by the others; empty for 3 pairs."""
+    """Return the distances (n,) of points from the positions predicted from the others."""
     if len(source) < 4:
         return np.zeros(0)
     apart = []
@@ -251,7 +252,7 @@ def _details(
 
 
 def _moved(cloud: PointCloud, fitted: Similarity, ctx: StepContext) -> PointCloud:
-    """Return the cloud in target coordinates, with its transformed origin as the new origin."""
+    """Return the cloud in target coordinates; its origin is transformed, too."""
     origin = fitted.apply(cloud.origin[None])[0]
     turn = fitted.scale * fitted.rotation
     offsets = {

@@ -1,6 +1,7 @@
-"""Areas of a wall that are behind its face or empty, and the kind of opening of each.
+"""Areas of a wall that are behind its face or empty, and the kind of opening of each area.
 
-Empty cells are classified by lines of sight that passed through the wall or ended in front of it.
+Empty cells are classified by rays from the scanner, which passed through the wall or ended in front
+of it.
 """
 
 from __future__ import annotations
@@ -15,19 +16,19 @@ from numpy.typing import NDArray
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import OpeningKind, PointCloud, SurfaceMask, Wall
 
-# Areas connected by a narrower neck are separate.
+# Areas connected only by a strip narrower than this are separate.
 _NECK_CELLS: Final = 3
-# An area is `through` if at least this share of its cells is crossed by rays.
+# An area is `through` if rays passed through at least this share of its cells.
 _CROSSED_LEAST: Final = 0.1
-# Any other area is `no data` if at least this share of its cells is empty.
+# Otherwise, an area is `no data` if at least this share of its cells is empty.
 _EMPTY_LEAST: Final = 0.5
 # If more than this share of the measured cells is behind the plane, the plane is not the wall's
 # face.
 _FACE_LEAST: Final = 0.5
 _CELLS_TOLD: Final = 1 << 25
-# Rays are counted on tiles of about this side length, which contain many rays.
+# Approximate side length of the tiles in which rays are counted; a tile contains many rays.
 _TILE_M: Final = 0.05
-# Larger clouds are reduced to a sample of about this many points by Fibonacci hashing.
+# Larger clouds are reduced by Fibonacci hashing to a sample of about this number of points.
 _POINTS_MOST: Final = 1 << 22
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 _BLOCK: Final = 1 << 18
@@ -35,15 +36,15 @@ _BLOCK: Final = 1 << 18
 # used.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 1.5
-# Minimum number and share of rays that must pass through a tile, or end in front of it; isolated
-# distant points are gross errors.
+# Minimum number and share of the rays of a tile that must pass through it, or end in front of it,
+# because isolated distant points are gross errors.
 _RAYS_LEAST: Final = 2
 _SHARE_LEAST: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class SightLines:
-    """Results of tracing lines of sight to a wall, on tiles of its raster.
+    """Results of tracing rays to a wall, on tiles of its raster.
 
     Attributes:
         side: number of cells along the side of a tile.
@@ -59,7 +60,7 @@ class SightLines:
     def over(
         self, tiles: NDArray[np.bool_], shape: tuple[int, int], step: int
     ) -> NDArray[np.bool_]:
-        """Return tile values for the cells in every `step`-th row and column of the raster."""
+        """Return the values of tiles for the cells in every `step`-th row and column."""
         rows, columns = (np.arange(0, count, step) // self.side for count in shape)
         return tiles[np.ix_(rows, columns)]
 
@@ -72,8 +73,8 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
     assumed.
 
     Args:
-        cloud: the points.
-        slab: the wall's raster, and its extent in front of and behind its plane.
+        cloud: the points, with their stations if known.
+        slab: the raster of the wall, and its depth in front of and behind the plane.
     """
     frame = slab.frame
     side = max(1, min(round(_TILE_M / frame.gsd_m), *frame.shape))
@@ -87,7 +88,7 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
             asked = (depth_m > -_BEHIND_MOST_M) & (depth_m < _BEFORE_MOST_M)
         else:
             from_station = tiles.wall_from_world(starts)
-            # A ray from behind or parallel to the plane is not used.
+            # Do not use rays that are parallel to the plane or come from behind it.
             asked = (from_station[:, 2] > np.maximum(depth_m, 0.0)) & (from_station[:, 2] > 0.0)
             fall = np.where(asked, from_station[:, 2] - depth_m, 1.0)
             share = np.where(asked, from_station[:, 2] / fall, 0.0)[:, None]
@@ -118,8 +119,9 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
 def _rays(
     cloud: PointCloud,
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64] | None]]:
-    """Yield blocks of ray ends (n, 3), each with the ray starts (n, 3), or None if unknown."""
-    # Only stations from the file are used; a viewpoint set by the user may be wrong for some scans.
+    """Yield the ends (n, 3) of rays in blocks, with the starts (n, 3), or None if unknown."""
+    # Use only stations from the file, because a viewpoint set by the user may be wrong for some
+    # scans.
     stations = cloud.stations if cloud.stations_source == "file" else None
     scan = cloud.scan
     every = -(-len(cloud) // _POINTS_MOST)
@@ -138,17 +140,18 @@ def _rays(
 
 @dataclass(frozen=True, kw_only=True)
 class Relief:
-    """The class of each cell of a wall, or of the cells in every nth row and column.
+    """Classes of the cells of a wall, or of only the cells in every nth row and column.
 
     Attributes:
         gsd_m: side length of these cells.
-        step: number of wall cells along the side of one of these cells.
-        is_face: (rows, cols) bool, measured and not behind the wall's face.
-        is_open: (rows, cols) bool, behind the face or empty, and not hidden.
-        is_empty: (rows, cols) bool, depth unknown.
-        is_crossed: (rows, cols) bool, True where rays passed through.
-        depth_m: (rows, cols) float32 depth in front of the plane; NaN where empty.
-        face_m: depth of the wall's face; 0 if the face is in the plane.
+        step: number of cells of the wall along the side of one of these cells.
+        is_face: (rows, cols) bool, True for measured cells that are not behind the wall's face.
+        is_open: (rows, cols) bool, True for cells that are behind the face or empty, and not
+            hidden.
+        is_empty: (rows, cols) bool, True for cells without a depth.
+        is_crossed: (rows, cols) bool, True where rays passed through the wall.
+        depth_m: (rows, cols) float32 depth in front of the plane in metres; NaN where empty.
+        face_m: depth of the wall's face in metres; 0 if the face is on the plane.
     """
 
     gsd_m: float
@@ -166,8 +169,9 @@ class Area:
     """An opening as a set of cells.
 
     Attributes:
-        corner: row and column of the first cell of `cells` in the relief.
-        cells: (rows, cols) bool, True in the opening, without holes and with a margin.
+        corner: row and column, in the relief, of the first cell of `cells`.
+        cells: (rows, cols) bool, True inside the opening; without holes, and with a margin around
+            the opening.
         kind: kind of the opening.
         depth_m: distance from the wall's face to the back of the opening; None if not measured.
     """
@@ -182,8 +186,8 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
     """Classify cells as face, open or hidden.
 
     Args:
-        wall: the wall; if it has more than 32 million cells, only every nth row and column is used.
-        lines: the traced lines of sight; if None, no cell counts as hidden.
+        wall: the wall. If it has more than 32 million cells, only every nth row and column is used.
+        lines: results of tracing rays; if None, no cell is considered hidden.
         behind_m: cells at least this far behind the wall's face do not belong to it.
     """
     import cv2
@@ -197,8 +201,8 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
     if lines is not None:
         is_crossed = lines.over(lines.crossed, wall.frame.shape, step) & is_empty
         is_hidden = lines.over(lines.stopped, wall.frame.shape, step) & is_empty
-    # A detected plane may be at the fronts of pilasters, or between the fronts and the wall. In
-    # this case, the face is the median of the cells behind the plane.
+    # A detected plane may be at the front of pilasters, or between this front and the wall. The
+    # face is then the median depth of the cells behind the plane.
     measured_m = depth_m[~is_empty]
     deeper_m = measured_m[measured_m <= -behind_m]
     is_deeper = len(deeper_m) > _FACE_LEAST * len(measured_m)
@@ -220,14 +224,14 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
 
 
 def open_areas(relief: Relief, width_least_m: float, area_least_m2: float) -> Iterator[Area]:
-    """Yield areas of sufficient size that contain a square of a given width, largest first."""
+    """Yield areas that are large enough and contain a square of a given width, largest first."""
     import cv2
 
     neck = cv2.getStructuringElement(cv2.MORPH_RECT, (_NECK_CELLS, _NECK_CELLS))
     cells = cv2.morphologyEx(relief.is_open.astype(np.uint8), cv2.MORPH_OPEN, neck)
     wide = max(1, round(width_least_m / relief.gsd_m))
     square = cv2.getStructuringElement(cv2.MORPH_RECT, (wide, wide))
-    # Cells outside the raster must not enlarge an area.
+    # Cells outside the raster must not enlarge areas.
     cores = cv2.erode(cells, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     n_areas, labels, boxes, _ = cv2.connectedComponentsWithStats(cells, connectivity=4)
     is_wide = np.zeros(n_areas, dtype=np.bool_)
@@ -244,7 +248,7 @@ def open_areas(relief: Relief, width_least_m: float, area_least_m2: float) -> It
             kind = "through"
         elif np.count_nonzero(relief.is_empty[part] & own) >= _EMPTY_LEAST * sizes[label]:
             kind = "no data"
-        # Bars and panes inside the opening are included.
+        # Include bars and panes inside the opening.
         outside = np.pad(own, 1).astype(np.uint8)
         cv2.floodFill(outside, None, (0, 0), 2)
         known = relief.depth_m[part][own & ~relief.is_empty[part]]

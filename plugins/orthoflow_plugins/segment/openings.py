@@ -1,4 +1,4 @@
-"""`segment.openings`: find windows, doors and niches of walls as outlines."""
+"""`segment.openings`: outlines of the windows, doors and niches of walls."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from orthoflow.sdk import (
 from orthoflow_plugins.segment.areas import Area, Relief, open_areas, relief_of, sight_lines
 from orthoflow_plugins.segment.outlines import Outline, moved_to_edges, outline_of
 
-# Planes inclined by more than this from the vertical are floors, ceilings and slopes.
+# Planes whose tilt from the vertical exceeds this angle are floors, ceilings and slopes.
 _UPRIGHT: Final = math.sin(math.radians(30.0))
-# A surface farther behind the plane is not the face of the same wall.
+# A surface farther behind the plane than this is not the face of the same wall.
 _FACE_FARTHEST_M: Final = 0.3
-# An empty area must fill at least this share of its bounding rectangle; round windows fill more,
-# and scan shadows less.
+# An empty area must fill at least this share of its bounding rectangle. Round windows fill a larger
+# share, and scan shadows a smaller one.
 _FILLED_LEAST: Final = 0.7
-# If the wall was measured along less than this share of an outline, the area is at the border of
-# the scan and not an opening.
+# If the wall was measured along less than this share of an outline, the area is not an opening, but
+# at the border of the scan.
 _SEEN_LEAST_SHARE: Final = 0.5
 _LONGEST_PX: Final = 1004
 _SMALLEST_PX: Final = 500
@@ -88,17 +88,17 @@ class SegmentOpenings(Method):
 
     Connected cells that are behind the face of a wall or empty form an opening if they contain a
     square of a given width and the face was measured along most of their border. The face is the
-    plane, or the median of the cells behind it if these are more than half of the wall. If a cloud
-    is given, lines of sight are traced. An area that some of them pass through is `through`; an
-    area in front of which they end is hidden and is not reported as an opening. An empty area
-    without lines of sight is `no data` if it is about as compact as a round window; usually, this
-    is glass or a mirror. An area with a measured back is a `niche`; this includes closed doors and
+    plane of the wall, or the median depth of the cells behind it if these are more than half of the
+    wall. If a cloud is given, the rays of the scanner are traced: an area through which some rays
+    pass is `through`, and an area in front of which rays end is hidden and not reported. An empty
+    area without rays is `no data` if it is at least about as compact as a round window; usually, it
+    is glass or a mirror. An area whose back was measured is a `niche`, and so are closed doors and
     windows that are set back.
 
-    Sides are lines fitted to the borders of the cells. The standard deviation of each side follows
-    from the cell size, the point spacing and the scatter of the border. With orthoimages from
-    photos, long sides are moved to the corresponding edge in the orthoimage if this edge is
-    unambiguous and more accurate than the scan.
+    Sides are lines fitted to the borders of the cells. The standard deviation of a side is computed
+    from the cell size, the point spacing and the scatter of the border. If orthoimages from photos
+    are given, a long side is moved to the corresponding edge in the orthoimage, provided that this
+    edge is unambiguous and more accurate than the scan.
     """
 
     id: ClassVar[str] = "segment.openings"
@@ -140,7 +140,7 @@ class SegmentOpenings(Method):
         level: bool = Field(default=False, description="Also search floors, ceilings and slopes.")
 
     class In(Ports):
-        """Walls, a cloud to detect hidden areas, and orthoimages to refine sides."""
+        """Walls; optionally, a cloud to detect hidden areas, and orthoimages to refine sides."""
 
         walls: Walls
         cloud: PointCloud | None = None
@@ -187,7 +187,7 @@ class SegmentOpenings(Method):
 def _found_on(
     inputs: SegmentOpenings.In, place: int, params: SegmentOpenings.Params, ctx: StepContext
 ) -> tuple[list[Opening], int]:
-    """Return a wall's openings, and the number of areas rejected due to their border or shape."""
+    """Return the openings of a wall, and the number of areas rejected for their border or shape."""
     wall, slab = inputs.walls.walls[place], inputs.walls.slab(place)
     lines = None if inputs.cloud is None else sight_lines(inputs.cloud, slab)
     relief = relief_of(wall, lines, params.behind_m)
@@ -238,8 +238,8 @@ def _opening(
     wall: Wall, relief: Relief, area: Area, outline: Outline, by_image: NDArray[np.bool_]
 ) -> Opening:
     frame = wall.frame
-    # Convert coordinates in the reduced grid (every nth cell, starting with the first) to the full
-    # grid.
+    # Convert coordinates in the reduced grid (every nth cell, beginning with the first) to those in
+    # the full grid.
     cells = np.clip(relief.step * (outline.corners - 0.5) + 0.5, 0.0, [frame.width, frame.height])
     places = frame.raster_from_wall(cells)
     spans_m = frame.gsd_m * (cells.max(axis=0) - cells.min(axis=0))
@@ -265,9 +265,9 @@ def _opening(
 def _grey(
     images: Orthoimages | None, wall: Wall, relief: Relief, ctx: StepContext
 ) -> NDArray[np.float32] | None:
-    """Return grey values (rows, cols), 0..255, of the wall's orthoimage in the relief's cells.
+    """Return grey values (rows, cols), 0..255, of a wall's orthoimage in the relief's cells.
 
-    The result is None if there is no suitable orthoimage; cells without colour are NaN.
+    Cells without colour are NaN. The result is None if there is no suitable orthoimage.
     """
     known = () if images is None else images.images
     image = next((each for each in known if each.number == wall.plane_index), None)
@@ -311,11 +311,11 @@ def outline_map(
     grey: NDArray[np.float32],
     outlines: Sequence[tuple[OpeningKind, NDArray[np.float64]]],
 ) -> bytes:
-    """Draw numbered outlines over a pale picture of the wall.
+    """Draw numbered outlines over a pale image of the wall.
 
     Args:
         grey: (rows, cols) grey values 0..1, NaN where unknown.
-        outlines: kind and corners (n, 2) = (column, row) of each outline.
+        outlines: kind and corners of each outline; corners are (n, 2) = (column, row).
     """
     import cv2
 

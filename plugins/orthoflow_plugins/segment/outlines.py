@@ -1,4 +1,4 @@
-"""Straight-sided outlines of cell areas, aligned to orthoimage edges, with their accuracy."""
+"""Polygonal outlines of areas of cells, their accuracy, and alignment with image edges."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ from orthoflow.geometry.frames import signed_area
 from orthoflow.geometry.robust import median_deviation
 from orthoflow_plugins.segment.areas import Area, Relief
 
-# Corners closer than this to the line between their neighbours are due to the grid and noise.
+# Corners closer than this to the line between neighbouring corners are caused by the grid and
+# noise.
 _STRAIGHT_CELLS: Final = 2.0
-# After lines have been fitted, two sides are joined if their corner deviates by no more than this.
+# After lines have been fitted, two sides are joined if the corner between them deviates by at most
+# this from a straight line.
 _JOINED_CELLS: Final = 1.0
-# Lines are fitted only to sides longer than this, and no corner is moved farther than this.
+# Lines are fitted only to sides longer than this, and no corner is moved by more than this.
 _FITTED_CELLS: Final = 8.0
-# Sides that meet at a smaller angle are not intersected; their corner is kept.
+# Sides that meet at a smaller angle than this are not intersected; the corner between them is kept.
 _TURN_LEAST: Final = math.sin(math.radians(15.0))
-# Length at each end of a side that belongs to the corner.
+# Length at each end of a side that is part of the corner and not used in the fit.
 _ENDS_CELLS: Final = 3.0
-# Rejection limit for cells, as a multiple of the median deviation.
+# Limit for the rejection of cells, as a multiple of the median deviation.
 _FAR_CELLS: Final = 3.0
-# Distances outside a side at which the wall's face is searched for.
+# Distances from a side, outwards, at which the wall's face is searched for.
 _BESIDE_CELLS: Final = (2.0, 3.0, 4.0)
-# A side counts as measured if the face was found along at least this share of it.
+# A side is considered measured if the face was found along at least this share of it.
 _BESIDE_LEAST: Final = 0.5
-# Standard deviation of a position that is uniformly distributed in an interval of length 1.
+# Standard deviation of a uniform distribution in an interval of length 1.
 _UNIFORM: Final = 1.0 / math.sqrt(12.0)
-# A cell crossed by a border may be on either side, so the border is uncertain by two cells.
+# A cell that the border crosses may be on either side of it, so the border is uncertain by two
+# cells.
 _BORDER_CELLS: Final = 2.0
 
 # --- edges in the image ---
@@ -47,32 +50,33 @@ _STEP_CELLS: Final = 0.25
 _PIECES: Final = 5
 # Minimum number of pieces in which the edge must be found.
 _PIECES_LEAST: Final = 4
-# Minimum slope of an edge in grey levels per cell, since weaker edges are stains.
+# Minimum slope of an edge in grey levels per cell; weaker edges are stains.
 _CONTRAST_LEAST_GREY: Final = 4.0
-# Minimum ratio of the slope to the median slope.
+# Minimum ratio of the slope of an edge to the median slope.
 _CONTRAST_LEAST: Final = 3.0
-# Slopes of at least this share of the steepest slope belong to an edge.
+# Slopes that are at least this share of the steepest slope belong to the edge.
 _EDGE_SHARE: Final = 0.2
-# Minimum standard deviation of an edge. The orthoimage was made with the same depths, so their
-# errors also affect its edges.
+# Minimum standard deviation of an edge. Errors of the depths also affect edges in the orthoimage,
+# because it was computed with these depths.
 _SIGMA_LEAST_CELLS: Final = 0.5
-# If an edge in the orthoimage is more than this many sigmas of the depth edge away from it, the two
-# edges are different.
+# An edge in the orthoimage differs from the edge in depth if the distance between the two exceeds
+# this number of standard deviations of the latter.
 _APART_SIGMAS: Final = 1.5
-# The choice is ambiguous if another edge in the profile exceeds this share of the steepest slope.
+# The edge is ambiguous if the slope of another edge in the profile exceeds this share of the
+# steepest slope.
 _SECOND_MOST: Final = 0.6
 _PARALLEL: Final = 0.26
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """An outline in cells of the relief.
+    """An outline, in cells of the relief.
 
     Attributes:
-        corners: (n, 2) column and row, centre of the first cell at (0.5, 0.5), counter-clockwise
-            as seen by the viewer.
-        sigma: (n,) standard deviation in cells perpendicular to each side; side i begins at corner
-            i.
+        corners: (n, 2) column and row, counter-clockwise for the viewer; the centre of the first
+            cell is at (0.5, 0.5).
+        sigma: (n,) standard deviation of each side in the perpendicular direction, in cells; side i
+            begins at corner i.
         seen_share: (n,) share of each side along which the wall's face was measured.
     """
 
@@ -82,13 +86,13 @@ class Outline:
 
     @property
     def lengths(self) -> NDArray[np.float64]:
-        """Length (n,) of each side in cells."""
+        """Lengths (n,) of the sides in cells."""
         ways = np.roll(self.corners, -1, axis=0) - self.corners
         return np.asarray(np.hypot(ways[:, 0], ways[:, 1]))
 
     @property
     def is_seen(self) -> NDArray[np.bool_]:
-        """Mask (n,) of sides along which the wall was measured."""
+        """Mask (n,) of the sides along which the wall was measured."""
         return self.seen_share >= _BESIDE_LEAST
 
     @property
@@ -103,7 +107,8 @@ def outline_of(area: Area, relief: Relief, spacing_m: float) -> Outline | None:
     Args:
         area: the area.
         relief: the relief in which it was found.
-        spacing_m: point spacing of the scan; the border may be anywhere between two points.
+        spacing_m: point spacing of the scan, in metres; the border may be anywhere between two
+            points.
     """
     ring = _ring(area.cells)
     kept = _corner_places(ring)
@@ -123,7 +128,7 @@ def outline_of(area: Area, relief: Relief, spacing_m: float) -> Outline | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Side:
-    """A part of a ring, given by the indices of its ends, and the line fitted to it.
+    """A part of a ring, given by the indices of its ends, and the line fitted to the part.
 
     `middle` and `direction` are None if the part is too short to fit a line.
     """
@@ -143,7 +148,7 @@ class _Side:
 
 
 def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return midpoints (n, 2) of cell sides along the border, counter-clockwise for the viewer."""
+    """Return midpoints (n, 2) of the cell sides on the border, counter-clockwise for viewers."""
     from orthoflow.files.polygons import outlines
 
     found = outlines(cells.astype(np.int16) - 1)
@@ -155,15 +160,15 @@ def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
     along = np.concatenate([np.arange(count) + 0.5 for count in steps])
     unit = ways / steps[:, None]
     middles = np.repeat(ring, steps, axis=0) + along[:, None] * np.repeat(unit, steps, axis=0)
-    # Rows increase downwards, so a positive area is clockwise for the viewer.
+    # Row numbers increase downwards, so a positive area means clockwise for the viewer.
     return np.asarray(middles[::-1] if signed_area(middles) > 0.0 else middles, dtype=np.float64)
 
 
 def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices of the corners of a ring (Douglas and Peucker)."""
+    """Return the indices of the corners of a ring (Douglas-Peucker algorithm)."""
     import cv2
 
-    # Doubled coordinates are integers, so the corners can be looked up exactly.
+    # Doubled coordinates are integers, so the corners can be found exactly.
     doubled = np.rint(2.0 * ring).astype(np.int32)
     simple = cv2.approxPolyDP(doubled[:, None, :], 2.0 * _STRAIGHT_CELLS, closed=True)[:, 0]
     place_of = {(int(x), int(y)): place for place, (x, y) in enumerate(doubled)}
@@ -182,7 +187,7 @@ def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
-    """Drop short sides that only cut off the corner at which their neighbours meet."""
+    """Remove short sides that only cut off the corner at which the adjoining sides meet."""
     kept = list(sides)
     for side in sides:
         at = kept.index(side)
@@ -196,7 +201,7 @@ def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
 
 
 def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
-    """Fit a line to the midpoints between two corners, and reject outliers."""
+    """Fit a line to the midpoints between two corners, rejecting outliers."""
     along = ring[first : last + 1] if first <= last else np.vstack([ring[first:], ring[: last + 1]])
     begin, end = along[0], along[-1]
     length = float(np.linalg.norm(end - begin))
@@ -251,7 +256,7 @@ def _corners(sides: list[_Side]) -> NDArray[np.float64]:
 
 
 def _corner(before: _Side, after: _Side) -> NDArray[np.float64]:
-    """Return the intersection of two sides if it is close to the corner of the cells."""
+    """Return the intersection of two sides, or the original corner if it is too far away."""
     met = _meeting(before, after)
     if met is not None and np.linalg.norm(met - after.begin) <= _FITTED_CELLS:
         return met
@@ -275,7 +280,7 @@ def _meeting(first: _Side, second: _Side) -> NDArray[np.float64] | None:
 
 
 def _sigma(side: _Side, spacing: float) -> float:
-    """Return the sigma of a side, due to cell size, point spacing and the scatter of its border."""
+    """Return sigma of a side, from cell size, point spacing and the scatter of its border."""
     scatter = side.scatter
     if side.middle is not None:
         scatter /= math.sqrt(max(1.0, side.length / spacing))
@@ -283,7 +288,7 @@ def _sigma(side: _Side, spacing: float) -> float:
 
 
 def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the shares (n,) of sides along which the wall's face was measured."""
+    """Return the shares (n,) of the sides along which the wall's face was measured."""
     rows, columns = is_face.shape
     shares = np.zeros(len(corners))
     for k, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
@@ -306,10 +311,10 @@ def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> ND
 def moved_to_edges(
     outline: Outline, grey: NDArray[np.float32]
 ) -> tuple[Outline, NDArray[np.bool_]]:
-    """Move each long, measured side to the corresponding edge of the picture, if unambiguous.
+    """Move each long, measured side to the corresponding edge of an image, if this is unambiguous.
 
     Args:
-        outline: the outline, in cells of the picture.
+        outline: the outline; cells are pixels of the image.
         grey: (rows, cols) grey values 0..255, NaN where unknown.
 
     Returns:
@@ -333,7 +338,7 @@ def moved_to_edges(
 def _edge(
     grey: NDArray[np.float32], begin: NDArray[np.float64], end: NDArray[np.float64]
 ) -> tuple[float, float] | None:
-    """Return the outward offset of a side's edge in the picture, and its sigma, in cells."""
+    """Return the outward distance from a side to its image edge, and the sigma, in cells."""
     import cv2
 
     way = end - begin
@@ -365,14 +370,14 @@ def _edge(
             found.append(_STEP_CELLS * _middle(slopes, top))
     if len(found) < _PIECES_LEAST:
         return None
-    # A slope is at the middle of the cell over which it is computed.
+    # The position of a slope is the middle of the cell over which it is computed.
     place = float(np.median(found)) - _REACH_CELLS + 0.5
     spread = float(np.std(found, ddof=1)) / np.sqrt(len(found))
     return place, float(np.hypot(_SIGMA_LEAST_CELLS, spread))
 
 
 def _slopes(profiles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the changes of the mean profile over one cell, at the middle of the cell."""
+    """Return the changes of the mean profile over one cell, valid at the middle of the cell."""
     mean = profiles.mean(axis=0)
     apart = round(1.0 / _STEP_CELLS)
     slopes: NDArray[np.float64] = mean[apart:] - mean[:-apart]
@@ -380,7 +385,7 @@ def _slopes(profiles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _middle(slopes: NDArray[np.float64], top: int) -> float:
-    """Return the position of an edge, the centroid of its slopes."""
+    """Return the position of an edge: the centroid of its slopes."""
     is_low = slopes < _EDGE_SHARE * slopes[top]
     before = np.flatnonzero(is_low[:top])
     behind = np.flatnonzero(is_low[top:])
@@ -391,7 +396,7 @@ def _middle(slopes: NDArray[np.float64], top: int) -> float:
 
 
 def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners after each side has been moved outwards."""
+    """Return the corners after moving each side outwards."""
     ways = np.roll(corners, -1, axis=0) - corners
     along = ways / np.linalg.norm(ways, axis=1, keepdims=True)
     outwards = np.column_stack([-along[:, 1], along[:, 0]])
@@ -399,7 +404,7 @@ def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArr
     for corner in range(len(corners)):
         pair = [corner - 1, corner]
         rows = outwards[pair]
-        # A corner between nearly parallel sides is moved by the mean of their shifts.
+        # Move a corner between nearly parallel sides by the mean of their displacements.
         if abs(float(np.linalg.det(rows))) < _PARALLEL:
             moved[corner] += (shifts[pair] @ rows) / 2.0
         else:
