@@ -287,7 +287,6 @@ def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float
 def _findings_in_space(
     points: Sequence[ShownPoint], surveyed: CheckPoints, found: Sequence[int]
 ) -> list[Finding]:
-    """Compute errors of the targets that were located in space."""
     apart = np.array(
         [
             np.linalg.norm(point.point_world - surveyed.points_world[k])

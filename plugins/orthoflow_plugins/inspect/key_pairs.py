@@ -127,7 +127,6 @@ def _pairs_of_tile(
 
 
 def _n_most(shape: tuple[int, int]) -> int:
-    """Return the maximum number of key points in an image."""
     return int(np.clip(math.prod(shape) // _CELLS_PER_POINT, _POINTS_LEAST, _POINTS_MOST))
 
 

@@ -206,11 +206,9 @@ class _PlaneDistance:
     offset_m: float
 
     def is_within(self, angle_deg: float, offset_m: float) -> bool:
-        """Return whether both differences are within the limits."""
         return self.angle_deg <= angle_deg and abs(self.offset_m) <= offset_m
 
     def numbers(self, suffix: str = "") -> list[Number]:
-        """Return metrics of the plane."""
         return [
             (f"plane_angle_deg{suffix}", self.angle_deg, "deg"),
             (f"plane_offset_mm{suffix}", 1e3 * self.offset_m, "mm"),
@@ -218,7 +216,6 @@ class _PlaneDistance:
 
     @property
     def score(self) -> float:
-        """Return the sum of angle and offset, each divided by its limit."""
         return self.angle_deg / _FOUND_ANGLE_DEG + abs(self.offset_m) / _FOUND_OFFSET_M
 
 
@@ -237,7 +234,6 @@ def _distances(found: Planes, true: Planes, index: int) -> list[_PlaneDistance]:
 def _nearest(
     distances: Iterable[_PlaneDistance], *, angle_deg: float, offset_m: float
 ) -> _PlaneDistance | None:
-    """Return the smallest difference that is within the limits, or None."""
     near = (distance for distance in distances if distance.is_within(angle_deg, offset_m))
     return min(near, key=lambda distance: distance.score, default=None)
 

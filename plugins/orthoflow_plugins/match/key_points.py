@@ -332,8 +332,6 @@ def rematched(
 
 @dataclass(frozen=True, kw_only=True)
 class _Seeker:
-    """Matches one photo with walls at several scales."""
-
     grey: NDArray[np.uint8]
     params: PairingParams
 
@@ -368,7 +366,6 @@ class _Seeker:
     def pairs(
         self, features: Features, scale: float, walls: Sequence[Features | None]
     ) -> PhotoPairs:
-        """Match key points found at `scale` with the walls that are not None."""
         radius_px = _LOOSE_SHARE * math.hypot(*self.grey.shape)
         pairs = []
         for index, wall in enumerate(walls):

@@ -188,7 +188,9 @@ def _judged(found: Sequence[Placed]) -> list[Placed]:
 def _camera_at(
     place: Place, structure: WallStructure, lens: ViewingCamera, quarters: int
 ) -> ViewingCamera | None:
-    """Compute the pose from the positions of the parts of a photo, starting perpendicular.
+    """Compute the pose of a photo from the positions of its parts on the wall.
+
+    The initial pose is perpendicular to the wall.
 
     Args:
         place: position of the photo rotated by `np.rot90`.
@@ -286,7 +288,6 @@ def _tied(
 
 
 def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
-    """Measure displacements of patches in the part of a wall that a photo shows."""
     border = radius + HALF_PATCH_CELLS + 2
 
     def framed(channels: Channels) -> Channels:

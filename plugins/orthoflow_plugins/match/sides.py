@@ -187,7 +187,6 @@ class FaceByPhotos(Method):
 
 
 def _is_decided(front: int, behind: int) -> bool:
-    """Return whether the numbers of inliers determine the side of a plane."""
     least = max(_MIN_AGREEING, _MIN_MARGIN_RATIO * min(front, behind))
     return max(front, behind) >= least
 

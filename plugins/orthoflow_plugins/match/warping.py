@@ -190,7 +190,6 @@ def _hidden(
 def _bared(
     projections: Sequence[Projection | None], hidden: Sequence[NDArray[np.bool_]]
 ) -> Sequence[Projection | None]:
-    """Set hidden cells to NaN in the projections."""
     for projection, mask in zip(projections, hidden, strict=bool(hidden)):
         if projection is not None:
             projection.hide(mask[projection.part])

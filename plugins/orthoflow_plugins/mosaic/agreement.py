@@ -78,7 +78,7 @@ def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overl
 
 
 def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, int, int, int]]:
-    """Return the first row and column of a patch with two layers that show it, for all pairs."""
+    """Return (row, column, layer, layer) for each pair of layers that show a whole patch."""
     n_rows, n_columns = (side // PATCH_CELLS for side in layers[0].frame.shape)
     if len(layers) < 2 or not n_rows or not n_columns:
         return []

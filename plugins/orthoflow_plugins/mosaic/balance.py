@@ -169,7 +169,6 @@ def _radii(
     blocks: Blocks,
     lights: Sequence[BlockLight],
 ) -> list[Radii | None]:
-    """Return the distances between the blocks of each layer and the centre of its photo."""
     lenses: dict[tuple[int, int, int], int] = {}
     found: list[Radii | None] = []
     down, right = blocks.centres()
@@ -520,7 +519,7 @@ def _solved(
     priors: NDArray[np.float64],
     overlaps: Sequence[_Overlap],
 ) -> NDArray[np.float64]:
-    """Solve a robust least-squares problem with zero-mean priors for unknowns (unknowns, channels).
+    """Solve for unknowns (unknowns, channels) by robust least squares with zero-mean priors.
 
     Cauchy weights are used, scaled by the scatter of the residuals of each pair of layers.
     """

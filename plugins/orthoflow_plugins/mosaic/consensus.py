@@ -295,7 +295,6 @@ def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64
 
 
 def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the weighted mean (r, c, 3) of the used values around each block."""
     import cv2
 
     weights = cv2.GaussianBlur(is_used.astype(np.float64), (0, 0), _SMOOTH_BLOCKS)
@@ -330,7 +329,6 @@ def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _any_left(
     painted: Sequence[NDArray[np.bool_]], is_out: Sequence[NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Return a mask of the cells that at least one layer shows and is not excluded from."""
     left = [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
     return np.asarray(np.logical_or.reduce(left), dtype=np.bool_)
 

@@ -127,7 +127,7 @@ def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
 
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
-    """Reassign cells to the layer `alpha` where a minimum cut finds this optimal."""
+    """Return the labels after the optimal expansion of one layer, found by a minimum cut."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 

@@ -355,7 +355,6 @@ unknowns, Jacobian (r, c) and residuals (r,).
 def _adjusted_points(
     block: Block, cofactors: NDArray[np.float64], soft_limit: float
 ) -> AdjustedPoints:
-    """Return the scan points with their residuals in the photos."""
     known = np.isfinite(block.points.sigma_m[block.seen.point])
     # Compare points that several photos see with the scan, too.
     at_scan = replace(block.points, now=block.points.known)

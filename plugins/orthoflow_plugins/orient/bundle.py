@@ -546,7 +546,6 @@ def _resection(
     middle: NDArray[np.float64],
     unit: float,
 ) -> Resection:
-    """Return the resection of one photo of the block."""
     columns = block.columns(at)
     own = covariance.matrix[np.ix_(columns, columns)]
     cofactors = covariance.cofactors[np.ix_(columns, columns)]

@@ -112,7 +112,6 @@ def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
 
 
 def _details(unchecked: Sequence[str]) -> dict[str, JsonValue]:
-    """List the photos whose poses were used unchecked."""
     return {"given": list(unchecked)}
 
 

@@ -500,7 +500,6 @@ def _draw_each(
     photos: Sequence[Oriented],
     pooled: dict[TieRole, NDArray[np.float64]],
 ) -> None:
-    """Draw one row per photo, with one panel per role and coordinate."""
     shown = photos[:_MAX_PHOTOS]
     figure = column_figure(len(pooled) * (0.45 + 0.22 * len(shown)))
     panels = figure.subplots(len(pooled), 2, squeeze=False, sharex=True, sharey=True)
@@ -529,7 +528,6 @@ def _draw_each(
 
 
 def _draw_row(axes: Axes, values: NDArray[np.float64], base: float, reach: float) -> None:
-    """Draw the residuals (n,) of a photo on the line `base`."""
     if len(values) < 3:
         return
     counts, edges = np.histogram(values, bins=_BARS_OF_A_PHOTO, range=(-reach, reach))

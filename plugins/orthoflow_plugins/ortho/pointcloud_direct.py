@@ -264,7 +264,6 @@ def _fill(
     *,
     threads: int,
 ) -> None:
-    """Fill the gaps of a band, and copy the band into the layer of the wall."""
     from orthoflow.geometry.interpolation import Surroundings
 
     width = layer.frame.width

@@ -375,7 +375,7 @@ def _highest_in_the_way(
 
     The rays from a block converge towards the camera, and none is lower than the ray from the
     lowest cell. A surface can hide the block only where this lowest ray is below the highest point
-    of the wall. The highest surface along this part of the ray gives a lower bound.
+    of the wall. The highest surface along this part of the ray gives a tighter bound.
 
     Args:
         view: the camera in the axes of the wall.

@@ -1,1 +1,1 @@
-"""Methods of the kind `read`."""
+"""Methods of the kind `read`, which read input files."""

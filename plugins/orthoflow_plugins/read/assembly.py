@@ -1,4 +1,4 @@
-"""Assembly of a cloud from the blocks of several files without copies; coordinate rounding."""
+"""Assembly of one cloud from the blocks of several files, and detection of rounded coordinates."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.read.scales import ColourScale
 
-# Coordinates rounded more coarsely than this limit the detail of an orthoimage.
+# Coordinates that are rounded more coarsely than this limit the detail of an orthoimage.
 COARSE_M: Final = 0.005
-# If offsets have a coarser resolution than this, a warning is reported.
+# A warning is reported if the resolution of offsets is coarser than this.
 FINE_M: Final = 5e-5
 _POINT_BYTES: Final = 40
 _MOST_SCANS: Final = 2**16
-# MADV_POPULATE_WRITE of Linux 5.14, for which Python has no name.
+# MADV_POPULATE_WRITE of Linux 5.14, which Python does not define.
 _POPULATE_WRITE: Final = 23
 _ROUNDING_SAMPLE: Final = 20_000
 _ROUNDING_VALUES: Final = 10
-# However coarsely coordinates are rounded, a twentieth of a scan's points cannot have the same
+# However coarsely coordinates are rounded, a twentieth of the points of a scan cannot have the same
 # position.
 _REPEATED_SAMPLE: Final = 2000
 _REPEATED_SHARE: Final = 0.05
@@ -54,12 +54,12 @@ class ScanCount:
         unit_m: metres per unit along x, y and z.
         start: index of the first point in the cloud.
         stop: index after the last point in the cloud.
-        n_read: number of points of the scan in the file.
-        left_out: number of points not in the cloud, by cause.
+        n_read: number of points that the scan has in the file.
+        left_out: number of points that are not in the cloud, by cause.
         n_without_rgb: number of points in the cloud without a valid colour.
-        rounding_m: step in metres to which coordinates are rounded; 0 if it is small.
+        rounding_m: step in metres to which coordinates are rounded; 0 if the step is small.
         colours: scale of the colours; None if there are no colours.
-        first_far_m: first point that is too far away; empty if there is none.
+        first_far_m: first point that is too far from the origin; empty if there is none.
         repeated_m: position shared by so many points that they cannot be laser returns, or None.
     """
 
@@ -91,7 +91,7 @@ class ScanCount:
 
 
 class CloudAssembly:
-    """Arrays of a growing cloud.
+    """Arrays of a cloud to which files are added one by one.
 
     Attributes:
         origin: (3,) whole metres near the data; set by the first points.
@@ -119,8 +119,8 @@ class CloudAssembly:
         self._ctx, self._box_m, self._unit_m = ctx, box_m, unit_m
         self._reach_m = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._capacity = sum(file.n_most for file in files)
-        # Check before writing, since a memory-mapped file on a full disk ends the process by a
-        # signal.
+        # Check the disk space before writing, since writing to a memory-mapped file on a full disk
+        # terminates the process with a signal.
         needed, free = self._capacity * _POINT_BYTES, shutil.disk_usage(ctx.scratch).free
         if free < needed:
             raise StoreError(
@@ -180,7 +180,8 @@ class CloudAssembly:
         """Check that points are left in the cloud.
 
         Raises:
-            InputError: all points belong to other classes or are outside the box.
+            InputError: all points belong to classes that were not requested, or are outside the
+                box.
         """
         if self.n_points:
             return
@@ -196,16 +197,16 @@ class CloudAssembly:
 
     @property
     def offsets(self) -> list[NDArray[Any]]:
-        """Return x, y and z relative to the origin, truncated to the actual number of points."""
+        """Return x, y and z relative to the origin, truncated to the current number of points."""
         return [self._arrays[name][: self.n_points] for name in "xyz"]
 
     def array(self, name: str) -> NDArray[Any] | None:
-        """Return another array, truncated to the number of points; None if no file has it."""
+        """Return another array, truncated to the number of points; None if no file contains it."""
         array = self._arrays.get(name)
         return None if array is None else array[: self.n_points]
 
     def colour_mask(self) -> NDArray[Any]:
-        """Return the mask of valid colours, truncated to the actual number of points."""
+        """Return the mask of valid colours, truncated to the current number of points."""
         if "has_rgb" not in self._arrays:
             self._arrays["has_rgb"] = self._new("has_rgb", np.bool_)
             self._arrays["has_rgb"][: self.n_points] = True
@@ -229,10 +230,11 @@ class CloudAssembly:
         if part.stop > self._capacity:
             raise InputError(f"{count.file} contains more points than its header declares")
         if scan > 0 and "scan" not in self._arrays:
-            # Zeros are correct for all previous points.
+            # All previous points belong to scan 0.
             self._arrays["scan"] = self._new("scan", np.uint16)
         if self.n_points == 0:
-            # Use the median, so that distant stray points do not reduce the precision of the scan.
+            # Distant stray points have no effect on the median, so they do not reduce the precision
+            # of the scan.
             self.origin = np.floor(np.median(usable, axis=0))
         self._store(usable, block, kept, part)
         if "scan" in self._arrays:
@@ -263,9 +265,9 @@ class CloudAssembly:
     def _kept(
         self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: ScanCount
     ) -> NDArray[np.bool_] | slice:
-        """Return a mask of the points (n, 3) to keep, or a slice for all; count the others."""
+        """Return a mask of the points (n, 3) to keep, or a slice if all are kept."""
         usable: NDArray[np.bool_] | slice = slice(None)
-        # NaN propagates through minimum and maximum, and compares as False.
+        # If a coordinate is NaN, the bounds are NaN and the comparison is False.
         if not np.all(np.abs(bounds) < FARTHEST_M) and len(points):
             usable = is_near = np.asarray((np.abs(points) < FARTHEST_M).all(axis=1))
             lost = points[~is_near]
@@ -287,7 +289,7 @@ class CloudAssembly:
         self._reach_m = np.stack(
             [np.minimum(self._reach_m[0], bounds[0]), np.maximum(self._reach_m[1], bounds[1])]
         )
-        # The faces of the box are included.
+        # Points on the faces of the box are kept.
         low, high = self._box_m
         is_inside = np.asarray(((points >= low) & (points <= high)).all(axis=1))
         if not isinstance(usable, slice):
@@ -324,12 +326,12 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
     """Return the step in metres to which coordinates (n, 3) of a block are rounded, if coarse.
 
     Args:
-        points: coordinates in the file's unit.
-        unit_m: the file's unit in metres.
+        points: coordinates in the unit of the file.
+        unit_m: unit of the file in metres.
 
     Returns:
-        The smallest over the axes of the largest step of which all values are multiples; 0 if it is
-        less than `COARSE_M` or unknown.
+        For each axis, the largest step is found of which all values are multiples. The result is
+        the smallest of the three, or 0 if it is less than `COARSE_M` or unknown.
     """
     sample = points[:: max(1, len(points) // _ROUNDING_SAMPLE)]
     found = []
@@ -342,10 +344,10 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
 
 
 def repeated_place(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return a position (3,) that more points (n, 3) share than laser returns could, or None.
+    """Return a position (3,) shared by too many points (n, 3) for laser returns, or None.
 
-    Rays without a return are written as points at 0 0 0; programs that transform a scan transform
-    these points, too.
+    Some files contain points at 0 0 0 for rays without a return. Programs that transform a scan
+    also transform these points.
     """
     sample = points[:: max(1, len(points) // _REPEATED_SAMPLE)]
     sample = sample[np.isfinite(sample).all(axis=1)]
@@ -356,12 +358,12 @@ def repeated_place(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def resolution_m(farthest_m: float) -> float:
-    """Return the distance between neighbouring float32 numbers at an offset."""
+    """Return the distance between neighbouring float32 numbers at the given offset."""
     return float(np.spacing(np.float32(farthest_m)))
 
 
 def _make_ready(array: NDArray[Any], part: slice) -> None:
-    """Request, in a single call, all pages of a memory-mapped file that will be written next.
+    """Request all pages of a memory-mapped file that will be written next in a single call.
 
     This is four times as fast as one page fault per page.
     """

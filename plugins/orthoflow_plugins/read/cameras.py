@@ -43,19 +43,19 @@ NOT_ORIENTED: Final = DiagnosticSpec(
 
 
 class ReadCameras(Method):
-    """Read poses and lenses: `cameras.json`, COLMAP, Metashape, Bundler, RealityCapture.
+    """Read poses and lenses from `cameras.json`, COLMAP, Metashape, Bundler or RealityCapture.
 
-    Poses must be in the frame of the scan; `orient.given` reports cameras that see no wall. Photos
+    Poses must be in the frame of the scan; `orient.given` reports cameras that show no wall. Photos
     are identified by their file names, with or without suffix, and by their folders if several have
-    the same name. A photo is not oriented if the files do not contain it, if it is disabled in
-    them, or if its lens differs from OpenCV's models by more than half a pixel; the reason is
-    reported. Smaller differences are reported, too.
+    the same name. A photo is not oriented if it is missing or disabled in the files, or if its lens
+    differs from OpenCV's models by more than half a pixel; the reason is reported. Smaller
+    differences of the lens are also reported.
 
-    For a run of orthoflow, give the folder with `cameras.json` and `ties.csv`: poses then keep
+    For a run of orthoflow, give the folder with `cameras.json` and `ties.csv`. The poses then keep
     their covariances and ties, from which the errors of orthoimages are predicted.
 
-    Photos with a fisheye lens must have been split into cube faces by `read.photos`, which needs
-    the lens for this; each face gets the pose of the whole photo.
+    Photos with a fisheye lens must be split into cube faces by `read.photos`, which needs the lens
+    for this. Each face gets the pose of the whole photo.
     """
 
     id = "read.cameras"
@@ -110,7 +110,7 @@ class ReadCameras(Method):
         cameras: Cameras
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read the files as described for the class."""
+        """Read all files."""
         ctx.progress(0.0, inputs.files.name)
         given = read_given_cameras(inputs.files.paths)
         photos = inputs.photos.photos
@@ -146,7 +146,7 @@ class ReadCameras(Method):
 
 
 def _ties(paths: Sequence[Path], names: Sequence[str], params: ReadCameras.Params) -> Ties | None:
-    """Return the ties next to the `cameras.json` of a run; None if there are none."""
+    """Return the ties next to the `cameras.json` of a run, or None if there are none."""
     beside = [path.with_name("ties.csv") for path in paths if path.name == _OF_RUN]
     path = next((path for path in beside if path in paths), None)
     if path is None:
@@ -198,7 +198,7 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
             "size and not rotated"
         )
     translation_m = unit_m * np.asarray(found.translation, dtype=np.float64)
-    # The comparison is negated, so that NaN is refused, too.
+    # The comparison is negated in order to reject NaN.
     if not np.abs(translation_m).max() < FARTHEST_M:
         raise InputError(
             f"photo {photo.name} was taken {np.abs(translation_m).max():.3g} m from the origin, "
@@ -221,7 +221,7 @@ class GivenByName:
     """Given cameras, by photo name."""
 
     def __init__(self, given: Sequence[GivenCamera], photos: Sequence[Photo] = ()) -> None:
-        """Index the cameras.
+        """Index the cameras by photo name.
 
         Args:
             given: the cameras.
@@ -233,11 +233,11 @@ class GivenByName:
         self._n_named = Counter(_file_name(photo.name).lower() for photo in photos)
 
     def of_photo(self, name: str, folder: str = "") -> GivenCamera | None:
-        """Return the camera of a photo, found by its name with or without suffix, or None.
+        """Return the camera of a photo by its name, with or without suffix, or None.
 
-        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye or a panorama. If
-        several cameras have the photo's name, the one whose folders match best is returned; if this
-        is ambiguous, the result contains a reason instead of a pose.
+        A photo NAME_front.png may be a cube face of NAME, which is a fisheye photo or a panorama.
+        If several cameras have the same photo name, the one whose folders match best is returned.
+        If this is ambiguous, the result contains a reason instead of a pose.
         """
         found, face = self._named(_file_name(name)), face_in(_file_name(name))
         if not found and face is not None:
@@ -250,7 +250,7 @@ class GivenByName:
         return _nearest(found, folder, is_only=is_only)
 
     def _named(self, name: str) -> list[GivenCamera]:
-        """Return the cameras with a file name or its stem, in the same letter case if possible."""
+        """Return the cameras with this file name or stem, in the same letter case if possible."""
         for wanted in (name, PurePath(name).stem):
             found = self._by_name.get(wanted.lower(), [])
             if found:
@@ -258,7 +258,7 @@ class GivenByName:
         return []
 
     def _of_stem(self, stem: str) -> list[GivenCamera]:
-        """Return the cameras of photos with this stem, whatever their suffix."""
+        """Return the cameras of photos with this stem and any suffix."""
         found = [
             camera
             for name, cameras in self._by_name.items()
@@ -273,10 +273,10 @@ def _file_name(path: str) -> str:
 
 
 def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> GivenCamera | None:
-    """Return the camera whose folders best match those of a photo, or a reason why there is none.
+    """Return the camera whose folders match those of a photo best, or why there is none.
 
     Args:
-        found: cameras with the photo's file name.
+        found: cameras with the file name of the photo.
         folder: folder of the photo.
         is_only: whether no other photo has this file name.
     """

@@ -18,14 +18,15 @@ from orthoflow_plugins.read.scan import Unit
 class ReadCheckpoints(Method):
     """Read check points: `name,x,y,z[,class]`, optionally with a position in an orthoimage.
 
-    World coordinates are those of the scan's files. The position in an orthoimage can be given in
-    three ways. `wall,u_px,v_px` are the number of the wall and the column and row in its
-    orthoimage, counted from the corner as in GIS programs, so that the centre of the first cell is
-    at (0.5, 0.5). `map_x,map_y` are the X and Y in metres that a GIS shows for the GeoTIFF:
-    positions in the plane of the wall, or easting and northing (`crs` of `raster.grid`), for which
-    `wall` is not needed. Eastings and northings remain valid for any cell size, and for images from
-    other programs. `shown_x,shown_y,shown_z` are the world coordinates in metres of the position in
-    the image, as saved from the report; they are valid for any cell size and crop of the same scan.
+    World coordinates are those of the scan files. The position in an orthoimage can be given in
+    three ways. `wall,u_px,v_px` are the number of the wall, and the column and row in its
+    orthoimage. Columns and rows are counted from the corner, as in GIS programs, so that the centre
+    of the first cell is at (0.5, 0.5). `map_x,map_y` are the X and Y in metres that a GIS shows for
+    the GeoTIFF: positions in the plane of the wall, or easting and northing (`crs` of
+    `raster.grid`). `wall` is not needed with easting and northing, which are valid for any cell
+    size and for images from other programs. `shown_x,shown_y,shown_z` are the world coordinates, in
+    metres, of the position in the image, as saved from the report. They are valid for any cell size
+    and crop of the same scan.
     """
 
     id = "read.checkpoints"
@@ -55,7 +56,7 @@ class ReadCheckpoints(Method):
         checkpoints: CheckPoints
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files as described for the class."""
+        """Read all files."""
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} has no files: expected check points")
         points: list[SurveyPoint] = []

@@ -1,4 +1,4 @@
-"""Pictures of input data: views of a cloud from above and its scanner, and contact sheets."""
+"""Images of input data: a cloud seen from above and from its scanner, and contact sheets."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ _PLAN_SAMPLE: Final = 250_000
 _POLAR_SIDE_PX: Final = 1200
 _POLAR_SAMPLE: Final = 2_000_000
 
-# Maximum number of rows, and of columns, of a scan that are drawn as lines over a wall.
+# Maximum number of rows, and of columns, of a scan that are drawn as lines on a wall.
 _LINES: Final = 24
-# Colours of these rows and of these columns.
+# Colours in which rows and columns are drawn.
 _ROW_RGB: Final = (235, 165, 20)
 _COLUMN_RGB: Final = (20, 150, 215)
 _WALL_STEP_DEG: Final = 2.0
 _WALL_FARTHEST_M: Final = 1000.0
 _WALL_CELL_M: Final = 0.05
 _WALL_REACH_M: Final = 0.15
-# Points of a line that are farther apart than this many median steps are not connected.
+# Neighbouring points of a line are not connected if their distance exceeds this many median
+# distances.
 _BREAK_STEPS: Final = 6.0
 
-# A journal column at 300 dpi, with 6-point text.
+# Width of a journal column at 300 dpi, with 6-point text.
 _SHEET_SIDE_PX: Final = 1004
 _CELL_PX: Final = 251
 _LABEL_PX: Final = 30
@@ -44,22 +45,22 @@ _INK: Final = (40, 40, 40)
 
 @in_column_style()
 def plan_chart(cloud: PointCloud) -> bytes:
-    """Return a picture of the cloud from above, with axes in metres, as WebP."""
+    """Return an image of the cloud from above, with axes in metres, as WebP."""
     grey, frame = plan_view(cloud)
     return encode_chart(picture_figure(grey, frame=frame)[0])
 
 
 def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
-    """Return the cloud from above, brighter where it is denser (logarithmic).
+    """Return the density of the cloud from above as grey levels on a logarithmic scale.
 
     Returns:
-        (rows, cols) grey, and the frame of the picture.
+        (rows, cols) grey levels, and the frame of the image.
     """
     step = max(1, len(cloud) // _PLAN_SAMPLE)
     offsets = np.column_stack([cloud.x[::step], cloud.y[::step], cloud.z[::step]])
     first, second, up = basis_from_up(cloud.up)
     plan = offsets.astype(np.float64) @ np.column_stack([first, second])
-    # Use percentiles, so that stray points do not reduce the scale.
+    # With percentiles, stray points do not reduce the scale.
     low, high = np.percentile(plan, [0.1, 99.9], axis=0)
     span = max(float((high - low).max()), 1e-6)
     size = np.maximum(np.ceil((high - low) / span * _PLAN_SIDE_PX).astype(int), 1)
@@ -69,7 +70,7 @@ def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
     counts = np.bincount(rows * size[0] + columns, minlength=int(size.prod())).astype(np.float64)
     shades = np.log1p(counts)
     grey = np.rint(255.0 * shades / max(float(shades.max()), 1.0)).astype(np.uint8)
-    # Row 0 is at the bottom of a map, but at the top of an image.
+    # Row 0 is at the bottom of a map but at the top of an image.
     gsd_m = span / _PLAN_SIDE_PX
     frame = WallFrame(
         origin_world=cloud.origin + low[0] * first + (low[1] + gsd_m * size[1]) * second,
@@ -87,8 +88,8 @@ def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
 def polar_view_png(cloud: PointCloud) -> bytes | None:
     """Return a PNG of the intensity by row and column of the scan with the most points.
 
-    This is the view in the scanner's own angles, in which straight edges are curved (Figure 2 of
-    markiewicz2015). If the station is known, the picture is oriented with up and left as seen from
+    The image is a view in scan angles, in which straight edges are curved (Figure 2 of
+    markiewicz2015). If the station is known, up and left in the image are up and left as seen from
     the station. The result is None if the cloud has no grid or no intensity.
     """
     if cloud.row is None or cloud.column is None or cloud.intensity is None or not len(cloud):
@@ -100,7 +101,7 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     row, column = (array[index].astype(np.int64) for array in (cloud.row, cloud.column))
     row, column = row - row.min(), column - column.min()
     size = np.array([row.max() + 1, column.max() + 1])
-    # Use no more pixels than sampled points.
+    # Use no more pixels than there are sampled points.
     coarser = max(float(size.max()) / _POLAR_SIDE_PX, math.sqrt(float(size.prod()) / len(index)))
     across = max(1, math.ceil(coarser))
     rows, columns = -(-size // across)
@@ -118,12 +119,12 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
 
 
 def scan_lines_png(cloud: PointCloud) -> bytes | None:
-    """Return a PNG of a wall in rectangular coordinates, with lines along rows and columns.
+    """Return a PNG of a wall in an orthogonal view, with lines along rows and columns of the scan.
 
-    The largest vertical plane of the scan with the most points is shown orthogonally, with up at
-    the top, and with all points within 15 cm of it. Some rows are drawn as yellow lines, some
-    columns as blue lines (markiewicz2015, Figure 2b); the lines bend at objects in front of the
-    wall. The result is None if the cloud has no grid.
+    The image shows the largest vertical plane of the scan with the most points, and all points
+    within 15 cm of this plane. Some rows of the scan are drawn as yellow lines and some columns as
+    blue lines, as in Figure 2b of markiewicz2015. The lines bend at objects in front of the wall.
+    The result is None if the cloud has no grid.
     """
     import cv2
 
@@ -136,7 +137,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     station = _station(cloud, scan)
     viewer = level.mean(axis=0) if station is None else basis_from_up(cloud.up) @ station
     on_wall = np.abs(level[:, :2] @ [along[1], -along[0]] - distance_m) <= _WALL_REACH_M
-    # Make `right` point to the right as seen from the scanner.
+    # `right` points to the right as seen from the scanner.
     right = along if viewer[:2] @ [along[1], -along[0]] > distance_m else -along
     places = np.column_stack([level[:, :2] @ right, -level[:, 2]])[on_wall]
     low, high = np.percentile(places, [0.1, 99.9], axis=0)
@@ -156,7 +157,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
 
 
 class ContactSheet:
-    """Thumbnails of the first hundred photos with their names; the EXIF rotation is not applied."""
+    """Thumbnails of the first hundred photos, with their names and without EXIF rotation."""
 
     def __init__(self, n_photos: int) -> None:
         self._n_photos = n_photos
@@ -166,7 +167,7 @@ class ContactSheet:
 
     @property
     def caption(self) -> str:
-        """Caption of the sheet, one sentence."""
+        """Caption of the sheet in one sentence."""
         which = "The photos" if self._n_photos <= _MOST else f"The first of {self._n_photos} photos"
         return (
             f"{which}, as they are stored: orthoimages are good where several photos show a wall "
@@ -174,7 +175,7 @@ class ContactSheet:
         )
 
     def add(self, name: str, image: NDArray[np.uint8]) -> None:
-        """Add a photo (rows, cols, 3) RGB to the sheet, if there is space."""
+        """Add a photo (rows, cols, 3) in RGB to the sheet if there is space."""
         import cv2
 
         if len(self._cells) == _MOST:
@@ -192,7 +193,7 @@ class ContactSheet:
         self._cells.append(cell)
 
     def encoded(self) -> bytes:
-        """Encode the sheet as WebP; its sides are at most 1004 pixels long."""
+        """Encode the sheet as WebP with sides of at most 1004 pixels."""
         blank = np.full_like(self._cells[0], _PAPER)
         cells = self._cells + [blank] * (-len(self._cells) % self._columns)
         starts = range(0, len(cells), self._columns)
@@ -209,7 +210,7 @@ def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:
 
 
 def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
-    """Return the station of a scan as an offset (3,); None if the files do not contain it."""
+    """Return the station of a scan as an offset (3,), or None if the files do not contain it."""
     stations = cloud.stations
     if stations is None or scan >= len(stations) or cloud.stations_source == "view_from":
         return None
@@ -218,9 +219,9 @@ def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
 
 
 def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the direction (2,) of the vertical plane with the most points, and its distance."""
+    """Return direction (2,) and distance of the vertical plane with the most points."""
     some = plan[:: max(1, len(plan) // _PLAN_SAMPLE)]
-    # Points of damaged files can be anywhere, so the size of the table of cells must be limited.
+    # Limit the size of the table of cells, since points of damaged files can be anywhere.
     is_near = np.all(np.abs(some - np.median(some, axis=0)) <= _WALL_FARTHEST_M, axis=1)
     some = some[is_near] if is_near.any() else some[:1]
     angles = np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG))
@@ -231,7 +232,7 @@ def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float
 
 
 def _fullest_cell(distances_m: NDArray[np.float64]) -> tuple[int, float]:
-    """Return the number of distances (n,) in the fullest cell, and the centre of that cell."""
+    """Return the largest number of distances (n,) in a cell, and the centre of that cell."""
     cells = np.floor(distances_m / _WALL_CELL_M).astype(np.int64)
     counts = np.bincount(cells - cells.min())
     fullest = int(counts.argmax())
@@ -239,7 +240,7 @@ def _fullest_cell(distances_m: NDArray[np.float64]) -> tuple[int, float]:
 
 
 def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Yield the indices of the points on evenly chosen lines of a scan."""
+    """Yield the point indices of evenly selected lines of a scan."""
     numbers = np.unique(lines)
     for number in numbers[:: max(1, len(numbers) // _LINES)]:
         mine = np.flatnonzero(lines == number)
@@ -247,7 +248,7 @@ def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[
 
 
 def _unbroken(pixels: NDArray[np.int64]) -> list[NDArray[np.int32]]:
-    """Split a line of points (n, 2) in pixels at its gaps."""
+    """Split a line of points (n, 2), in pixels, at its gaps."""
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
     usual = max(1.0, float(np.median(steps))) if len(steps) else 1.0
     return np.split(pixels.astype(np.int32), np.flatnonzero(steps > _BREAK_STEPS * usual) + 1)
@@ -260,7 +261,7 @@ def _ways_of_grid(
     row: NDArray[np.int64],
     column: NDArray[np.int64],
 ) -> tuple[bool, bool]:
-    """Return whether rows run upwards and columns to the left, as seen from the station."""
+    """Return whether rows run upwards, and whether columns run to the left, for the station."""
     station = _station(cloud, scan)
     if station is None:
         return True, False
@@ -268,8 +269,8 @@ def _ways_of_grid(
     rays = (offsets - station) @ basis_from_up(cloud.up).T
     elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
     upward = float(np.cov(row, elevation)[0, 1]) >= 0.0
-    # Mean directions of the columns; differences between them keep their sign where a panorama
-    # closes.
+    # Compute the mean direction of each column. Differences between these directions keep their
+    # sign at the seam of a panorama.
     east, north = (np.bincount(column, rays[:, axis]) for axis in (0, 1))
     azimuth = np.arctan2(north, east)[np.bincount(column) > 0]
     steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
@@ -277,7 +278,7 @@ def _ways_of_grid(
 
 
 def _shortened(name: str, n_letters: int) -> str:
-    """Shorten a name in the middle, since photo names differ at their ends, to ASCII for OpenCV."""
+    """Shorten a photo name in the middle, since the ends differ, and make it ASCII for OpenCV."""
     label = name.encode("ascii", "replace").decode()
     if len(label) <= n_letters:
         return label

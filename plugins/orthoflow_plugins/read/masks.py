@@ -1,4 +1,4 @@
-"""Masks of photos from files: pictures next to the photos, or polygons."""
+"""Masks of photos from files: images next to the photos, or polygons."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NO_MASKS: Final = DiagnosticSpec(
 
 
 class Masks:
-    """Mask pictures and polygons, which of them have been used, and files that are not masks."""
+    """Mask images, mask polygons, the photos whose masks have been used, and other files."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class Masks:
         """Sort mask files by type.
 
         Args:
-            beside: pictures found among the photos.
+            beside: images found next to the photos.
             given: files of the input `masks`.
 
         Raises:
@@ -79,10 +79,10 @@ class Masks:
         return cls(pictures, polygons, others)
 
     def encoded(self, photo: str, size: tuple[int, int]) -> bytes | None:
-        """Return the mask of a photo as PNG, white for usable pixels; None if all are usable.
+        """Return the mask of a photo as PNG, with usable pixels in white; None if all are usable.
 
         Raises:
-            InputError: the mask is not a picture, has another size, or covers the whole photo.
+            InputError: the mask is not an image, has a different size, or excludes the whole photo.
         """
         used: NDArray[np.bool_] | None = None
         for key in dict.fromkeys((photo, Path(photo).name, Path(photo).stem)):
@@ -102,7 +102,7 @@ class Masks:
         return encode_png(np.where(used, np.uint8(255), np.uint8(0)))
 
     def warn_of_unused(self, ctx: StepContext) -> None:
-        """Report masks without a photo, and files that are not masks."""
+        """Warn of masks without a photo, and of files that are not masks."""
         unused = [path.name for path in self._pictures.values() if path.name not in self._taken] + [
             polygon.name for polygon in self._polygons if polygon.name not in self._taken
         ]
@@ -127,7 +127,7 @@ class Masks:
 
 
 def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
-    """Return the files among photos that are masks of other photos: NAME_mask.png for NAME.jpg."""
+    """Return the files that are masks of other photos, such as NAME_mask.png for NAME.jpg."""
     stems = {path.stem for path in paths}
     return frozenset(
         path
@@ -139,5 +139,5 @@ def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
 
 
 def _key(stem: str) -> str:
-    """Return the name or stem of the photo to which a mask with this stem belongs."""
+    """Return the name or stem of the photo that a mask with this stem belongs to."""
     return stem.removesuffix(_ENDING)

@@ -1,4 +1,4 @@
-"""`read.orthoimage`: orthoimages from other programs, for comparison with orthoflow's."""
+"""`read.orthoimage`: orthoimages from other programs, for comparison with those of orthoflow."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class ReadOrthoimage(Method):
     """Read orthoimages from GeoTIFF files whose X and Y are metres in the plane of a wall.
 
     The plane is given by a JSON file with the same name (`wall.tif`, `wall.json`) among the input
-    files, with `origin_world`, `u_world`, `v_world`, `normal_world` as in the JSON files of
-    orthoflow's rasters; a copy of `wall_0_intensity.json` is sufficient. Files from orthoflow need
-    no JSON file. X and Y have the same meaning as in orthoflow's GeoTIFF files. At the origin, they
-    have the values `x_of_left_m` and `height_of_top_m` of the JSON file, or 0 if it does not
-    contain these. Thus, the size, cell size and extent of the image may differ from those of the
-    wall's raster. `wall` in the JSON file is the number of the wall: the index of its plane in
-    `planes.json`, as in file names.
+    files. It contains `origin_world`, `u_world`, `v_world` and `normal_world`, as in the JSON files
+    of rasters from orthoflow; a copy of `wall_0_intensity.json` is sufficient. GeoTIFF files from
+    orthoflow need no JSON file. X and Y have the same meaning as in GeoTIFF files from orthoflow.
+    At the origin, they have the values `x_of_left_m` and `height_of_top_m` of the JSON file, or 0
+    if these are missing. The size, cell size and extent of the image may therefore differ from
+    those of the raster of the wall. `wall` in the JSON file is the number of the wall, that is, the
+    index of its plane in `planes.json`, as in file names.
     """
 
     id: ClassVar[str] = "read.orthoimage"
@@ -58,7 +58,7 @@ class ReadOrthoimage(Method):
         )
 
     class In(Ports):
-        """The GeoTIFF files, and the JSON files with their positions."""
+        """The GeoTIFF files, and the JSON files that describe their planes."""
 
         files: InputFiles
 
@@ -68,7 +68,7 @@ class ReadOrthoimage(Method):
         orthoimages: Orthoimages
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files as described for the class."""
+        """Read all files."""
         paths = [
             path
             for path in inputs.files.paths
@@ -128,7 +128,7 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
 
 
 def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, object]:
-    """Return the content of the JSON file next to an image, or of the tag written by orthoflow."""
+    """Return the content of the JSON file next to an image, or of the tag that orthoflow wrote."""
     for other in among:
         if other.stem == path.stem and other.suffix.lower() == ".json":
             return read_sidecar(other)
@@ -143,7 +143,7 @@ def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, o
 
 
 def _rgb(path: Path, raster: RasterFile) -> Colours:
-    """Return colours (rows, cols, 3) with 8 or 16 bits; a fourth band is transparency."""
+    """Return the colours (rows, cols, 3) with 8 or 16 bits; a fourth band is transparency."""
     values = raster.values
     bands = values[..., None] if values.ndim == 2 else values
     if bands.shape[2] not in (1, 3, 4) or bands.dtype not in (np.uint8, np.uint16):

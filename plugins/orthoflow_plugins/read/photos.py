@@ -1,4 +1,4 @@
-"""`read.photos`: a folder of photos, with cameras from EXIF and a calibration."""
+"""`read.photos`: a folder of photos, with cameras from EXIF and from a calibration."""
 
 from __future__ import annotations
 
@@ -95,25 +95,26 @@ UNUSED_ENTRIES: Final = DiagnosticSpec(
 
 
 class ReadPhotos(Method):
-    """Read JPEG, PNG, TIFF, WebP and HEIC photos and those in E57 files, ordered by name.
+    """Read JPEG, PNG, TIFF, WebP and HEIC photos and photos in E57 files, ordered by name.
 
     If photos in several folders have the same file name, their names include the path within the
     input.
 
-    A panorama, from an E57 file or listed in `panoramas`, is split into six photos, the faces of a
-    cube, as PNG files without distortion. Photos that have a fisheye lens (OpenCV's model) or are
-    panoramas according to the calibration or the given cameras are split in the same way; only the
-    parts of the faces that a fisheye photo shows are used.
+    A panorama, which is contained in an E57 file or listed in `panoramas`, is split into six photos
+    without distortion, the faces of a cube, which are stored as PNG files. Photos are split in the
+    same way if they have a fisheye lens (OpenCV's model) or are panoramas according to the
+    calibration or the given cameras. Of a fisheye photo, only the parts of the faces that the photo
+    shows are used.
 
     The content of the files is kept unchanged and never re-encoded. Pixels are those of the stored
-    array, that is, the EXIF orientation is recorded but not applied. In a TIFF file with several
-    pages, the photo is the largest page that is not a preview. Every photo is decoded once, so that
-    damaged files are found here and not in a later step.
+    array; the EXIF orientation is recorded but not applied. If a TIFF file has several pages, the
+    photo is the largest page that is not a preview. Every photo is decoded once, so that damaged
+    files are found here and not in a later step.
 
     Pixels that are transparent, black in a mask, or inside polygons are used neither for ties nor
-    for colours. Masks are pictures NAME_mask.png next to NAME.jpg, or files of the input `masks`:
-    pictures with that name or the name of the photo, or GeoJSON files with polygons in pixels.
-    Masks of a panorama or a fisheye photo apply to its faces.
+    for colours. Masks are images named NAME_mask.png next to NAME.jpg, or files of the input
+    `masks`: images with that name or the name of the photo, or GeoJSON files with polygons in
+    pixels. Masks of a panorama or a fisheye photo apply to its faces.
     """
 
     id = "read.photos"
@@ -149,7 +150,7 @@ class ReadPhotos(Method):
     class In(Ports):
         """The photos, and optionally a calibration file, masks and given cameras.
 
-        Only those given cameras that have a fisheye lens or are panoramas are used here.
+        Of the given cameras, only panoramas and those with a fisheye lens are used here.
         """
 
         files: InputFiles
@@ -163,7 +164,7 @@ class ReadPhotos(Method):
         photos: Photos
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all photos as described for the class."""
+        """Read all photos."""
         ctx.progress(0.0, inputs.files.name)
         beside = beside_photos(inputs.files.paths)
         masks = Masks.of(sorted(beside), () if inputs.masks is None else inputs.masks.paths)
@@ -218,7 +219,7 @@ class _Source:
         name: name of the photo.
         content: a file, the content of a photo in an E57 file, or a cube face.
         lens: lens parameters read from the E57 file, or None.
-        whole: name of the wide photo that a cube face was cut from, or "".
+        whole: name of the panorama or fisheye photo from which a cube face was cut, or "".
         folder: folder of the file within the input.
     """
 
@@ -229,7 +230,7 @@ class _Source:
     folder: str = ""
 
     def encoded(self) -> bytes:
-        """Return the content of the photo's file."""
+        """Return the encoded content of the photo."""
         if isinstance(self.content, bytes):
             return self.content
         return _bytes_of(self.content) if isinstance(self.content, Path) else self.content.encoded()
@@ -247,7 +248,7 @@ class _Cubes:
     """Photos that are split into cube faces.
 
     Attributes:
-        panoramas: names or patterns of photos that are panoramas.
+        panoramas: names of photos that are panoramas, or patterns of such names.
         calibration: lenses by photo name, or None.
         given: cameras from other programs, or None.
         masks: masks of the photos.
@@ -259,7 +260,7 @@ class _Cubes:
     masks: Masks
 
     def sources(self, path: Path, folder: str) -> list[_Source]:
-        """Return the photo in a file or its faces, or the photos in an E57 file."""
+        """Return the photo in a file, the cube faces of the photo, or the photos in an E57 file."""
         if path.suffix.lower() == E57_SUFFIX:
             return [source for image in read_e57_images(path) for source in self._of_e57(image)]
         lens = self._lens(path.name, folder)
@@ -277,7 +278,7 @@ class _Cubes:
         return [_Source(name=image.name, content=image.content, lens=lens)]
 
     def _lens(self, name: str, folder: str) -> WideLens | None:
-        """Return the lens of a wide photo, from the given cameras or the calibration, or None."""
+        """Return the lens of a panorama or fisheye photo, or None if the photo is neither."""
         camera = None if self.given is None else self.given.of_photo(name, folder)
         if camera is not None and isinstance(camera.lens, WideLens):
             return camera.lens
@@ -290,7 +291,7 @@ class _Cubes:
         return lens if isinstance(lens, FisheyeLens) else None
 
     def _faces(self, name: str, encoded: bytes, lens: WideLens) -> list[_Source]:
-        """Return the faces of a wide photo that are not completely masked."""
+        """Return the cube faces of a photo that are not completely masked."""
         _require_whole(name, encoded)
         height, width = decode_image(encoded, f"photo {name}").shape[:2]
         if lens == _PANORAMA and width != 2 * height:
@@ -316,19 +317,18 @@ class _Cubes:
         ]
 
 
-# Lens of photos that the user declares as panoramas; the size is set later.
+# Lens of photos that the user declares to be panoramas; the size is set later.
 _PANORAMA: Final = PanoramaLens(width=0, height=0)
 
 
 def _both(
     one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_] | None:
-    """Return the pixels that are usable in both masks; None means all."""
+    """Return a mask of the pixels that are usable in both masks; None means all pixels."""
     return other if one is None else one if other is None else one & other
 
 
 def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
-    """Return a photo with its mask, if it has one."""
     photo = read.photo
     mask = masks.encoded(photo.name, (photo.width, photo.height))
     face = source.content if isinstance(source.content, CubeFace) else None
@@ -345,7 +345,7 @@ def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
 
 
 def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cubes) -> list[_Source]:
-    """Return the photos ordered by name; warn about other files."""
+    """Return the photos ordered by name, and warn of other files."""
     if not files.paths:
         raise InputError(f"the input {files.name} has no files: expected photos")
     photos = [path for path in files.paths if path not in masks]
@@ -366,7 +366,7 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     if others:
         counts = {"n": len(others), "n_files": len(files.paths)}
         ctx.report(NO_PHOTOS, subject=files.name, names=first_few(others), **counts)
-    # Photos with the same file name are named by their paths within the input.
+    # If photos have the same file name, name them by their paths within the input.
     counts = Counter(source.name for source in sources)
     named = (
         replace(source, name=f"{source.folder}/{source.name}")
@@ -385,10 +385,10 @@ def _folders(paths: Sequence[Path]) -> dict[Path, str]:
 
 
 def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -> None:
-    """Refuse undeveloped camera raw files, because photos must not be omitted unnoticed.
+    """Reject undeveloped camera raw files, since photos must not be omitted silently.
 
     Raises:
-        InputError: there is a raw file without a photo with the same name.
+        InputError: there is a raw file without a photo of the same name.
     """
     developed = {Path(name).stem.lower() for name in photos}
     raw = [
@@ -405,7 +405,7 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
 
 
 def _given(files: InputFiles | None) -> GivenByName | None:
-    """Return cameras from other programs; those from E57 files are for the photos in them."""
+    """Return cameras from other programs; those in E57 files belong to the photos in them."""
     if files is None or all(path.suffix.lower() == E57_SUFFIX for path in files.paths):
         return None
     return GivenByName(read_given_cameras(files.paths))
@@ -423,11 +423,10 @@ def _calibration(files: InputFiles | None) -> CalibratedLenses | None:
 
 
 def _require_whole(name: str, encoded: bytes) -> str:
-    """Check that a photo is intact; return a remark if it is unusual, otherwise an empty text.
+    """Check that a photo is intact; return a remark if it is unusual, otherwise an empty string.
 
     Raises:
-        InputError: the file is not a photo, its format is not supported, or a part of it is
-            missing.
+        InputError: the file is not a photo, has an unsupported format, or is incomplete.
     """
     problem = unreadable(encoded)
     if problem:

@@ -19,11 +19,11 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, ScanCount, resolution_m
 from orthoflow_plugins.read.scales import IntensityScale
 
-# If two sides of a scan are shorter than the first value, or longer than the second, the unit is
+# If two sides of a scan are shorter than the first value or longer than the second, the unit is
 # probably wrong.
 _SMALL_M: Final = 1.0
 _LARGE_M: Final = 1000.0
-# Maximum number of names listed in a sentence.
+# Maximum number of names in a sentence.
 _MOST_NAMES: Final = 12
 
 SUMMARY: Final = DiagnosticSpec(
@@ -253,7 +253,7 @@ def unit_and_source(count: ScanCount, unit: str | None) -> tuple[str, str]:
 def scan_json(
     count: ScanCount, scale: IntensityScale | None, unit: str | None
 ) -> dict[str, JsonValue]:
-    """Return the summary of a scan, as in `scans.json`."""
+    """Return the summary of a scan for `scans.json`."""
     name, unit_from = unit_and_source(count, unit)
     return {
         "file": count.file,
@@ -280,7 +280,7 @@ def scan_json(
 def report_summary(
     ctx: StepContext, assembly: CloudAssembly, cloud: PointCloud, *, up: str, unit: str | None
 ) -> None:
-    """Report counts and extent as metrics, and a summary in one line."""
+    """Report counts and the extent as metrics, and a summary in one line."""
     counts = assembly.counts
     left_out: Counter[str] = Counter()
     for count in counts:
@@ -324,7 +324,7 @@ def report_summary(
 
 
 def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) -> None:
-    """Warn if surfaces are level and upright with respect to an axis other than the given one."""
+    """Warn if most surfaces are horizontal or vertical for an axis other than the given one."""
     axis = None if quality is None else quality.plainly_up(up_vector(up))
     if quality is None or axis is None:
         return
@@ -333,7 +333,7 @@ def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) 
 
 
 def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
-    """Report quality metrics; warn if the cloud is thick or its scans disagree."""
+    """Report quality metrics; warn if surfaces of the cloud are thick or its scans disagree."""
     if quality is None:
         return
     sigma_mm, step_mm = 1e3 * quality.sigma_m, 1e3 * quality.scan_step_m

@@ -1,7 +1,8 @@
 """Normalisation of intensities to 0..1 and of colours to 8 bits.
 
-Each scan is scaled separately, by the limits in its metadata if its data are within them, otherwise
-by its data. A few extreme values, e.g. from a reflector, never determine a scale.
+Each scan is scaled separately. The limits in its metadata are used if the data are within these
+limits; otherwise, the limits are those of the data. A few extreme values, such as those from a
+reflector, do not affect the scale.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from orthoflow.geometry.levels import REC_601
 
 RgbScale = Literal["0..1", "8 bit", "10 bit", "12 bit", "16 bit", "stated limit"]
 
-# Values of full brightness; a scale is replaced when a wider one is found.
+# Values of full brightness; a scale is replaced when a value beyond it is found.
 _FULL: Final[dict[RgbScale, float]] = {
     "0..1": 1.0,
     "8 bit": 255.0,
@@ -28,38 +29,39 @@ _FULL: Final[dict[RgbScale, float]] = {
 
 _BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
-# An intensity with at least this correlation with the grey of the colours is considered a copy. The
-# correlation is 0.99997 for lion-takanawa, whose intensity is such a copy; laser intensity at
-# 532..1550 nm correlates far less, unless a scene has only two colours.
+# An intensity with at least this correlation with the brightness of the colours is considered a
+# copy of it. The correlation is 0.99997 for lion-takanawa, whose intensity is such a copy. It is
+# far lower for laser intensity at 532..1550 nm, unless a scene has only two colours.
 _LUMINANCE_CORRELATION: Final = 0.999
-# Two roundings to 8 bits cause differences of 0.4 grey levels.
+# Tolerance in grey levels; two roundings to 8 bits cause differences of 0.4 grey levels.
 _ROUNDING_LEVELS: Final = 0.7
-# Values are extreme if they are outside these percentiles by more than the distance between the
-# two.
+# A value is extreme if its distance from the range of these percentiles exceeds the width of this
+# range.
 _PERCENTILES: Final = (2.0, 98.0)
-# If the data of all scans cover less than this part of the range in the metadata, the latter is the
-# range of the sensor, and pictures scaled by it would be black.
+# If no scan reaches more than this part of the range in its metadata, that is the range of the
+# sensor, and images scaled by it would be black.
 _SMALLEST_PART: Final = 0.25
-# Scans whose ranges overlap by more than this part get a common scale, so that the same surfaces
+# Scans whose ranges overlap by at least this part get a common scale, so that the same surfaces
 # have the same brightness.
 _COMMON_PART: Final = 0.4
-# Ranges written by scanners and programs, for scans that have no limits and differ from other
-# scans. The first range that contains a scan's data is used if the data cover enough of it.
+# Ranges that scanners and programs write. They are used for scans that have no limits and differ
+# from other scans. The first range that contains the data of a scan is used if the data cover
+# enough of it.
 _NOMINAL: Final = ((0.0, 1.0), (0.0, 255.0), (-2048.0, 2047.0), (0.0, 4095.0), (0.0, 65535.0))
 _NOMINAL_PART: Final = 0.4
-# A smaller share of colours outside a scale does not change it.
+# Colours outside a scale do not change it if their share is smaller than this.
 _STRAY_SHARE: Final = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntensityScale:
-    """The linear scale from a scan's intensities to 0..1.
+    """The linear scale from the intensities of a scan to 0..1.
 
     Attributes:
         low: intensity that maps to 0.
         high: intensity that maps to 1.
         rule: source of the scale: `intensity_max`, `stated`, `nominal` or `data`.
-        stated: limits in the scan's metadata that are not used because the data do not fit.
+        stated: limits in the metadata that are not used because the data do not fit them.
     """
 
     low: float
@@ -69,7 +71,7 @@ class IntensityScale:
 
 
 def robust_range(values: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Return the smallest and largest values that are not extreme; None if no value is finite."""
+    """Return the smallest and the largest value that are not extreme; None if none is finite."""
     sample = values[:: max(1, len(values) // _SAMPLE)]
     sample = sample[np.isfinite(sample)]
     if not len(sample):
@@ -88,19 +90,19 @@ def choose_scales(
     """Choose the scale of each scan.
 
     Args:
-        ranges: `robust_range` of each scan's data; None if a scan has no intensity.
+        ranges: `robust_range` of the data of each scan; None if a scan has no intensity.
         stated: limits in the metadata of each scan, or None.
-        intensity_max: full intensity given by the user, or None.
+        intensity_max: intensity of full brightness given by the user, or None.
 
     Returns:
-        The user's scale if given; otherwise, the limits in the metadata if the data are within them
-        and cover more than a small part; otherwise, the range of the data, which is common to scans
-        with similar ranges. If scans differ, this range is replaced with the first nominal range
-        that the data fill.
+        The scale is given by the user, or by the limits in the metadata if the data are within
+        these limits and cover more than a small part of them. Otherwise, it is the range of the
+        data, which is common to scans with similar ranges. If scans differ, this range is replaced
+        by a nominal range if the data fill enough of it.
     """
     scales: list[IntensityScale | None] = [None] * len(ranges)
     known = [(seen, one) for seen, one in zip(ranges, stated, strict=True) if seen and one]
-    # Largest value of each scan, as a share of the range between its limits.
+    # Largest value of each scan, relative to the range of the limits.
     parts = [(s[1] - one[0]) / (one[1] - one[0]) for s, one in known if _is_within(s, one)]
     largest_part = max(parts, default=0.0)
     groups: list[tuple[list[int], tuple[float, float]]] = []
@@ -153,7 +155,7 @@ def _join(
 
 
 def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
-    """Scale intensities in place to 0..1; values that are not finite become NaN.
+    """Scale intensities to 0..1 in place; values that are not finite become NaN.
 
     Args:
         intensity: (n,) values as read.
@@ -187,11 +189,11 @@ def correlation_with_grey(
     rgb: NDArray[np.uint8],
     has_rgb: NDArray[np.bool_] | None = None,
 ) -> float | None:
-    """Return the correlation of the intensity with the grey of the colours if it is a copy of it.
+    """Return the correlation of an intensity with the brightness if it is a copy of that.
 
     Returns:
-        The correlation; None if the two differ by more than rounding errors, or if too few points
-        have both.
+        The correlation; None if intensity and brightness differ by more than rounding errors, or if
+        too few points have both.
     """
     step = max(1, len(intensity) // _SAMPLE)
     values = intensity[::step].astype(np.float64)
@@ -209,30 +211,30 @@ def correlation_with_grey(
 
 
 def is_grey(rgb: NDArray[np.uint8]) -> bool:
-    """Return whether all colours of a sample are grey."""
+    """Return whether all colours in a sample of the points are grey."""
     part = rgb[:: max(1, len(rgb) // _SAMPLE)]
     return bool(np.all(part[:, 0] == part[:, 1]) and np.all(part[:, 1] == part[:, 2]))
 
 
 class ColourScale:
-    """Determines the scale of a scan's colours while they are read.
+    """Detection of the scale of the colours of a scan while they are read.
 
-    LAS stores 8-bit colours in the low byte, or multiplied by 256 or 257; text and PLY have 0..1 or
-    0..255; some files have values from 10-bit and 12-bit cameras that were not scaled to 16 bits.
-    If a block exceeds the current scale, the colours stored so far are rescaled. A limit in the
-    metadata is used if the data reach more than 1/255 of it and do not exceed it.
+    LAS files contain 8-bit colours unscaled, or multiplied by 256 or 257. Text and PLY files use
+    0..1 or 0..255. Some files contain values from 10-bit or 12-bit cameras that were not scaled to
+    16 bits. If a block exceeds the current scale, the colours stored so far are rescaled. A limit
+    in the metadata is used if the data reach more than 1/255 of it and do not exceed it.
 
     Attributes:
-        scale: scale of the values so far.
+        scale: scale of the values read so far.
         misfit: the limit in the metadata if the data do not fit it, otherwise None.
-        largest: largest value so far, except for a few outliers.
+        largest: largest value read so far, except for a few outliers.
     """
 
     def __init__(self, stored: NDArray[np.uint8], limit: float | None) -> None:
-        """Start a scan.
+        """Start with the colours of a scan.
 
         Args:
-            stored: (n, 3) output for the scan's colours, from its first point on.
+            stored: (n, 3) output for the colours, starting at the first point of the scan.
             limit: value of full brightness in the metadata, or None.
         """
         self._stored = stored
@@ -243,7 +245,7 @@ class ColourScale:
         self.largest = 0.0
 
     def add(self, rgb: NDArray[np.generic], has_rgb: NDArray[np.bool_] | None = None) -> None:
-        """Store the next colours (n, 3); `has_rgb` (n,) marks the valid ones."""
+        """Store the next colours (n, 3); `has_rgb` (n,) marks the points with valid colours."""
         values = rgb.astype(np.float32)
         valid = values if has_rgb is None else values[has_rgb]
         if valid.size:
@@ -259,7 +261,7 @@ class ColourScale:
         if largest > 255.0:
             depths: tuple[RgbScale, ...] = ("10 bit", "12 bit", "16 bit")
             fitting = (one for one in depths if largest <= _FULL[one])
-            # A 16-bit limit applies to dark colours, too.
+            # A 16-bit limit also applies to dark colours.
             is_stated = limit is not None and largest <= limit
             seen = "16 bit" if is_stated else next(fitting, "16 bit")
         elif largest <= 1.0 and (limit == 1.0 or (limit is None and not is_whole)):
@@ -270,12 +272,12 @@ class ColourScale:
         if self.scale is None:
             self.scale = seen
         elif full[seen] > full[self.scale]:
-            # Previous values were scaled by a full brightness that was too low.
+            # The stored values were scaled with a full brightness that was too low.
             before = self._stored[: self._count]
             before[:] = np.rint(before * np.float32(full[self.scale] / full[seen]))
             self.scale = seen
         fits = limit is None or full[self.scale] == limit or self.largest <= 1.0
-        # Metadata may contain a 16-bit limit for any 16-bit data.
+        # Metadata may contain a 16-bit limit for any data stored in 16 bits.
         self.misfit = None if fits or (limit == 65280.0 and self.scale == "16 bit") else limit
 
 
@@ -286,7 +288,7 @@ def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> flo
 
 
 def _largest(rgb: NDArray[np.float32]) -> float:
-    """Return the largest value of (n, 3), except for a few outliers."""
+    """Return the largest value of an array (n, 3), except for a few outliers."""
     largest = float(np.nanmax(rgb, initial=0.0))
     if largest > 255.0:
         n_beyond = int(np.count_nonzero(rgb > np.float32(255.0)))
@@ -302,7 +304,7 @@ def _to_bytes(
     if scale == "stated limit" and limit is not None:
         scaled = values * np.float32(255.0 / limit)
     elif scale == "16 bit":
-        # This is exact for 8-bit values times 256 and times 257.
+        # The result is exact for 8-bit values that were multiplied by 256 or 257.
         scaled = np.floor(values / np.float32(256.0))
     elif scale is not None and scale != "8 bit":
         scaled = values * np.float32(255.0 / _FULL[scale])

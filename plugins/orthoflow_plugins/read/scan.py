@@ -56,7 +56,7 @@ _SAMPLE: Final = 200_000
 
 
 class ReadScan(Method):
-    """Read one or several E57, LAS, LAZ, COPC, PLY, PCD, PTX or text scans into one cloud."""
+    """Read one or several E57, LAS, LAZ, COPC, PLY, PCD, PTX or text files into one cloud."""
 
     id = "read.scan"
     result_version: ClassVar[int] = 2
@@ -155,7 +155,7 @@ class ReadScan(Method):
         cloud: PointCloud
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files as described for the class."""
+        """Read all files."""
         columns = None if params.columns is None else columns_of_user(params.columns)
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} has no files: expected a scan")
@@ -164,7 +164,8 @@ class ReadScan(Method):
         _check_settings(ctx, files, params)
         assembly = CloudAssembly(ctx, files, partial(_unit_m, params=params), box_m)
         for file in files:
-            # Damaged numbers may overflow; values that are not finite are omitted and counted.
+            # Values in damaged files may overflow. Values that are not finite are omitted and
+            # counted.
             with np.errstate(all="ignore"):
                 assembly.add_file(file)
             report_notes(ctx, file)
@@ -203,7 +204,7 @@ class ReadScan(Method):
 def _opened(
     path: Path, columns: Columns | None, box_m: NDArray[np.float64] | None, params: ReadScan.Params
 ) -> ScanFile:
-    """Open a file; if it is a COPC file, only the requested parts are read."""
+    """Open a file; of a COPC file, only the requested parts are read."""
     opened = partial(
         open_scan,
         path,
@@ -255,7 +256,7 @@ def _check_settings(ctx: StepContext, files: list[ScanFile], params: ReadScan.Pa
 
 
 def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) -> PointCloud:
-    """Convert the raw arrays to a cloud, and report its limitations."""
+    """Convert the raw arrays to a cloud and report limitations of the cloud."""
     rgb, has_rgb = _colours(ctx, assembly)
     intensity, scales = _intensity(ctx, assembly, params)
     intensity, intensity_source = _judged_intensity(ctx, intensity, rgb, has_rgb)
@@ -279,7 +280,7 @@ def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) 
         intensity=intensity,
         rgb=rgb,
         has_rgb=has_rgb,
-        # Scan numbers that are not indices of the stations are not stored.
+        # Scan numbers are only stored if they are indices of the stations.
         scan=assembly.array("scan") if is_per_scan or not is_from_files else None,
         row=assembly.array("row"),
         column=assembly.array("column"),
@@ -368,7 +369,10 @@ def _judged_intensity(
     rgb: NDArray[np.uint8] | None,
     has_rgb: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float32] | None, str]:
-    """Discard an intensity that only repeats the colours; return the source of the intensity."""
+    """Discard an intensity that only repeats the brightness of the colours.
+
+    Also return the source of the intensity.
+    """
     if intensity is None:
         return None, "none"
     if rgb is None:
@@ -390,14 +394,14 @@ def _choose_stations(
     extents: Sequence[NDArray[np.float64]],
     view_from: tuple[float, float, float] | None,
 ) -> tuple[NDArray[np.float64] | None, str | None]:
-    """Return stations (s, 3) and their source: those of the files, or the user's viewpoint.
+    """Return stations (s, 3) and their source: those in the files, or the viewpoint of the user.
 
-    The origin is used as the station of a scan without a pose only if there is a single such scan
-    and it could have been taken from the origin. A scan in its scanner's frame surrounds or faces
-    the origin, whereas a cloud in survey coordinates can be anywhere.
+    The station of a scan without a pose is the origin, if there is only one such scan and it could
+    have been taken from the origin. The points of a scan in the frame of the scanner surround the
+    origin or are in front of it, whereas a cloud in survey coordinates can be anywhere.
 
     Args:
-        counts: statistics of the scans with points.
+        counts: statistics of the scans that have points.
         extents: (2, 3) smallest and largest coordinates of each scan, except for a few outliers.
         view_from: viewpoint given by the user, or None.
     """
@@ -417,7 +421,7 @@ def _choose_stations(
 
 
 def _extent(assembly: CloudAssembly, count: ScanCount) -> NDArray[np.float64]:
-    """Return smallest and largest coordinates (2, 3) of a scan, except for a few outliers."""
+    """Return the smallest and the largest coordinates (2, 3) of a scan, except for outliers."""
     part = slice(count.start, count.stop, max(1, count.n_kept // _SAMPLE))
     ends = [np.percentile(values[part], _PERCENTILES) for values in assembly.offsets]
     return np.asarray(assembly.origin + np.array(ends).T)

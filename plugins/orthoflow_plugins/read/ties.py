@@ -21,10 +21,10 @@ _MOST_PROBLEMS = 20
 
 
 class ReadTies(Method):
-    """Read ties measured by hand: `photo,u_px,v_px,x,y,z[,sigma_px]`, or `ties.csv` of a run.
+    """Read ties measured by hand (`photo,u_px,v_px,x,y,z[,sigma_px]`), or `ties.csv` of a run.
 
     World coordinates are those of the scan. Pixel coordinates are as in `ties.csv` and
-    `cameras.json` (OpenCV), so the centre of the photo's first pixel is at (0, 0), and the EXIF
+    `cameras.json` (OpenCV): the centre of the first pixel of a photo is at (0, 0), and the EXIF
     orientation is not applied.
     """
 
@@ -64,7 +64,7 @@ class ReadTies(Method):
         ties: Ties
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files as described for the class."""
+        """Read all files."""
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} has no files: expected ties")
         ctx.progress(0.0, inputs.files.name)
@@ -74,7 +74,7 @@ class ReadTies(Method):
         if wrong:
             left_out = len(wrong) - _MOST_PROBLEMS
             more = [f"... and {left_out} more problems"] if left_out > 0 else []
-            # Finding similar names is slow, so it is only done for the ties in the message.
+            # Finding similar names is slow, so this is only done for the ties in the message.
             shown = [_problem(tie, photos) for tie in wrong[:_MOST_PROBLEMS]]
             raise InputError("\n".join(shown + more))
         ties = _ties(found, tuple(photos), params)
@@ -96,7 +96,7 @@ def _is_in_photo(tie: MeasuredTie, photos: Mapping[str, Photo]) -> bool:
 
 
 def _problem(tie: MeasuredTie, photos: Mapping[str, Photo]) -> str:
-    """Return the reason why a tie is not in any photo."""
+    """Return why a tie is not in any photo."""
     photo = photos.get(tie.photo)
     if photo is None:
         near = difflib.get_close_matches(tie.photo, photos, n=1)
