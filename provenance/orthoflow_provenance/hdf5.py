@@ -64,8 +64,8 @@ _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
 _LONGEST_NAME: Final = 256
 # Maximum size of compressed texts, tables and figures; larger ones could expand to excessive sizes.
 _PACKED_BYTES_MOST: Final = 4 << 20
-# Maximum number of groups, datasets and attributes in a record; a cell with its products has about
-# 50 (for other limits, see `provenance/SPEC.md`, section 2).
+# A cell with its products has about 50. Section 2 of `provenance/SPEC.md` lists other limits.
+#: groups, datasets and attributes of a record
 MAX_OBJECTS: Final = 1_000_000
 _FILTERS: Final = {
     h5py.h5z.FILTER_SHUFFLE: "shuffle",
