@@ -12,6 +12,7 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
+from orthoflow.diagnostics import grouped, standing
 from orthoflow.engine.journal import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products import JsonValue
@@ -44,6 +45,7 @@ class RunSummary:
         status: `ok`; `failed` if a cell failed; `running`; `unfinished` if interrupted; `damaged`
             if the record cannot be read or its seal is broken.
         reason: first failure, or the reason why the record cannot be read; empty if there is none.
+        n_errors: number of kinds of errors that steps reported, i.e. of wrong results.
         workflow: name of the workflow.
         run_id: id of the run.
         started: ISO 8601 UTC; empty if unknown.
@@ -60,6 +62,7 @@ class RunSummary:
     folder: Path
     status: RunState
     reason: str = ""
+    n_errors: int = 0
     workflow: str = ""
     run_id: str = ""
     started: str = ""
@@ -202,6 +205,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         folder=folder,
         status=record.status,
         reason="" if failed is None else f"{failed.address}: {failed.error_message}",
+        n_errors=sum(group.worst.severity == "error" for group in grouped(standing(record.cells))),
         workflow=record.name,
         run_id=record.run_id,
         started=record.started,

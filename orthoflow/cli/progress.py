@@ -223,11 +223,8 @@ class Progress:
             self._n_similar[address] += 1
             return ""
         self._reported.add(key)
-        if one.severity == "error" or is_plain:
-            text = f"{one.text}: {one.remedy}" if one.remedy else one.text
-        else:
-            # The summary contains the complete sentences.
-            text = f"{one.code} ({one.subject})" if one.subject else one.code
+        has_remedy = one.severity == "error" and one.remedy
+        text = f"{one.text}: {one.remedy}" if has_remedy else one.text
         return f"{address}: {one.severity}: {text}"
 
     def cells(self) -> dict[str, CellState]:

@@ -150,7 +150,7 @@ def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
                 str(run.folder),
                 run.started[:16].replace("T", " "),
                 run.workflow,
-                run.status,
+                run.status + (f", {counted(run.n_errors, 'error')}" if run.n_errors else ""),
                 *(number(run.metrics[name]) if name in run.metrics else "" for name in names),
                 _facts_text(facts[run.folder]),
             )

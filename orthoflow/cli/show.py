@@ -168,7 +168,9 @@ def _print_comparison(run: Run, most: int | None) -> bool:
             for row in compared.rows
         ],
     )
-    echo("means over repeats ± standard deviation; --all prints all metrics")
+    has_repeats = any(cell.repeat for cell in run.record.cells)
+    means = "means over repeats ± standard deviation; " if has_repeats else ""
+    echo(f"{means}--all prints all metrics")
     return True
 
 

@@ -457,14 +457,14 @@ class RunComparison:
             changed: whether to return only parameters that differ.
 
         Returns:
-            A table with the columns `cell`, `parameter`, `left` and `right`; a value is None if the
-            run does not have the parameter.
+            A table with the columns `cell`, `parameter`, `left` and `right` for the cells that both
+            runs have; a value is None if the run does not have the parameter.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
         rows = [
             (row.cell, row.name, row.left and row.left.value, row.right and row.right.value)
-            for row in self.parameters
+            for row in self.shared(self.parameters)
             if not (changed and row.is_same)
         ]
         return pd.DataFrame(rows, columns=["cell", "parameter", "left", "right"], dtype=object)

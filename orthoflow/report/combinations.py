@@ -17,6 +17,7 @@ from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell, RecordedEnvironment
 from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.records.write import NOT_YET
+from orthoflow.report.rankings import cost_share
 from orthoflow.untrusted_text import first_few, parse_json
 from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.expand import variants_text
@@ -41,6 +42,7 @@ class Measured:
         unit: `1` for counts and shares.
         environment: id of the environment in which the metric was computed.
         is_of_sizes: whether `value` is a mean of absolute values.
+        scatter: `spread`, or 0 for a single value that depends on no seed.
     """
 
     value: float
@@ -50,6 +52,7 @@ class Measured:
     unit: str
     environment: str
     is_of_sizes: bool = False
+    scatter: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,10 +114,21 @@ class Combination:
         is_of_sizes = bool(values.min() < 0.0 < values.max()) and found[0][0].better == "lower"
         if is_of_sizes:
             values = np.abs(values)
+        # The first value is subtracted so that the spread of identical values is exactly 0.
+        spread = float((values - values[0]).std(ddof=1)) if len(values) > 1 else math.nan
+        own = next(cell.address for cell in self.cells if cell.step == step)
+        varied = {cell.address for cell in self.varied_cells}
+        # Cells without inputs provide the data, which are the same for all compared values.
+        is_seeded = any(
+            cell.determinism == "seeded"
+            for cell in self.run.upstream(own)
+            if cell.address in varied and (cell.inputs or {*cell.assignment} - {DATA})
+        )
+        is_known = len(values) == 1 and not (is_seeded or cost_share(found[0][0].unit))
         return Measured(
             value=float(values.mean()),
-            # The first value is subtracted so that the spread of identical values is exactly 0.
-            spread=float((values - values[0]).std(ddof=1)) if len(values) > 1 else math.nan,
+            spread=spread,
+            scatter=0.0 if is_known else spread,
             n_repeats=len(values),
             n_all=sum(cell.step == step and cell.status == "ok" for cell in self.cells),
             unit=found[0][0].unit,

@@ -26,6 +26,7 @@ from orthoflow.report.combinations import (
 )
 from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import (
+    BETTER,
     Mark,
     Value,
     cost_share,
@@ -39,8 +40,6 @@ from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
 _NOTHING: Final = "-"
-# Run times of short steps vary by this much even on an idle machine.
-_TIMED_S: Final = 0.1
 _MAX_DESCRIBED: Final = 12  # metrics shown if no quality metric differs
 _MAX_NAMED: Final = 3  # metrics listed in which a combination is best
 # Costs of the steps in which combinations differ; unlike the elapsed time, processor time hardly
@@ -129,6 +128,17 @@ class ComparisonTable:
             return bool(row.shortfall), -row.count(Mark.BEST), -row.count(Mark.NEAR)
 
         return tuple(sorted(self.rows, key=place))
+
+    @property
+    def n_ranked(self) -> int:
+        """Number of columns in which the scatter of all values is known."""
+        return sum(
+            column.better in BETTER
+            and not any(value.text and math.isnan(value.spread) for value in values)
+            for column, *values in zip(
+                self.columns, *(row.values for row in self.rows), strict=True
+            )
+        )
 
     def best_in(self, row: Row) -> str:
         """Return the names of up to three metrics in which a row is clearly the best."""
@@ -249,7 +259,7 @@ def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
     group = "".join(dict.fromkeys(origins.letter(one, cell.environment) for cell in varied))
     text = f"{time_s:.2f}" if time_s < 1.0 else f"{time_s:.1f}"
     return (
-        Value(text=text, sort=time_s, spread=_TIMED_S, group=group),
+        Value(text=text, sort=time_s, group=group),
         Value(text=f"{memory_mib:.0f}", sort=memory_mib, group=group),
     )
 
@@ -288,7 +298,7 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
     return Value(
         text=f"{measured_text(measured)}{of_all}",
         sort=measured.value,
-        spread=measured.spread,
+        spread=measured.scatter,
         group=origins.letter(one, measured.environment),
         note=of_what if measured.n_repeats > 1 else "",
         n_items=one.n_items(column.step, column.counted_by),

@@ -84,12 +84,16 @@ class OpenedRun(Run):
         Returns:
             A table with one row for each metric and combination of variants. It contains the
             median, the difference from `reference`, the confidence interval of the difference, the
-            p-value before and after Holm's correction, and the effect.
+            p-value before and after Holm's correction, and the effect; NaN if unknown. `partly` is
+            the number of datasets on which only some repeats have a value, `apart` the number that
+            cannot be paired because the environments or the numbers of photos differ.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second and is rarely needed
 
         table = over_table(over_datasets(parts_of(self)))
-        return pd.DataFrame(table.rows, columns=[column.name for column in table.columns])
+        frame = pd.DataFrame(table.rows, columns=[column.name for column in table.columns])
+        numeric = [column.name for column in table.columns if column.is_numeric]
+        return frame.astype({name: float for name in numeric if frame[name].dtype == object})
 
     @cached_property
     def figures(self) -> Figures:

@@ -105,7 +105,7 @@ class Value:
     Attributes:
         text: formatted number; empty if the value is missing.
         sort: number by which the table is sorted; NaN if the value is missing.
-        spread: standard deviation over repeats; NaN without repeats.
+        spread: standard deviation over repeats, 0 if the value depends on no seed; NaN if unknown.
         mark: rank among the values of the group.
         group: letter for the environment and data; empty if they are the same for all values.
         note: remark, such as the number of repeats.
@@ -124,7 +124,7 @@ class Value:
 def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
     """Mark the best value of each group, unless the values of the group cannot be distinguished.
 
-    Groups that contain a value without repeats are not ranked, because another value may be the
+    Groups that contain a value of unknown spread are not ranked, because another value may be the
     best on another machine or with another seed. A value is near the best if their difference does
     not exceed the root of the sum of their squared standard deviations. If the repeats are
     identical, the limit is 1 % of the best value; it is at least 10 % for memory and 30 % for

@@ -17,8 +17,11 @@ from orthoflow.cli.browsing import (
     run_folders,
     summaries,
 )
+from orthoflow.diagnostics import DiagnosticSpec
 from orthoflow.errors import ArgumentError
 from tests.report_runs import cell, metrics, record
+
+UPSIDE_DOWN = DiagnosticSpec(code="upside-down", severity="error", text="{subject} is upside down")
 
 
 def a_run(folder: Path, name: str = "journal.jsonl") -> Path:
@@ -69,7 +72,12 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
     scan = RecordedFile(name="hall.laz", size_bytes=3, sha256="0123456789" + "a" * 54)
     folder = written(
         tmp_path / "run",
-        cell("plane", params={"cell_m": 0.1}, metrics=metrics(rms_mm=3.0, omega_deg=4.0)),
+        cell(
+            "plane",
+            params={"cell_m": 0.1},
+            metrics=metrics(rms_mm=3.0, omega_deg=4.0),
+            diagnostics=(UPSIDE_DOWN.of("", {}), UPSIDE_DOWN.of("photo 2", {})),
+        ),
         cell("check", params={"tries": 2}, metrics=metrics(rms_mm=1.0)),
         cell("lost", status="skipped", params={"none": 1}),
         cell("bad", status="failed", error_message="no plane"),
@@ -81,7 +89,7 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
     )
     (recorded,) = summaries([folder])
     assert (recorded.folder, recorded.status) == (folder, "failed")
-    assert recorded.reason == "bad: no plane"
+    assert (recorded.reason, recorded.n_errors) == ("bad: no plane", 1)
     assert (recorded.workflow, recorded.run_id, recorded.started) == (
         "hall",
         "r1",

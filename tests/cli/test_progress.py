@@ -112,7 +112,7 @@ def test_a_log_has_a_line_per_start_end_and_code(
         "cloud: cached (1 of 5)",
         "plane: started",
         "plane: warning: the side is a [guess]",
-        "plane: warning: empty-wall (wall 2)",
+        "plane: warning: no point",
         "plane: error: all are upside down",
         "plane: failed in 1 min 15 s: no plane, 1 warning with a code shown above (2 of 5)",
         "wall: skipped (3 of 5)",

@@ -172,8 +172,7 @@ def test_rows_of_a_comparison_stand_beside_each_other(
     assert rows == snapshot(name="rows")
     fine, coarse, _ = table.rows
     assert {row.run for row in table.rows} == {f"toy <run>, {tmp_path.name}, r1"}
-    # Of `coarse` there is a single run, so that nothing is ranked.
-    assert {value.mark for row in (fine, coarse) for value in row.values} == {Mark.NONE}
+    assert {value.mark for row in (fine, coarse) for value in row.values} == {Mark.NONE, Mark.BEST}
     assert fine.values[0].note == "mean and standard deviation of 3 repeats"
     assert coarse.values[0].note == ""
 

@@ -224,23 +224,6 @@ def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
     assert "0 metrics, 1 file</span>" in page
 
 
-def test_processor_times_are_ranked_whatever_the_clock_says() -> None:
-    def costs(wall_s: float, cpu_s: float, other_cpu_s: float = 1.0) -> list[tuple[str, Mark]]:
-        cells = (
-            cell("plane@plane=hough", wall_s=2.0, cpu_s=other_cpu_s),
-            cell("plane@plane=ransac", wall_s=wall_s, cpu_s=cpu_s),
-        )
-        table = comparison_table([run(*cells)])
-        assert table is not None
-        return [(one.values[-2].text, one.values[-2].mark) for one in table.rows]
-
-    for wall_s in (9.0, 0.5):
-        assert [mark for _, mark in costs(wall_s, 6.0)] == [Mark.BEST, Mark.NONE]
-    assert [mark for _, mark in costs(22.0, 0.5)] == [Mark.NONE, Mark.BEST]
-    # Either may be wrong by a tenth of a second.
-    assert costs(2.0, 0.11, 0.08) == [("0.08", Mark.NONE), ("0.11", Mark.NONE)]
-
-
 def test_costs_are_summed_over_the_steps_of_a_combination() -> None:
     cells = [
         cell("plane@plane=hough", cpu_s=0.75, peak_rss_mib=1234.6),
@@ -254,6 +237,8 @@ def test_costs_are_summed_over_the_steps_of_a_combination() -> None:
     assert table is not None
     found = [tuple(cost.text for cost in one.values[-2:]) for one in table.rows]
     assert found == [("1.5", "1235"), ("", ""), ("1.00", "50")]
+    # The next run may take another time, whichever is shorter now.
+    assert {cost.mark for one in table.rows for cost in one.values[-2:]} == {Mark.NONE}
 
 
 @pytest.mark.parametrize(
@@ -330,8 +315,13 @@ def test_a_glance_states_which_lead_and_names_three_at_most(compared: Run) -> No
     assert table is not None
     first, _, last = table.glance
     assert (first.name, first.is_baseline) == ("plane=fine", True)
-    # The other one was run once only, and single runs are not ranked.
-    assert table.best_in(first) == ""
+    # The other one was run once only, which is enough for exact methods.
+    assert table.best_in(first).startswith("plane: points to the first plane")
+    n_exact = table.n_ranked
+    cells = [replace(one, determinism="seeded") for one in compared.record.cells]
+    seeded = comparison_table([run(*cells, workflow_resolved=compared.record.workflow_resolved)])
+    assert seeded is not None
+    assert (n_exact, seeded.n_ranked, seeded.best_in(seeded.glance[0])) == (3, 0, "")
     assert (last.name, last.shortfall, last.count(Mark.BEST)) == ("plane=broken", "failed", 0)
     for n_best in (3, 4):
         values = tuple(
