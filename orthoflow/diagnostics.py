@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import string
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
@@ -39,6 +39,7 @@ _ORDER: Final = ("error", "warning", "note")
 _LONGEST: Final = 2000
 _CODE: Final = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _STEP: Final = re.compile(r"\{step(?:\[([^\]]+)\])?\}")
+_UNLESS: Final = re.compile(r"\{unless\[([^\]]+)\]:([^}]*)\}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +48,9 @@ class DiagnosticSpec:
 
     In `text` and `remedy`, `{step}` is replaced by the name of the reporting step, and
     `{step[raster]}` or `{step[raster.grid]}` by the name of the step with that kind or method, so
-    that a remedy can refer to a setting, as in `{step[raster]}.margin_m=0.2`.
+    that a remedy can refer to a setting, as in `{step[raster]}.margin_m=0.2`. The part of a remedy
+    that recommends a method, such as `{unless[match.guided]:match again with match.guided, or }`,
+    is omitted in workflows with this method.
 
     Attributes:
         code: stable name for documents and tests, e.g. `scan-without-colour`.
@@ -87,7 +90,8 @@ class DiagnosticSpec:
         Raises:
             ProductError: a value in the text is missing, or is neither a number nor a string.
         """
-        fields = {**values, "subject": subject, "step": _StepPlaceholder()}
+        later = {name: _Placeholder(name) for name in ("step", "unless")}
+        fields = {**values, "subject": subject, **later}
         try:
             text, remedy = (
                 _FORMATTER.vformat(template, (), fields) for template in (self.text, self.remedy)
@@ -225,8 +229,10 @@ def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
     return lambda name: min(found[name]) if len(found.get(name, ())) == 1 else name
 
 
-def placed(one: Diagnostic, step: str, step_of: Callable[[str], str]) -> Diagnostic:
-    """Insert the names of steps into the text and the remedy of a diagnostic.
+def placed(
+    one: Diagnostic, step: str, step_of: Callable[[str], str], methods: Container[str] = ()
+) -> Diagnostic:
+    """Insert names of steps into text and remedy; omit remedies with methods of the workflow.
 
     Workflows share results, but may have different names for steps, so the names are inserted when
     a result is used.
@@ -235,18 +241,21 @@ def placed(one: Diagnostic, step: str, step_of: Callable[[str], str]) -> Diagnos
     def name(found: re.Match[str]) -> str:
         return step_of(found[1]) if found[1] else step
 
-    return replace(one, text=_STEP.sub(name, one.text), remedy=_STEP.sub(name, one.remedy))
+    remedy = _UNLESS.sub(lambda found: "" if found[1] in methods else found[2], one.remedy)
+    return replace(one, text=_STEP.sub(name, one.text), remedy=_STEP.sub(name, remedy))
 
 
-class _StepPlaceholder:
-    def __str__(self) -> str:
-        return "{step}"
+class _Placeholder:
+    """A field that remains in the text until `placed` replaces it."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
 
     def __format__(self, form: str) -> str:
-        return str(self)
+        return f"{{{self._name}{form and ':'}{form}}}"
 
-    def __getitem__(self, name: str) -> str:
-        return f"{{step[{name}]}}"
+    def __getitem__(self, name: str) -> _Placeholder:
+        return _Placeholder(f"{self._name}[{name}]")
 
 
 _FORMATTER: Final = string.Formatter()

@@ -95,6 +95,11 @@ def test_settings_are_named_by_the_steps_of_the_workflow() -> None:
     assert placed(apart(0, 60), "plane.ransac", names).remedy == (
         "register them, or set wall.buffer_m=0.1 for plane.ransac"
     )
+    again = DiagnosticSpec(code="a", text="", remedy="{unless[match.b]:use match.b, or }ask").of(
+        "", {}
+    )
+    assert placed(again, "", names).remedy == "use match.b, or ask"
+    assert placed(again, "", names, {"match.b"}).remedy == "ask"
     # Of two steps of a kind nobody knows which is meant.
     assert [names(name) for name in ("plane", "plane.x", "ortho")] == ["plane", "a", "ortho"]
 

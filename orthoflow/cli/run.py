@@ -220,6 +220,10 @@ def executed(  # noqa: PLR0913 - parts of a run
             return execute(plan, folder, store, take, run_id=run_id)
 
     def write(outcome: RunOutcome) -> Run:
+        current_session().resume_hint = (
+            "interrupted while products, report and record were written; all steps are kept: to "
+            f"finish, repeat the command with -o {folder}"
+        )
         with working_on("writing the products and the record") as note:
 
             def write_report(made: Run) -> None:

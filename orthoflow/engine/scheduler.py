@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Final, Literal
@@ -190,7 +191,8 @@ class _Run:
         self._ready: dict[str, tuple[CellKey, Mapping[str, ProductRef]]] = {}
         self._running: dict[str, Task] = {}
         self._settings = {item.cell.address: item.cell.setting for item in self._plan.cells}
-        self._step_of = step_names((item.cell.step, item.cell.method) for item in self._plan.cells)
+        used = [(item.cell.step, item.cell.method) for item in self._plan.cells]
+        self._named = partial(placed, step_of=step_names(used), methods={one for _, one in used})
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
         while self._waiting or self._running:
@@ -202,7 +204,7 @@ class _Run:
     def report(self, address: str, event: StepEvent) -> None:
         """Pass on an event of a cell, with the step names that this workflow uses."""
         if event.diagnostic is not None:
-            named = placed(event.diagnostic, self._settings[address], self._step_of)
+            named = self._named(event.diagnostic, self._settings[address])
             event = dataclasses.replace(event, text=named.text, diagnostic=named)
         self._listen(CellReported(address=address, event=event))
 
@@ -378,9 +380,7 @@ class _Run:
         self._waiting.pop(cell.address, None)
         # A stored result may come from another workflow, so replace its step names by those of
         # this workflow.
-        named = (
-            placed(one, self._settings[cell.address], self._step_of) for one in result.diagnostics
-        )
+        named = (self._named(one, self._settings[cell.address]) for one in result.diagnostics)
         result = _reporting(dataclasses.replace(result, diagnostics=()), *named)
         self._results[cell.address] = result
         # A result that another cell of this run has just computed counts as new.

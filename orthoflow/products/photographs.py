@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, ClassVar, Final, Self
@@ -24,12 +24,16 @@ from orthoflow.products.walls import Wall
 # A photo counts as upside down if the cosine of the angle between its up direction and the vertical
 # is below minus this value.
 _UPRIGHT: Final = 0.5
+# Ties of floors and ceilings do not determine the image of the vertical: their relief is below the
+# first share of their extent, and the scale along the vertical below the second share.
+_MIN_RELIEF: Final = 0.1
+_MIN_VERTICAL: Final = 0.3
 PHOTOS_UPSIDE_DOWN: Final = DiagnosticSpec(
     code="photos-upside-down",
     severity="error",
     text="{n_down} of {n_photos} photos are upside down: if the vertical axis of the scan points "
     "down, walls and orthoimages are upside down and floor and ceiling are swapped",
-    remedy="set {step[read.scan]}.up={opposite}",
+    remedy="set {step[read.scan]}.up={opposite}, or rotate the photos if they are upside down",
 )
 # Focal length relative to the longer side, assumed if neither a calibration nor EXIF provides it.
 _USUAL_FOCAL: Final = 0.8
@@ -331,6 +335,30 @@ class Ties(Product):
                 raise ProductError(f"ties.{name} must be 0 or more")
         _require_photos("ties", self.photo_names, others)
 
+    def upside_down(self, up: NDArray[np.float64]) -> dict[str, Any]:
+        """Return the values of `PHOTOS_UPSIDE_DOWN` if most photos with ties are upside down.
+
+        Each photo is approximated by an affine map of its ties that are not rejected.
+
+        Args:
+            up: (3,) unit vector, vertical axis of the scan.
+        """
+        tops = []
+        kept = self.role != TieRole.REJECTED
+        for photo in np.unique(self.photo[kept]):
+            points, pixels = (
+                given[kept & (self.photo == photo)]
+                for given in (self.points_world, self.pixels_photo)
+            )
+            pixels_per_m = np.linalg.lstsq(
+                points - points.mean(axis=0), pixels - pixels.mean(axis=0), rcond=_MIN_RELIEF
+            )[0]
+            above = up @ pixels_per_m
+            scale = float(np.linalg.norm(above))
+            is_known = scale > _MIN_VERTICAL * float(np.linalg.norm(pixels_per_m))
+            tops.append(-float(above[1]) / scale if is_known else 0.0)
+        return _upside_down(tops, up)
+
     def number(self, wall: int) -> int:
         """Return the wall number shown to users: the index of the plane in `planes.json`."""
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
@@ -460,12 +488,7 @@ class Cameras(Product):
         """
         # The up direction of a photo is the negative second axis of its camera, which points down.
         tops = [-one.viewing().rotation[1] @ up for one in self.cameras if one.status == "ok"]
-        n_down = sum(float(top) < -_UPRIGHT for top in tops)
-        if 2 * n_down <= len(tops):
-            return {}
-        axis = int(np.abs(up).argmax())
-        opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
-        return {"n_down": n_down, "n_photos": len(tops), "opposite": opposite}
+        return _upside_down(tops, up)
 
     def check_against(self, others: Mapping[str, Product]) -> None:
         """See `Product.check_against`.
@@ -500,6 +523,15 @@ class Cameras(Product):
                     "0"
                 )
         _require_photos("cameras", [camera.photo for camera in self.cameras], others)
+
+
+def _upside_down(tops: Sequence[float], up: NDArray[np.float64]) -> dict[str, Any]:
+    n_down = sum(float(top) < -_UPRIGHT for top in tops)
+    if 2 * n_down <= len(tops):
+        return {}
+    axis = int(np.abs(up).argmax())
+    opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
+    return {"n_down": n_down, "n_photos": len(tops), "opposite": opposite}
 
 
 def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:

@@ -123,6 +123,12 @@ def test_rows_state_which_of_several_swept_methods_they_are_of(tmp_path: Path) -
         ["hall", f"plane.{kind}", value] for kind in ("hough", "region") for value in (2.0, 3.0)
     ]
     assert rows["plane.tolerance_m"].dtype == float
+    resolved = json.dumps({"datasets": {"hall": {}, "yard": {}}})
+    cells += [replace(one, address=one.address.replace("hall", "yard")) for one in cells]
+    cells = [cell(one.address, metrics=one.metrics) for one in cells]
+    compared = OpenedRun(path=tmp_path / "run.h5", record=record(cells, workflow_resolved=resolved))
+    # Two datasets are too few for p, which is a number nevertheless.
+    assert compared.statistics()[["wins", "p", "effect"]].abs().sum().tolist() == [0.0, 0.0, 0.0]
 
 
 def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:

@@ -11,8 +11,17 @@ from typing import TYPE_CHECKING, ClassVar, Final, Literal
 import numpy as np
 from pydantic import Field
 
+from orthoflow.errors import MethodError
 from orthoflow.geometry.key_points import Features
-from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
+from orthoflow.products import (
+    PHOTOS_UPSIDE_DOWN,
+    JsonValue,
+    Photo,
+    Photos,
+    TieRole,
+    Ties,
+    Walls,
+)
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.key_points import (
@@ -59,7 +68,9 @@ class MatchSift(Method):
     matched with the recognised walls. If no wall is clearly recognised in grey, mixtures of the
     colours of the photo are tried. If these also fail, edges are compared regardless of which side
     is brighter; another photo must confirm the resulting position. Matches that do not fit a
-    homography of the wall are kept as rejected ties. Ties include the depth of the surface.
+    homography of the wall are kept as rejected ties. Ties include the depth of the surface. The
+    step fails if most photos are upside down, because the vertical axis of the scan is then usually
+    wrong.
     """
 
     id: ClassVar[str] = "match.sift"
@@ -130,6 +141,9 @@ class MatchSift(Method):
             pieces, details["photos"], radii_px = _matched(photos, walls, on_walls, params, ctx)
         ties = ties_of(pieces, photos, walls, details, search_radius_px=tuple(radii_px))
         _report(ctx, ties, on_walls)
+        if values := ties.upside_down(walls.up):
+            ctx.report(PHOTOS_UPSIDE_DOWN, **values)
+            raise MethodError("most photos are upside down, so all later results would be wrong")
         return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
 
     @classmethod

@@ -232,7 +232,8 @@ CROWDED: Final = DiagnosticSpec(
     severity="warning",
     text="photo {subject}: the ties are unevenly distributed; one quarter of the photo has "
     "{n_most}, another only {n_least} (a ratio of more than {ratio})",
-    remedy="match the photo again with match.guided, or measure points there (input ties)",
+    remedy="{unless[match.guided]:match the photo again with match.guided, or }measure points "
+    "there (input ties)",
     settled_by=("match.guided",),
 )
 SMALL_HULL: Final = DiagnosticSpec(

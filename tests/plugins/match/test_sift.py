@@ -51,6 +51,17 @@ def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: 
     assert 0.3 < np.sqrt(np.mean((right / stated[:, None]) ** 2)) < 1.5
 
 
+def test_where_photos_are_upside_down_the_run_goes_no_further(tmp_path: Path) -> None:
+    with pytest.raises(MethodError, match="upside down"):
+        sift(tmp_path, ms.photo_of(SCENE, ms.camera_before(roll=3.1)))
+    ties, _ = sift(tmp_path, ms.photo_of(SCENE, ms.camera_before()))
+    down = replace(ties, pixels_photo=-ties.pixels_photo)
+    # The ties of a floor or ceiling do not tell.
+    level = replace(down, points_world=ties.points_world[:, [0, 2, 1]])
+    found = [one.upside_down(np.array([0.0, 0.0, 1.0])) for one in (ties, down, level)]
+    assert found == [{}, {"n_down": 1, "n_photos": 1, "opposite": "-z"}, {}]
+
+
 def test_a_photo_of_nothing_known_is_warned_of(tmp_path: Path) -> None:
     photo = ms.photo_of(SCENE, ms.camera_before())
     blank = replace(photo, encoded=encode_png(np.full((photo.height, photo.width), 128, np.uint8)))
