@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         """Writes the files of a product for other programs."""
 
         def __call__(self, product: Product, folder: Path, digest: str) -> object:
-            """Write to an existing folder."""
+            """Write the files to an existing folder."""
 
 
 EntryState = Literal["fine", "broken", "clash"]

@@ -158,7 +158,7 @@ def cells_per_preview_px(shape: tuple[int, ...]) -> tuple[float, float]:
 
 
 def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return a grey picture of a raster: 1st percentile and NaN black, 99th percentile white."""
+    """Return a grey picture of a raster, from black (1st percentile and NaN) to white (99th)."""
     return _stretched(values, _stretch_of(values))
 
 

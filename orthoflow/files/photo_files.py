@@ -551,7 +551,7 @@ class Exif:
         focal_mm: focal length in millimetres.
         focal_35mm: full-frame equivalent of the focal length in millimetres.
         resolution_px_per_mm: pixels of the original image per millimetre on the sensor.
-        width: width in pixels of the original image, which may have been reduced since then.
+        width: width in pixels of the original image, which may have been reduced afterwards.
         height: height in pixels of the original image.
         is_damaged: whether some of the data could not be read.
     """
@@ -657,8 +657,8 @@ def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], b
 def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     """Return the focal length of a photo in pixels of its stored array.
 
-    The pixel pitch in the focal plane has priority, since a correct pitch is exact; it is
-    adapted if the image was reduced or rotated since then. It is ignored if it contradicts the 35
+    The pixel pitch in the focal plane has priority, since a correct pitch is exact; it is adapted
+    if the image was reduced or rotated after it was taken. It is ignored if it contradicts the 35
     mm equivalent, which does not depend on the image size and refers to the diagonal (see
     `FULL_FRAME_DIAGONAL_MM`). Impossible values are reported and ignored.
 

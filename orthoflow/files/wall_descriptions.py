@@ -26,7 +26,8 @@ class WallDescription(BaseModel):
         kind: `wall`, `floor`, `ceiling`, or another kind defined by the method.
         recommended: whether the orthoimage should be delivered.
         reason: reason for the recommendation.
-        width_m: width of the image in metres; None if there is no image, as for the numbers below.
+        width_m: width of the image in metres; None if there is no image, like the following
+            numbers.
         height_m: height of the image in metres.
         area_m2: area of the image in square metres.
         painted_share: share of cells with a colour in the image.

@@ -278,7 +278,7 @@ def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
     stumbled = int(getattr(error.problem_mark, "index", 0) or 0)
     if re.search(r":[\[{]$", text[: stumbled + 1]):
         return _UnreadableError(noticed, "this is not YAML: put a space after the colon")
-    # `key:value` in the line above is a single text, after which no key may follow.
+    # `key:value` in the line above is a single string, after which no key may follow.
     above = noticed.line - 1
     if "mapping values" in problem and (glued := _GLUED.match(text.splitlines()[above - 1])):
         position = Position(line=above, column=glued.end())

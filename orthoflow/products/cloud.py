@@ -112,10 +112,9 @@ class PointCloud(Product):
 
     @cached_property
     def boxes_m(self) -> NDArray[np.float32] | None:
-        """Return bounding boxes (blocks, 2, 3) of blocks of points, metres; None for small clouds.
+        """Return the bounding boxes (b, 2, 3) of blocks of points, metres; None for a small cloud.
 
-        The first row of a box is its minimum (x, y, z), relative to the origin, and the second its
-        maximum.
+        The rows of a box are its lowest and its highest x, y and z, relative to the origin.
         """
         return block_boxes_m(self) if len(self) > _BLOCKS_LEAST * BOXED_POINTS else None
 

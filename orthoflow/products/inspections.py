@@ -29,8 +29,8 @@ class CheckPoints(Product):
         names: name of each point.
         points_world: (n, 3) float64 metres.
         classes: class of each point, such as `flat` or `vertical`; empty if none is given.
-        wall: (n,) int32 number of the wall in whose orthoimage the point was measured (index of its
-            plane in `planes.json`); -1 if not measured.
+        wall: (n,) int32 number of the wall in whose orthoimage the point was measured (index of the
+            wall's plane in `planes.json`); -1 if not measured.
         pixels_wall: (n, 2) float64 (column, row) as measured, NaN where not measured.
         places_m: (n, 2) float64 X and Y as measured, in the coordinates of the orthoimage's
             GeoTIFF: metres in the plane of the wall, or easting and northing of a map. NaN if a
@@ -124,7 +124,7 @@ class Finding:
     """One numerical result of an inspection.
 
     Attributes:
-        name: name of the metric, which contains the unit if it has one.
+        name: name of the metric; contains the unit, if there is one.
         value: the result, in `unit`.
         unit: `1` for shares and counts.
         wall: index of the wall in `Walls`; -1 if the result refers to all walls together.

@@ -209,8 +209,8 @@ class TieWall:
         corners_world: four corners (x, y, z) of its raster in metres: top-left, then
             counter-clockwise for the viewer, as in `WallFrame.corners_world`.
         normal_world: unit vector (x, y, z) towards the viewer; photos are never taken from behind.
-        gsd_m: cell size of its raster in metres. None if the wall has no raster; limits in cells do
-            not apply then.
+        gsd_m: cell size of its raster in metres. None if the wall has no raster, in which case
+            limits in cells do not apply.
         plane_index: index of its plane in `Planes`; None if unknown.
     """
 
@@ -243,7 +243,7 @@ class TieWall:
 
 @dataclass(frozen=True, kw_only=True)
 class Ties(Product):
-    """Points with known positions on walls that were measured in photos.
+    """Points on walls, with known positions, that were measured in photos.
 
     A method may leave `walls` and `search_radius_px` empty, although both help to assess
     orientations. If `walls` is empty, walls are described by the points of the ties, and neither
@@ -422,7 +422,7 @@ class ResidualRow:
         shift_p: probability of a mean at least this far from zero if the expected value is zero
             (two-sided t-test); None for one tie.
         sd: standard deviation.
-        median: median.
+        median: median of the residuals.
         nmad: 1.4826 times the median absolute deviation from the median.
         skewness: third standardised moment; None if all residuals are the same.
         rmse: root mean square.

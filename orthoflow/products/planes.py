@@ -66,13 +66,13 @@ class Thickness:
     """Thickness of the cloud on one plane.
 
     Attributes:
-        sigma_m: robust standard deviation of the distances from the plane. To exclude relief, each
-            distance is reduced by the mean distance of a small tile of the plane.
+        sigma_m: robust standard deviation of the distances from the plane. To exclude relief, the
+            mean of a small tile of the plane is subtracted from each distance.
         width_95_m: width of the range that contains the middle 95 % of these distances.
         scan_step_m: median distance between neighbouring points on the plane.
         incidence_deg: classes by angle of incidence; empty if unknown.
         range_m: classes by distance from the scanner; empty if unknown.
-        material: thickness by material.
+        material: classes by material; empty if unknown.
     """
 
     sigma_m: float
@@ -93,7 +93,7 @@ class ScanRow:
         n_points: number of points of the row on the plane.
         sigma_m: robust standard deviation of their distances, as in `Thickness`; None if there are
             too few points.
-        material: thickness by material.
+        material: classes by material; empty if unknown.
     """
 
     row: int

@@ -236,7 +236,7 @@ def _decode(hint: object, stored: JsonValue, name: str, arrays: Mapping[str, Arr
 
 
 def _may_be(candidate: object, stored: JsonValue, hint: object) -> bool:
-    """Return whether a stored value fits a dataclass: the only candidate, or with all fields."""
+    """Return whether a value fits a dataclass: it is the only candidate, or has all fields."""
     if not dataclasses.is_dataclass(candidate) or not isinstance(stored, dict):
         return False
     is_only = sum(map(dataclasses.is_dataclass, _alternatives(hint))) == 1

@@ -77,13 +77,13 @@ class Surface:
 
     @property
     def sigma_axis_deg(self) -> float:
-        """Largest standard deviation of the direction of the axis, in any direction."""
+        """Largest standard deviation of the axis direction."""
         largest = float(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 
     @property
     def sigma_radius_m(self) -> float:
-        """Standard deviation of the radius; for a cone, of that in the middle of its points."""
+        """Standard deviation of the radius; for a cone, of its radius halfway along the points."""
         sigma = math.sqrt(max(0.0, float(self.covariance[6, 6])))
         if isinstance(self.shape, Cylinder):
             return sigma

@@ -1,4 +1,4 @@
-"""The context of a step: seeded generator, scratch folder, metrics, figures and progress."""
+"""The context of a step: random generator, scratch folder, metrics, figures and progress."""
 
 from __future__ import annotations
 

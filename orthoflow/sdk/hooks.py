@@ -1,4 +1,4 @@
-"""Hooks and specs with which a plugin declares its content; they do not import numpy or pydantic.
+"""Hooks and specs with which a plugin declares its content, without importing numpy or pydantic.
 
 A plugin is an installed distribution with an entry point in the group `orthoflow.plugins`. The
 entry point refers to a module that implements one or more of the hooks below with `hookimpl`.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-# Units by the words in names that stand for them; `1` for dimensionless numbers.
+# Unit by word in a name; `1` for dimensionless numbers.
 UNITS: Final[Mapping[str, str]] = {
     **{unit: unit for unit in ("m", "mm", "m2", "px", "deg", "rad", "s", "cells", "ppm")},
     "mib": "MiB",
@@ -16,7 +16,7 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def unit_of(name: str) -> str:
-    """Return the unit given by the last word that stands for one; a mere unit such as `m` has none.
+    """Return the unit of a name, from its last word that has one; a lone unit such as `m` has none.
 
     >>> unit_of("tolerance_m"), unit_of("area_min_m2"), unit_of("area_m2_min"), unit_of("n_trials")
     ('m', 'm2', 'm2', '')

@@ -3,8 +3,8 @@
 The exact bits of a result also depend on the processor and on the versions of numerical libraries.
 Therefore, the file contains samples of the numbers, which must be reproduced within the tolerances
 of the product types. The products declare no tolerances for metadata that describe a result, and
-the last bits of the inputs can change some of these values considerably, such as a share of a few
-cells. Metadata are therefore compared only if the samples of the inputs are the same.
+some of these values, such as a share of a few cells, can change considerably with the last bits of
+the inputs. Metadata are therefore compared only if the samples of the inputs are the same.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from orthoflow.products.product import Tolerance
 from orthoflow.testing.trials import Trial
 
 _AT_MOST: Final = 32
-# Share of the sampled values that may differ, since rounding errors can move a cell at an edge to
-# the other side.
+# Share of the sampled values that may differ, since a rounding error can assign a cell at an edge
+# to the other side of the edge.
 _STRAY_SHARE: Final = 1 / 16
 # Absolute and relative tolerance of values for which none is declared, as in comparisons of
 # records.

@@ -70,7 +70,7 @@ class TexturedWall:
     noises: tuple[_Array, ...]
 
     def depth_m(self, across_m: _Array, down_m: _Array) -> _Array:
-        """Return the relief, positive towards the viewer, at metres from the top-left corner."""
+        """Return the relief in metres, positive towards the viewer, at positions on the wall."""
         wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4)
         return RELIEF_M * (wave + 0.4 * np.sin(5.0 * across_m + 1))
 
@@ -140,7 +140,7 @@ def walls_of(scene: TexturedWall) -> Walls:
 
 
 def places_of_cells(frame: WallFrame) -> tuple[_Array, _Array]:
-    """Return two arrays (rows, cols): metres across and metres down to the cell centres."""
+    """Return the metres across and down to the centres of cells, as two arrays (rows, cols)."""
     across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
     return across * frame.gsd_m, down * frame.gsd_m
 
@@ -262,7 +262,10 @@ def nudged(camera: ViewingCamera, vector: tuple[float, ...]) -> ViewingCamera:
 
 
 def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera) -> float:
-    """Return the RMS per coordinate of the differences between two cameras' pixels on the wall."""
+    """Return the RMS error of a camera on the wall, in metres per coordinate.
+
+    It is computed from pixels that are projected onto the wall with the found and the true camera.
+    """
     pixels = np.mgrid[20.0:880.0:9j, 20.0:620.0:9j].reshape(2, -1).T
     landed = []
     for camera in (found, true):

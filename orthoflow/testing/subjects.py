@@ -78,8 +78,8 @@ class Subject:
     def elsewhere(self) -> tuple[Mapping[str, str], list[str]]:
         """Digests of the same run in a new process with another hash seed, and files left behind.
 
-        These are files in the working, home and temporary folders of the process, which were empty
-        before the run.
+        Files left behind are those in the working, home and temporary folders of the process, all
+        of which were empty before the run.
 
         Raises:
             AssertionError: the process failed; the message ends with the last line of its output.

@@ -334,7 +334,7 @@ class RegularOpening:
     Attributes:
         kind: `rectangle`, `arch` (a rectangle under a circular segment), or `outline` if neither
             fits.
-        outline_m: (n, 2) X and Y, counter-clockwise, not closed; arcs are polygons.
+        outline_m: (n, 2) X and Y, counter-clockwise, not closed; arcs are divided into chords.
         deviation_m: maximum distance between the detected outline and this one.
     """
 

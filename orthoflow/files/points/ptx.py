@@ -134,7 +134,7 @@ def _blocks(path: Path, parts: list[_Part]) -> Iterator[PointBlock]:
 
 
 def _find_headers(path: Path) -> list[tuple[int, int]]:
-    """Return the offset of each header and of the end, and how many filled lines precede it."""
+    """Return the offset of each header and of the end, with the number of filled lines before."""
     found: list[tuple[int, int]] = []
     offset, n_filled, kept = 0, 0, b""
     with path.open("rb") as file:

@@ -347,7 +347,7 @@ def _numbers(line: str, layout: Layout) -> list[float]:
 
 
 def take_lines(file: BinaryIO, n_lines: int) -> list[bytes]:
-    """Read up to `n_lines` further lines of a file; no line is read beyond its maximum length.
+    """Read up to `n_lines` further lines of a file; no line is read beyond the maximum length.
 
     Raises:
         InputError: a line is longer than `MOST_LINE_BYTES`.

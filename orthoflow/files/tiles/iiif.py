@@ -1,7 +1,7 @@
 """Export to IIIF: a Presentation 3 manifest with physical scale, and level 0 image services.
 
-Each wall is a canvas; its pictures (orthoimage, intensity, depth, relief) are alternatives that the
-viewer offers. An image service is a folder with static tiles and an `info.json`, for any web
+Each wall is a canvas; its pictures (orthoimage, intensity, depth and relief) are alternatives that
+the viewer offers. An image service is a folder with static tiles and an `info.json`, for any web
 server.
 """
 
