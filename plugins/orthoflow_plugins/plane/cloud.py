@@ -1,6 +1,6 @@
-"""Preparation of a cloud for detection: blocks of points, a sample, its box, and the noise.
+"""Preparation of a cloud for detection: blocks of points, a sample, a bounding box, and noise.
 
-Detectors search only the sample. Fits and labels then use all points.
+Detectors search only the sample; planes are then fitted to all points, and all points are labelled.
 """
 
 from __future__ import annotations
@@ -28,30 +28,32 @@ from orthoflow_plugins.plane.kernels import (
 _Label = TypeVar("_Label", np.int8, np.int16)
 
 SAMPLE_POINTS: Final = 200_000
-# Points used to find the extent of a scene.
+# Number of points from which the extent of a scene is computed.
 _BOX_POINTS: Final = 20_000
 _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
-# Margin of the robust box on each side, as a share of its size, and the additional margin.
+# Margin of the robust box on each side, as a share of the size of the box, and an additional
+# margin.
 _MARGIN_SHARE: Final = 0.02
 MARGIN_M: Final = 2.5
-# Share of the points allowed outside the box on each side, far below the minimum share of a plane.
-# Otherwise ghosts in mirrors and stray points (0.4 % in simulated rooms) would make the box several
-# times as large.
+# Share of the points that may be outside the box on each side, far below the minimum share of a
+# plane. If no points were allowed outside, reflections in mirrors and stray points (0.4 % in
+# simulated rooms) would make the box several times as large.
 _OUTSIDE_SHARE: Final = 0.00125
-# Maximum number of threads, so that the threads' own plans and rasters are small relative to the
-# cloud.
+# Maximum number of threads, so that the memory for plans and rasters, which each thread needs, is
+# small compared with the cloud.
 _PARTS_MOST: Final = 8
-# A cloud thinner than this in two directions is a line or a point.
+# A cloud that is thinner than this in two directions is a line or a point.
 _THINNEST_M: Final = 1e-4
 
-# Number of positions at which noise is measured, radii of neighbourhoods, and their minimum and
-# maximum numbers of points.
+# Number of positions at which noise is measured, radii of the neighbourhoods, and minimum and
+# maximum number of points in a neighbourhood.
 _NOISE_SEEDS: Final = 600
 _RADII_M: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
 _NEAR_LEAST: Final = 12
 _NEAR_MOST: Final = 400
-# A neighbourhood is flat if it extends this many times farther along its plane than across it.
+# A neighbourhood is flat if its extent along its plane is at least this multiple of the extent
+# across it.
 _FLATNESS: Final = 5.0
 # Minimum number of flat neighbourhoods for an estimate.
 _FLAT_LEAST: Final = 20
@@ -60,7 +62,7 @@ _QUARTER: Final = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Points that represent the cloud, at most `SAMPLE_POINTS`.
+    """A sample of at most `SAMPLE_POINTS` points of a cloud.
 
     Attributes:
         index: (m,) int64 indices of the points in the cloud, ascending.
@@ -75,19 +77,20 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedCloud:
-    """A cloud in the form that kernels need, and the plane of each point.
+    """A cloud in the form that kernels need, with the plane of each point.
 
     Attributes:
         points: all points.
         sample: a sample of the points.
         basis: (3, 3) rows e1, e2, up (see `geometry.basis_from_up`).
-        low_m: (3,) lower corner of the robust box in the (e1, e2, up) frame of the offsets.
-        extent_m: (3,) size of this box.
-        viewpoint_m: (3,) mean of the stations, or median of the points if none is known; offsets.
+        low_m: (3,) lower corner of the robust box, as offsets in the (e1, e2, up) frame.
+        extent_m: (3,) size of the robust box.
+        viewpoint_m: (3,) offset of the mean of the stations, or of the median of the points if no
+            station is known.
         tolerance_m: maximum distance of points that belong to a plane.
         fit_tolerance_m: maximum distance of points used to fit a plane.
         parts: number of parts that are processed in parallel.
-        claims: (n,) int8 plane of each point, -1 if not yet assigned; set by `search.label`.
+        claims: (n,) int8 plane of each point, set by `search.label`; -1 if not yet assigned.
     """
 
     points: BlockedPoints
@@ -103,16 +106,16 @@ class PreparedCloud:
 
     @property
     def up(self) -> NDArray[np.float64]:
-        """Unit vector (3,)."""
+        """Unit vector (3,) upwards, in world axes."""
         return np.asarray(self.basis[2])
 
     @property
     def sample_claims(self) -> NDArray[np.int8]:
-        """Planes of the sample points (m,) int8, -1 if not yet assigned."""
+        """Planes (m,) int8 of the sample points; -1 if not yet assigned."""
         return self.claims[self.sample.index]
 
     def box_corners(self) -> NDArray[np.float64]:
-        """Return the corners (8, 3) of the robust box, offsets in metres."""
+        """Return the corners (8, 3) of the robust box as offsets in metres."""
         steps = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
         return (self.low_m + steps * self.extent_m) @ self.basis
 
@@ -131,16 +134,17 @@ class PreparedCloud:
         each_part(len(self.claims), self.parts, claim)
 
     def write_labels(self, names: NDArray[_Label], labels: NDArray[_Label]) -> None:
-        """Write labels (n,) of points from (k + 1,) names; the last is for points on no plane.
+        """Write the labels (n,) of points, given the names (k + 1,) of planes and of no plane.
 
         Args:
-            names: names of the planes, in the type of the labels.
+            names: the label of each plane, and finally that of points on no plane, in the type of
+                the labels.
             labels: output; may be the claims themselves.
         """
         import cv2
 
-        # Indexing would convert all claims to 64 bits; a table has an entry for each byte, -1
-        # included.
+        # Use a table with an entry for each value of a byte, including -1, because indexing `names`
+        # would convert all claims to 64 bits.
         table = np.full(256, names[-1], dtype=names.dtype)
         table[: len(names) - 1] = names[:-1]
 
@@ -159,14 +163,15 @@ def prepare(
     parts: int,
     outside_share: float = _OUTSIDE_SHARE,
 ) -> PreparedCloud:
-    """Sample a cloud and find the boxes of its blocks; no point is assigned yet.
+    """Sample a cloud and compute the boxes of its blocks; no point is assigned to a plane yet.
 
     Args:
         cloud: the cloud.
         tolerance_m: maximum distance of points that belong to a plane.
-        fit_tolerance_m: maximum distance of points used to fit a plane, at most `tolerance_m`.
+        fit_tolerance_m: maximum distance of points that are used to fit a plane; at most
+            `tolerance_m`.
         parts: number of threads.
-        outside_share: share of the points allowed outside the box on each side.
+        outside_share: share of the points that may be outside the box on each side.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -201,10 +206,10 @@ def prepare(
 
 
 def draw_sample(cloud: PointCloud) -> Sample:
-    """Draw one point from each of `SAMPLE_POINTS` equal parts of a cloud, or all of a small cloud.
+    """Draw one point from each of `SAMPLE_POINTS` equal parts of a cloud; all if there are fewer.
 
-    The position within a part follows the golden ratio: a fixed stride would coincide with the
-    columns of a scan, and random positions would need a seed.
+    The position of the point within each part is computed with the golden ratio, because a fixed
+    stride could coincide with the columns of a scan, and random positions would need a seed.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -219,7 +224,7 @@ def draw_sample(cloud: PointCloud) -> Sample:
 
 
 def thinned(cloud: PointCloud, every: int) -> PointCloud:
-    """Return every n-th point, at least three, as in `draw_sample`: coordinates and scan."""
+    """Return coordinates and scans of every n-th point, at least three, as in `draw_sample`."""
     if every == 1:
         return cloud
     index = _spread_index(len(cloud), min(len(cloud), max(3, len(cloud) // every)))
@@ -244,7 +249,7 @@ def _spread_index(n_points: int, count: int) -> NDArray[np.int64]:
 
 
 def blocked(offsets_m: NDArray[np.float64]) -> BlockedPoints:
-    """Return the points (m, 3) of a sample in blocks."""
+    """Return the points (m, 3) of a sample, divided into blocks."""
     offsets = read_only(*np.ascontiguousarray(offsets_m.T, dtype=np.float32))
     return in_blocks(offsets, parts=1)
 
@@ -252,18 +257,18 @@ def blocked(offsets_m: NDArray[np.float64]) -> BlockedPoints:
 def robust_box(
     sample: Sample, basis: NDArray[np.float64], outside_share: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return lower corner and size (3,) of the box of a cloud without gross outliers.
+    """Return the lower corner (3,) and size (3,) of the box of a cloud, excluding gross outliers.
 
     Args:
         sample: points of the cloud.
         basis: (3, 3) rows e1, e2, up.
-        outside_share: share of the points allowed outside on each side.
+        outside_share: share of the points that may be outside the box on each side.
     """
     framed = sample.offsets_m[:: max(1, len(sample.index) // _BOX_POINTS)] @ basis.T
     low, high = np.quantile(framed, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), axis=0)
-    # The tails may be a side room or stray echoes; only points farther away than the size of the
-    # scene are certainly stray. A single wall is thin in one direction, so the largest extent is
-    # used.
+    # The outermost points may be in a side room or stray; only points farther away than the size of
+    # the scene are certainly stray. This size is the largest extent, because a single wall is thin
+    # in one direction.
     reach_m = float((high - low).max())
     framed = framed[((framed >= low - reach_m) & (framed <= high + reach_m)).all(axis=1)]
     low, high = np.quantile(framed, (outside_share, 1.0 - outside_share), axis=0)
@@ -272,17 +277,18 @@ def robust_box(
 
 
 def measure_noise(points_m: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Measure the noise of a cloud on a sample (n, 3) of its points; None if it has no flat parts.
+    """Measure the noise of a cloud on a sample (n, 3) of its points; None without flat parts.
 
     A plane is fitted to the points around a seed (principal components). Their scatter across the
-    plane is noise if they are flat, which means that they extend at least five times farther along
-    the plane than across it. Small neighbourhoods give the noise of single points. Large ones also
-    contain errors that are common to neighbouring points (a bent trajectory, stereo matching,
-    misregistered scans). They contain relief as well, so the lower quartile is used.
+    plane is noise if the neighbourhood is flat, which means that its extent along the plane is at
+    least five times that across it. Small neighbourhoods show the noise of single points. Large
+    neighbourhoods also show errors common to neighbouring points, as caused by a bent trajectory,
+    stereo matching or misregistered scans. Large neighbourhoods contain relief, too, so the lower
+    quartile is used.
 
     Returns:
-        Standard deviations across the surfaces, metres: of single points relative to their
-        neighbours, and including errors that are common to points within 0.8 m.
+        Standard deviations across the surfaces, in metres: of single points relative to their
+        neighbours, and of points including errors common to all points within 0.8 m.
     """
     from scipy.spatial import cKDTree
 
@@ -312,10 +318,10 @@ def measure_noise(points_m: NDArray[np.float64]) -> tuple[float, float] | None:
 
 
 def _flat_scatter_m(points_m: NDArray[np.float64]) -> float:
-    """Return the robust scatter of points across their plane; NaN if they are not flat.
+    """Return the robust scatter of points (n, 3) across their plane; NaN if they are not flat.
 
-    This is 1.4826 times the median deviation from the plane of principal components. A second
-    surface or an edge widens the components, so the test of flatness rejects such neighbourhoods.
+    The scatter is 1.4826 times the median distance from the plane of principal components. A
+    neighbourhood with a second surface or an edge is thicker, so it fails the test for flatness.
     """
     relative = points_m - points_m.mean(axis=0)
     values, axes = np.linalg.eigh(relative.T @ relative / (len(points_m) - 3))

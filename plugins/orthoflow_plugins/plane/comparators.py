@@ -1,4 +1,4 @@
-"""Plane detectors of open3d for comparison: `segment_plane` and `detect_planar_patches`."""
+"""Plane detectors of open3d, for comparison: `segment_plane` and `detect_planar_patches`."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from orthoflow_plugins.plane.proposing import Candidate, DetectorParams, Propose
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
 
-# Minimum number of points of a candidate, as a share of the minimum number for a plane.
+# Minimum number of points of a candidate, as a share of the minimum number of points of a plane.
 PART_SHARE: Final = 0.2
-# Number of neighbours for normals and region growing.
+# Number of neighbours for normals and for region growing.
 _NEIGHBOURS: Final = 30
 # Number of hypotheses of `segment_plane` per plane.
 _HYPOTHESES: Final = 1000
 
 
-# Any, because open3d has no types.
+# The type is Any, because open3d has no type annotations.
 def load_open3d(purpose: str) -> Any:
     """Import open3d.
 
-    Its wheel needs libusb-1.0.so.0, which may be missing on a new machine; the package
-    libusb-package contains it, and open3d finds it once it is loaded globally.
+    The wheel of open3d needs libusb-1.0.so.0, which may not be installed. The package
+    libusb-package contains this library, and open3d finds it after it has been loaded globally.
 
     Args:
-        purpose: the feature that needs open3d, for error messages.
+        purpose: feature that needs open3d, for error messages.
 
     Raises:
-        PluginError: open3d is not installed or does not load.
+        PluginError: open3d is not installed or cannot be loaded.
     """
     try:
         usb = import_module("libusb_package")
         ctypes.CDLL(str(usb.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError):
-        # The system may have libusb; otherwise, the import of open3d fails below.
+        # libusb may be installed in the system; otherwise, the import of open3d fails below.
         pass
     try:
         return import_module("open3d")
@@ -62,13 +62,13 @@ def load_open3d(purpose: str) -> Any:
 
 
 class _Open3dMethod(Detector):
-    """Base class of the methods that use open3d."""
+    """Base class of methods that use open3d."""
 
     determinism = "loose"
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Return the version of open3d, which affects results, under its installed name."""
+        """Return open3d, whose version affects results, under its distribution's name."""
         for name in ("open3d-cpu", "open3d"):
             try:
                 return {"open3d": version(name)}
@@ -78,12 +78,12 @@ class _Open3dMethod(Detector):
 
 
 class Open3dRansac(_Open3dMethod):
-    """Find one plane after another in the remaining points with open3d's `segment_plane`.
+    """Find planes one by one with open3d's `segment_plane`.
 
-    For comparison: it uses the same sample of the cloud as the other detectors, takes longer than
-    plane.ransac, and is not exactly repeatable, even with a fixed seed. `refit: false` returns the
-    planes of open3d; after the common refit, its planes are as accurate as those of other
-    detectors.
+    This method is meant for comparison. It uses the same sample of the cloud as the other
+    detectors, takes longer than plane.ransac, and is not exactly reproducible, even with a fixed
+    seed. `refit: false` returns the planes as computed by open3d; after the common refit, they are
+    as accurate as those of other detectors.
     """
 
     id = "plane.open3d-ransac"
@@ -102,17 +102,17 @@ class Open3dRansac(_Open3dMethod):
 
 
 class SegmentProposer(Proposer):
-    """Proposes the plane that `segment_plane` finds in the remaining points."""
+    """Proposes the planes that `segment_plane` finds in the remaining points."""
 
-    # Any: the library has no types.
+    # The type is Any, because open3d has no type annotations.
     def __init__(self, search: Search, params: DetectorParams, open3d: Any) -> None:
-        """Store the settings; open3d has no constraints, so unsuitable planes are refused later."""
+        """Store the settings; open3d has no constraints, so the search rejects other planes."""
         self._params, self._open3d = params, open3d
         self._passed_over = np.zeros(len(search.claims), dtype=bool)
         self._last = np.zeros(0, dtype=np.int64)
 
     def propose(self, search: Search) -> Candidate | None:
-        """Return the plane with the most inliers, or None if it has too few."""
+        """Return the plane with the most inliers; None if it has too few."""
         free = np.flatnonzero((search.claims < 0) & ~self._passed_over)
         if len(free) < max(3.0, search.least_points):
             return None
@@ -130,16 +130,17 @@ class SegmentProposer(Proposer):
         )
 
     def reject(self) -> None:
-        """Exclude the inliers of the rejected plane from further searches."""
+        """Exclude the inliers of the rejected plane from the next searches."""
         self._passed_over[self._last] = True
 
 
 class Open3dPatches(_Open3dMethod):
     """Find planes by region growing with open3d's `detect_planar_patches`.
 
-    For comparison: it uses the same sample of the cloud as the other detectors, with normals from
-    nearest neighbours in it. `refit: false` returns the planes of open3d, which pass through the
-    centre of the box around a patch and are biased by mouldings.
+    This method is meant for comparison. It uses the same sample of the cloud as the other
+    detectors, and computes normals from nearest neighbours in the sample. `refit: false` returns
+    the planes as computed by open3d. These pass through the centre of the box around a patch, so
+    mouldings bias them.
     """
 
     id = "plane.open3d-patches"
@@ -159,14 +160,14 @@ class Open3dPatches(_Open3dMethod):
 
 
 class PatchProposer(Proposer):
-    """Proposes the patches of `detect_planar_patches`, those with the most points first."""
+    """Proposes the patches found by `detect_planar_patches`, those with the most points first."""
 
-    # Any: the library has no types.
+    # The type is Any, because open3d has no type annotations.
     def __init__(self, search: Search, params: DetectorParams, open3d: Any) -> None:
         """Find all patches at once.
 
         Raises:
-            MethodError: open3d fails.
+            MethodError: open3d raised an error.
         """
         points_m = search.cloud.sample.offsets_m
         cloud = open3d.geometry.PointCloud()

@@ -1,4 +1,4 @@
-"""Base class, ports and metrics of the detectors."""
+"""Base class, ports and metrics of all detectors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthoflow_plugins.plane.proposing import Proposer
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
 
-# Metrics of every detector.
+# Metrics that all detectors report.
 DETECTOR_METRICS: Final = (
     MetricSpec("n_planes", label="planes found"),
     MetricSpec("thinning", label="points of the cloud per point used in the search"),
@@ -85,7 +85,7 @@ PAPER: Final = (
 
 
 class DetectorIn(Ports):
-    """The cloud."""
+    """The cloud in which planes are detected."""
 
     cloud: PointCloud
 
@@ -98,7 +98,7 @@ class DetectorOut(Ports):
 
 
 class Detector(Method):
-    """Base class of the methods that detect planes, which differ in how they propose planes."""
+    """Base class of methods that detect planes; subclasses provide the proposer."""
 
     result_version = 3
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = DETECTOR_METRICS
@@ -113,7 +113,7 @@ class Detector(Method):
         planes, labels = detect(inputs.cloud, params, ctx, proposer_of, method=self.id)
         return DetectorOut(planes=planes, labels=labels)
 
-    # Any: each detector has parameters of its own.
+    # The type of `params` is Any, because each detector has other parameters.
     @abstractmethod
     def proposer(self, search: Search, params: Any, ctx: StepContext) -> Proposer:
-        """Return the proposer at the beginning of a search."""
+        """Return the proposer of this detector for a new search."""

@@ -1,4 +1,4 @@
-"""Figures of planes and their detection: deviations, thickness, accumulators, normals."""
+"""Figures of planes and of their detection: deviations, thickness, accumulators and normals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PANELS_MOST: Final = 4
 _POINTS_MOST: Final = 25_000
 _NAMED_MOST: Final = 12
 _NAMES_ABREAST: Final = 3
-# A parallel projection, obliquely from above.
+# Direction of the parallel projection, obliquely from above.
 _AZIMUTH_DEG: Final = -60.0
 _ELEVATION_DEG: Final = 35.0
 _GREY: Final = "#c8c8c8"
@@ -47,17 +47,18 @@ def draw_deviations(
     deviations: Deviations,
     normalities: Sequence[Normality | None],
 ) -> None:
-    """Draw the distances of points from the first planes, with the normal distribution."""
+    """Draw histograms of the distances of points from the first planes, with normal curves."""
     count = min(_PANELS_MOST, len(planes))
     figure = column_figure(0.3 + 1.15 * count)
-    # Use the same scale for all planes, so that they can be compared.
+    # Use the same scale for all planes, so that histograms can be compared.
     panels = figure.subplots(count, 2, squeeze=False, sharex="col", sharey="col")
     tolerance_mm = 1000.0 * deviations.tolerance_m
     edges_mm = np.linspace(-tolerance_mm, tolerance_mm, HISTOGRAM_BINS + 1)
     middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
     width_mm = edges_mm[1] - edges_mm[0]
     for index, (axes, beside) in enumerate(panels):
-        # Percentage of points per millimetre, so that planes of any size can be compared.
+        # Use the percentage of points per millimetre, so that planes of different sizes can be
+        # compared.
         share = 100.0 / (max(1.0, float(deviations.histogram[index].sum())) * width_mm)
         axes.stairs(
             share * deviations.histogram[index], edges_mm, fill=True, color=plane_ink(index)
@@ -109,13 +110,13 @@ def draw_planes(
     plane_of_point: NDArray[np.int64],
     cloud: PointCloud,
 ) -> None:
-    """Draw the points coloured by plane and, below, the rectangles of the parts of the planes.
+    """Draw points coloured by plane, and below them the rectangles of the planes' parts.
 
     Args:
         ctx: receives the figure.
         planes: the planes, in world coordinates.
-        points_m: (m, 3) a sample of the cloud, offsets.
-        plane_of_point: (m,) plane of each point, -1 for none.
+        points_m: (m, 3) offsets of a sample of the cloud.
+        plane_of_point: (m,) plane of each point; -1 for points on no plane.
         cloud: the cloud.
     """
     every = max(1, len(points_m) // _POINTS_MOST)
@@ -126,7 +127,7 @@ def draw_planes(
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.04 * (high - low)
     n_named = min(_NAMED_MOST, len(planes))
-    # Do not use the constrained layout, since it would draw all points twice.
+    # Do not use the constrained layout, because it would draw all points twice.
     panel_in = COLUMN_INCHES * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.0))
     legend_in = 0.08 + 0.14 * -(-n_named // _NAMES_ABREAST)
     figure = column_figure(2.0 * panel_in + legend_in)
@@ -138,7 +139,7 @@ def draw_planes(
     above.plot(*flat[on_none].T, ".", markersize=1.0, markeredgewidth=0.0, color=_GREY)
     below.plot(*flat.T, ",", color="#e4e4e4")
     from_the_front = planes.normal @ np.cross(*view) > 0.0
-    # Draw the smallest planes last, so that the floor does not hide objects on it.
+    # Draw the smallest planes last, so that the floor does not hide the objects that stand on it.
     for k in range(len(planes)):
         colour = plane_ink(k)
         if from_the_front[k]:
@@ -174,7 +175,7 @@ def draw_thickness(
     row: RowPoints | None,
     materials: Materials,
 ) -> None:
-    """Draw the thickness of the cloud; nothing if no plane has enough points."""
+    """Draw the thickness of the cloud, unless no plane has enough points."""
     known = [(k, item) for k, item in enumerate(found) if item is not None][:_PLANES_MOST]
     if not known:
         return
@@ -224,12 +225,12 @@ def draw_thickness(
     )
 
 
-# Attributes against which the thickness is plotted, by axis label.
+# Attributes over which the thickness is plotted, by axis label.
 _CLASSES: Final = {"angle of incidence [deg]": "incidence_deg", "range [m]": "range_m"}
 
 
 def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the right and up directions (2, 3) of the figure, in world axes."""
+    """Return the directions (2, 3), in world axes, that are to the right and up in the figure."""
     azimuth, elevation = math.radians(_AZIMUTH_DEG), math.radians(_ELEVATION_DEG)
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
@@ -249,7 +250,7 @@ def _draw_bars(
 
 
 def _draw_row(axes: Axes, planes: Planes, row: RowPoints, materials: Materials) -> None:
-    """Draw the distances of a scan row from the first plane, coloured by material."""
+    """Draw the distances of the points of a scan row from the first plane, coloured by material."""
     axes.plot(row.along_m, 1000.0 * row.distance_m, ".", markersize=1, color="#333333")
     if row.intensity is not None:
         for name, (low, high) in materials.items():
@@ -266,7 +267,7 @@ _PIXELS_MOST: Final = 900
 _SECTION_POINTS_MOST: Final = 2_000_000
 _SECTION_CELLS_MOST: Final = 2_000
 _BIN_DEG: Final = 1.0
-# The map shows voxels up to this distance from the plane, so that it includes niches and objects in
+# Maximum distance from the plane of the voxels in the map, which includes niches and objects in
 # front of the wall.
 _MAP_DEPTH_M: Final = 0.6
 _MAP_MOST_DEG: Final = 15.0
@@ -283,13 +284,15 @@ def draw_accumulator(
     planes: Planes,
     cloud: PointCloud,
 ) -> None:
-    """Draw the plan with the detected walls, and the parameter space with their maxima.
+    """Draw the plan with the detected walls, and the parameter space with the maxima of the walls.
 
     Args:
         ctx: receives the figure.
-        points_m: (s, 2) sample in the plan, e1 and e2 from the centre; NaN for points left out.
-        votes: (angles, bins) votes for lines before any plane was removed.
-        centre_m: (2,) centre of the plan; its distance is at the middle edge of the bins.
+        points_m: (s, 2) positions of sample points in plan, along e1 and e2 from the centre; NaN
+            for points to omit.
+        votes: (angles, bins) votes for lines, before any plane was removed.
+        centre_m: (2,) centre of the plan; lines through it have the distance 0, at the middle edge
+            of the bins.
         bin_m: width of a bin, and minimum side of a pixel of the plan.
         planes: the planes, in world coordinates.
         cloud: the cloud.
@@ -297,7 +300,7 @@ def draw_accumulator(
     basis, (n_angles, n_bins) = basis_from_up(planes.up), votes.shape
     reach_m, half_m = 0.5 * n_bins * bin_m, np.nanmax(np.abs(points_m), axis=0)
     pixel_m = max(bin_m, 2.0 * float(half_m.max()) / _PIXELS_MOST)
-    # A margin of five pixels.
+    # Add a margin of five pixels.
     edges_m = [pixel_m * np.arange(-n, n + 1) for n in np.ceil(half_m / pixel_m).astype(int) + 5]
     high = np.array([along_m[-1] for along_m in edges_m])
     low, high = centre_m - high, centre_m + high
@@ -317,7 +320,7 @@ def draw_accumulator(
     extent = (*_around(0.0, 180.0, n_angles), -reach_m, reach_m)
     shown = _show_votes(below, _thinned_sum(votes), extent)
     figure.colorbar(shown, ax=below, label="votes")
-    # The global maximum, as a line in the plan and as a point in the parameter space.
+    # Draw the global maximum as a line in the plan and as a point in the parameter space.
     row, column = np.unravel_index(int(votes.argmax()), votes.shape)
     angle, distance_m = math.pi * row / n_angles, reach_m * (2.0 * (column + 0.5) / n_bins - 1.0)
     across = np.array([math.cos(angle), math.sin(angle)])
@@ -329,7 +332,7 @@ def draw_accumulator(
         corners = (planes.corners[index] - cloud.origin) @ basis.T
         colour, name = plane_ink(int(index)), planes.names[index]
         above.plot(*corners[[1, 2], :2].T, linewidth=1.2, color=colour, label=name)
-        # Position of the wall in the parameter space.
+        # Compute the position of the wall in the parameter space.
         normal = basis @ planes.normal[index]
         angle = math.atan2(normal[1], normal[0]) % math.pi
         direction = np.array([math.cos(angle), math.sin(angle)])
@@ -341,7 +344,7 @@ def draw_accumulator(
     above.set_ylabel("e2 [m]")
     below.set_xlabel("direction of the normal [deg]")
     below.set_ylabel("distance from the centre [m]")
-    # The legend is below the panels, because the plan of a single long wall is too narrow for it.
+    # Draw the legend below the panels, because the plan of a single long wall has no space for it.
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     ctx.figure(
         "accumulator",
@@ -362,14 +365,14 @@ def draw_space(
     reach_m: float,
     planes: Planes,
 ) -> None:
-    """Draw the best votes of an accumulator with the detected planes, and its sections.
+    """Draw the best scores of an accumulator, with the detected planes, and its sections.
 
     Args:
         ctx: receives the figures.
-        best: see `hough3d.sections_of`, also for the next three arguments.
-        over_omega: see best.
-        over_phi: see best.
-        reach_m: see best.
+        best: see `hough.sections_of`.
+        over_omega: see `hough.sections_of`.
+        over_phi: see `hough.sections_of`.
+        reach_m: see `hough.sections_of`.
         planes: the planes, in world coordinates.
     """
     figure = column_figure(2.4)
@@ -417,7 +420,7 @@ def draw_space(
 
 
 def _around(first_deg: float, end_deg: float, count: int) -> tuple[float, float]:
-    """Return the limits of an axis whose pixels are centred on evenly spaced angles."""
+    """Return the limits of an axis on which pixels are centred at evenly spaced angles."""
     half_deg = 0.5 * (end_deg - first_deg) / count
     return first_deg - half_deg, end_deg - half_deg
 
@@ -428,7 +431,7 @@ def _show_votes(
     extent: tuple[float, float, float, float],
     most: float | None = None,
 ) -> AxesImage:
-    """Show votes (across, up) in grey by their square root; white is the maximum."""
+    """Draw votes (across, up) as grey levels, by their square roots; the maximum is white."""
     norm = PowerNorm(0.5, vmin=0.0, vmax=most)
     return axes.imshow(
         votes.T, origin="lower", aspect="auto", cmap="gray", norm=norm, extent=extent
@@ -437,19 +440,19 @@ def _show_votes(
 
 @in_column_style()
 def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m: float) -> None:
-    """Draw the points per voxel in three sections through the middle of the planes.
+    """Draw the number of points per voxel in three sections through the middle of the planes.
 
     Args:
         ctx: receives the figure.
         planes: the planes, in world coordinates; at least one.
         cloud: the cloud.
-        cell_m: side of a voxel; enlarged if the scene would need too many voxels.
+        cell_m: side of a voxel; it is increased if the scene would need too many voxels.
     """
     every = max(1, len(cloud) // _SECTION_POINTS_MOST)
     points_m = np.column_stack([cloud.x[::every], cloud.y[::every], cloud.z[::every]])
     basis = basis_from_up(planes.up)
     framed = points_m.astype(np.float64) @ basis.T
-    # Do not use the extent of all points, since some are far outside, behind mirrors and windows.
+    # Do not use the extent of all points, because some appear far away behind mirrors and windows.
     corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ basis.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     cell_m = max(cell_m, float((high - low).max()) / _SECTION_CELLS_MOST)
@@ -458,7 +461,7 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     names = ("e1", "e2", "up")
     views = ((0, 1, 2), (0, 2, 1), (1, 2, 0))
     sides_m = high - low
-    # All sections have the same scale, so the heights of the panels differ.
+    # Use the same scale for all sections, so that the panels have different heights.
     heights = [float(np.clip(sides_m[up] / sides_m[:2].max(), 0.25, 1.5)) for _, up, _ in views]
     figure = column_figure(2.3 * sum(heights) + 0.5 * len(views))
     panels = figure.subplots(len(views), 1, height_ratios=heights)
@@ -491,10 +494,10 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
 def draw_normals(
     ctx: StepContext, voxels: SurfaceVoxels, n_regions: int, planes: Planes, cloud: PointCloud
 ) -> None:
-    """Report the scatter of normals about the first plane's normal; draw histogram and map.
+    """Report and draw the scatter of normals about the normal of the first plane.
 
     Args:
-        ctx: receives metrics and figure.
+        ctx: receives the metrics and the figure.
         voxels: the voxels with their normals.
         n_regions: number of regions with enough points.
         planes: the planes, in world coordinates.
@@ -515,7 +518,7 @@ def draw_normals(
     ctx.metric("cell_mm", 1000.0 * voxels.table.voxel_m, "mm")
     ctx.metric("normal_scatter_deg", scatter_deg, "deg")
     shown = over & (np.abs(depth_m) < _MAP_DEPTH_M) & np.isfinite(voxels.spreads[:, 0])
-    # Angle at the voxel nearest to the viewer; NaN where there is none.
+    # For each pixel, the angle at the voxel nearest to the viewer; NaN if there is none.
     pixel_m = max(voxels.table.voxel_m, float(size_m.max()) / _MAP_PIXELS_MOST)
     picture = np.full(np.maximum(1, np.ceil(size_m / pixel_m).astype(int))[::-1], np.nan)
     order = np.flatnonzero(shown)[np.argsort(depth_m[shown], kind="stable")]
@@ -571,7 +574,7 @@ def _draw_normals(
 
 
 def _thinned_sum(values: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return the sums of blocks of an image, so that it is small enough to draw."""
+    """Return the sums over blocks of an image, so that it is small enough to draw."""
     rows, columns = (max(1, -(-size // _PIXELS_MOST)) for size in values.shape)
     padded = np.pad(values, ((0, -values.shape[0] % rows), (0, -values.shape[1] % columns)))
     blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)

@@ -1,28 +1,31 @@
-"""Fits of a plane to points of the sample, with decreasing tolerance, and to the cells on it.
+"""Fits of a plane: to sample points, with decreasing tolerance, and to the cells on the plane.
 
-All planes here are in the cloud's offsets (metres from its origin), so that large survey
-coordinates keep their precision; `planes` adds the origin at the end.
+All planes in this module refer to offsets in metres from the cloud's origin, so that no precision
+is lost with large survey coordinates. The module `planes` adds the origin at the end.
 
-The fit to cells is robust total least squares. Neighbouring points of a scan have common errors,
-because relief, bow and waves of the plaster exceed the noise of the scanner. Each cell is therefore
-one observation, whose variance is that of the surface plus that due to the noise of its points.
+The fit to cells is a robust total least squares adjustment. Neighbouring points of a scan have
+common errors, because relief, bow and waves of the plaster exceed the noise of the scanner. Each
+cell is therefore an observation whose variance is the sum of the variance of the surface and that
+due to the noise of the cell's points.
 
-Mouldings, edges and mixed pixels cause points off the surface, nearly always on one side of it.
-Their influence is reduced in three ways: the fit starts at the densest layer of cells instead of
-their median, distant cells have no weight, and cells with a larger scatter than usual have less.
+Mouldings, edges and mixed pixels cause points off the surface, nearly always on the same side of
+it. The influence of these points is reduced in three ways: the fit starts at the densest layer of
+cells instead of at their median, distant cells have no weight, and cells with a larger scatter than
+usual have less weight.
 
-A covariance from single points would be far too small. It is estimated in three steps.
+A covariance computed from single points would be far too small. Instead, the covariance is
+estimated in three steps.
 
 - Tiles of cells are the independent units: the covariance is estimated by leaving out one tile at a
   time (cluster jackknife, CR3 in Cameron & Miller 2015, section VI.B), which remains valid with few
   tiles. Several tile sizes are tried, and the one with the largest variance is used, because the
-  variance grows with the size as long as tiles are smaller than the correlation length.
+  variance increases with the size as long as tiles are smaller than the correlation length.
 - Cells whose weight decreases with their residual carry less information than their weights
   suggest: the covariance is enlarged by the derivative of the influence function (Huber &
   Ronchetti 2009, section 7.6).
-- Mouldings and mixed pixels are on one side and bias the fit, which the scatter does not reveal.
-  The bias is estimated from the shift of the plane if cells at twice the distance are used, and is
-  added as a separate component (GUM, JCGM 100:2008, 4.3).
+- Mouldings and mixed pixels, which are on one side, bias the fit, but the scatter does not show
+  this bias. It is estimated from the displacement of the plane when cells up to twice the distance
+  are used, and is added as a separate component (GUM, JCGM 100:2008, 4.3).
 """
 
 from __future__ import annotations
@@ -45,40 +48,45 @@ from orthoflow_plugins.plane.kernels import (
 from orthoflow_plugins.plane.proposing import Candidate, Constraint
 from orthoflow_plugins.plane.support import CellSums, Support, SurfaceRaster
 
-# For each orientation that a fit keeps exactly, the constant of the kernel, and the unknowns among
-# height, slope along u and slope along v.
+# For each constraint on the orientation: the constant of the kernel, and the free unknowns (0:
+# height, 1: slope along u, 2: slope along v).
 _FREEDOMS: Final[dict[Constraint, tuple[int, list[int]]]] = {
     "any": (FREE, [0, 1, 2]),
     "vertical": (VERTICAL, [0, 1]),
     "horizontal": (LEVEL, [0]),
 }
 
-# Residual, in standard deviations of a cell, beyond which it has no weight (Beaton & Tukey 1974).
+# Residual, in standard deviations of a cell, beyond which the cell has no weight (Beaton & Tukey
+# 1974).
 _TUKEY: Final = 3.5
-# Cells closer than this share of the limit have full weight. With Tukey's weight, which decreases
-# from zero distance on, the weights of points would depend on the division into cells: a seventh of
-# the information would be lost, and rotating a wall would move the plane by half its sigma.
+# Cells whose residuals are below this share of the limit have full weight. With Tukey's original
+# function, weights decrease even for small residuals. The weights of points would then depend on
+# the division into cells: a seventh of the information would be lost, and rotating a wall would
+# displace the plane by half its standard deviation.
 _FULL_SHARE: Final = 0.571
-# The densest layer contains this share of the cells; a normal distribution has it within +-0.385.
+# The densest layer contains this share of the cells. In a normal distribution, this share is within
+# +-0.385 standard deviations.
 _LAYER_SHARE: Final = 0.3
 _LAYER_SIGMAS: Final = 0.7706
-# Weight of the usual variance near a cell, as a number of points, when it is averaged with the
+# Weight, as a number of points, of the usual variance near a cell when it is averaged with the
 # cell's own variance.
 _USUAL_POINTS: Final = 40
-# The usual variance is the median in a block of this width, if it has at least this many cells.
+# The usual variance is the median in a block of this width, provided that the block contains a
+# minimum number of cells.
 _BLOCK_CELLS: Final = 8
 _BLOCK_LEAST: Final = 12
 _CHANCE_SIGMAS: Final = 3.0
 _STEPS_MOST: Final = 30
-# A fit has converged when no cell moves by more than this.
+# A fit has converged if it moves no cell by more than this.
 SETTLED_M: Final = 1e-7
-# Lower limit of the roughness of a surface, so that weights of perfectly flat surfaces are finite.
+# Lower limit for the roughness of a surface, so that the weights of perfectly flat surfaces are
+# finite.
 _FLATTEST_M: Final = 2e-5
 
-# Widths of tiles for the covariance in cells, and minimum number of tiles.
+# Widths, in cells, of the tiles for the covariance, and minimum number of tiles.
 _TILE_CELLS: Final = (2, 4, 8, 16)
 _TILES_LEAST: Final = 8
-# Lower limit of the ratio of the derivative of the influence function to the weights.
+# Lower limit for the ratio of the derivative of the influence function to the weights.
 _FLATTENING_LEAST: Final = 0.3
 _STEADY: Final = 1e-6
 _WIDER: Final = 2.0
@@ -86,10 +94,10 @@ _WIDER_STEPS: Final = 3
 
 
 def shrinking_tolerances(tolerance_m: float, fit_tolerance_m: float) -> tuple[float, ...]:
-    """Return the tolerances of successive fits: 5 cm, 2.7 cm and 1.5 cm for the defaults.
+    """Return the tolerances of successive fits; by default, these are 5, 2.7 and 1.5 cm.
 
-    A fit at 5 cm finds the wall but is biased by mouldings and the edge of the floor; a fit at 1.5
-    cm is accurate but does not converge from a poor initial plane.
+    A fit with 5 cm finds the wall, but is biased by mouldings and the edge of the floor. A fit with
+    1.5 cm is accurate, but does not converge from a poor initial plane.
     """
     if fit_tolerance_m >= tolerance_m:
         return (tolerance_m,)
@@ -103,18 +111,17 @@ def refine_plane(
     freedom: Constraint,
     up: NDArray[np.float64],
 ) -> Plane | None:
-    """Move a plane to the densest layer of points near it: total least squares, reweighted.
+    """Move a plane to the densest layer of points near it, by reweighted total least squares.
 
     Args:
         points: (m, 3) offsets, metres.
         start: initial plane.
         tolerances_m: tolerances of successive fits; points farther away have no weight (Tukey).
-        freedom: orientation that the fit keeps exactly.
+        freedom: constraint on the orientation, which the fit keeps exactly.
         up: (3,) unit vector.
 
     Returns:
-        The plane, or None if it is supported by fewer than three points or by collinear points
-        only.
+        The plane; None if fewer than three points, or only collinear points, are near it.
     """
     basis = np.eye(3) if freedom == "any" else basis_from_up(up)
     # Always use the same memory layout, so that only one version of the kernel is compiled.
@@ -124,18 +131,18 @@ def refine_plane(
         if not refine_robustly(packed, row, tolerance_m, _FREEDOMS[freedom][0]):
             return None
     normal = row[:3] @ basis
-    # Normalise twice, because Plane accepts only rounding errors in the length.
+    # Normalise twice, because `Plane` tolerates only rounding errors in the length.
     normal /= np.linalg.norm(normal)
     return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(row[3]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellFit:
-    """A robust fit to cells, whose heights above an approximate plane are the observations.
+    """A robust fit to cells; observations are the heights of cells above an approximate plane.
 
     Attributes:
         design: (n, p) derivatives of heights with respect to the unknowns.
-        heights_m: (n,) mean height of the points of each cell.
+        heights_m: (n,) mean height of the points in each cell.
         rows: (n,) row of each cell.
         columns: (n,) column of each cell.
         limit_m: (n,) residual beyond which a cell has no weight.
@@ -152,16 +159,16 @@ class CellFit:
     solution: NDArray[np.float64]
 
     def residuals_m(self) -> NDArray[np.float64]:
-        """Return the heights (n,) above the plane."""
+        """Heights (n,) of the cells above the fitted plane."""
         return np.asarray(self.heights_m - self.design @ self.solution)
 
     def faded(self) -> NDArray[np.float64]:
-        """Return how far (n,) residuals are between full weight (0) and no weight (1)."""
+        """Positions (n,) of the residuals between full weight (0) and no weight (1)."""
         beyond = (np.abs(self.residuals_m() / self.limit_m) - _FULL_SHARE) / (1.0 - _FULL_SHARE)
         return np.clip(beyond, 0.0, 1.0)
 
     def weights(self) -> NDArray[np.float64]:
-        """Return weights (n,): inverse variances, reduced by Tukey's function near the limit."""
+        """Weights (n,): inverse variances, reduced by Tukey's function near the limit."""
         return (1.0 - self.faded() ** 2) ** 2 / self.variance_m2
 
     def stepped(self) -> CellFit | None:
@@ -180,10 +187,10 @@ class AdjustedPlane:
     """A plane fitted to cells.
 
     Attributes:
-        plane: the plane in the cloud's offsets.
-        moved_m: largest displacement of a cell by the fit.
+        plane: the plane, for offsets from the cloud's origin.
+        moved_m: largest displacement of a cell by the fit, in metres.
         bend_per_m: largest curvature of the surface, the inverse of its radius.
-        bend_share: share of the variance of the cells explained by the curvature.
+        bend_share: share of the variance of the cells that the curvature explains.
         fit: the fit to the cells.
         jacobian: (4, p) derivatives of (normal, offset) with respect to the unknowns.
     """
@@ -196,7 +203,7 @@ class AdjustedPlane:
     jacobian: NDArray[np.float64]
 
     def stated(self) -> tuple[NDArray[np.float64], float]:
-        """Return the covariance (4, 4) of (normal, offset) in the cloud's offsets.
+        """Return the covariance (4, 4) of (normal, offset), for offsets from the cloud's origin.
 
         Returns:
             The covariance, and the number of independent cells that would give the same covariance.
@@ -210,11 +217,12 @@ class FoundPlane:
     """An accepted plane.
 
     Attributes:
-        raster: cells on the plane; `raster.plane` is the plane in the cloud's offsets.
-        support: cells that belong to the plane, its parts and rectangle.
+        raster: raster on the plane; `raster.plane` is the plane, for offsets from the cloud's
+            origin.
+        support: cells that belong to the plane, connected parts and rectangle.
         adjusted: the fit.
         candidate: proposal of the detector.
-        freedom: orientation that the fit keeps exactly.
+        freedom: constraint on the orientation, which the fit keeps exactly.
     """
 
     raster: SurfaceRaster
@@ -233,18 +241,18 @@ def adjust_plane(
     freedom: Constraint,
     settled_m: float = SETTLED_M,
 ) -> AdjustedPlane | None:
-    """Fit a plane to the mean distances of cells; to second order, this is total least squares.
+    """Fit a plane to the mean distances of cells; equals total least squares to second order.
 
     Args:
-        raster: cells on an approximate plane.
-        sums: sums over the points of each cell.
+        raster: raster on an approximate plane.
+        sums: sums over the points in each cell.
         cells: (rows, columns) bool, True for cells that belong to the plane.
-        fit_tolerance_m: tolerance of the sums.
-        freedom: orientation that the fit keeps exactly.
-        settled_m: the fit has converged if no cell moves by more than this.
+        fit_tolerance_m: maximum distance of the points in the sums from the approximate plane.
+        freedom: constraint on the orientation, which the fit keeps exactly.
+        settled_m: the fit has converged if it moves no cell by more than this.
 
     Returns:
-        The plane, or None if the cells do not determine it.
+        The plane; None if the cells do not determine it.
     """
     rows, columns = np.nonzero(cells & (sums.n_fit > 0))
     if len(rows) < 4:
@@ -265,7 +273,7 @@ def adjust_plane(
         return None
     change = np.zeros(3)
     change[unknowns] = fit.solution
-    # Height and slopes at the centre of the cells.
+    # Use the height and the slopes at the centre of the cells as unknowns.
     axes = raster.axes
     normal = raster.plane.normal - change[1:] @ axes
     offset_m = raster.plane.offset_m + float(change @ [1.0, *-centre])
@@ -275,7 +283,7 @@ def adjust_plane(
     normal = normal / length
     bend_per_m, bend_share = _bend(full, heights_m)
     return AdjustedPlane(
-        # Normalise twice, because Plane accepts only rounding errors in the length.
+        # Normalise twice, because `Plane` tolerates only rounding errors in the length.
         plane=Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m / length),
         moved_m=float(np.abs(full @ change).max()),
         bend_per_m=bend_per_m,
@@ -292,12 +300,13 @@ def _cell_variances(
     columns: NDArray[np.int64],
     fit_tolerance_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the variances of cell means due to noise, and due to points off the surface.
+    """Return the variances of the cells' means due to noise, and due to points off the surface.
 
-    A share of points distributed evenly between the surface and the tolerance D, as with mixed
-    pixels, adds share * D**2 / 3 to the variance of a cell and moves its mean by share * D / 2. The
-    error of the mean is therefore 1.5 / D times the excess of the variance over the usual variance.
-    The latter is the median in a block of cells, because noise depends on incidence and material.
+    If a share of the points is distributed evenly between the surface and the tolerance D, as with
+    mixed pixels, the variance of a cell increases by share * D**2 / 3, and its mean moves by share
+    * D / 2. The error of the mean is therefore 1.5 / D times the difference between the variance
+    and the usual variance. The usual variance is the median in a block of cells, because noise
+    depends on incidence and material.
     """
     free = np.maximum(number - 1, 0)
     own = np.maximum(spread_m2, 0.0) * number / np.maximum(free, 1)
@@ -307,7 +316,7 @@ def _cell_variances(
     block = rows // _BLOCK_CELLS * across + columns // _BLOCK_CELLS
     n_blocks = across * (int(rows.max()) // _BLOCK_CELLS + 1)
     order = np.argsort(own)
-    # 16-bit numbers are sorted without comparisons.
+    # NumPy sorts 16-bit integers by radix sort, without comparisons.
     narrow = block[order].astype(np.uint16 if n_blocks <= 65536 else np.int64)
     order = order[np.argsort(narrow, kind="stable")]
     count = np.bincount(block, minlength=n_blocks)
@@ -331,7 +340,7 @@ def _solved(
     mixture_m2: NDArray[np.float64],
     settled_m: float,
 ) -> CellFit | None:
-    """Solve by reweighted least squares and estimate the variance of cells."""
+    """Solve by reweighted least squares, and estimate the variances of cells."""
     solution = np.zeros(design.shape[1])
     solution[0] = _densest_layer(heights_m)[0]
     usual_m2 = float(np.median(noise_m2 + mixture_m2))
@@ -357,10 +366,10 @@ def _solved(
 
 
 def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the centre of the shortest interval with a share of the heights, and the sigma.
+    """Return the centre of the shortest interval with a given share of the heights, and sigma.
 
-    This is the "shorth" of Rousseeuw & Leroy 1987 with a smaller share, so that a panel over half
-    of the wall does not affect it.
+    This is the "shorth" of Rousseeuw & Leroy 1987 with a smaller share, so that a panel that covers
+    half of the wall does not affect the result.
     """
     ordered = np.sort(heights_m)
     held = max(2, int(_LAYER_SHARE * len(ordered)))
@@ -371,9 +380,9 @@ def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the curvature of cell heights, and the share of their variance that it explains."""
+    """Return the curvature of the cells' heights, and the share of variance that it explains."""
     reach_m = max(float(np.abs(design[:, 1:]).max()), _FLATTEST_M)
-    # Use units of the reach, so that the normal equations are well conditioned.
+    # Scale coordinates by their range, so that the normal equations are well conditioned.
     u, v = design[:, 1] / reach_m, design[:, 2] / reach_m
     curved = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
     normal_matrix, right = curved.T @ curved, curved.T @ heights_m
@@ -389,7 +398,7 @@ def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[
 
 
 def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
-    """Return the covariance of a robust fit, including correlated and one-sided errors.
+    """Return the covariance of a robust fit, allowing for correlated and one-sided errors.
 
     Returns:
         The covariance (p, p) of the unknowns, and the number of independent cells that would give
@@ -400,7 +409,7 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
     rows, columns = fit.rows[used], fit.columns[used]
     factor = _flattening(fit, weights) ** -2
     largest = np.zeros((design.shape[1],) * 2)
-    # Each cell is its own tile.
+    # With independent cells, each cell is a tile.
     alone = before = _mean_variance(design, independent_covariance(fit))
     reach = -math.inf
     for size in _TILE_CELLS:
@@ -410,11 +419,12 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
         covariance = factor * jackknife_covariance(scores, products, tile)
         variance = _mean_variance(design, covariance)
         if variance > reach:
-            # Extrapolation: the correlation across tile borders halves if the tile size doubles.
+            # Extrapolate: if the tile size doubles, the effect of correlation across tile borders
+            # is halved.
             beyond = max(1.0, 2.0 - before / variance) if variance else 1.0
             largest, reach = beyond * covariance, variance
         before = variance
-    # The change of the unknowns if cells at twice the distance are used.
+    # Compute the change of the unknowns when cells up to twice the distance are used.
     wider = replace(fit, limit_m=_WIDER * fit.limit_m)
     for _ in range(_WIDER_STEPS):
         wider = wider.stepped() or wider
@@ -428,8 +438,8 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
 def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
     """Return the covariance (p, p) of the unknowns for independent cells.
 
-    This is the sandwich estimator for M-estimates (Huber & Ronchetti 2009, section 7.6); the
-    leverage of single cells is negligible.
+    This is the sandwich estimator for M-estimates (Huber & Ronchetti 2009, section 7.6). It
+    neglects the leverage of single cells.
     """
     scores, products, _ = _scores(fit)
     inverse = np.linalg.inv(products.sum(axis=0))
@@ -440,7 +450,7 @@ def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
 def _scores(
     fit: CellFit,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return scores (m, p), products (m, p, p) and the mask (n,) of cells with a weight."""
+    """Return scores (m, p) and products (m, p, p) of cells with a weight, and their mask (n,)."""
     weights = fit.weights()
     used = weights > 0.0
     design, weights = fit.design[used], weights[used]
@@ -450,14 +460,14 @@ def _scores(
 
 
 def _mean_variance(design: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Return the mean variance of the plane's height over its cells, to compare covariances."""
+    """Return the mean variance of the plane's height over all cells, to compare covariances."""
     return float(np.sum((design @ covariance) * design)) / len(design)
 
 
 def jackknife_covariance(
     scores: NDArray[np.float64], products: NDArray[np.float64], tile: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the jackknife covariance, with one tile left out at a time."""
+    """Return the jackknife covariance, leaving out one tile at a time."""
     held = np.bincount(tile) > 0
     n_tiles, size = int(np.count_nonzero(held)), scores.shape[1]
     sums = np.column_stack([np.bincount(tile, column)[held] for column in scores.T])
@@ -466,7 +476,7 @@ def jackknife_covariance(
         for j in range(i, size):
             parts[:, i, j] = parts[:, j, i] = np.bincount(tile, products[:, i, j])[held]
     whole = parts.sum(axis=0)
-    # The matrix is damped in case the other tiles do not determine a plane.
+    # Damp the matrix, because the other tiles may not determine a plane.
     without = whole - parts + _STEADY * np.diag(np.diag(whole))
     moves = np.linalg.solve(without, sums[:, :, None])[:, :, 0]
     return (n_tiles - 1) / n_tiles * (moves.T @ moves)

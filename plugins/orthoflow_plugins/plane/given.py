@@ -1,4 +1,4 @@
-"""`plane.given`: a reference plane given by the user, as in skarlatos2012."""
+"""`plane.given`: reference planes given by the user, as in skarlatos2012."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 
-# Share of the points below the horizontal plane, which is below the scene but above stray echoes.
+# Share of the points below the default horizontal plane, which is below the scene but above stray
+# points.
 _GROUND_SHARE: Final = 0.01
-# A larger share of points outside the rectangle than this is reported.
+# A share of points outside the rectangle that exceeds this is reported.
 _STRAY_REPORTED: Final = 1e-3
 # Buffer of skarlatos2012: three tolerances on each side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0
@@ -34,7 +35,7 @@ _METRICS: Final = {"n_planes", "labelled_share", "rms_mm", "omega_deg", "phi_deg
 _EVERYWHERE_M: Final = 1e9
 _NO_BOUNDS_M: Final = (-_EVERYWHERE_M, _EVERYWHERE_M, -_EVERYWHERE_M, _EVERYWHERE_M)
 
-# A viewpoint set by the user counts as given, as does a normal.
+# Sources of the visible side: a normal or a viewpoint set by the user counts as given.
 _SIDES: Final[Mapping[str, SideSource]] = {
     "given": "given",
     "view_from": "given",
@@ -57,7 +58,7 @@ STRAY_PARTS: Final = DiagnosticSpec(
 
 
 class StatedPlane(MethodParams):
-    """One plane, given in exactly one of three ways."""
+    """A plane, given in exactly one of three ways."""
 
     normal: Vector | None = Field(
         None, description="Direction towards the viewer, world axes; any length."
@@ -80,7 +81,7 @@ class StatedPlane(MethodParams):
 
     @property
     def ways(self) -> tuple[str, ...]:
-        """Return which of the three ways are used."""
+        """Return those of the three ways that are used."""
         ways = {
             "normal": self.normal is not None or self.offset_m is not None,
             "points": self.points is not None,
@@ -105,15 +106,15 @@ class StatedPlane(MethodParams):
 class GivenPlane(Method):
     """Use one or more reference planes given by the user.
 
-    Each is given in exactly one of three ways: `normal` with `offset_m` (the normal points to the
-    viewer and is never reversed), three `points` (world metres; the normal is turned towards the
-    viewer), or the `horizontal` plane seen from above, which is also the default, as in
-    skarlatos2012. If `height_m` is not set, its height is the first percentile of the heights of
-    the points. Several planes are listed in `planes`; a point near several of them belongs to the
-    nearest.
+    Each plane is given in exactly one of three ways: by `normal` and `offset_m` (the normal points
+    towards the viewer and is never reversed); by three `points` in world coordinates, in metres
+    (the normal is turned towards the viewer); or as `horizontal`, a plane seen from above. By
+    default, as in skarlatos2012, the plane is horizontal. If `height_m` is not set, the height of a
+    horizontal plane is the first percentile of the heights of the points. Several planes are listed
+    in `planes`; a point near several of them belongs to the nearest.
 
-    The rectangle encloses the points within `buffer_m` of the plane (all points for the horizontal
-    one), except insignificant parts such as stray echoes outside the scene.
+    The rectangle of a plane contains the points within `buffer_m` of the plane (for a horizontal
+    plane, all points by default), except small parts, such as stray points outside the scene.
     """
 
     id = "plane.given"
@@ -127,7 +128,7 @@ class GivenPlane(Method):
     )
 
     class Params(StatedPlane):
-        """One plane or several."""
+        """Parameters: one plane, or several."""
 
         planes: tuple[StatedPlane, ...] = Field(
             (),
@@ -166,14 +167,14 @@ class GivenPlane(Method):
     Out = DetectorOut
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
-        """Place the planes and label the points on them."""
+        """Determine the rectangles of the planes, and label the points on them."""
         from orthoflow_plugins.plane.cloud import prepare
         from orthoflow_plugins.plane.planes import measure_planes, planes_of, report_planes
         from orthoflow_plugins.plane.support import slab_of
 
         cloud, tolerance_m = inputs.cloud, params.tolerance_m
         ctx.progress(0.0, "placing the plane")
-        # With part_min_share = 0, no points are treated as stray.
+        # If part_min_share is 0, no points are considered stray.
         outside_share = _OUTSIDE_SHARE if params.part_min_share else 0.0
         reaches_m = (tolerance_m, tolerance_m)
         prepared = prepare(cloud, *reaches_m, parts=ctx.cores, outside_share=outside_share)
@@ -185,7 +186,8 @@ class GivenPlane(Method):
         prepared.assign(slabs, np.insert(everywhere, 0, tolerance_m, axis=1))
         counts = np.bincount(prepared.claims[prepared.claims >= 0], minlength=len(placed_planes))
         order = np.argsort(-counts, kind="stable")
-        # The plane with the most points comes first; the last entry is for points on no plane.
+        # Sort planes by their numbers of points, largest first; the last entry is for points on no
+        # plane.
         prepared.claims[:] = np.append(np.argsort(order), -1).astype(np.int8)[prepared.claims]
         labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
         labels[:] = prepared.claims
@@ -197,7 +199,7 @@ class GivenPlane(Method):
             deviations,
             cloud,
             covariances=[np.zeros((4, 4))] * len(placed_planes),
-            # One value for all planes, the least certain.
+            # There is one value for all planes: the least certain one.
             viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
             side_from=sides if len(set(sides)) > 1 else (),
         )
@@ -208,7 +210,7 @@ class GivenPlane(Method):
 def _all_placed(
     params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud, ctx: StepContext
 ) -> list[tuple[FacedPlane, str]]:
-    """Return each plane with its rectangle, and how its visible side was determined."""
+    """Return each plane with its rectangle, and the source of its visible side."""
     placed_planes = []
     for nth, stated in enumerate(params.planes or (params,)):
         try:
@@ -226,7 +228,7 @@ def _all_placed(
 def _placed(
     stated: StatedPlane, params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud
 ) -> tuple[FacedPlane, str, int]:
-    """Return a plane facing the viewer, the source of its side, and the number of stray points."""
+    """Return a plane facing the viewer, how its side is known, and the number of omitted points."""
     from orthoflow_plugins.plane.planes import (
         face,
         known_viewpoint,
@@ -245,8 +247,8 @@ def _placed(
         buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
     near = np.abs(distances_m) <= reach_m
-    # Cells that connect points near the plane. Their size is computed from quantiles, because a few
-    # distant echoes would make the cells as large as the scene.
+    # Cells connect the points near the plane into parts. Compute the size of cells from quantiles,
+    # because a few distant stray points would make the cells as large as the scene.
     up = prepared.up
     placed = members[near] @ wall_axes(plane.normal, up).T
     low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(placed) else np.zeros((2, 2))
@@ -282,7 +284,7 @@ def _placed(
 def _plane_of(
     stated: StatedPlane, cloud: PointCloud, prepared: PreparedCloud
 ) -> tuple[Plane, bool]:
-    """Return the plane in the cloud's offsets, and whether its side is known."""
+    """Return the plane, for offsets from the cloud's origin, and whether its side is known."""
     if stated.normal is not None and stated.offset_m is not None:
         normal = np.array(stated.normal) / math.hypot(*stated.normal)
         normal = normal / np.linalg.norm(normal)
