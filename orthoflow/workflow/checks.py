@@ -1,4 +1,4 @@
-"""Checks that concern several parts of a workflow: connections, comparison, and plausibility."""
+"""Checks that concern several parts of a workflow: connections, comparison and plausibility."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def check_wiring(
     """Report all mistakes in the connections between steps.
 
     Args:
-        steps: all steps that could be read.
-        step_names: names of all steps in the file, including unreadable ones.
+        steps: the steps that could be read.
+        step_names: names of all steps in the file, including steps that could not be read.
         input_names: names of all inputs.
-        log: receives the problems.
+        log: log to which problems are added.
     """
     type_of = _types(steps, step_names, input_names, log)
     for step in steps:
@@ -83,7 +83,7 @@ def _types(
     given = {step.name: _ports(step, are_given=True) for step in steps}
 
     def type_of(location: Location, reference: Reference) -> str | None:
-        """Return the product type of a reference; if it is unknown, report this and return None."""
+        """Return the product type of a reference; if it is unknown, add a problem."""
         name, source = reference.name, reference.source
         if reference.is_input and name in input_names:
             return FILES
@@ -114,7 +114,7 @@ def _types(
 
 
 def _check_required(step: DraftStep, log: ProblemLog) -> None:
-    # Ports with unreadable references count as connected.
+    # A port whose reference could not be read counts as connected.
     written = log.get((*step.location, "in"))
     wired = written if isinstance(written, dict) else step.inputs
     for call in step.calls:
@@ -129,14 +129,17 @@ def _check_required(step: DraftStep, log: ProblemLog) -> None:
 
 
 def _placed(step: DraftStep) -> Iterator[tuple[str, Location, Reference]]:
-    """Yield all references of a step, each with its port and its location."""
+    """Yield port, location and reference for all references of a step."""
     for port, references in step.inputs.items():
         for index, reference in enumerate(references):
             yield port, (*step.location, "in", port, index), reference
 
 
 def _ports(step: DraftStep, *, are_given: bool) -> Mapping[str, str] | None:
-    """Return port -> product type of a step; None if its kind is unknown."""
+    """Return port -> product type for the output or input ports of a step.
+
+    The result is None if the kind of the step is unknown.
+    """
     for call in step.calls:
         if call.kind is not None and not call.kind.is_source:
             return call.kind.outputs if are_given else call.kind.inputs
@@ -164,7 +167,7 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
         try:
             TopologicalSorter(sources).prepare()
         except CycleError as error:
-            # Each step in this list is a source of the next; the last step is the same as the
+            # Each step in this list is a source of the next step, and the last step is equal to the
             # first.
             names_in_cycle: list[str] = error.args[1]
         else:
@@ -192,11 +195,14 @@ def check_comparison(
     seeds: Sequence[int],
     log: ProblemLog,
 ) -> Comparison | None:
-    """Check the section `compare` against steps, datasets and seeds; return None if absent."""
+    """Check the section `compare` against steps, datasets and seeds.
+
+    Names of swept variants are replaced by the names of the variants for their values.
+    """
     if section is None:
         return None
     names = {
-        # The name of a swept variant is still valid; it refers to the variants for all its values.
+        # The name of a swept variant remains valid and refers to the variants for all values.
         step.name: list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
         for step in steps
         if step.is_varied
@@ -244,8 +250,8 @@ def _check_baseline(comparison: Comparison, log: ProblemLog) -> None:
 def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
     """Return the variant that a name refers to after overrides have been applied.
 
-    If a call is swept in the file and the command line sets a single value, names of swept values
-    refer to that call, whose name is empty for a step without other variants.
+    If the file sweeps a parameter and the command line sets a single value, the names of the swept
+    variants refer to the call with this value. Its name is empty if the step has no other variants.
     """
     draft = next((one for one in steps if one.name == step), None)
     fitting = [
@@ -257,7 +263,7 @@ def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
 
 
 def _families(step: DraftStep) -> dict[str, list[str]]:
-    """Return name of a swept variant -> names of the variants for its values."""
+    """Return name of a swept variant -> names of the variants for the values."""
     found: dict[str, list[str]] = {}
     for call in step.calls:
         if call.family:
@@ -268,7 +274,7 @@ def _families(step: DraftStep) -> dict[str, list[str]]:
 def _spelled_out(
     assignment: Mapping[str, str], steps: Sequence[DraftStep]
 ) -> Iterator[dict[str, str]]:
-    """Yield an assignment for each value of the swept variants in an assignment, in order."""
+    """Yield an assignment for each value of the swept variants in an assignment."""
     families = {step.name: _families(step) for step in steps}
     several = [
         families.get(step, {}).get(variant, [variant]) for step, variant in assignment.items()
@@ -288,7 +294,7 @@ def _known(
     names: Mapping[str, Sequence[str]],
     log: ProblemLog,
 ) -> dict[str, str]:
-    """Return the entries whose factor and level are known; report the others."""
+    """Return the entries whose factor and level exist; report the others."""
     chosen: dict[str, str] = {}
     for factor, level in assignment.items():
         known = names.get(factor)
@@ -314,7 +320,7 @@ def _known(
 
 
 def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequence[str]) -> str:
-    """Return the reason why a metric pattern matches nothing; empty if it may match a metric."""
+    """Return why a metric pattern matches no metric; empty if it may match one."""
     step, _, metric = pattern.partition(".")
     if not _has_wildcard(step) and step not in step_names:
         return (
@@ -352,7 +358,7 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
 
 
 def _may_match(declared: str, metric: str) -> bool:
-    """Whether a declared and a requested name can be the same; both may contain wildcards."""
+    """Whether a declared and a requested name may be equal; both may contain wildcards."""
     if fnmatchcase(metric, declared) or fnmatchcase(declared, metric):
         return True
     # Assume that two patterns with wildcards can match the same name.
@@ -367,17 +373,17 @@ def _has_wildcard(text: str) -> bool:
 
 _GSD: Final = "gsd_m"
 _CROP: Final = "crop"
-# Prefix of the methods that find photos on walls.
+# Prefix of the methods that match photos with walls.
 _MATCHING: Final = "match."
-# Limits for pixel sizes of walls and plans: finer than any scan, or coarser than any building
-# drawing.
+# Pixel sizes outside these limits are implausible: smaller than the point spacing of any scan, or
+# too large for a drawing of a building.
 _MIN_GSD_M: Final = 0.0001
 _MAX_GSD_M: Final = 0.5
 _MILLIMETRES: Final = 1000.0
 
 
 def lint_workflow(workflow: Workflow) -> tuple[str, ...]:
-    """Yield a sentence for each implausible setting."""
+    """Return a sentence for each implausible setting."""
     return (*_idle_inputs(workflow), *_cell_sizes(workflow), *_cropped_matching(workflow))
 
 
@@ -424,7 +430,7 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
         for step in workflow.steps.values()
         if any(variant.method.startswith(_MATCHING) for variant in step.variants)
     ]
-    # If cameras are given, no matching is needed.
+    # If the input with which matching is skipped is given, no photos are matched.
     if any(step.unless and workflow.inputs[step.unless].files for step in matching):
         return
     for first in matching[:1]:
@@ -437,7 +443,10 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
 
 
 def _calls(workflow: Workflow, parameter: str) -> Iterator[tuple[str, str, StepVariant]]:
-    """Yield origin, step and call, for all calls and for those whose `parameter` a dataset sets."""
+    """Yield origin, step and call for all calls.
+
+    These include the calls of datasets that set `parameter`.
+    """
     for step in workflow.steps.values():
         for variant in step.variants:
             yield "", step.name, variant

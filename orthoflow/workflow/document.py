@@ -1,4 +1,4 @@
-"""Reading of a workflow file in one pass that reports all problems."""
+"""Reads and checks a workflow file, and reports all problems at once."""
 
 from __future__ import annotations
 
@@ -68,22 +68,23 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     """Read and check a workflow.
 
     Args:
-        name_or_path: an existing file, or the name of a shipped recipe.
+        name_or_path: path of a workflow file, or name of a shipped recipe.
         catalog: the installed plugins.
-        sets: settings `step[.variant].param=value`, as for `--set`.
-        inputs: `NAME=PATH`, as for `--input`; paths are relative to the working directory.
-        datasets: table that replaces the datasets in the file, as for `--datasets`, or the content
-            of the section itself.
-        only_data: names of datasets, as for `--only-data`.
+        sets: settings in the form `step[.variant].param=value`, as for `--set`.
+        inputs: inputs as `NAME=PATH`, as for `--input`; paths are relative to the working
+            directory.
+        datasets: path of a table that replaces the datasets in the file, as for `--datasets`, or
+            the content of the section `datasets`.
+        only_data: names of the datasets to select, as for `--only-data`.
         set_files: YAML files with lines `step.parameter: value`, as for `--set-file`; values in
             `sets` take precedence.
-        also_files: whether to report missing input files together with other problems of the file.
+        also_files: whether to report missing input files, too, if the file has other problems.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
         InvalidArgumentsError: the file is valid, but the options are not.
-        UnusablePluginError: the only problem is that plugins are broken or missing.
-        WorkflowError: the file does not exist or cannot be read at all.
+        UnusablePluginError: plugins are broken or missing, and there is no other problem.
+        WorkflowError: the file does not exist or cannot be read.
     """
     path = find_workflow(name_or_path)
     source = read_text(path)
@@ -98,7 +99,7 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         if not log.has((key,)):
             log.report((key,), needed)
     if not log.has((_STEPS,)):
-        # The other sections refer to steps, so that checking them would report each name as a
+        # The other sections refer to steps, so each of these references would be reported as a
         # problem.
         _sections(log)
         log.raise_any()
@@ -106,7 +107,7 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     reader = _Reader(path=path, source=source, catalog=catalog, log=log)
     workflow = reader.read(tuple(sets), tuple(inputs), datasets, tuple(only_data), tuple(profiles))
     if also_files and log.has_any:
-        # Otherwise, input files are located when they are needed.
+        # If there are no other problems, the caller searches for the input files itself.
         add_missing_inputs(workflow, log)
     log.raise_any()
     return workflow
@@ -120,7 +121,7 @@ def _is_mapping(log: ProblemLog, text: str) -> bool:
 
 
 def _sections(log: ProblemLog) -> WorkflowFile:
-    """Validate the file; `datasets` is read separately, because it may be replaced."""
+    """Validate all sections except `datasets`, which an option may replace."""
     data = log.get(())
     assert isinstance(data, dict)  # noqa: S101 - checked before
     sections = {key: value for key, value in data.items() if key != "datasets"}
@@ -128,7 +129,6 @@ def _sections(log: ProblemLog) -> WorkflowFile:
 
 
 def _read_profile(path: Path, log: ProblemLog) -> ProblemLog:
-    """Read a settings file given with `--set-file`."""
     try:
         text = read_text(path, "a settings file")
     except WorkflowError as error:
@@ -161,7 +161,7 @@ class _Reader:
         only_data: Sequence[str],
         profiles: Sequence[ProblemLog],
     ) -> Workflow:
-        """Read all sections; the result is only valid if the log is empty."""
+        """Read all sections; the result is valid only if the log is empty."""
         log = self.log
         file = _sections(log)
         folder = self.path.resolve().parent
@@ -227,7 +227,7 @@ class _Reader:
             steps=read,
             compare=compare,
             overrides=(
-                # Records do not contain settings files, so each entry is recorded as `--set`.
+                # Records contain no settings files, so each setting in them is recorded as `--set`.
                 *(
                     f"--set {key}={json.dumps(value, ensure_ascii=False)}"
                     for profile in profiles

@@ -1,4 +1,4 @@
-"""Drafting of a workflow: recognition of files, and their insertion into a shipped recipe."""
+"""Drafts a workflow: recognises files, and inserts them into a shipped recipe."""
 
 from __future__ import annotations
 
@@ -50,32 +50,32 @@ _SCAN_SUFFIXES: Final = tuple(
 )
 _FIRST_LINE_BYTES: Final = 10_000
 _WORKFLOW_BYTES: Final = 1_000_000
-# Files that identify a run folder: images in it are not photos.
+# These files identify a run folder, in which images are not photos.
 _OF_RUNS: Final = frozenset(("run.h5", "journal.jsonl"))
-#: levels of folders in a folder given to `orthoflow new`
+#: Maximum depth of subfolders that `orthoflow new` searches.
 DEEPEST: Final = 3
-#: files that `orthoflow new` visits in a folder
+#: Maximum number of files that `orthoflow new` reads.
 MOST_FILES: Final = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recognised:
-    """A recognised file, or a folder that is a single item.
+    """A recognised file, or a folder that counts as a single item, such as a run folder.
 
     Attributes:
-        kind: type of the item; `unknown` if no method reads it.
-        path: path of the file.
-        summary: description of the content, or the reason why it is not recognised.
+        kind: type of the item; `unknown` if no method can read it.
+        path: path of the file or folder.
+        summary: description of the content, or the reason why the file cannot be used.
         n_points: number of points of a scan.
-        n_photos: number of photos, including photos in a scan.
+        n_photos: 1 for a photo; for a scan, number of photos in its file.
         n_posed: number of photos in a scan whose lens and pose are known.
-        fields: non-empty point attributes of a scan, without coordinates.
-        lens: names of camera and focal length of a photo, from its EXIF data.
+        fields: point attributes of a scan that are not empty, without the coordinates.
+        lens: camera and focal length of a photo, from its EXIF data.
         size_px: width and height of a photo.
-        matrix: fx, fy, cx, cy of a text file with a camera matrix.
-        is_text: whether it is a text file that cannot be read as a scan.
-        up: up axis suggested by the surfaces, if it is clearly not z.
-        advice: suggested settings and inputs, as far as they follow from the data.
+        matrix: fx, fy, cx and cy in pixels, if the file contains a camera matrix.
+        is_text: whether the file is a text file that cannot be read as a scan.
+        up: up axis suggested by the surfaces of a scan; empty unless it is clearly not z.
+        advice: suggested settings and inputs that follow from the data.
     """
 
     kind: FileKind
@@ -150,7 +150,8 @@ def _file(path: Path) -> Recognised:
         (_YAML, _yaml),
         (_CAMERAS, lambda file: _read("cameras", file, lambda one: _cameras_summary([one]))),
     ]
-    # Scanners and sidecars also use JSON, so an unknown JSON file is not an error.
+    # JSON files are also written by scanners and as sidecars, so do not try to read them as
+    # cameras.
     is_odd = suffix == ".json" and path.name != "cameras.json"
     for suffixes, reader in readers:
         if suffix in suffixes and not is_odd:
@@ -161,7 +162,7 @@ def _file(path: Path) -> Recognised:
 def _photo(path: Path) -> Recognised:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    # HEIC files are opened; related formats are recognised by their first bytes.
+    # A HEIC file must be read completely; other formats are recognised by their first bytes.
     problem = unreadable(path.read_bytes() if photo_format(head) == "HEIC" else head)
     if problem:
         return _unknown(path, problem)
@@ -224,7 +225,7 @@ def _scan(path: Path) -> Recognised:
 
 
 def _axis_up(points_m: NDArray[np.float64]) -> str:
-    """Return the up axis if the surfaces show that it is clearly not z; otherwise ""."""
+    """Return the up axis suggested by points (n, 3) in metres; empty unless it is clearly not z."""
     if not len(points_m):
         return ""
     offsets = (points_m - np.median(points_m, axis=0)).astype(np.float32)
@@ -236,7 +237,11 @@ def _axis_up(points_m: NDArray[np.float64]) -> str:
 def _seen_in(
     scan: ScanFile, unit_m: NDArray[np.float64]
 ) -> tuple[frozenset[str], NDArray[np.float64]]:
-    """Return non-empty fields of a scan's first points, and the points (n, 3) in metres."""
+    """Return the fields of a scan that are not empty, and points (n, 3) in metres.
+
+    Only the first points of the scan are read. `unit_m` contains the lengths in metres of one unit
+    along the three axes.
+    """
     kept: list[NDArray[np.float64]] = []
     found: set[str] = set()
     n_seen = 0
@@ -253,7 +258,7 @@ def _seen_in(
 
 
 def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
-    """Return advice to check the unit if a scan is unusually large or small."""
+    """Return advice to check the unit if the extent of a scan is implausible."""
     if extent_m > _MAX_EXTENT_M:
         size, hint = (
             f"{extent_m:,.0f} m",
@@ -267,17 +272,18 @@ def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
     return [f"{_word(name)} extends over {size} if its unit is {unit}: {hint}"]
 
 
-# Usual extents of terrestrial scans.
+# Extents of terrestrial scans are usually between these limits.
 _MAX_EXTENT_M: Final = 2000.0
 _MIN_EXTENT_M: Final = 0.2
-# Number of points read from a scan, and number of bytes read from a photo, which begins with EXIF.
+# Number of points read from a scan, and number of bytes read from the beginning of a photo, which
+# contains the EXIF data.
 _LOOKED_AT: Final = 1_000_000
 _HEAD_BYTES: Final = 1 << 20
 _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
 
 def _table(path: Path) -> Recognised:
-    """Recognise a table of points or ties, or else a text scan, whose lines contain no names."""
+    """Recognise a text file: a table of points or ties, cameras, or a scan."""
     with path.open("rb") as file:
         head = file.read(_FIRST_LINE_BYTES).decode("utf-8", "replace")
     if matrix := _matrix_in(head):
@@ -289,7 +295,7 @@ def _table(path: Path) -> Recognised:
         try:
             rows = reader(path)
         except InputError as error:
-            # Only a file of this type has these columns.
+            # Only files of this type have these columns.
             if columns >= own:
                 return _unknown(path, error)
             continue
@@ -306,7 +312,7 @@ def _table(path: Path) -> Recognised:
 
 
 def _matrix_in(text: str) -> tuple[float, ...]:
-    """Return fx, fy, cx and cy from a text that begins with a 3 x 3 camera matrix; otherwise ()."""
+    """Return fx, fy, cx and cy if text begins with a 3 x 3 camera matrix, otherwise ()."""
     try:
         values = [float(word) for word in re.split(r"[\s,;]+", text.strip())[:9]]
     except ValueError:
@@ -331,13 +337,13 @@ _TABLES: Final[
 
 
 def _is_cloud(rows: Sequence[object]) -> bool:
-    """Whether all point names are decimal numbers, so that they are in fact coordinates."""
+    """Whether all point names are decimal numbers, so that the points are in fact a scan."""
     names = [str(getattr(row, "name", "")) for row in rows]
     return all(re.fullmatch(r"[-+]?\d+\.\d*(e[-+]?\d+)?", name) for name in names)
 
 
 def _yaml(path: Path) -> Recognised:
-    """Recognise a calibration; an existing workflow is reported as one."""
+    """Recognise a calibration; a workflow is reported as such."""
     found = _read(
         "calibration",
         path,
@@ -366,13 +372,13 @@ def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recogni
 
 Recipe: TypeAlias = Literal["photos-on-scan", "direct", "plan"]
 
-# Steps that take the place of a missing scan.
+# Steps of the recipe that replace a missing scan by a simulated room.
 _STAND_INS: Final = ("room", "check")
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
 _FEW_SCANS: Final = 3
-# Paths that begin with this are easier to read as absolute paths.
+# A relative path that begins with this is replaced by the absolute path, which is easier to read.
 _FAR: Final = "../../.."
 
 
@@ -381,11 +387,11 @@ class Draft:
     """A drafted workflow.
 
     Attributes:
-        recipe: name of the shipped recipe on which it is based.
+        recipe: name of the shipped recipe on which the workflow is based.
         text: text of the workflow file.
-        inputs: description of each input.
-        left_out: files that are not used as input, with the reason.
-        advice: suggested settings and inputs, as far as they follow from the data.
+        inputs: input -> description of its files.
+        left_out: files that are not used as input, each with the reason.
+        advice: suggested settings and inputs that follow from the data.
     """
 
     recipe: Recipe
@@ -400,12 +406,13 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
 
     Args:
         found: recognised files.
-        target: path of the workflow; paths in it are relative to its folder.
-        recipe: recipe to use; if None, orthoimages are made from photos if there are any, otherwise
-            from the colours of the scan.
+        target: path of the workflow file; paths in the file are relative to its folder.
+        recipe: recipe to use; if None, the recipe creates orthoimages from photos if there are any,
+            otherwise from the colours of the scan.
 
     Raises:
-        InputError: there is no scan, or there are no photos although the recipe needs them.
+        InputError: there is no scan, the recipe needs photos but there are none, or, if no recipe
+            is given, the scan has neither colours nor intensity.
     """
     by_kind: dict[FileKind, list[Recognised]] = {}
     for item in found:
@@ -419,7 +426,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         )
     own_formats = [scan for scan in scans if scan.path.suffix.lower() not in TEXT.suffixes]
     if own_formats:
-        # Text files next to scans in other formats are probably notes with numbers.
+        # If there are scans in other formats, text files are probably not scans but notes.
         by_kind["unknown"] = [
             replace(
                 item,
@@ -434,7 +441,8 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         scans = by_kind["scan"] = own_formats
     own_photos = [scan for scan in scans if scan.n_photos]
     has_posed = any(scan.n_posed for scan in own_photos)
-    # Images without a pose are mostly for viewing, and matching would not locate them on the walls.
+    # Images without a pose in a scan are mostly meant for viewing, and could not be matched with
+    # walls.
     is_usual = bool(by_kind.get("photos") or has_posed)
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
@@ -447,7 +455,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
             "scan with its colours (--recipe direct writes the workflow anyway)"
         )
     if own_photos and "photos" not in by_kind:
-        # Photos taken by a scanner are in the scan file, with their poses.
+        # Photos taken by a scanner are stored in the scan file together with their poses.
         inside = [
             replace(scan, summary="the photos in this file", n_points=0) for scan in own_photos
         ]
@@ -463,7 +471,7 @@ _ByKind: TypeAlias = Mapping[FileKind, Sequence[Recognised]]
 
 
 def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
-    """Return the text of the recipe with its inputs filled in and a new heading."""
+    """Insert inputs and a heading into the text of a recipe."""
     shipped = shipped_workflow(recipe).read_text(encoding="utf-8")
     _, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
     taken, left_out = _assigned(by_kind, inputs, recipe)
@@ -488,7 +496,7 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
         f"#   orthoflow run {run} --set wall.gsd_m=0.02    a fast coarse run; then without",
         "",
     ]
-    # Steps of the recipe, with the up axis if it follows from the scans.
+    # Set the up axis if all scans suggest the same axis.
     steps = _without_stand_ins(steps)
     axes = {item.up for item in by_kind["scan"]}
     (up,) = axes if len(axes) == 1 else ("",)
@@ -521,7 +529,7 @@ def _advice(by_kind: _ByKind) -> list[str]:
 def _assigned(
     by_kind: _ByKind, inputs: str, recipe: Recipe
 ) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
-    """Assign files to inputs; also return the files that are not used."""
+    """Return input -> files, and a sentence for each file or group of files that is not used."""
     names = [match[1] for line in inputs.splitlines() if (match := _INPUT.fullmatch(line))]
     taken: dict[str, Sequence[Recognised]] = {}
     left_out = []
@@ -556,23 +564,26 @@ def _input_line(name: str, items: Sequence[Recognised], target: Path) -> str:
 
 
 def _place(path: Path, target: Path) -> str:
-    """Return a path relative to the workflow's folder."""
+    """Return a path relative to the folder of the workflow, or absolute if it is far away."""
     here, place = (Path(os.path.normpath(one.absolute())) for one in (target.parent, path))
     if not place.is_relative_to(here):
-        # `..` after a symbolic link may lead to a different folder than the path suggests.
+        # If `..` follows a symbolic link, it leads to another folder than the path suggests.
         here, place = here.resolve(), place.resolve()
     relative = Path(os.path.relpath(place, here)).as_posix()
     return place.as_posix() if relative.startswith(_FAR) else relative
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
-    """Return paths of photos; for a folder whose photos are all used, its path or a pattern."""
+    """Return paths of photos, with a folder or pattern in place of photos where possible.
+
+    This is possible for a folder if all photos in it are used.
+    """
     paths = [item.path for item in items]
     places: dict[Path, None] = {}
     for path in paths:
         inside = [p for p in path.parent.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES]
         whole = path.suffix.lower() in PHOTO_SUFFIXES and set(inside) <= set(paths)
-        # A folder given as input includes all its files, so it must contain only photos.
+        # A folder as input stands for all files in it, so it must contain only photos.
         beside = (file for file in path.parent.iterdir() if file.is_file())
         whole = whole and len(inside) > 1
         if whole and all(file.suffix.lower() in PHOTO_SUFFIXES for file in beside):
@@ -596,12 +607,11 @@ def _described(items: Sequence[Recognised]) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    """Return the names of the first few files."""
     return first_few([*map(_word, names)], most=4)
 
 
 def _word(name: str) -> str:
-    """Return the name of a file without line breaks, for use in a comment."""
+    """Escape line breaks in the name of a file, for use in a comment."""
     return json.dumps(name, ensure_ascii=False)[1:-1]
 
 
@@ -610,7 +620,7 @@ def _quoted(text: str) -> str:
 
 
 def _seen(text: str) -> str:
-    """Escape all invisible characters as in YAML, because some of them end lines and comments."""
+    """Escape all invisible characters as in YAML, because some of them would end a comment."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
         for letter in text
@@ -618,7 +628,7 @@ def _seen(text: str) -> str:
 
 
 def _without_stand_ins(steps: str) -> str:
-    """Remove the simulated room, and inspections that are impossible without it, from the steps."""
+    """Remove the simulated room, and the inspection that needs it, from the steps."""
     blocks = re.split(r"^(?=  \w+:)", steps, flags=re.MULTILINE)
     has_room = any(block.startswith("  room:") for block in blocks)
     kept = [

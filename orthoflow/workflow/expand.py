@@ -1,6 +1,6 @@
-"""Cells: the method calls that result from the steps and variants of a workflow.
+"""Expands a workflow into cells, which are the method calls for its steps and variants.
 
-All cells are created first; `--only`, `--from` and `--until` then select among them.
+All cells are created first; `--only`, `--from` and `--until` then select some of them.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ from orthoflow.workflow.parameters import SWEEP
 
 # Factor (dataset, seed or step with variants) -> level.
 Assignment: TypeAlias = dict[str, str]
-#: steps of a workflow with all variants, datasets, seeds and repeats, excluded ones included
+#: Maximum number of cells of a workflow, including excluded combinations.
 MOST_CELLS: Final = 20_000
-# Product type of methods that measure the quality of results.
+# Product type of methods that inspect the quality of results.
 _JUDGEMENT: Final = "inspection"
-# `error_type` of a cell that is skipped because of optional data and not after a failure.
+# This is the `error_type` of a cell that is skipped because of optional data and not because of a
+# failure.
 NOT_ASKED_FOR: Final = "not-asked-for"
 _SEED_BITS: Final = 53  # exact in all JSON readers, including those that only use doubles
 
@@ -53,7 +54,7 @@ class CellOutput:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowInput:
-    """An input of the workflow by its name: `scan`, or `scan@hall` for a dataset."""
+    """An input of the workflow; the name is `scan`, or `scan@hall` for the dataset `hall`."""
 
     name: str
 
@@ -66,27 +67,29 @@ class Cell:
     """One method call of a run.
 
     Attributes:
-        address: `step`, or `step@step=variant,...` with the variants of upstream steps in graph
-            order, preceded by `data=name` and `seed=n` if the cell depends on them, and followed by
-            `#n` for repeats 1, 2, ...
+        address: `step`, or `step@step=variant,...` with the variants of this step and its upstream
+            steps in graph order. If the cell depends on the dataset or seed, the variants are
+            preceded by `data=name` and `seed=n`. Repeats 1, 2, ... end with `#n`.
         step: name of the step.
         assignment: step -> variant for each step with variants that affects this cell, including
-            its own, preceded by `data` -> dataset and `seed` -> seed.
-        repeat: 0 for the first execution, which downstream cells use; repeats extend to the steps
-            that the workflow compares, and to those in between.
+            its own step; preceded by `data` -> dataset and `seed` -> seed if they affect it.
+        repeat: number of the repeat, which is 0 for the first execution. Only steps that the
+            workflow compares, and steps upstream of these, use repeats of other steps; all others
+            use the first execution.
         method: method id.
         params: resolved parameters with defaults, as JSON.
         params_set: parameters set in the file or on the command line, as JSON.
-        inputs: port -> source; without ports that the method ignores and optional ones without a
+        inputs: port -> source, without ports that the method ignores and optional ports without a
             source.
-        seed: seed derived from (seed of the workflow or assignment, method id, repeat).
+        seed: seed derived from the seed of the workflow or assignment, the method id and the
+            repeat.
         cores: requested number of cores; None for all.
         timeout_s: time limit in seconds; None if there is none.
-        skip_reason: reason why the cell will not run (optional data is not given); empty if it
-            will.
-        skip_type: the same reason as the `error_type` of the result.
-        variant: name that the workflow file gives to its variant, from which a sweep may have
-            generated it; empty if the step has none.
+        skip_reason: reason why the cell will not run, such as missing optional data; empty if it
+            will run.
+        skip_type: `error_type` of the result if the cell will not run, otherwise empty.
+        variant: name of the variant in the workflow file; for a swept variant, the name without the
+            values. Empty if the step has no variants there.
     """
 
     address: str
@@ -106,28 +109,28 @@ class Cell:
 
     @property
     def setting(self) -> str:
-        """Return the prefix of its parameters in settings: `step`, or `step.variant`."""
+        """Prefix for the parameters of this cell in `--set`, which is `step` or `step.variant`."""
         return f"{self.step}.{self.variant}" if self.variant else self.step
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Return the addresses of the cells whose products it uses, without duplicates."""
+        """Addresses of the cells whose products this cell uses, without duplicates."""
         sources = (one for one in self.inputs.values() if isinstance(one, CellOutput))
         return tuple(dict.fromkeys(source.address for source in sources))
 
 
 def is_plain(cells: Iterable[Cell]) -> bool:
-    """Whether nothing varies between cells, so that each step has only one."""
+    """Whether each step has only one cell."""
     return all(cell.address == cell.step for cell in cells)
 
 
 def variants_text(assignment: Mapping[str, str]) -> str:
-    """Format the chosen variants as `plane=ransac, orient=pnp`; empty if there are none."""
+    """Format an assignment as text such as `plane=ransac, orient=pnp`."""
     return ", ".join(f"{step}={variant}" for step, variant in assignment.items())
 
 
 def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
-    """Return the variants that are named by an index, each with its values."""
+    """Return the variants whose name contains an index, each with its swept values as text."""
     return [
         (
             f"{step.name}={variant.name}",
@@ -140,7 +143,7 @@ def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
 
 
 def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
-    """Derive the seed of a cell; a method gets the same seed in every step."""
+    """Derive the seed of a cell, which is the same for a method in every step."""
     preimage = json.dumps(["orthoflow/seed", 1, workflow_seed, method_id, repeat])
     digest = hashlib.sha256(preimage.encode()).digest()
     return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)
@@ -161,7 +164,7 @@ def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set
 
 
 def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
-    """Sort steps so that each follows its upstream steps, and otherwise in file order."""
+    """Sort steps so that each follows its upstream steps; keep the order of the file otherwise."""
     waiting = list(steps)
     ordered: dict[str, None] = {}
     while waiting:
@@ -176,14 +179,14 @@ def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Names of selected steps; a step must match all given options.
+    """Names of selected steps; a step is selected if it matches all given options.
 
     Attributes:
         only: select these steps.
         from_: select these steps and all steps downstream.
         until: select these steps and all steps upstream.
 
-    Steps on which the selected ones depend are included, from the cache if possible.
+    Steps on which selected steps depend are always included.
     """
 
     only: tuple[str, ...] = ()
@@ -197,16 +200,16 @@ class Selection:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Return the options as given; empty if nothing is omitted."""
+        """The options as text, one for each step; empty if all steps are selected."""
         named = self.by_option.items()
         return tuple(f"{option} {name}" for option, names in named for name in names)
 
 
 def check_step_names(workflow: Workflow, names: Iterable[str], option: str) -> None:
-    """Refuse unknown step names, e.g. in `--force`.
+    """Raise an error if the workflow lacks a step that an option such as `--force` names.
 
     Raises:
-        ArgumentError: a name is unknown.
+        ArgumentError: the workflow lacks a step.
     """
     for name in names:
         if name not in workflow.steps:
@@ -222,7 +225,7 @@ def select_cells(
     """Return the cells of the selected steps and the cells on which they depend.
 
     Raises:
-        ArgumentError: a step is unknown, or no cell is left.
+        ArgumentError: the workflow lacks a named step, or no step matches all options.
     """
     for option, names in selection.by_option.items():
         check_step_names(workflow, names, option)
@@ -249,7 +252,7 @@ def select_cells(
 
 
 def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignment]:
-    """Yield the combinations of variants that affect a step; the last step varies fastest.
+    """Yield the combinations of variants that affect a step; the last factor varies fastest.
 
     Args:
         workflow: the workflow.
@@ -275,11 +278,7 @@ def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignmen
 
 
 def _require_few(workflow: Workflow, count: int) -> None:
-    """Refuse an impractical number of cells.
-
-    Raises:
-        WorkflowError: there are too many cells.
-    """
+    """Raise an error if a workflow has too many cells."""
     if count < MOST_CELLS:
         return
     raise WorkflowError(
@@ -290,7 +289,6 @@ def _require_few(workflow: Workflow, count: int) -> None:
 
 
 def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
-    """Whether an assignment contains a combination that the comparison excludes."""
     excluded = workflow.compare.exclude if workflow.compare else ()
     return any(combination.items() <= assignment.items() for combination in excluded)
 
@@ -301,10 +299,11 @@ def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
 def expand_cells(workflow: Workflow, catalog: Catalog) -> tuple[Cell, ...]:
     """Expand a workflow into cells in topological order.
 
-    Checks which optional input files exist, because this determines which cells can run.
+    The function also checks which optional input files exist, because this determines which cells
+    can run.
 
     Raises:
-        InputError: an optional input was given on the command line, but is missing.
+        InputError: an optional input was given on the command line, but its files are missing.
         PluginError: a method cannot be loaded.
     """
     expansion = _Expansion(
@@ -322,13 +321,15 @@ def expand_cells(workflow: Workflow, catalog: Catalog) -> tuple[Cell, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Node:
-    """A cell, with the conditions under which it exists.
+    """A cell, with the factors on which it depends.
 
     Attributes:
         cell: the cell.
-        dependence: factors on which its product depends; for a skipped cell, factors on which
-            skipping depends, which may be fewer than those in its address.
-        causes: changes of inputs that would avoid the skip, such as `with the input scan`.
+        dependence: factors on which the products of the cell depend, with their levels. For a
+            skipped cell, these are the factors that determine whether it is skipped, which may be
+            fewer than those in its address.
+        causes: changes of inputs after which the cell would not be skipped, such as `with the input
+            scan`.
     """
 
     cell: Cell
@@ -336,13 +337,13 @@ class _Node:
     causes: tuple[str, ...] = ()
 
 
-# Source of a port (the first available candidate, or None), the factors on which this choice
-# depends, and the changes of inputs that would provide a source.
+# Source of a port, which is the first available candidate or None; factors on which this choice
+# depends; and changes of inputs after which there would be a source.
 _Choice: TypeAlias = tuple[CellOutput | WorkflowInput | None, Assignment, tuple[str, ...]]
 
 
 class _ExcludedError(Exception):
-    """The combination is excluded from the comparison."""
+    """The workflow excludes this combination from the comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,7 +355,7 @@ class _Expansion:
     nodes: dict[str, dict[frozenset[tuple[str, str]], _Node]] = field(default_factory=dict)
 
     def expand(self) -> tuple[Cell, ...]:
-        """Return all cells in topological order, each before its repeats."""
+        """Return all cells in topological order; repeats follow their cell."""
         workflow = self.workflow
         graph = {name: step.upstream() for name, step in workflow.steps.items()}
         compared = _compared_steps(workflow, self.methods)
@@ -379,7 +380,7 @@ class _Expansion:
                         for cell in self._repeats(node.cell, cells, is_reached=name in repeated):
                             cells[cell.address] = cell
         _require_few(workflow, len(cells))
-        # Cells upstream of skipped inspections need no repeats.
+        # Cells need no repeats for the sake of skipped inspections.
         judged = [cell.address for cell in cells.values() if cell.step in compared and cell.repeat]
         needed = {*judged, *_reached({name: cell.sources for name, cell in cells.items()}, judged)}
         return tuple(
@@ -389,12 +390,11 @@ class _Expansion:
         )
 
     def _own_repeats(self, cell: Cell) -> int:
-        """Return the number of executions of a cell requested in the file."""
         step = self.workflow.steps[cell.step]
         return step.variant(cell.assignment.get(step.name, "")).repeat
 
     def _outer(self, steps: Iterable[str]) -> list[Assignment]:
-        """Return the datasets and seeds for a step, as far as they can affect it."""
+        """Return the assignments of dataset and seed that can affect one of the steps."""
         workflow = self.workflow
         variants = [variant for name in steps for variant in workflow.steps[name].variants]
         is_random = workflow.has_seeds and any(map(self._uses_seed, variants))
@@ -415,7 +415,6 @@ class _Expansion:
         return port_specs(self.methods[variant.method].In)
 
     def _takes_data(self, name: str) -> bool:
-        """Whether a step directly depends on the dataset."""
         step = self.workflow.steps[name]
         names = step.conditions | {one.name for one in step.references if one.is_input}
         calls = ((name, variant.name) for variant in step.variants)
@@ -427,10 +426,12 @@ class _Expansion:
     def _repeats(
         self, cell: Cell, before: Mapping[str, Cell], *, is_reached: bool
     ) -> Iterator[Cell]:
-        """Yield the repeats 1, 2, ... of a cell: requested ones, and those caused by upstream ones.
+        """Yield the repeats 1, 2, ... of a cell.
 
-        Repeat n uses repeat n of each upstream cell that has one, and otherwise its first
-        execution.
+        A cell is repeated if the file requests it, or if an upstream cell is repeated.
+
+        Repeat n uses repeat n of each upstream cell, or the first execution if there is no such
+        repeat.
         """
         if cell.skip_reason:
             return
@@ -454,9 +455,9 @@ class _Expansion:
             yield replace(cell, address=address, repeat=repeat, inputs=inputs, seed=seed)
 
     def _differs(self, address: str, before: Mapping[str, Cell]) -> bool:
-        """Whether the repeat with an address exists and its result may differ from the first one.
+        """Whether the repeat with an address exists and may differ from the first execution.
 
-        Repeats of a deterministic method only measure its time, unless its inputs differ.
+        Repeats of a deterministic method with the same inputs only measure its time.
         """
         cell = before.get(address)
         if cell is None:
@@ -475,7 +476,7 @@ class _Expansion:
             variant = calls.get((step.name, variant.name), variant)
         if workflow.has_seeds and self._uses_seed(variant):
             own |= {SEED: full[SEED], **(by_data if workflow.has_data_seeds else {})}
-        # The condition of a step may depend on the dataset, too.
+        # The condition of a step may also depend on the dataset.
         always = {} if step.conditions.isdisjoint(workflow.data_inputs) else by_data
         own |= always
         if _is_excluded(workflow, own):
@@ -510,7 +511,10 @@ class _Expansion:
         return _Node(cell=cell, dependence=dependence, causes=causes)
 
     def _stopped_by(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
-        """Return the change of inputs that would avoid a skip due to a condition; empty if none."""
+        """Return the change of inputs after which the conditions of a step would be met.
+
+        The result is empty if they are met.
+        """
         if step.unless and self._input_name(step.unless, full) in self.present:
             return f"without the input {step.unless}"
         if step.only_if and self._input_name(step.only_if, full) not in self.present:
@@ -530,7 +534,7 @@ class _Expansion:
                 causes[f"with the input {reference.name}"] = None
                 continue
             node = self._upstream(reference.source, full)
-            # The choice also depends on the factors of rejected candidates.
+            # The choice also depends on the factors of candidates that are not available.
             dependence |= node.dependence
             if not node.cell.skip_reason:
                 output = CellOutput(address=node.cell.address, port=reference.name)
@@ -539,7 +543,7 @@ class _Expansion:
         return None, dependence, tuple(causes)
 
     def _input_name(self, name: str, full: Mapping[str, str]) -> str:
-        """Return the name of an input for a dataset, or its plain name if the dataset has none."""
+        """Return the name of an input, followed by the dataset if it has its own files."""
         dataset = self.workflow.datasets.get(full.get(DATA, ""))
         return dataset.inputs[name].name if dataset and name in dataset.inputs else name
 
@@ -581,10 +585,12 @@ class _Expansion:
 
 
 def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> set[str]:
-    """Return the steps that the workflow compares; they run once per repeat of an upstream step.
+    """Return the steps that the workflow compares.
 
-    These are the steps in `compare.metrics` and all inspections that match its wildcards; without
-    `metrics`, they are all inspections.
+    These steps run once per repeat of an upstream step.
+
+    They are the steps named in `compare.metrics`, and the inspections that match its wildcards.
+    Without `metrics`, they are all inspections.
     """
     metrics = workflow.compare.metrics if workflow.compare else ()
     patterns = [pattern.partition(".")[0] for pattern in metrics] or ["*"]
@@ -604,5 +610,4 @@ def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> 
 
 
 def _reason(*causes: str) -> str:
-    """Return the reason why a cell is skipped, from its possible causes."""
     return f"only {' or '.join(causes)}"

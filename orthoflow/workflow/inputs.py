@@ -1,4 +1,4 @@
-"""Inputs and datasets of a workflow: file names, overrides, and the search for files."""
+"""Inputs and datasets of a workflow: file names, overrides and the search for files."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ from orthoflow.workflow.parameters import (
 )
 from orthoflow.workflow.source import ProblemLog, read_text, validate
 
-#: limit for the bytes of a table of datasets
+#: Maximum size of a datasets table in bytes.
 MOST_TABLE_BYTES: Final = 4_000_000
-#: limit for the datasets in a table
+#: Maximum number of datasets in a table.
 MOST_DATASETS: Final = 10_000
 _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200
@@ -55,7 +55,7 @@ _SEPARATORS: Final = (";", "\t", ",")
 
 
 class MissingInputsError(InputError):
-    """Input files are missing; `problems` lists all of them or the first few."""
+    """Input files are missing; `problems` contains one sentence for each input."""
 
     def __init__(self, problems: Sequence[str], *, most: int = 100) -> None:
         self.problems = tuple(problems)
@@ -85,7 +85,7 @@ def input_specs(
 
 
 def written_files(source: str) -> Mapping[str, tuple[str, ...]]:
-    """Return the files that a workflow file gives for each input, regardless of `--input`."""
+    """Return input -> files as written in the text of a workflow."""
     log = ProblemLog(file="")
     log.parse(source)
     file = validate(WorkflowFile, {"inputs": log.get(("inputs",)) or {}}, log) or WorkflowFile()
@@ -98,7 +98,7 @@ class InputOption:
 
     Attributes:
         name: name of the workflow input.
-        path: a file, a folder or a glob, relative to the working directory.
+        path: a file, a folder or a glob pattern, relative to the working directory.
     """
 
     name: str
@@ -109,12 +109,12 @@ class InputOption:
 
     @property
     def is_of_dataset(self) -> bool:
-        """Whether it refers to the input of one dataset, as in `scan@hall`."""
+        """Whether the option refers to the input of one dataset, as in `scan@hall`."""
         return "@" in self.name
 
     @property
     def without_folder(self) -> str:
-        """Return the option as it is recorded, without folders of this machine."""
+        """The option as it is recorded, without the folders of this machine."""
         return f"--input {self.name}={Path(self.path).name}"
 
 
@@ -133,7 +133,7 @@ def read_input_options(texts: Sequence[str], log: ProblemLog) -> tuple[InputOpti
 def override_inputs(
     specs: Mapping[str, WorkflowInputSpec], options: Sequence[InputOption], log: ProblemLog
 ) -> dict[str, WorkflowInputSpec]:
-    """Replace input files with those on the command line; options for the same name are joined."""
+    """Replace input files by those on the command line; join options for the same input."""
     changed = dict(specs)
     for option in options:
         name = option.name
@@ -153,7 +153,7 @@ def override_inputs(
 def check_shared_inputs(
     workflow: Workflow, options: Sequence[InputOption], log: ProblemLog
 ) -> None:
-    """Refuse files for an input that each dataset sets itself."""
+    """Report options for inputs that every dataset sets itself."""
     for option in options:
         if option.name in workflow.inputs and option.name not in workflow.input_specs:
             example = workflow.chosen_data[0].inputs[option.name].name
@@ -177,10 +177,11 @@ def some_of(names: Collection[str]) -> str:
 
 
 def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
-    """Find the files of each input, sorted by name; None for an optional input without files.
+    """Return input -> files, sorted by name; None for an optional input without files.
 
-    A path may be a file, a folder (all files except hidden ones in the folder and its subfolders)
-    or a pattern (all matching files; `**` matches folders at any depth).
+    A path may be a file, a folder or a glob pattern. A folder stands for all files in it and in its
+    subfolders, except hidden files. A pattern stands for all matching files; `**` matches folders
+    at any depth.
 
     Raises:
         InputError: a file is missing, a folder is empty, a pattern has no match, or a required
@@ -203,7 +204,7 @@ def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
 
 
 def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
-    """Add inputs with missing files to the problems of a workflow."""
+    """Add a problem for each input whose files are missing."""
     for spec in workflow.input_specs.values():
         try:
             _resolve(spec)
@@ -212,7 +213,7 @@ def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
 
 
 def present_inputs(workflow: Workflow) -> frozenset[str]:
-    """Return the names of available inputs; required ones are assumed to be available."""
+    """Return the names of available inputs; required inputs are assumed to be available."""
     return frozenset(
         spec.name
         for spec in workflow.input_specs.values()
@@ -252,8 +253,8 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
         files = []
         missing = f"{pattern}{where} is a link to {path.readlink()}, which does not exist"
     elif glob.has_magic(pattern):
-        # Names may contain brackets, so only a path that does not exist is treated as a pattern.
-        # Path.glob does not support absolute patterns.
+        # A file name may contain brackets, so a path is a pattern only if it does not exist.
+        # `Path.glob` does not support absolute patterns.
         matches = glob.iglob(pattern, root_dir=spec.folder, recursive=True)  # noqa: PTH207
         files = [spec.folder / match for match in matches if (spec.folder / match).is_file()]
         missing = f"no file matches {pattern}{where}"
@@ -265,7 +266,7 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
 
 
 def _meant(path: Path) -> str:
-    """Return a suggestion with a similar file name in the same folder, or ""."""
+    """Return a suggestion with a similar file name in the same folder; empty if there is none."""
     with suppress(OSError):
         beside = [item.name for item in islice(path.parent.iterdir(), _MOST_BESIDE)]
         return did_you_mean(path.name, beside)
@@ -273,7 +274,10 @@ def _meant(path: Path) -> str:
 
 
 def _below(folder: Path) -> Iterator[Path]:
-    """Yield the files in a folder and its subfolders; links to folders are not followed."""
+    """Yield the files in a folder and its subfolders, except hidden files.
+
+    Links to folders are not followed.
+    """
     for place, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if name[0] != "."]
         yield from (Path(place, name) for name in names if name[0] != ".")
@@ -285,7 +289,7 @@ def _below(folder: Path) -> Iterator[Path]:
 def check_no_step(
     steps: Sequence[DraftStep], factor: str, log: ProblemLog, location: Location
 ) -> None:
-    """Refuse a step whose name is also a factor in addresses."""
+    """Report a step whose name is also a factor in addresses."""
     if any(step.name == factor for step in steps):
         what = {DATA: "the dataset", SEED: "the seed"}[factor]
         log.report(
@@ -298,14 +302,14 @@ def check_no_step(
 
 @dataclass(frozen=True, kw_only=True)
 class _Origin:
-    """Origin of a list of datasets.
+    """Where the datasets come from.
 
     Attributes:
-        log: log of the file.
+        log: log of the file that contains the datasets.
         folder: base folder of relative paths.
         table: name of the table; empty for the workflow itself.
-        is_given: whether the datasets were given from Python, with paths relative to the working
-            directory.
+        is_given: whether the datasets were passed from Python; paths are then relative to the
+            working directory.
     """
 
     log: ProblemLog
@@ -320,10 +324,10 @@ class DatasetReader:
 
     Attributes:
         folder: folder of the workflow.
-        inputs: inputs of the workflow, including `--input`.
+        inputs: inputs of the workflow, including those from `--input`.
         steps: steps of the workflow.
-        overrides: overrides from `--set`, which take precedence over those from datasets.
-        calls: (step, variant) -> valid method call without datasets.
+        overrides: overrides from `--set`, which take precedence over settings of datasets.
+        calls: (step, variant) -> method call without settings of datasets; only valid calls.
         log: log to which problems are added.
     """
 
@@ -335,16 +339,16 @@ class DatasetReader:
     log: ProblemLog
 
     def read(self, table: str | Mapping[str, JsonValue]) -> dict[str, Dataset]:
-        """Read the table given with `--datasets`, or else the section, which may name a table.
+        """Read the datasets from a table or from the section `datasets`.
 
         Args:
-            table: path from the command line, relative to the working directory; empty if there is
-                none. From Python, the content of the section may be given instead, with paths
-                relative to the same directory.
+            table: path given with `--datasets`, relative to the working directory; if empty, the
+                section of the workflow is read, which may name a table. From Python, this may be
+                the content of the section, with paths relative to the working directory.
         """
         if isinstance(table, Mapping):
             log = self.log.beside("datasets=", "")
-            # There is no document for datasets given from Python.
+            # Datasets that are passed from Python have no document.
             log.document = Document(value={_DATASETS: dict(table)}, places={(): _NOWHERE})
             log.unnamed = _DATASETS
             return self._named(_Origin(log=log, folder=Path.cwd(), is_given=True))
@@ -378,14 +382,14 @@ class DatasetReader:
         return self._named(_Origin(log=log, folder=path.resolve().parent, table=name))
 
     def _named(self, origin: _Origin) -> dict[str, Dataset]:
-        """Read the mapping `datasets` of an origin."""
+        """Read the mapping `datasets` in the log of an origin."""
         log = origin.log
         check_no_step(self.steps, DATA, log, (_DATASETS,))
         written = log.get((_DATASETS,))
         assert isinstance(written, dict)  # noqa: S101 - by the callers
         if not written:
             log.report((_DATASETS,), "expected at least one dataset")
-        # An unknown key is reported once, without problems of its value.
+        # Report an unknown key once, without problems of its value.
         known = {"set", *self.inputs}
         data = dict(written)
         for name, items in written.items():
@@ -438,14 +442,14 @@ class DatasetReader:
         if key == SEED or (parameter and any(one.name == step for one in self.steps)):
             meant = f"; parameters belong in set: {{set: {{{key}: VALUE}}}}"
         elif origin.table:
-            # In a table, names of parameter columns contain a dot.
+            # In a table, the names of parameter columns contain a dot.
             meant = "; parameter columns are named step.parameter"
         origin.log.report(
             location,
             f"there is no input {key}{did_you_mean(key, self.inputs)}; inputs: "
             f"{', '.join(self.inputs) or 'none'}{meant}",
             at_key=True,
-            # Problems with a table column are reported once, not for each row.
+            # Report a problem with a table column once, and not for each row.
             shown=(key,) if origin.table else None,
         )
 
@@ -465,7 +469,8 @@ class DatasetReader:
                     continue
                 call = self.calls.get(name)
                 overrides = (*assigned[name], *self.overrides.get(name, ()))
-                # Mistakes in the call itself are reported once, at their own positions.
+                # If the call is invalid without the dataset, its mistakes are reported at their own
+                # positions.
                 resolved = resolve_call(draft, overrides, self.log, blame if call else None)
                 if call is not None:
                     calls[name] = resolved
@@ -482,7 +487,7 @@ def choose_data(
             if name in datasets:
                 chosen[name] = None
             elif not datasets and log.has_any:
-                # The dataset names are unknown if the table is unreadable.
+                # The names of the datasets are unknown if the table could not be read.
                 continue
             elif not datasets:
                 log.report_option(f"--only-data {text}", "the workflow has no datasets")
@@ -499,12 +504,12 @@ def choose_data(
 
 
 def read_rows(log: ProblemLog) -> Document:
-    """Read a table as the section `datasets`: a mapping from names to datasets.
+    """Convert a table to a document with the section `datasets`.
 
-    Columns are separated by semicolons, tabs or commas. A column whose name contains a dot or is
-    `seed` becomes an entry of `set` of the dataset, with its values read as YAML; empty fields are
-    omitted. Keys have the position of their column in the header, so that a problem with a column
-    is reported once.
+    Columns are separated by semicolons, tabs or commas. If the name of a column contains a dot or
+    is `seed`, its fields are read as YAML and become entries of `set` of the datasets. Empty fields
+    are omitted. The position of a key is that of the column in the header, so that a problem with a
+    column is reported once.
     """
     rows = _rows(log)
     header = next(rows, None)
@@ -553,14 +558,12 @@ def read_rows(log: ProblemLog) -> Document:
 
 
 class _Field(NamedTuple):
-    """A field of a table."""
-
     text: str
     position: Position
 
 
 def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
-    """Yield the fields of each non-empty line."""
+    """Yield the fields of each line that is neither empty nor a comment."""
     separator = ""
     for number, line in enumerate(log.lines, start=1):
         if not line.strip() or line.lstrip()[0] == "#":
@@ -574,7 +577,7 @@ def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
             continue
         placed, at = [], 0
         for field in fields:
-            # A field with doubled quotes is not found literally; its position is then approximate.
+            # A field with doubled quotes cannot be found literally, so its position is approximate.
             at = max(at, line.find(field, at))
             placed.append(_Field(field.strip(), Position(line=number, column=at + 1)))
             at += len(field)
@@ -582,7 +585,10 @@ def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
 
 
 def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
-    """Return the columns of a table, including unnamed ones; empty if the table cannot be used."""
+    """Return the columns of a table, including unnamed columns.
+
+    The result is empty if the table has no column `name`.
+    """
     names = [field.text for field in header]
     for index, (name, position) in enumerate(header):
         if name and name in names[:index]:
@@ -603,7 +609,7 @@ def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
 
 
 def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog) -> _Field | None:
-    """Return the dataset name in a row; if it is invalid, report this and return None."""
+    """Return the dataset name in a row; if there is none, add a problem and return None."""
     names = [column.text for column in columns]
     for index, field in enumerate(row):
         if field.text and not "".join(names[index : index + 1]):
@@ -617,9 +623,10 @@ def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog)
 
 
 def _as_yaml(field: _Field, key: str, log: ProblemLog) -> list[JsonValue]:
-    """Read a value in a parameter column, as for `--set`; return an empty list on an error."""
+    """Return a list with the value in a parameter column; empty if it is not valid YAML."""
     if _NUMBER.fullmatch(field.text):
-        # Fast path for numbers: reading each as YAML takes milliseconds, and tables may be long.
+        # Read numbers directly, because reading a value as YAML takes milliseconds, and tables may
+        # be long.
         return [float(field.text) if "." in field.text else int(field.text)]
     own = ProblemLog(file="")
     if own.parse(field.text) is None or own.has_any:

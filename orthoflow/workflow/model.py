@@ -1,7 +1,8 @@
-"""The workflow format: models of the file, and the checked workflow built from them.
+"""The workflow format: models of the file, and the checked workflow.
 
-The models of the file define the format: checks, JSON Schema and `docs/workflow-format.md` are
-derived from them. Relations between keys are checked in `document` and `checks`.
+The models of the file define the format: the checks of single keys, the JSON Schema and
+`docs/workflow-format.md` are derived from them. Relations between keys are checked in `document`
+and `checks`.
 """
 
 from __future__ import annotations
@@ -32,17 +33,16 @@ from orthoflow.products.product import JsonValue
 from orthoflow.workflow.source import Problem
 
 FORMAT: Final = 1
-#: `repeat` of a method call
+#: Maximum value of `repeat`.
 MOST_REPEATS: Final = 10_000
-# More values would be unreadable in a curve and impractical to run.
-#: values of a sweep
+# Maximum number of values of a sweep; more would be impractical to run and unreadable in a curve.
 MOST_SWEPT: Final = 100
-#: combinations in `exclude`
+#: Maximum number of combinations in `exclude`.
 MOST_EXCLUDED: Final = 500
-# Every JSON reader represents integers up to this one exactly.
+# All JSON readers represent integers up to this value exactly.
 _MOST_OF_A_NUMBER: Final = 10**15
 INPUTS: Final = "inputs"
-# Factors in addresses besides the steps: dataset and seed.
+# Factors in addresses that are not steps: dataset and seed.
 DATA: Final = "data"
 SEED: Final = "seed"
 NAME_RULE: Final = (
@@ -64,7 +64,7 @@ def check_name(name: str) -> str:
     """Return a name if it is allowed in addresses and file names.
 
     Raises:
-        PydanticCustomError: the name is invalid; a subclass of `ValueError`.
+        PydanticCustomError: the name is not allowed; this is a subclass of `ValueError`.
     """
     if not re.fullmatch(NAME_PATTERN, name):
         raise PydanticCustomError(
@@ -78,7 +78,7 @@ def _refusal(code: str, form: str) -> PydanticCustomError:
 
 
 def _seconds(raw: object) -> float:
-    """Return a time in seconds, e.g. 1800 for `30min`."""
+    """Convert a time to seconds, such as 1800 for `30min`."""
     seconds = 0.0
     if isinstance(raw, int | float) and not isinstance(raw, bool):
         seconds = float(raw)
@@ -103,7 +103,7 @@ class Reference:
 
     @property
     def is_input(self) -> bool:
-        """Whether the reference is to an input of the workflow."""
+        """Whether the reference points to an input of the workflow."""
         return self.source == INPUTS
 
     def __str__(self) -> str:
@@ -155,7 +155,7 @@ def _each_once(values: list[_Item]) -> list[_Item]:
 _Name: TypeAlias = Annotated[str, AfterValidator(check_name)]
 _Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1)]
 _Flag: TypeAlias = Annotated[bool, Strict()]
-# Integers, but not `true`, which Python treats as an integer.
+# Strict integers exclude `true`, which Python treats as an integer.
 _Positive: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=_MOST_OF_A_NUMBER)]
 _Seed: TypeAlias = Annotated[int, Strict(), Field(ge=0, le=_MOST_OF_A_NUMBER)]
 _Repeats: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=MOST_REPEATS)]
@@ -168,7 +168,7 @@ _IS_TEXT: Final = WithJsonSchema({"type": "string"})
 _Source: TypeAlias = Annotated[Reference, BeforeValidator(_reference), _IS_TEXT]
 _InputSource: TypeAlias = Annotated[Reference, BeforeValidator(_input_reference), _IS_TEXT]
 _Metric: TypeAlias = Annotated[str, Strict(), AfterValidator(_metric)]
-# Levels are text, so seeds are converted to text.
+# Levels are strings, so seeds are converted to strings.
 _Level: TypeAlias = Annotated[
     str,
     Field(min_length=1),
@@ -195,7 +195,7 @@ _Metrics: TypeAlias = Annotated[
 
 
 class FileSection(BaseModel):
-    """A mapping of the file with fixed keys."""
+    """A mapping in a workflow file, which has fixed keys."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True
@@ -435,13 +435,13 @@ class WorkflowFile(FileSection):
 
 # Checked workflow -------------------------------------------------------------------------------
 
-# A reference in the form used in records.
+# A reference as it is written in records.
 _Recorded: TypeAlias = Annotated[Reference, BeforeValidator(_reference), PlainSerializer(str)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowInputSpec:
-    """An input as given in the file or on the command line, before its files are searched for.
+    """An input as given in the file or on the command line, before its files are located.
 
     Attributes:
         name: name of the input.
@@ -449,11 +449,12 @@ class WorkflowInputSpec:
         optional: whether steps that need the input are skipped if it is missing.
         folder: base folder of relative paths: the folder of the workflow, or the working directory
             for paths from the command line.
-        is_given: whether files were given with `--input`, so that they must exist even if the input
-            is optional.
-        table: datasets table and line that contain the files, e.g. `rooms.csv:3`; empty for the
-            workflow itself.
-        place: position of the files in the document; None if they do not come from a file.
+        is_given: whether the files were given with `--input` and must therefore exist even if the
+            input is optional.
+        table: datasets table and line that name the files, e.g. `rooms.csv:3`; empty if the
+            workflow names them.
+        place: position in the document where the files are named; None if they do not come from a
+            document.
     """
 
     name: str
@@ -467,7 +468,7 @@ class WorkflowInputSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class StepVariant:
-    """A variant of a step; a step without variants has exactly one, with an empty name.
+    """A variant of a step; a step without variants has a single one with an empty name.
 
     Attributes:
         name: name of the variant; empty for a step without variants.
@@ -477,16 +478,16 @@ class StepVariant:
         repeat: number of executions, with different seeds if the method is random.
         cores: requested number of cores; None for all.
         timeout_s: time limit in seconds; None if there is none.
-        swept: swept parameter -> its value in this variant; a subset of `params_set`.
-        family: name that the workflow file gives to the variant from which a sweep generated this
-            one; not in the record.
+        swept: swept parameter -> value in this variant; a subset of `params_set`.
+        family: for a swept variant, its name in the workflow file, without the values; not in the
+            record.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
     name: str
     method: Annotated[str, Field(alias="use")]
-    # `Any`: JSON.
+    # The values are JSON.
     params: Mapping[str, Any] = field(default_factory=dict)
     params_set: Mapping[str, Any] = field(default_factory=dict)
     repeat: Annotated[int, Field(ge=1, le=MOST_REPEATS)] = 1
@@ -503,10 +504,10 @@ class WorkflowStep:
     Attributes:
         name: name of the step.
         variants: variants in the order of the file.
-        inputs: port -> references; the first available one is used.
+        inputs: port -> references, of which the first available one is used.
         only_if: input without which the step is skipped; empty if there is no condition.
         unless: input with which the step is skipped; empty if there is no condition.
-        is_varied: whether the file lists variants, even if only one.
+        is_varied: whether the step has variants, even if there is only one.
     """
 
     name: Annotated[str, Field(exclude=True)] = ""
@@ -519,21 +520,21 @@ class WorkflowStep:
     is_varied: bool = False
 
     def variant(self, name: str) -> StepVariant:
-        """Return the variant with a given name."""
+        """Return the variant with this name."""
         return next(variant for variant in self.variants if variant.name == name)
 
     @property
     def conditions(self) -> frozenset[str]:
-        """Return the inputs on whose presence the step depends through `if` and `unless`."""
+        """The inputs in the conditions `if` and `unless`."""
         return frozenset((self.only_if, self.unless)) - {""}
 
     @property
     def references(self) -> tuple[Reference, ...]:
-        """Return the possible sources of all ports."""
+        """The possible sources of all ports."""
         return tuple(item for references in self.inputs.values() for item in references)
 
     def upstream(self) -> tuple[str, ...]:
-        """Return the names of the steps whose products the ports may use, without duplicates."""
+        """Return the names of the steps whose products this step may use, without duplicates."""
         return tuple(dict.fromkeys(one.source for one in self.references if not one.is_input))
 
 
@@ -543,11 +544,12 @@ class Dataset:
 
     Attributes:
         name: name of the dataset.
-        inputs: input -> files; the name of the input `scan` is `scan@<dataset>`.
-        sets: parameters as written, `step.parameter` -> JSON.
-        seeds: root seeds for this dataset; empty to use those of the workflow.
-        calls: (step, variant) -> method call with these parameters, only for calls that they
-            change; not stored in records, whose cells contain the parameters.
+        inputs: input -> files; for the input `scan`, the name in the value is `scan@<dataset>`.
+        sets: `step.parameter` -> value, as written.
+        seeds: root seeds of this dataset; if empty, the seeds of the workflow are used.
+        calls: (step, variant) -> method call with the parameters of this dataset, for calls that
+            they change. Calls are not stored in records, because the recorded cells contain the
+            parameters.
     """
 
     name: str
@@ -565,14 +567,14 @@ class Workflow:
         name: name of the workflow.
         path: path of the file.
         source: text of the file as written.
-        seed: root seed; the first of the seeds if they are swept.
-        seeds: root seeds if they are swept; otherwise empty.
-        inputs: inputs by name.
-        steps: steps by name, in the order of the file.
+        seed: root seed; the first value if the seed is swept.
+        seeds: values of the root seed if it is swept; otherwise empty.
+        inputs: name -> input.
+        steps: name -> step, in the order of the file.
         compare: the comparison; None if only the baseline runs.
-        overrides: options `--set ...` and `--input ...` that changed the document, in order, with
-            files given without their folders.
-        datasets: datasets by name; empty if the workflow runs once, on its inputs.
+        overrides: options that changed the workflow, such as `--set ...`, in order; file names have
+            no folders.
+        datasets: name -> dataset; empty if the workflow runs once, on its own inputs.
         only_data: names of the selected datasets; empty for all.
     """
 
@@ -596,12 +598,15 @@ class Workflow:
 
     @cached_property
     def data_inputs(self) -> frozenset[str]:
-        """Inputs that any dataset, even unselected, sets; so a selection changes no address."""
+        """Names of the inputs that datasets set.
+
+        Datasets that are not selected are included, so that a selection changes no address.
+        """
         return frozenset(name for item in self.datasets.values() for name in item.inputs)
 
     @cached_property
     def data_calls(self) -> frozenset[tuple[str, str]]:
-        """Return (step, variant) of the method calls whose parameters are changed by datasets."""
+        """Step and variant of the method calls whose parameters datasets change."""
         return frozenset(call for item in self.datasets.values() for call in item.calls)
 
     @cached_property
@@ -611,7 +616,7 @@ class Workflow:
 
     @cached_property
     def has_seeds(self) -> bool:
-        """Whether the seed is a factor, so that addresses of random steps contain it."""
+        """Whether the seed is a factor, which the addresses of random steps contain."""
         return bool(self.seeds) or self.has_data_seeds
 
     def seeds_of(self, dataset: Dataset | None) -> tuple[int, ...]:
@@ -620,7 +625,7 @@ class Workflow:
 
     @cached_property
     def input_specs(self) -> Mapping[str, WorkflowInputSpec]:
-        """Return all inputs that cells may use, by name: `scan`, `scan@hall`."""
+        """Name, such as `scan` or `scan@hall`, -> input, for all inputs that cells may use."""
         chosen = self.chosen_data
         shared = {
             name: spec
@@ -630,7 +635,7 @@ class Workflow:
         return shared | {spec.name: spec for item in chosen for spec in item.inputs.values()}
 
     def with_input_specs(self, specs: Mapping[str, WorkflowInputSpec]) -> Workflow:
-        """Return the workflow with other inputs, which are given by name."""
+        """Return the workflow with some inputs replaced by those of the same name."""
         datasets = {
             item.name: replace(
                 item, inputs={name: specs.get(one.name, one) for name, one in item.inputs.items()}
@@ -642,7 +647,7 @@ class Workflow:
 
     @property
     def baseline(self) -> dict[str, str]:
-        """Return the variants that run without a comparison, for each step with variants."""
+        """Step -> variant that runs without a comparison, for each step with variants."""
         chosen = self.compare.baseline if self.compare else {}
         return {
             step.name: chosen.get(step.name, step.variants[0].name)
@@ -652,7 +657,7 @@ class Workflow:
 
 
 def factors_of(workflow: Workflow) -> frozenset[str]:
-    """Return the factors in addresses that are not steps: `data`, `seed`."""
+    """Return the factors in addresses that are not steps, which are `data` and `seed`."""
     data = {DATA} if workflow.datasets else set()
     return frozenset(data | ({SEED} if workflow.has_seeds else set()))
 

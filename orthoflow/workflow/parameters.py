@@ -1,4 +1,4 @@
-"""Parameters of method calls: values from the file, `--set` and sweeps, and defaults."""
+"""Parameters of method calls, with values from the file, `--set`, sweeps and defaults."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from orthoflow.workflow.source import InvalidWorkflowError, ProblemLog, validate
 Report: TypeAlias = Callable[[str], None]
 
 SWEEP: Final = "sweep"
-# Maximum length of a name in characters, see `NAME_PATTERN`.
+# Maximum length of a name in characters; see `NAME_PATTERN`.
 _LETTERS: Final = 32
 
 
@@ -39,11 +39,11 @@ class DraftCall:
     Attributes:
         location: location of the mapping that contains `use`.
         name: name of the variant; empty for a step without variants.
-        call: content of the mapping, with parameters that are not swept.
-        method: class of the method; None if it cannot be loaded.
-        kind: ports of the call's kind, which is known even if the method is not.
-        swept: parameters and values of this variant, if it comes from a sweep.
-        family: name of the original variant, if it comes from a sweep.
+        call: content of the mapping; after the expansion of sweeps, without the swept parameters.
+        method: class of the method; None if the method cannot be loaded.
+        kind: kind of the method, which may be known even if the method cannot be loaded.
+        swept: parameter -> value, if a sweep created this variant.
+        family: name of the variant in the file, if a sweep created this variant.
         is_unswept: whether the file sweeps a parameter for which the command line sets a single
             value.
     """
@@ -59,7 +59,7 @@ class DraftCall:
 
     @property
     def id(self) -> str:
-        """Method id; empty if the file contains none."""
+        """Method id; empty if it is missing in the file."""
         return self.call.use or ""
 
     @property
@@ -74,11 +74,11 @@ class DraftCall:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names by which `--set` may refer to the call.
+        """Names by which `--set` may refer to the call.
 
-        A step without variants can be addressed by the name of its method, so that
-        `plane.hough2d.cell_m` works in recipes with and without variants; a swept variant can also
-        be addressed by its original name.
+        The name of the method refers to the call of a step without variants, so that
+        `plane.hough2d.cell_m` works in recipes with and without variants. The name of a variant in
+        the file refers to all variants that a sweep created from it.
         """
         method = self.id.partition(".")[2]
         before = (self.family or method,) if self.swept else ()
@@ -107,7 +107,7 @@ class Override:
 
     Attributes:
         report: function that reports a problem at its position.
-        keys: parameter name, followed by keys inside the parameter if it is a mapping.
+        keys: parameter name, followed by keys inside the value if it is a mapping.
         value: value as JSON.
     """
 
@@ -123,7 +123,7 @@ Overrides: TypeAlias = dict[tuple[str, str], tuple[Override, ...]]
 def overrides_of_options(
     sets: Sequence[str], steps: Sequence[DraftStep], log: ProblemLog
 ) -> Overrides:
-    """Find the method calls to which each `--set` applies; report options that match none."""
+    """Find the method calls to which each `--set` applies; report options that match no call."""
     assigned: Overrides = {}
     for text in sets:
         report = partial(log.report_option, f"--set {text}")
@@ -150,8 +150,8 @@ def overrides_of_settings(
         location: location of the mapping in the document.
         steps: steps of the workflow.
         log: log to which problems are added.
-        is_column: whether the keys are table columns; problems then refer only to the key, so that
-            each is reported once.
+        is_column: whether the keys are columns of a table, in which case problems refer only to the
+            key and are therefore reported once.
     """
     assigned: Overrides = {}
     for key, value in settings.items():
@@ -170,7 +170,7 @@ def overrides_of_settings(
 
 
 def joined(*several: Mapping[tuple[str, str], tuple[Override, ...]]) -> Overrides:
-    """Join overrides; later ones take precedence."""
+    """Join overrides, of which later ones take precedence."""
     found: Overrides = {}
     for overrides in several:
         for call, own in overrides.items():
@@ -190,7 +190,7 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
     try:
         log.raise_any()
     except InvalidWorkflowError as error:
-        # A value with a space was quoted already, or the shell would have split it.
+        # A value that contains a space is already quoted; otherwise, the shell would have split it.
         way_out = "" if " " in raw.strip() else "; quote it"
         raise ArgumentError(
             f"the value cannot be read as YAML: {error.problems[0].message}{way_out}"
@@ -213,7 +213,7 @@ def _assign(
             f"{', '.join(by_name)}"
         )
     calls, keys = _select_calls(step, parts[1:])
-    # If a method cannot be loaded, any parameter may be valid.
+    # If a method cannot be loaded, accept any parameter.
     chosen = [call for call in calls if call.method is None or keys[0] in call.parameters]
     if not chosen:
         known = sorted({name for call in calls for name in call.parameters})
@@ -257,16 +257,19 @@ def resolve_call(
     log: ProblemLog,
     blame: Report | None = None,
 ) -> StepVariant:
-    """Check the parameters of a method call, strictly: the text "0.003" is not a number.
+    """Check the parameters of a method call and add the defaults.
+
+    The check is strict: the string "0.003" is not accepted as a number.
 
     Args:
         draft: the method call.
         overrides: overrides, applied in order to the parameters in the file.
         log: log for problems with the parameters in the file.
-        blame: used instead of `log`, for a call that is valid without the overrides.
+        blame: function that reports problems instead of `log`, for a call that is valid without the
+            overrides.
 
     Returns:
-        The call; without resolved parameters if they are invalid or the method is unknown.
+        The call, without resolved parameters if these are invalid or the method is unknown.
     """
     as_set: dict[str, JsonValue] = deepcopy(draft.call.params)
     for override in overrides:
@@ -300,15 +303,15 @@ def _resolved(
         with guarded():
             checked = model.model_validate_json(json.dumps(as_set), strict=True)
             resolved: dict[str, JsonValue] = checked.model_dump(mode="json")
-            # Check defaults in the same way as given values, so that the resolved parameters can be
-            # validated again.
+            # Check the defaults like given values, because the resolved parameters must pass
+            # another validation.
             model.model_validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
         for loc, message, _ in mistakes(error, model, dict(as_set), draft.id):
             name = str(loc[0]) if loc else ""
             if report := reports.get(name, blame):
-                # A reported position identifies the parameter but not a key inside it; for
-                # datasets, not even the parameter.
+                # The position of the report identifies the parameter but not a key inside its
+                # value. For datasets, it does not even identify the parameter.
                 inside = ProblemLog(file="").path(loc) or f"the parameters of {draft.id}"
                 is_named = name in reports and len(loc) == 1
                 report(message if is_named else f"{inside}: {message}")
@@ -335,25 +338,26 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
             override.report(f"{key} is not a mapping, so keys in it cannot be set")
             return
         place = inner
-    # Copy it, because several calls may use the same value and later settings modify it.
+    # Copy the value, because several calls may share it and later settings may modify it.
     place[last] = deepcopy(override.value)
 
 
 # Sweeps -------------------------------------------------------------------------------------------
 
-# Parameter -> its values, each with a function that reports its problems.
+# Parameter -> swept values, each with a function that reports a problem with it.
 _Sweeps: TypeAlias = dict[str, list[tuple[JsonValue, Report]]]
 
 
 def expand_sweeps(
     steps: Sequence[DraftStep], overrides: Overrides, log: ProblemLog
 ) -> tuple[tuple[DraftStep, ...], Overrides]:
-    """Replace each call with a swept parameter by one variant per value.
+    """Replace each call with swept parameters by one variant per combination of values.
 
-    `--set` for a swept parameter replaces the sweep, and may itself be a sweep.
+    If `--set` sets a swept parameter, its value, which may be another sweep, replaces the sweep.
 
     Returns:
-        The steps with these variants, and the overrides of their calls, including the swept values.
+        The steps with these variants, and the overrides of their calls, which include the swept
+        values.
     """
     expanded: list[DraftStep] = []
     kept: Overrides = {}
@@ -379,7 +383,7 @@ def expand_sweeps(
 def _sweeps_of(
     draft: DraftCall, overrides: Sequence[Override], log: ProblemLog
 ) -> tuple[_Sweeps, tuple[Override, ...]]:
-    """Return the sweeps of a call, and the overrides that are not sweeps."""
+    """Return the sweeps of a call, and the overrides that do not contain sweeps."""
     found: _Sweeps = {}
     for name, value in draft.call.params.items():
         if _is_sweep(value):
@@ -432,7 +436,7 @@ def _once(values: list[tuple[JsonValue, Report]]) -> list[tuple[JsonValue, Repor
 
 
 def _canonical(value: JsonValue) -> str:
-    # 1 and 1.0 are the same number.
+    # Treat 1 and 1.0 as the same number.
     whole = int(value) if isinstance(value, float) and value.is_integer() else value
     return json.dumps(whole, sort_keys=True)
 
@@ -459,7 +463,6 @@ def _may_vary(step: DraftStep, draft: DraftCall, log: ProblemLog) -> bool:
 def _variants(
     draft: DraftCall, sweeps: _Sweeps, taken: set[str]
 ) -> Iterator[tuple[DraftCall, tuple[Override, ...]]]:
-    """Yield one variant per combination of values."""
     combinations = [
         dict(zip(sweeps, chosen, strict=True)) for chosen in itertools.product(*sweeps.values())
     ]
@@ -484,12 +487,12 @@ def _numbered(name: str) -> Iterator[str]:
 
 
 def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) -> list[str]:
-    """Name the combinations of a sweep by their exact values, or else by indices.
+    """Name the combinations of a sweep by their exact values or, if this is impossible, by indices.
 
     The names do not depend on the order of the combinations.
 
     Args:
-        before: name of the swept variant, or empty.
+        before: name of the variant in the file; empty for a step without variants.
         combinations: parameter -> value, with the same parameters in each.
 
     >>> variant_names("", [{"tolerance_m": 0.02}, {"tolerance_m": 1e-07}])
@@ -506,7 +509,8 @@ def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) 
     is_short = all(re.fullmatch(NAME_PATTERN, name) for name in names)
     if is_stated and is_short and len({*names}) == len(names):
         return names
-    # Number the combinations by their values, so that their order in the list does not matter.
+    # Number the combinations in the order of their values, so that their order in the list does not
+    # matter.
     keys = [[_ordered(one[name]) for name in sorted(one)] for one in combinations]
     in_order = sorted(range(len(keys)), key=keys.__getitem__)
     before = before[: _LETTERS - len(f"-{SWEEP}-{len(keys)}")]
@@ -521,11 +525,11 @@ def _ordered(value: JsonValue) -> tuple[int, float, str]:
 
 
 def _word(value: JsonValue) -> str:
-    """Return an exact value as part of a name; empty if that is not possible."""
+    """Return a value in a form that is allowed in names; empty if there is no exact form."""
     if value is None or isinstance(value, bool):
         return {True: "true", False: "false", None: "none"}[value]
     if isinstance(value, int | float):
-        # Names cannot contain points and signs.
+        # Names must not contain points and signs.
         text = _canonical(value).lower()
         return text.replace("+", "").replace("-", "m").replace(".", "_")
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""The text of a workflow: finding and reading it, and the list of its problems."""
+"""Finds and reads the text of a workflow, and collects its problems."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from orthoflow.files.yaml_positions import Document, Location, Position, path_te
 from orthoflow.products.product import JsonValue
 from orthoflow.untrusted_text import open_file
 
-#: limit for the bytes of a workflow file
+#: Maximum size of a workflow file in bytes.
 MOST_BYTES: Final = 400_000
 _INSTALLED: Final = Path(__file__).parent / "shipped"
 _CHECKOUT: Final = Path(__file__).parents[2] / "workflows"
 
 
 def shipped_workflows() -> dict[str, Path]:
-    """Return the shipped recipes by name, e.g. `direct` -> .../direct.yaml."""
+    """Return name -> path of the shipped recipes, such as `direct` -> .../direct.yaml."""
     folder = _INSTALLED if _INSTALLED.is_dir() else _CHECKOUT
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def shipped_workflow(name: str) -> Path:
-    """Return the path of a shipped recipe: `direct`, `direct.yaml` or `workflows/direct.yaml`.
+    """Return the path of a shipped recipe.
+
+    The name may be `direct`, `direct.yaml` or `workflows/direct.yaml`.
 
     Raises:
         WorkflowError: there is no such recipe.
@@ -45,7 +47,7 @@ def shipped_workflow(name: str) -> Path:
 
 
 def find_workflow(name_or_path: str | Path) -> Path:
-    """Return the path of an existing file, or else that of a shipped recipe.
+    """Return the path of a workflow file, or of a shipped recipe if there is no such file.
 
     Raises:
         WorkflowError: there is no such file or recipe.
@@ -59,13 +61,13 @@ def find_workflow(name_or_path: str | Path) -> Path:
 
 
 def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_BYTES) -> str:
-    """Read a text file of bounded size.
+    """Read a text file of limited size.
 
     Raises:
         WorkflowError: the file cannot be read, is too large, or is not UTF-8.
     """
     try:
-        # Read no more than the limit: a file given by mistake may be a scan.
+        # Read no more than the limit, because the file may be a scan that was given by mistake.
         with open_file(path) as stream:
             content = stream.read(most_bytes + 1)
     except OSError as error:
@@ -85,25 +87,25 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
 
 # Problems -----------------------------------------------------------------------------------------
 
-#: limit for the problems of a workflow that are reported at once
+#: Maximum number of problems of a workflow that are reported at once.
 MOST_PROBLEMS: Final = 100
 _SNIPPET_WIDTH: Final = 120
 Model = TypeVar("Model", bound=BaseModel)
 _Origin: TypeAlias = Literal["file", "plugin", "input", "option"]
-# Stands for a document that cannot be read.
+# This value represents a document that cannot be read.
 NOTHING: Final = Document(value=None, places={(): Position(line=1, column=1)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """A problem of a workflow file or command-line option.
+    """A problem with a workflow file or command-line option.
 
     Attributes:
         file: the workflow file as given by the user, or the command-line option.
-        line: line, from 1; 0 for a command-line option.
-        column: column, from 1; 0 for a command-line option.
-        path: location in the document, keys joined by dots, e.g. `steps.wall.params.gsd_m`.
-        message: one sentence.
+        line: line number, starting at 1; 0 for a command-line option.
+        column: column number, starting at 1; 0 for a command-line option.
+        path: location in the document, as keys joined by dots, e.g. `steps.wall.params.gsd_m`.
+        message: description of the problem, as one sentence.
         text: the line with the problem; empty for a command-line option.
     """
 
@@ -116,14 +118,14 @@ class Problem:
 
     @property
     def place(self) -> str:
-        """Return the position as a prefix of the message: `hall.yaml:3:9: steps.wall: `."""
+        """Position as a prefix of the message, such as `hall.yaml:3:9: steps.wall: `."""
         where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
         return f"{where}: {self.path}: " if self.path else f"{where}: "
 
     def __str__(self) -> str:
         head = f"{self.place}{self.message}"
-        # Show only the part of a long line around the column, so that the line does not hide the
-        # message.
+        # Show only the part of a long line that is close to the column, so that the message remains
+        # visible.
         is_long = len(self.text) > _SNIPPET_WIDTH
         start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2) if is_long else 0
         cut = self.text[start : start + _SNIPPET_WIDTH]
@@ -136,7 +138,7 @@ class Problem:
 
 
 class _ProblemsError(OrthoflowError):
-    """Several problems, each with one or more lines; `problems` contains them as data."""
+    """Several problems; the message has one or more lines for each."""
 
     def __init__(self, problems: tuple[Problem, ...]) -> None:
         self.problems = problems
@@ -148,7 +150,7 @@ class InvalidWorkflowError(_ProblemsError, WorkflowError):
 
 
 class UnusablePluginError(_ProblemsError, PluginError):
-    """A workflow is valid, but needs plugins that are unusable; `problems` lists where."""
+    """A workflow is valid, but needs unusable plugins; `problems` contains the positions."""
 
 
 class InvalidArgumentsError(_ProblemsError, ArgumentError):
@@ -162,8 +164,9 @@ class ProblemLog:
     Attributes:
         file: the workflow file as given by the user.
         lines: lines of the file.
-        document: values with their positions; empty before parsing.
-        unnamed: first key that is omitted from locations when they are formatted as paths, if any.
+        document: values with their positions; `NOTHING` before parsing.
+        unnamed: key that is omitted at the beginning of formatted locations; empty if there is
+            none.
     """
 
     file: str
@@ -173,27 +176,27 @@ class ProblemLog:
     _found: list[tuple[_Origin, Problem]] = field(default_factory=list)
 
     def parse(self, text: str) -> Document | None:
-        """Parse YAML and add its problems; return None if nothing can be read."""
+        """Parse YAML and add its problems; return None if the text cannot be read."""
         found = read_yaml(text, self)
         self.document = found or NOTHING
         return found
 
     def beside(self, file: str, text: str) -> ProblemLog:
-        """Return a log for another file, whose problems are raised together with these."""
+        """Return a log for another file, whose problems are raised together with those here."""
         return replace(
             self, file=file, lines=tuple(text.splitlines()), document=NOTHING, unnamed=""
         )
 
     @property
     def has_any(self) -> bool:
-        """Whether there are problems other than missing input files."""
+        """Whether problems other than missing input files have been found."""
         return any(origin != "input" for origin, _ in self._found)
 
     def add(self, position: Position, path: str, message: str) -> None:
         """Add a problem at a position.
 
         Raises:
-            InvalidWorkflowError: there are so many problems that the file cannot be a workflow.
+            InvalidWorkflowError: there are more than `MOST_PROBLEMS` problems.
         """
         self._add("file", self._at(position, path, message))
         if sum(origin == "file" for origin, _ in self._found) > MOST_PROBLEMS:
@@ -213,43 +216,46 @@ class ProblemLog:
         at_key: bool = False,
         shown: Location | None = None,
     ) -> None:
-        """Add a problem with the value, or with its key, at a location in the document.
+        """Add a problem with a value or its key in the document.
 
         Args:
-            location: location in the document.
-            message: one sentence.
-            at_key: whether to report the position of the key.
-            shown: path to show in the problem, if it differs from the location.
+            location: location of the value in the document.
+            message: description of the problem, as one sentence.
+            at_key: whether to report the position of the key instead of that of the value.
+            shown: location to show as the path of the problem, if it is another one.
         """
         path = self.path(location if shown is None else shown)
         self.add(self.position(location, at_key=at_key), path, message)
 
     def report_plugin(self, location: Location, message: str) -> None:
-        """Add a problem with a plugin that is needed at a location."""
+        """Add a problem with a plugin that is needed at a location in the document."""
         problem = self._at(self.position(location), self.path(location), message)
         self._add("plugin", problem)
 
     def report_input(self, place: Problem | None, message: str) -> None:
-        """Add a problem with input files; it does not make the workflow file invalid."""
+        """Add a problem with input files, which does not make the workflow file invalid."""
         if len(self._found) < 2 * MOST_PROBLEMS:
             nowhere = Problem(file=self.file, message="")
             self._add("input", replace(place or nowhere, message=message))
 
     def report_option(self, option: str, message: str) -> None:
-        """Add a problem with a command-line option, e.g. `--set wall.gsd_m=0`."""
+        """Add a problem with a command-line option, such as `--set wall.gsd_m=0`."""
         self._add("option", Problem(file=option, message=message))
 
     def place(self, location: Location) -> Problem | None:
-        """Return an empty problem at a location; None if the value does not come from a file."""
+        """Return a problem without a message at a location; None for values from Python."""
         position = self.position(location)
         return self._at(position, self.path(location), "") if position.line else None
 
     def position(self, location: Location, *, at_key: bool = False) -> Position:
-        """Return the position of a value or its key, or that of the enclosing value if missing."""
+        """Return the position of a value or its key, or else that of the enclosing value."""
         return self.document.position(location, at_key=at_key)
 
     def path(self, location: Location) -> str:
-        """Format a location, e.g. `steps.wall.in.cloud[1]`; only indices into lists are shown."""
+        """Format a location, such as `steps.wall.in.cloud[1]`.
+
+        Indices into values that are not lists are omitted.
+        """
         stated, _ = self.document.resolve(location)
         return path_text(stated[1:] if stated[:1] == (self.unnamed,) else stated)
 
@@ -262,7 +268,7 @@ class ProblemLog:
         return self.document.get(location)
 
     def raise_any(self) -> None:
-        """Raise an error with all problems found so far, if there are any.
+        """Raise an error with all problems found so far, unless only input files are missing.
 
         Raises:
             InvalidWorkflowError: the file has problems.
@@ -273,7 +279,7 @@ class ProblemLog:
             self._raise()
 
     def _raise(self) -> NoReturn:
-        # Problems of command-line options come last.
+        # Problems with command-line options come last.
         in_order = sorted(
             self._found,
             key=lambda one: ("" if one[0] == "option" else one[1].file, one[1].line, one[1].column),
@@ -302,16 +308,16 @@ def validate(
 ) -> Model | None:
     """Validate the content of a document, and report all mistakes at their positions.
 
-    Invalid parts are then left out of the model, so that later checks can use the valid parts.
+    Invalid parts are omitted from the model so that later checks can use the valid parts.
 
     Args:
-        model: expected model.
+        model: class of the expected model.
         data: value at the location.
         log: log of the document, to which problems are added.
         location: location of the value in the document.
 
     Returns:
-        The model of all valid parts; None if the value as a whole is invalid.
+        The model with all valid parts; None if the value as a whole is invalid.
     """
     data, is_first = deepcopy(data), True
     while True:
@@ -325,7 +331,7 @@ def validate(
         unfit = {existing(data, loc) for loc, _, _ in found}
         if () in unfit:
             return None
-        # Remove later list items first, so that indices remain valid.
+        # Remove later list items first, so that the indices of the others remain valid.
         for *outer, last in sorted(
             unfit,
             key=lambda loc: (len(loc), [part for part in loc if isinstance(part, int)]),

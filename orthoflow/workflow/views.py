@@ -31,15 +31,16 @@ from orthoflow.workflow.model import (
     is_acyclic,
 )
 
-# `Any`: JSON.
+# The values are JSON.
 Schema: TypeAlias = dict[str, Any]
 _SWEEP: Final = {"$ref": "#/$defs/SweepSection"}
-# Parts of a parameter's schema that, for editors, remain at the top level if a sweep is allowed.
+# These parts of a parameter's schema remain at the top level, where editors look for them, if a
+# sweep is allowed.
 _SHOWN: Final = ("description", "default")
 
 
 class _Untitled(GenerateJsonSchema):
-    """Omits titles generated from field names, which are of no use in editors."""
+    """Omits the titles that pydantic generates from field names; they are useless in editors."""
 
     def field_title_should_be_set(self, schema: object) -> bool:
         return False
@@ -48,8 +49,8 @@ class _Untitled(GenerateJsonSchema):
 def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     """Return the JSON Schema (2020-12) of workflows, for editors and other programs.
 
-    Methods that cannot be loaded are omitted. The schema is intended for completion, and checks
-    less than `load_workflow`: neither dependences between keys, nor whether references and ports
+    Methods that cannot be loaded are omitted. The schema is intended for completion. It checks less
+    than `load_workflow`: it does not check relations between keys, and whether references and ports
     match.
     """
     methods = list(_loadable(catalog))
@@ -65,7 +66,7 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
         properties = params.get("properties", {})
         params["properties"] = {name: _or_sweep(inner) for name, inner in properties.items()}
         defs[info.id] = _renamed(params, info)
-    # One definition per method, shared by steps and variants.
+    # Steps and variants share one definition per method.
     defs["parameters"] = {
         "allOf": [
             {
@@ -108,7 +109,6 @@ def _is_source(method: type[Method], catalog: Catalog) -> bool:
 
 
 def _renamed(schema: Any, info: type[Method]) -> Any:
-    """Update references to a method's own definitions, which have been renamed."""
     if isinstance(schema, dict):
         return {
             key: f"#/$defs/{info.id}.{value.rpartition('/')[2]}"
@@ -131,12 +131,13 @@ def _or_sweep(schema: Schema) -> Schema:
 
 
 def mermaid(workflow: Workflow, catalog: Catalog) -> str:
-    """Return a Mermaid flowchart of inputs, steps with variants, and connections.
+    """Return a Mermaid flowchart with the inputs, steps, variants and connections.
 
-    A dotted edge may be unused: the port has several candidates, or the input disables the step.
-    Ports that all methods of a step ignore are omitted.
+    A dotted line shows a connection that may be unused because the port has several candidates, or
+    an input on which a condition of the step depends. Ports that all methods of a step ignore are
+    omitted.
     """
-    # Names may be reserved words of Mermaid, such as `end`, so they only appear in labels.
+    # A name may be a reserved word of Mermaid, such as `end`, so names are used only as labels.
     nodes = {f"{INPUTS}.{name}": f"input{k}" for k, name in enumerate(workflow.inputs)}
     nodes |= {name: f"step{k}" for k, name in enumerate(workflow.steps)}
     lines = ["flowchart LR"]
@@ -204,7 +205,7 @@ _ResolvedName: TypeAlias = Annotated[str, AfterValidator(check_name)]
 
 
 class _Resolved(BaseModel):
-    """The resolved form of a workflow; untrusted, because it is read from records."""
+    """The resolved form of a workflow, which is untrusted because it is read from records."""
 
     orthoflow: Literal[1]
     name: _ResolvedName
@@ -220,8 +221,8 @@ class _Resolved(BaseModel):
 def resolved_json(workflow: Workflow) -> str:
     """Return the workflow, including all defaults and overrides, as canonical JSON.
 
-    Paths from the command line are reduced to their last part, because records contain no folders
-    of the machine on which they were made.
+    Paths from the command line are reduced to their last part, because records must not contain
+    folders of the user's machine.
     """
     document: dict[str, object] = {
         "orthoflow": FORMAT,
@@ -253,7 +254,8 @@ def resolved_json(workflow: Workflow) -> str:
 
 def _input_json(spec: WorkflowInputSpec) -> JsonValue:
     def recorded(name: str) -> str:
-        # A record contains the text of the workflow with its paths, but not the table of datasets.
+        # Paths in the workflow are in the record anyway, as part of its text; absolute paths in a
+        # table are not.
         is_private = spec.is_given or (spec.table and Path(name).is_absolute())
         return Path(name).name if is_private else name
 
@@ -261,14 +263,14 @@ def _input_json(spec: WorkflowInputSpec) -> JsonValue:
 
 
 def workflow_from_resolved(resolved: str, source: str) -> Workflow:
-    """Restore a workflow that has been checked and resolved before; plugins are not needed.
+    """Restore a workflow from its resolved form in a record; no plugins are needed.
 
     Args:
         resolved: JSON text from `resolved_json`.
         source: text of the workflow file as written.
 
     Raises:
-        WorkflowError: the text is not a resolved workflow, or has a newer format.
+        WorkflowError: the text is not a resolved workflow, or its format is newer.
     """
     try:
         workflow = _from_resolved(_Resolved.model_validate_json(resolved, strict=True), source)
@@ -306,7 +308,7 @@ def _from_resolved(document: _Resolved, source: str) -> Workflow:
 
 
 def _check_resolved(workflow: Workflow) -> None:
-    """Repeat the checks of a workflow file, since a record may have been changed.
+    """Repeat the checks of a workflow file, because a record may have been changed.
 
     Raises:
         ValueError: a value is out of range, or refers to something that does not exist.
