@@ -232,7 +232,7 @@ REPORT_FILE: Final = "report.html"
 METADATA_FILE: Final = "ro-crate-metadata.json"
 WORKFLOW_FILE: Final = "workflow.yaml"
 RESOLVED_FILE: Final = "workflow-resolved.json"
-#: Maximum size of a report page, and of a file that it refers to.
+#: bytes of a report page, or of a file that it refers to
 LARGEST_PAGE_BYTES: Final = 1 << 30
 _DAMAGED: Final = "the file is damaged"
 _AWAY: Final = "; use another copy, and check it with `orthoflow verify`"

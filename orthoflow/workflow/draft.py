@@ -52,9 +52,9 @@ _FIRST_LINE_BYTES: Final = 10_000
 _WORKFLOW_BYTES: Final = 1_000_000
 # These files identify a run folder, in which images are not photos.
 _OF_RUNS: Final = frozenset(("run.h5", "journal.jsonl"))
-#: Maximum depth of subfolders that `orthoflow new` searches.
+#: levels of subfolders that `orthoflow new` searches
 DEEPEST: Final = 3
-#: Maximum number of files that `orthoflow new` reads.
+#: files that `orthoflow new` inspects in a folder
 MOST_FILES: Final = 20_000
 
 

@@ -31,7 +31,7 @@ from orthoflow.workflow.parameters import SWEEP
 
 # Factor (dataset, seed or step with variants) -> level.
 Assignment: TypeAlias = dict[str, str]
-#: Maximum number of cells of a workflow, including excluded combinations.
+#: cells of a workflow, including excluded combinations
 MOST_CELLS: Final = 20_000
 # Product type of methods that inspect the quality of results.
 _JUDGEMENT: Final = "inspection"

@@ -41,9 +41,9 @@ from orthoflow.workflow.parameters import (
 )
 from orthoflow.workflow.source import ProblemLog, read_text, validate
 
-#: Maximum size of a datasets table in bytes.
+#: bytes of a table of datasets
 MOST_TABLE_BYTES: Final = 4_000_000
-#: Maximum number of datasets in a table.
+#: datasets in a table
 MOST_DATASETS: Final = 10_000
 _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200

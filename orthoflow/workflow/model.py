@@ -33,11 +33,12 @@ from orthoflow.products.product import JsonValue
 from orthoflow.workflow.source import Problem
 
 FORMAT: Final = 1
-#: Maximum value of `repeat`.
+#: repeats of a method call
 MOST_REPEATS: Final = 10_000
-# Maximum number of values of a sweep; more would be impractical to run and unreadable in a curve.
+# More values would be impractical to run and unreadable in a curve.
+#: values of a sweep
 MOST_SWEPT: Final = 100
-#: Maximum number of combinations in `exclude`.
+#: combinations in `exclude`
 MOST_EXCLUDED: Final = 500
 # All JSON readers represent integers up to this value exactly.
 _MOST_OF_A_NUMBER: Final = 10**15

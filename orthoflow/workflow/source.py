@@ -15,7 +15,7 @@ from orthoflow.files.yaml_positions import Document, Location, Position, path_te
 from orthoflow.products.product import JsonValue
 from orthoflow.untrusted_text import open_file
 
-#: Maximum size of a workflow file in bytes.
+#: bytes of a workflow file
 MOST_BYTES: Final = 400_000
 _INSTALLED: Final = Path(__file__).parent / "shipped"
 _CHECKOUT: Final = Path(__file__).parents[2] / "workflows"
@@ -87,7 +87,7 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
 
 # Problems -----------------------------------------------------------------------------------------
 
-#: Maximum number of problems of a workflow that are reported at once.
+#: problems of a workflow that are reported at once
 MOST_PROBLEMS: Final = 100
 _SNIPPET_WIDTH: Final = 120
 Model = TypeVar("Model", bound=BaseModel)
