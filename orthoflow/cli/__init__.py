@@ -1,4 +1,4 @@
-"""The command line: one module per command, imported when the command is used."""
+"""The command line, with one module per command, which is imported when the command is used."""
 
 from __future__ import annotations
 

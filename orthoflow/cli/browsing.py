@@ -1,4 +1,4 @@
-"""Overview of several runs: run folders below given folders, with results and differences."""
+"""Summaries of the runs in and below given folders."""
 
 from __future__ import annotations
 
@@ -27,36 +27,39 @@ from orthoflow.untrusted_text import open_file, parse_json
 
 RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"]
 
-# Run folders are in runs/ or a few folders below it; deeper ones are not searched for.
+# Folders deeper than this are not searched, because run folders are in `runs/` or a few levels
+# below it.
 _DEEPEST: Final = 6
-# Folders that contain no runs; searching them takes time.
+# These folders contain no runs, and searching them would take time.
 _NO_RUNS: Final = frozenset({"products", "logs", "pages", "node_modules", "__pycache__"})
-# Subfolders of a run folder that contain no further runs.
+# These subfolders of a run folder contain exports of the same run.
 _OF_A_RUN: Final = frozenset({"datasets", "export"})
 _FIRST_LINE_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """Summary of a run, a row in a table of runs.
+    """Summary of a run, which is a row in a table of runs.
 
     Attributes:
-        folder: run folder, as found.
-        status: `ok`; `failed` if a cell failed; `running`; `unfinished` if interrupted; `damaged`
-            if the record cannot be read or its seal is broken.
-        reason: first failure, or the reason why the record cannot be read; empty if there is none.
-        n_errors: number of kinds of errors that steps reported, i.e. of wrong results.
+        folder: path of the run folder, which begins with the given path.
+        status: `ok`; `failed` if a cell failed; `running` if the run is in progress; `unfinished`
+            if it was interrupted; `damaged` if the record cannot be read or its seal is broken.
+        reason: first failure, or the reason why there is no readable record; empty if there is
+            none.
+        n_errors: number of different error codes in the diagnostics that steps reported.
         workflow: name of the workflow.
         run_id: id of the run.
-        started: ISO 8601 UTC; empty if unknown.
-        metrics: metrics of the baseline by `step.metric`, and by `metric` alone for the last step
-            that reports it. For several datasets, the median, or the share of "yes" for yes/no
-            metrics.
+        started: start of the run, ISO 8601, UTC; empty if unknown.
+        metrics: `step.metric` -> value for the baseline, and `metric` -> value for the last step
+            that reports the metric. For several datasets, the value is the median, or the share of
+            "yes" for yes/no metrics.
         n_datasets: number of datasets; 0 if the workflow lists none.
         headlines: names of the headline metrics, most important first.
-        facts: properties other than parameters that may differ between runs: `seed`, `orthoflow`
-            (version), methods of the baseline by `step.use`, and inputs by `input <name>`.
-        parameters: `step.parameter` -> values, more than one if variants or datasets differ.
+        facts: name -> property, other than parameters, that may differ between runs: `seed`,
+            `orthoflow` (version), `datasets` (number), `step.use` (method of the baseline) and
+            `input <name>` (files).
+        parameters: `step.parameter` -> values; there are several if variants or datasets differ.
     """
 
     folder: Path
@@ -78,7 +81,7 @@ class RunSummary:
         return frozenset((*self.metrics, *self.facts, *self.parameters))
 
     def values(self, name: str) -> tuple[JsonValue, ...]:
-        """Return a metric, a fact, or all values of a parameter."""
+        """Return all values of a metric, fact or parameter."""
         for known in (self.metrics, self.facts):
             if name in known:
                 return (known[name],)
@@ -86,7 +89,7 @@ class RunSummary:
 
     @property
     def all_facts(self) -> dict[str, JsonValue]:
-        """Facts and parameters; several values of a parameter are joined, as in `0.02|0.05`."""
+        """Facts and parameters; several values of a parameter become text such as `0.02|0.05`."""
         return dict(self.facts) | {
             name: values[0] if len(values) == 1 else "|".join(map(_sorted_json, values))
             for name, values in self.parameters.items()
@@ -94,7 +97,7 @@ class RunSummary:
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
-    """Return the run folders in and below the given folders, sorted; links are not followed.
+    """Return the run folders in and below the given folders; links are not followed.
 
     Raises:
         ArgumentError: a path is not a folder.
@@ -108,16 +111,15 @@ def run_folders(folders: Sequence[Path]) -> list[Path]:
 
 
 def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
-    """Yield a summary of each run folder; the status of unreadable ones is `damaged`."""
+    """Yield a summary of each run folder; its status is `damaged` if it cannot be read."""
     for folder in folders:
         yield _summary(folder)
 
 
 def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """Return, by folder, the facts that distinguish a run from other runs of its workflow.
+    """Return run folder -> facts that distinguish the run from other runs of its workflow.
 
-    A fact that is missing in some runs counts as different only if two of the other runs disagree
-    on it.
+    A fact that some runs lack is included only if two of the other runs have different values.
     """
     facts = {run.folder: run.all_facts for run in runs}
     values: dict[tuple[str, str], set[str]] = {}
@@ -139,7 +141,7 @@ def _sorted_json(value: JsonValue) -> str:
 
 
 def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
-    """Return the names of the headline metrics of the runs, most frequent first."""
+    """Return the names of the most frequent headline metrics of the runs."""
     counts = Counter(name for run in runs for name in run.headlines)
     chosen = sorted(counts, key=lambda name: -counts[name])[:most]
     return [name for name in counts if name in chosen]
@@ -149,7 +151,8 @@ def _below(folder: Path) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         if RECORD_FILE in files or JOURNAL in files:
             yield Path(place)
-            # A record that is alone in its folder can be replayed there.
+            # Do not search in a run folder unless it was given: other run folders may be below a
+            # given one, such as replays.
             if Path(place) != folder:
                 folders.clear()
                 continue
@@ -194,7 +197,8 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
             if cell.status != "skipped":
                 facts[f"{cell.step}.use"] = cell.method
             for row in cell_metrics(cell):
-                # Over several datasets, the absolute values of signed errors are used.
+                # For several datasets, use absolute values, because errors of both signs would
+                # cancel.
                 is_size = len(parts) > 1 and row.better == "lower"
                 for name in (f"{row.step}.{row.metric}", row.metric):
                     own[name] = abs(row.value) if is_size else row.value
@@ -221,7 +225,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
 
 
 def _parameters(cells: Iterable[RecordedCell]) -> dict[str, tuple[JsonValue, ...]]:
-    """Return the distinct values of each parameter in the cells."""
+    """Return `step.parameter` -> values that occur in the cells."""
     found: dict[str, dict[str, JsonValue]] = {}
     for cell in cells:
         if cell.repeat == 0 and cell.status != "skipped":
@@ -232,7 +236,7 @@ def _parameters(cells: Iterable[RecordedCell]) -> dict[str, tuple[JsonValue, ...
 
 
 def _unfinished(folder: Path) -> RunSummary:
-    """Summarise a run without a record from the first line of its journal."""
+    """Summarise a run without a record, from the first line of its journal."""
     try:
         with open_file(folder / JOURNAL) as journal:
             first = parse_json(journal.readline(_FIRST_LINE_BYTES).decode("utf-8"))

@@ -37,7 +37,7 @@ def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
 
 
 def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
-    """Return a summary of a valid workflow, and the probable mistakes in it."""
+    """Return a summary of a valid workflow, and warnings about implausible settings."""
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.checks import lint_workflow
     from orthoflow.workflow.expand import expand_cells, is_plain, variants_text
@@ -55,7 +55,7 @@ def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
         parts.append(f"{counted(len(cells), 'step run')} in total")
     if skipped:
         parts.append(f"{skipped} skipped because optional inputs are missing")
-    # In a sweep, the user chose no baseline, so none is shown.
+    # The baseline is empty if no step has variants.
     if named := variants_text(loaded.baseline):
         parts.append(f"baseline {named}")
     return f"{loaded.name} is valid: {', '.join(parts)}", lint_workflow(loaded)

@@ -1,4 +1,4 @@
-"""Building blocks of commands: lazy groups, shared options, error messages and exit codes."""
+"""Building blocks of commands: groups, shared options, error messages and exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 
 DEBUG_HELP: Final = "Show tracebacks of errors."
-# Per command, because click caches the help option that the first call creates.
+# These settings are passed to each command, because click caches the help option that the first
+# call creates.
 HELP_OPTIONS: Final = {"help_option_names": ["-h", "--help"]}
 
 
@@ -44,14 +45,14 @@ class Session:
 
 
 def current_session() -> Session:
-    """Return the session of the running command, or a new one if it is called on its own."""
+    """Return the session of the running command, or a new session if there is no such command."""
     context = click.get_current_context(silent=True)
     session = context.find_object(Session) if context is not None else None
     return session if session is not None else Session()
 
 
 def command_again(output: Path) -> str:
-    """Return the running command as a shell command line, with this folder after -o."""
+    """Return the running command as a shell command line with the given folder after -o."""
     context = click.get_current_context()
     words = [context.command_path]
     for item in context.command.params:
@@ -77,21 +78,21 @@ def debug_parameter() -> click.Option:
 class Command(click.Command):
     """A command that accepts `--debug` after its name."""
 
-    # Any: keyword arguments are passed on to click.
+    # The types are `Any` because the arguments are passed on to click.
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{"context_settings": HELP_OPTIONS, **kwargs})
         self.params.append(debug_parameter())
 
 
 class RecordCommand(Command):
-    """A command whose arguments are runs; errors due to a damaged record are reported as such.
+    """A command whose arguments are runs; it reports damaged records as the cause of errors.
 
-    Reading checks the format of a record; only verification checks whether its parts are
-    consistent.
+    Reading a record checks only its format. If reading succeeds but the command then fails, the
+    record is verified to find out whether its parts are consistent.
     """
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run the command; if it fails because of a damaged record, report the damage."""
+        """Run the command; if it fails because a record is damaged, report the damage."""
         try:
             return super().invoke(ctx)
         except (GeometryError, ProductError) as error:
@@ -116,7 +117,7 @@ class RecordCommand(Command):
 
 
 class LazyGroup(click.Group):
-    """A group whose `--help` lists summaries without importing the commands.
+    """A group of commands whose `--help` does not import the commands.
 
     Args:
         summaries: name of a command -> its one-line summary, in the order shown in the help.
@@ -124,11 +125,11 @@ class LazyGroup(click.Group):
             name.
     """
 
-    # Any: keyword arguments are passed on to click.
+    # The types are `Any` because the arguments are passed on to click.
     def __init__(
         self, *args: Any, summaries: Mapping[str, str], target: str, **kwargs: Any
     ) -> None:
-        # Click requires a callback for a group, although it does nothing.
+        # Click requires a callback for a group, although this callback has nothing to do.
         super().__init__(
             *args, **{"callback": lambda: None, "context_settings": HELP_OPTIONS, **kwargs}
         )
@@ -140,7 +141,7 @@ class LazyGroup(click.Group):
         return list(self._summaries)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import one command."""
+        """Import a command; return None if there is no such command."""
         if cmd_name not in self._summaries:
             return None
         module_name, _, attribute = self._target.replace("{}", cmd_name).partition(":")
@@ -150,7 +151,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command; if it does not exist, suggest similar names."""
+        """Find the command; if there is none, suggest a similar name."""
         if args and self.get_command(ctx, args[0]) is None:
             from orthoflow.errors import nearest
 
@@ -171,7 +172,7 @@ def _keep_debug(ctx: click.Context, _param: click.Parameter, value: bool) -> Non
         session.debug = True
 
 
-# Any: click decorates functions as well as commands.
+# The bound is `Any` because click decorates functions as well as commands.
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any] | click.Command)
 
 DEFAULT_STORE: Final = Path(".orthoflow")
@@ -179,7 +180,7 @@ DEFAULT_STORE: Final = Path(".orthoflow")
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """Settings from the command line that override those in a workflow file."""
+    """Options of a command that change the settings of a workflow file."""
 
     sets: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -195,9 +196,9 @@ class Changes:
 
 
 def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
-    """Add WORKFLOW and `changes`: `WORKFLOW --set --set-file --input --datasets ...`."""
+    """Add the argument WORKFLOW and the options for `Changes`, such as `--set`."""
 
-    # Any: parameters of the command, whose types click has checked.
+    # The type is `Any` because click has checked the parameters of the command.
     @wraps(run)
     def command(**given: Any) -> int:
         changes = Changes(**{item.name: given.pop(item.name) for item in fields(Changes)})
@@ -207,7 +208,7 @@ def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
 
 
 def _together(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
-    """Return a decorator that adds arguments and options in the order shown in the help."""
+    """Return a decorator that adds arguments and options, in the order of the help."""
 
     def add(command: _Decorated) -> _Decorated:
         for option in reversed(options):
@@ -265,7 +266,7 @@ _workflow_options = _together(
         help="Run only on these datasets (comma-separated names).",
     ),
 )
-#: options that select steps
+#: Options that select steps.
 selection_options = _together(
     *(
         click.option(option, name, metavar="STEP", multiple=True, help=f"{text} Repeatable.")
@@ -292,7 +293,7 @@ selection_options = _together(
         )
     )
 )
-#: options for the execution of steps
+#: Options for the execution of steps.
 execution_options = _together(
     click.option(
         "--jobs", type=int, default=1, metavar="N", help="Number of steps that run in parallel."
@@ -322,7 +323,7 @@ execution_options = _together(
 
 
 def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
-    """Add `-o`; `name` is the name of the default folder."""
+    """Return a decorator that adds `-o`; `name` is the name of the default folder in `runs`."""
     return click.option(
         "-o",
         "--output",
@@ -384,12 +385,13 @@ def _sentences(error: OrthoflowError) -> list[str]:
     n_problems = len(getattr(error, "problems", ()))
     if not n_problems:
         return [f"error: {str(error) or type(error).__name__}"]
-    # Each line begins with file:line:column, which editors and other tools parse.
+    # Print the problems unchanged: each begins with file:line:column, which editors and other tools
+    # parse.
     return [*str(error).split("\n"), f"error: {counted(n_problems, 'problem')}"]
 
 
 def echo_error(*lines: str) -> None:
-    """Write lines to standard error; ignore a closed stream."""
+    """Write lines to standard error; do nothing if the stream is closed."""
     with contextlib.suppress(BrokenPipeError):
         echo(*lines, err=True)
 
@@ -403,7 +405,7 @@ def echo_lint(workflow: Workflow) -> None:
 
 
 def code_for(findings: Iterable[str], consequence: str) -> int:
-    """Report changes to sealed records, and return the exit code."""
+    """Report findings on broken seals with their consequence, and return the exit code."""
     lines = [f"error: {one}; {consequence}" for one in findings if one]
     if not lines:
         return EXIT_GOOD
@@ -412,7 +414,7 @@ def code_for(findings: Iterable[str], consequence: str) -> int:
 
 
 def silence_stdout() -> None:
-    """Discard further output, so that a closed pipe causes no error at exit."""
+    """Discard further output, so that a closed pipe does not cause an error at exit."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())

@@ -22,7 +22,7 @@ from orthoflow.cli.tables import (
 if TYPE_CHECKING:
     from orthoflow.records.compare import Pair, RunComparison
 
-# Fields of a run that the JSON output contains.
+# The JSON output contains these fields of both records.
 _OF_RUNS: Final = ("run_id", "name", "created_by", "status", "started", "ended", "seed")
 
 
@@ -57,7 +57,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
 
 
 def _as_json(comparison: RunComparison) -> dict[str, object]:
-    """Return a comparison as JSON; every row states whether both values are the same."""
+    """Return a comparison as JSON; each row states whether both values are the same."""
     return {
         "runs": [
             {name: getattr(record, name) for name in _OF_RUNS}
@@ -74,7 +74,7 @@ def _as_json(comparison: RunComparison) -> dict[str, object]:
     }
 
 
-# Any: rows of all kinds.
+# The values of rows may have any type.
 def _row_json(row: Pair[Any]) -> dict[str, object]:
     return {**dataclasses.asdict(row), "same": row.is_same}
 

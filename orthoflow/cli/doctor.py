@@ -34,11 +34,11 @@ _IMPORT_TIMEOUT_S: Final = 120
 _MIN_DISK_BYTES: Final = 5 * 1024**3
 _MIN_MEMORY_BYTES: Final = 2 * 1024**3
 
-# Distributions without which no command works.
+# No command works without these distributions.
 _CORE: Final = frozenset(
     {"click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich", "ruamel-yaml"}
 )
-# Modules whose names differ from those of their distributions.
+# Distribution -> module, where the names differ.
 _MODULES: Final[Mapping[str, str]] = {
     "fonttools": "fontTools",
     "open3d-cpu": "open3d",
@@ -53,8 +53,8 @@ _SYSTEM_PACKAGES: Final = {
     "libusb": "libusb-1.0-0",
     "libgomp": "libgomp1",
 }
-# The wheel of open3d needs libusb-1.0.so.0, which libusb-package contains; loading it globally
-# makes it available to open3d.
+# The wheel of open3d needs libusb-1.0.so.0, which the distribution libusb-package contains. Loading
+# this library globally makes it available to open3d.
 _OPEN3D_PRELUDE: Final = """
 import ctypes
 try:
@@ -73,8 +73,8 @@ class Finding:
         name: name of the checked item.
         verdict: ok, limited (works with a restriction) or missing.
         found: version, size or setting.
-        cost: consequence and remedy; empty if ok.
-        core: whether orthoflow requires it.
+        cost: consequence and remedy; empty if the verdict is ok.
+        core: whether orthoflow requires the item.
     """
 
     name: str
@@ -92,7 +92,7 @@ def doctor(store: Path, *, as_json: bool) -> int:
 
     The exit code is 4 if something essential is missing.
     """
-    # A broken library may crash the process that imports it.
+    # Import each library in a process of its own, which a broken library may crash.
     with ThreadPoolExecutor(max_workers=max(2, os.cpu_count() or 1)) as pool:
         libraries = list(pool.map(_library, _libraries()))
     findings = [*_machine(), *_store(store), *libraries, *_plugins()]
@@ -117,8 +117,8 @@ def _print(findings: list[Finding], *, is_broken: bool) -> None:
 
 
 def _libraries() -> list[str]:
-    """Return the names of the libraries that are installed with orthoflow."""
-    # On Linux, open3d comes as open3d-cpu.
+    """Return the names of the libraries that orthoflow requires."""
+    # On Linux, open3d is provided by open3d-cpu.
     return sorted((direct_requirements(DISTRIBUTION) or frozenset()) - {"open3d"})
 
 
@@ -168,7 +168,6 @@ def _machine() -> Iterator[Finding]:
 
 
 def _enough(name: str, n_bytes: int, min_bytes: int, cost: str) -> Finding:
-    """Return the finding on whether there is enough of a resource."""
     is_enough = n_bytes >= min_bytes
     verdict: Literal["ok", "limited"] = "ok" if is_enough else "limited"
     return Finding(name, verdict, f"{size(n_bytes)} free", "" if is_enough else cost)

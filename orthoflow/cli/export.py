@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from orthoflow.records.runs import Run
 
 _Command = TypeVar("_Command", bound=Callable[..., Any] | click.Command)
-# Subfolder of the run folder, with a folder per format.
+# This subfolder of the run folder contains one folder per format.
 _EXPORT_FOLDER: Final = "export"
 
 
 class _Scale(click.IntRange):
-    """The N of a scale 1:N, entered as N or as 1:N."""
+    """The denominator N of a scale 1:N, which the user enters as N or as 1:N."""
 
-    # Any: as declared by click.
+    # Click declares the value as `Any`.
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         text: Any = value.replace(" ", "").removeprefix("1:") if isinstance(value, str) else value
         return int(super().convert(text, param, ctx))
@@ -40,9 +40,8 @@ _STEPWISE: Final = (
 )
 
 
-# Any: options accept any click parameter.
+# The type is `Any` because the arguments are passed on to click.
 def _for(formats: str, *names: str, help: str, **more: Any) -> Callable[[_Command], _Command]:
-    """Add an option that applies only to some formats."""
     text = f"{formats.replace(' ', ', ')}: {help}"
     return click.option(*names, cls=FormatOption, formats=formats.split(), help=text, **more)
 
@@ -236,7 +235,7 @@ _HELP: Final = "\n\n".join(
     "export/datasets).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
-    """Write results of a run for other programs; return 3 if the seal of the record is broken."""
+    """Write the results of a run for other programs, and return the exit code."""
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records.open import open_run
@@ -249,7 +248,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    # These formats copy the record, including arrays that were not read, or print its seal.
+    # These formats copy the whole record or print its seal, so check all of it.
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
@@ -313,7 +312,7 @@ def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _folder_inside(run: Run, *names: str) -> Path:
-    """Return a default folder inside the run; reject links that lead out of it."""
+    """Return the path of a subfolder of the run folder; reject links."""
     folder = run.home_folder
     for name in names:
         folder /= name

@@ -1,4 +1,4 @@
-"""`orthoflow.run`: the command `run` as a Python function."""
+"""`orthoflow.run`, which is the command `orthoflow run` as a Python function."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def run(
     workflow: str | Path,
     *,
-    # Any: values of parameters.
+    # Parameters may have values of any type.
     set: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str | Path | Sequence[str | Path]] | None = None,
     datasets: str | Path | Mapping[str, Mapping[str, Any]] = "",
@@ -34,20 +34,20 @@ def run(
 ) -> OpenedRun:
     """Run a workflow, as `orthoflow run` does, and open the finished run.
 
-    Progress is written to standard error. If a step fails, `record.status` of the run is `failed`.
-    Stored results are not recomputed.
+    Progress is written to standard error. If a step fails, no exception is raised, but
+    `record.status` of the run is `failed`. Stored results are not recomputed.
 
     Args:
-        workflow: a file, or the name of a shipped workflow.
-        set: parameters by `step.parameter` or `step.variant.parameter`; `{"sweep": [...]}` creates
-            a variant for each value; arrays may be used instead of lists.
-        inputs: files by name of the input.
-        datasets: a CSV file with a table of datasets, or a mapping as in a workflow, `{"hall":
-            {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`; paths are relative to the working
-            directory.
+        workflow: path of a workflow file, or name of a shipped workflow.
+        set: `step.parameter` or `step.variant.parameter` -> value. The value `{"sweep": [...]}`
+            creates a variant for each item. Arrays may be used instead of lists.
+        inputs: name of the input -> file or files.
+        datasets: path of a CSV file with a table of datasets, or a mapping as in a workflow, such
+            as `{"hall": {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`. Paths in the mapping
+            are relative to the working directory.
         only_data: names of the datasets to run; empty for all.
         output: run folder; `runs/<name>-<run id>` if None.
-        store: folder of stored results.
+        store: folder of the store.
         **options: options of the command: `jobs`, `executor`, `scheduler`, `retries` and `embed`;
         `only`, `from_`, `until` and `force`, with one or more steps; `set_files`, one or more YAML
         files of `step.parameter: value`, which `set` overrides.
@@ -85,7 +85,7 @@ def run(
     if isinstance(datasets, Mapping):
         chosen["datasets"] = json.loads(_json("datasets", datasets))
     changes = Changes(**{item.name: chosen.pop(item.name) for item in fields(Changes)})
-    # The report of an interrupted run states the command of the context.
+    # If the run is interrupted, its report shows the command in this context.
     with context:
         _, made = run_workflow(changes=changes, **chosen)
     from orthoflow.report.notebooks import open_run
@@ -93,7 +93,7 @@ def run(
     return open_run(made.path)
 
 
-# Any below: values from the caller.
+# In the following functions, `Any` is the type of values from the caller.
 def _listed(value: Any) -> list[Any]:
     is_many = hasattr(value, "__iter__") and not isinstance(value, str | os.PathLike)
     return list(value) if is_many else [value]
@@ -109,5 +109,5 @@ def _json(where: str, value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert the array and number types of libraries to those of Python, and paths to text."""
+    """Convert arrays and numbers of libraries to lists and numbers, and paths to strings."""
     return value.tolist() if callable(getattr(value, "tolist", None)) else os.fspath(value)

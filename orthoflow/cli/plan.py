@@ -35,7 +35,7 @@ def plan(
     store: Path,
     *,
     as_json: bool,
-    # Any: the fields of RunOptions, whose types click has checked.
+    # These are options that select steps or belong to `RunOptions`; click has checked their types.
     **selection: Any,
 ) -> int:
     """Show for every step of WORKFLOW whether its result is stored, and if not, why it would run.

@@ -34,7 +34,7 @@ _SUMMARIES: Final = {
     "check": "Run the conformance suite on a method.",
 }
 
-# Number of parameters of a method that are shown first.
+# Number of parameters of a method that are shown in the first table.
 _FIRST_SHOWN: Final = 5
 
 plugins: Final[click.Command] = LazyGroup(
@@ -203,7 +203,7 @@ def _print_method(method: Mapping[str, Any]) -> None:
             ],
         )
     echo(*([""] if method["params"] else ["", "no parameters"]))
-    # Methods declare the most frequently set parameters first.
+    # Methods declare the parameters that users set most often first.
     first, others = method["params"][:_FIRST_SHOWN], method["params"][_FIRST_SHOWN:]
     for title, params in (("parameter", first), ("other parameters", others)):
         if others and title != "parameter":
@@ -372,7 +372,7 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
 
 @contextmanager
 def _sharing_kernels(method_id: str) -> Iterator[None]:
-    """Let the checks use and extend the cache of compiled kernels of this user."""
+    """While the block runs, use and extend this user's cache of compiled kernels."""
     from orthoflow.engine.kernels import VARIABLE, kernel_folder, kernels_in
     from orthoflow.engine.keys import method_facts
 

@@ -1,4 +1,4 @@
-"""The program: the table of commands, and the root group that runs them."""
+"""The program `orthoflow`: the table of commands, and the group that runs them."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ interrupted.
 
 
 class Program(LazyGroup):
-    """The root group; every error ends with a one-sentence message and an exit code."""
+    """The group of all commands; it turns errors into a message and an exit code."""
 
-    # Any: click's signature.
+    # The types are those of click.
     def main(self, *args: Any, **extra: Any) -> NoReturn:
-        """Run the command line and exit with an exit code."""
+        """Run a command line, and exit with its exit code."""
         session = Session()
         extra.update(standalone_mode=False, obj=session)
         code: object
@@ -79,15 +79,16 @@ class Program(LazyGroup):
             code = error.exit_code
         except Exception as error:  # noqa: BLE001 - last handler before the user
             code = explain(error, session)
-        # A command that returns no exit code has failed.
+        # If a command returns no exit code, it has failed.
         sys.exit(code if isinstance(code, int) else EXIT_CELL_FAILED)
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run the chosen command; a reader that closed the pipe early is not an error."""
+        """Run the chosen command; succeed if the reader of its output closes the pipe."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError:
-            # Handled here because click would turn it into exit code 1, "some cell failed".
+            # Handle the error here, because click would return the exit code 1, which means that a
+            # step failed.
             silence_stdout()
             return 0
 
@@ -121,7 +122,8 @@ program: Final = Program(
 def main() -> NoReturn:
     """Run the `orthoflow` command."""
     take_up_streams()
-    # Imports create many permanent objects and little garbage; collection took 10 % of a `plan`.
+    # Imports create many permanent objects but little garbage. With the default threshold, garbage
+    # collection took 10 % of the time of `orthoflow plan`.
     gc.set_threshold(50_000, *gc.get_threshold()[1:])
     try:
         program.main(prog_name="orthoflow")
@@ -133,20 +135,21 @@ def main() -> NoReturn:
 def take_up_streams() -> None:
     """Replace closed standard streams by the null device.
 
-    Otherwise a file opened later would get the descriptor of a closed stream, and its output.
+    Otherwise, a file that is opened later would get the descriptor of the closed stream, and would
+    receive its output.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            # open() uses the lowest free descriptor, which is that of the closed stream.
+            # The lowest free descriptor, which is that of the closed stream, is used.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # noqa: FBT003
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8"))  # noqa: SIM115, PTH123
 
 
 def _leave_library_threads(code: object) -> None:
-    """Exit immediately if a plugin left threads running, for which Python would wait forever."""
+    """Exit immediately if threads of a plugin are still running; Python would wait for them."""
     main_thread = threading.main_thread()
     if all(thread.daemon or thread is main_thread for thread in threading.enumerate()):
         return

@@ -1,4 +1,4 @@
-"""Progress of a running workflow: a live table on a terminal, and plain lines elsewhere."""
+"""Display of the progress of a run: a live table on a terminal, and plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
     from orthoflow.engine.plan import PlannedCell
 
-# Below these limits, the progress of a step is too small to predict its remaining time.
+# Below these limits, a step has progressed too little to predict its remaining time.
 _MIN_FRACTION: Final = 0.05
 _MIN_ELAPSED_S: Final = 2.0
 _REFRESH_PER_S: Final = 4
 # Maximum time between lines in a log file.
 _EVERY_S: Final = 10.0
-# Shorter times for starting, loading and compiling are not reported.
+# Time for starting, loading and compiling is reported only if it is longer than this.
 _MIN_MORE_S: Final = 2.0
 _STYLES: Final = {
     "running": "cyan",
@@ -50,15 +50,16 @@ _STYLES: Final = {
 
 @dataclass
 class CellState:
-    """A cell of a run in progress.
+    """State of a cell of a run that is in progress.
 
     Attributes:
         state: `waiting`, `running`, or the outcome of the cell.
-        fraction: progress reported by the step, 0 to 1.
+        fraction: progress reported by the step, from 0 to 1.
         text: current activity of the cell, or the reason for its outcome.
-        started: clock time of its start in seconds.
-        wall_s: duration in seconds.
-        took_s: duration of an earlier run of this or a similar cell in seconds; None if unknown.
+        started: start of the cell, in seconds of the monotonic clock.
+        wall_s: duration in seconds, once the cell has ended.
+        took_s: duration in seconds of an earlier run of this cell or a similar one; None if
+            unknown.
     """
 
     state: str = "waiting"
@@ -69,7 +70,7 @@ class CellState:
     took_s: float | None = None
 
     def left_s(self, now_s: float) -> float | None:
-        """Estimate the remaining time in seconds from an earlier duration, or from progress."""
+        """Estimate the remaining time in seconds; return None if it cannot be estimated."""
         if self.state == "waiting":
             return self.took_s
         if self.state != "running":
@@ -83,24 +84,25 @@ class CellState:
 
 
 def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> str:
-    """Estimate the remaining time of a run; empty if nothing remains.
+    """Describe the estimated remaining time of a run; empty if nothing remains.
 
     Args:
         cells: all cells.
-        now_s: current time of the clock used for `started`.
+        now_s: current time of the monotonic clock in seconds.
         jobs: number of cells that run at the same time.
     """
     left = [
         cell.left_s(now_s)
         for cell in cells
-        # Stored and skipped steps take no time, and their durations do not predict those of others.
+        # Omit waiting cells that will not run, whose `took_s` is 0.
         if cell.state == "running" or (cell.state == "waiting" and cell.took_s != 0.0)
     ]
     known = [seconds for seconds in left if seconds is not None]
     n_unknown = len(left) - len(known)
     if not left:
         return ""
-    # Otherwise a few short steps would suggest that a run that takes minutes is nearly finished.
+    # Give no estimate if most cells have none: a few short steps would suggest that the run is
+    # nearly finished.
     if not known or n_unknown > len(known):
         return "remaining time not yet known"
     seconds = about(max(*known, sum(known) / jobs, 0.0))
@@ -110,7 +112,7 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
 
 
 def about(seconds: float) -> str:
-    """Format an estimated duration, rounded up.
+    """Format an estimated duration, rounded up to a coarse unit.
 
     >>> [about(seconds) for seconds in (0.3, 7, 42, 130, 4000)]
     ['5 s', '10 s', '45 s', '2 min 10 s', '1 h 07 min']
@@ -124,7 +126,7 @@ class Progress:
     """Display of a run: a table on a terminal, and log lines elsewhere.
 
     Attributes:
-        every_s: interval in seconds between log lines on running steps.
+        every_s: interval in seconds between log lines about running steps.
         console: console of the terminal; None if there is no terminal.
     """
 
@@ -132,7 +134,8 @@ class Progress:
         self._jobs = jobs
         self._lock = threading.Lock()
         self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
-        # A step with one of these methods may resolve a diagnostic; the summary has the others.
+        # A diagnostic that a step with one of these methods may resolve is not reported during the
+        # run; if it is not resolved, the summary contains it.
         self._methods = {item.cell.method for item in cells}
         self._n_cells = len(cells)
         self._reported: set[tuple[str, str]] = set()
@@ -167,7 +170,7 @@ class Progress:
         if not line:
             return
         if self.console:
-            # Warnings and failures are printed above the table, so that they stay readable.
+            # Print warnings and failures above the table, so that they remain visible.
             has_failed = isinstance(event, CellFinished) and event.result.status == "failed"
             style = _STYLES["failed"] if has_failed else "yellow"
             if has_failed or isinstance(event, CellReported | RunStarted):
@@ -177,7 +180,7 @@ class Progress:
             echo_error(f"{line} ({self.n_ended} of {self._n_cells})" if is_end else line)
 
     def _applied(self, event: RunEvent) -> str:
-        """Apply an event; return a log line about it, or an empty text."""
+        """Update the cells with an event; return a log line, which may be empty."""
         with self._lock:
             match event:
                 case RunStarted():
@@ -212,7 +215,7 @@ class Progress:
         return ""
 
     def _reported_line(self, address: str, one: Diagnostic) -> str:
-        """Format a diagnostic as a line; empty for notes, and for codes already reported."""
+        """Format a diagnostic as a line; empty for notes and for codes reported before."""
         if one.is_summary:
             return f"{address}: {one.text}"
         if one.severity == "note" or not self._methods.isdisjoint(one.settled_by):
@@ -233,7 +236,7 @@ class Progress:
             return dict(self._cells)
 
     def left(self) -> str:
-        """Estimate the remaining time of the run; empty if nothing remains."""
+        """Describe the estimated remaining time of the run; empty if nothing remains."""
         return left_of_run(self.cells().values(), time.monotonic(), jobs=self._jobs)
 
     @property
@@ -242,7 +245,7 @@ class Progress:
         return sum(cell.state not in ("waiting", "running") for cell in self.cells().values())
 
     def refresh(self) -> None:
-        """Show the progress of running steps."""
+        """Log the progress of running steps."""
         now_s = time.monotonic()
         running = []
         for address, cell in self.cells().items():
@@ -259,7 +262,7 @@ class Progress:
             echo_error(*running)
 
     def drawn(self) -> Group:
-        """Return the table for a terminal, with the progress of the run below it."""
+        """Return the table of cells for a terminal, followed by the progress of the run."""
         from rich.console import Group
         from rich.text import Text
 
@@ -268,7 +271,7 @@ class Progress:
         return Group(self.table(), Text(f"{ended}, {left}" if left else ended, style="dim"))
 
     def table(self) -> Table:
-        """Return the table; if it is too long, only its running, failed and waiting cells."""
+        """Return the table of cells; omit cells if it is too long for the terminal."""
         from rich.table import Table
         from rich.text import Text
 
@@ -280,7 +283,7 @@ class Progress:
         most = (self.console.height if self.console else len(cells) + 4) - 4
         ended = len(cells) - most if len(cells) > most else 0
         for address, cell in cells.items():
-            # If not all fit, the cells that ended first are omitted.
+            # Omit the cells that ended first, except failed cells.
             if ended > 0 and cell.state not in ("running", "failed", "waiting"):
                 ended -= 1
                 continue
@@ -303,7 +306,7 @@ def _end_text(event: CellFinished, more_s: float) -> str:
 
     Args:
         event: the end of the cell.
-        more_s: time since its start that is not part of its duration.
+        more_s: elapsed seconds since the start of the cell that are not part of its duration.
     """
     result = event.result
     if event.cached:
@@ -311,17 +314,17 @@ def _end_text(event: CellFinished, more_s: float) -> str:
     took = f" in {duration(result.wall_s)}" if result.started else ""
     if took and more_s >= _MIN_MORE_S:
         took += f", plus {duration(more_s)} for starting, loading and compiling"
-    # The summary contains the reasons for skipped cells.
+    # The summary contains the reasons why cells were skipped.
     why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"
 
 
 @contextmanager
 def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[Callable[[str], None]]:
-    """While the block runs, show an activity that is not part of a cell, and its duration so far.
+    """While the block runs, show an activity outside cells, and its duration so far.
 
     Yields:
-        A function that names the current part of the activity.
+        A function to call with the name of the current part of the activity.
     """
     started = time.monotonic()
     parts = [what]
@@ -340,7 +343,7 @@ def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[Callable[[st
 
 
 def _live(console: Console, drawn: Callable[[], RenderableType]) -> Live:
-    """Return a display that refreshes itself and disappears at its end."""
+    """Return a display that refreshes itself, and is removed from the terminal at the end."""
     from rich.live import Live
 
     return Live(
@@ -353,7 +356,6 @@ def _live(console: Console, drawn: Callable[[], RenderableType]) -> Live:
 
 @contextmanager
 def _repeating(call: Callable[[], None], every_s: float) -> Iterator[None]:
-    """Call a function every few seconds while the block runs."""
     is_over = threading.Event()
 
     def go() -> None:

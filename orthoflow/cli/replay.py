@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from orthoflow.records.replay import ReplayedMetric
 
 _NOTHING: Final = "-"
-# Verdict -> why a metric is not the same.
+# Verdict -> reason why the values of a metric differ.
 _CAUSES: Final = {
     "different": "unknown: the products of its step are identical",
     "code changed": "the code of a method on which it depends has changed",
@@ -67,7 +67,7 @@ def replay(
     store: Path | None,
     *,
     as_json: bool,
-    # Any: the fields of RunOptions about how steps run, whose types click has checked.
+    # These options belong to `RunOptions`; click has checked their types.
     **choices: Any,
 ) -> int:
     """Repeat RUN, a run folder or its run.h5, from its record and its input files.
@@ -158,7 +158,7 @@ def replay(
 
 @contextmanager
 def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
-    """Return the given store, or a new one next to the run that is removed at the end."""
+    """Yield the given store, or a new store next to the run folder, which is removed at the end."""
     if given is not None:
         yield given
         return
@@ -168,12 +168,12 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
     try:
         yield fresh
     except (CancelledStepError, ClusterError, KeyboardInterrupt):
-        # Keep finished results, which the same command reuses when it is called again.
+        # Keep the store: if the same command is called again, it uses the finished results.
         raise
     except BaseException:
         shutil.rmtree(fresh, ignore_errors=True)
         if is_new:
-            # A folder such as `runs`, if nothing was run.
+            # Remove the parent folder, such as `runs`, too if it is empty.
             with contextlib.suppress(OSError):
                 fresh.parent.rmdir()
         raise

@@ -78,7 +78,7 @@ def run(
     *,
     embed: bool,
     json_log: Path | None,
-    # Any: the fields of RunOptions, whose types click has checked.
+    # These options belong to `RunOptions`; click has checked their types.
     **choices: Any,
 ) -> int:
     """Run WORKFLOW, a file or the name of a shipped workflow.
@@ -100,7 +100,8 @@ def run(
     try:
         _print_summary(made, outcome.resumed, time.monotonic() - began_s)
     except BrokenPipeError:
-        # The reader has closed the pipe; the exit code still gives the outcome of the run.
+        # The reader of the output has closed the pipe, but the exit code still states the outcome
+        # of the run.
         silence_stdout()
     return outcome.exit_code
 
@@ -113,10 +114,10 @@ def run_workflow(
     *,
     embed: bool,
     json_log: Path | None,
-    # Any: the fields of RunOptions.
+    # These are the fields of `RunOptions`.
     **choices: Any,
 ) -> tuple[RunOutcome, Run]:
-    """Plan and execute a workflow, and write record and report.
+    """Plan and execute a workflow, and write its record and report.
 
     Raises:
         ArgumentError: an option is invalid.
@@ -124,7 +125,7 @@ def run_workflow(
     from orthoflow.cli.progress import working_on
 
     with working_on("reading the workflow, its inputs and the store"):
-        # Import slow modules here.
+        # Import slow modules here, while the activity is displayed.
         from orthoflow.catalog.discovery import discover_catalog
         from orthoflow.engine.journal import new_run_folder, new_run_id, require_run_folder
         from orthoflow.engine.plan import RunOptions, plan_run
@@ -138,7 +139,7 @@ def run_workflow(
         catalog = discover_catalog()
         loaded = changes.load(workflow, catalog)
         if output is not None:
-            # Checked first, because reading gigabytes of inputs comes next.
+            # Check the folder before the inputs are read, which may take long.
             require_run_folder(output.absolute(), loaded.name)
         opened = Store(store)
         cells = expand_cells(loaded, catalog)
@@ -147,7 +148,7 @@ def run_workflow(
     folder = output or new_run_folder(loaded.name, run_id)
     # Mark the store as in use until the record is written, so that `cache gc` removes no results.
     with opened.in_use(), _json_log(json_log, plan) as log:
-        # Shown before the run, which may take minutes.
+        # Print warnings before the run, which may take long.
         echo_lint(loaded)
         has_begun = False
 
@@ -176,9 +177,10 @@ def run_workflow(
 
 
 def _report_unfinished(folder: Path) -> None:
-    """Write the report of an interrupted run: its results so far, and how to resume it.
+    """Write the report of an interrupted run, with the results so far and how to resume it.
 
-    Failures, e.g. due to a full disk, are ignored, since the results are already stored.
+    Errors, for example because the disk is full, are ignored, because the results are already
+    stored.
     """
     from orthoflow.records.open import open_unfinished
     from orthoflow.records.runs import REPORT_FILE
@@ -201,7 +203,7 @@ def executed(  # noqa: PLR0913 - parts of a run
     report: Callable[[Run, Callable[[str], None]], None],
     listen: RunListener = lambda _: None,
 ) -> tuple[RunOutcome, Run]:
-    """Execute a plan, show its progress, and write products, record and report."""
+    """Execute a plan, show the progress, and write the products, record and report."""
     from orthoflow.cli.progress import Progress, working_on
     from orthoflow.engine.scheduler import execute
     from orthoflow.records.write import executed_and_written, write_run
@@ -239,7 +241,7 @@ def executed(  # noqa: PLR0913 - parts of a run
 
 @contextmanager
 def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
-    """When a cell ends, write its diagnostics as JSON lines, including those of cached cells.
+    """Yield a listener that writes the diagnostics of finished cells to a file as JSON lines.
 
     Raises:
         ArgumentError: the file cannot be written.
@@ -266,12 +268,12 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
 
 
 def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
-    """Print the table of cells, the warnings, and the paths of report, record and images.
+    """Print the table of cells, the warnings, and the paths of the results.
 
     Args:
         run: the finished run.
         kept: addresses of the cells that were computed before an interruption.
-        took_s: duration of the whole run.
+        took_s: duration of the whole run in seconds.
     """
     cells = run.record.cells
     echo()
@@ -307,7 +309,7 @@ def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
 
 
 def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
-    """Count cells from the store or from before an interruption; skipped cells are not counted."""
+    """Count the cells that were cached or computed before an interruption."""
     counted_cells = [cell for cell in cells if cell.status != "skipped"]
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)

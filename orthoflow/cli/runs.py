@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from orthoflow.cli.browsing import RunSummary
 
 _COLUMNS: Final = ("folder", "started", "workflow", "status")
-# Number of metrics that fit next to the other columns on a wide terminal.
+# Maximum number of metrics, which fit next to the other columns on a wide terminal.
 _METRICS_MOST: Final = 4
 _LONGEST_FACT: Final = 40
 _FACTS_MOST: Final = 4
@@ -92,7 +92,6 @@ def runs(
 
 
 def _write_table(folders: Sequence[Path], table: Path) -> int:
-    """Merge runs into one CSV table."""
     from orthoflow.cli.browsing import run_folders
     from orthoflow.engine.durability import write_whole, writing_to
     from orthoflow.engine.journal import RECORD_FILE
@@ -120,7 +119,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
 
 
 def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
-    """Summarise all runs in and below folders, oldest first."""
+    """Summarise all runs in and below the given folders, oldest first."""
     from orthoflow.cli.progress import working_on
 
     with working_on("reading the records"):
@@ -130,7 +129,7 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 
 def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[dict[str, object]]:
-    """Return runs as JSON, with all metrics and parameters, and differences from other runs."""
+    """Return runs as JSON, including all metrics, facts and differences from other runs."""
     from orthoflow.cli.browsing import differing_facts
 
     differs = differing_facts(found)
@@ -138,7 +137,7 @@ def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[d
 
 
 def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
-    """Print a table of some of the runs found, their problems, and their number."""
+    """Print a table of runs, and their problems."""
     from orthoflow.cli.browsing import differing_facts, key_metrics
 
     names = key_metrics(kept, most=_METRICS_MOST)
@@ -166,7 +165,7 @@ def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
 
 
 def _condition(text: str) -> tuple[str, Callable[[float], bool]]:
-    """Parse one `--where`: a name and a condition on its value."""
+    """Parse the value of `--where` into a name and a condition."""
     match = _CONDITION.fullmatch(text)
     if match is None:
         raise click.UsageError(
@@ -192,7 +191,7 @@ def _filtered(found: Sequence[RunSummary], where: Sequence[str]) -> list[RunSumm
 
 
 def _sorted(kept: Sequence[RunSummary], key: str) -> list[RunSummary]:
-    """Sort runs; those without the metric come last in both directions."""
+    """Sort runs by a column or metric; runs without the metric come last in both directions."""
     name = key.removeprefix("-")
     if name in _COLUMNS:
         text = operator.attrgetter(name)
@@ -212,7 +211,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
         if name not in known:
             from orthoflow.errors import nearest
 
-            # Users often enter only the last part of a parameter's name, without step and method.
+            # Users often enter only the last part of a name, without the step.
             ends = sorted(one for one in known if one.endswith(f".{name}"))
             near = ends[0] if ends else nearest(name, known)
             hint = f"did you mean {near!r}?" if near else "--json lists all names"
@@ -220,7 +219,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
 
 
 def _facts_text(facts: Mapping[str, object]) -> str:
-    """Describe how a run differs from others, as far as this fits on a line."""
+    """Describe the first few differences of a run from other runs in one line."""
     parts = []
     for name, value in facts.items():
         text = json.dumps(value, ensure_ascii=False)

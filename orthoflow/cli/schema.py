@@ -22,7 +22,7 @@ def schema(*, as_json: bool) -> int:
     from orthoflow.workflow.views import workflow_schema
 
     del as_json
-    # Without whitespace, the text, which only programs read, is half as large.
+    # Only programs read the schema; it is half as large without whitespace.
     schema_text = json.dumps(
         workflow_schema(discover_catalog()), separators=(",", ":"), ensure_ascii=False
     )

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
 
-# Number of columns of metrics that fit in a wide window.
+# Maximum number of columns for metrics, which fit in a wide window.
 _COLUMNS_MOST: Final = 5
 _NOTHING: Final = "-"
 _COST_UNITS: Final = ("s", "MiB")
@@ -119,7 +119,7 @@ def _print_cells(run: Run, *, is_whole: bool) -> None:
 
 
 def _print_comparison(run: Run, most: int | None) -> bool:
-    """Print a row per combination; return whether there are several."""
+    """Print one row per combination; return whether there are several combinations."""
     if all(set(cell.assignment) <= {DATA} for cell in run.record.cells):
         return False
     from orthoflow.records.runs import parts_of
@@ -182,7 +182,8 @@ def _print_metrics(run: Run, *, most: int | None = None) -> None:
         for cell, metric in first_rows(
             metrics,
             most,
-            # Quality first, later steps before earlier ones; times and memory last.
+            # Headline metrics come first, then other ranked metrics, and then the rest; times and
+            # memory come last. Later steps come before earlier ones.
             lambda one: (
                 one[1].unit in _COST_UNITS,
                 not one[1].headline,
@@ -237,7 +238,7 @@ def _as_json(run: Run) -> dict[str, object]:
 
 def _cell_json(cell: RecordedCell) -> dict[str, object]:
     values = dataclasses.asdict(dataclasses.replace(cell, figures=()))
-    # Pictures are in the record and the report; only their names are listed here.
+    # Omit the content of figures, which is in the record and the report.
     values["figures"] = [
         {"name": figure.name, "caption": figure.caption, "media_type": figure.media_type}
         for figure in cell.figures

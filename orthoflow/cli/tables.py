@@ -1,4 +1,4 @@
-"""Plain text for terminals: aligned tables, differences between products, quantities, and JSON."""
+"""Plain text for terminals: tables, diagnostics, quantities and JSON."""
 
 from __future__ import annotations
 
@@ -19,28 +19,29 @@ if TYPE_CHECKING:
 
 Row = TypeVar("Row")
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
-# Longer tables are truncated unless all rows are requested.
+# Maximum number of rows of a table, unless all rows are requested.
 ROWS_MOST: Final = 20
-# Units of tolerances as printed; `1` is for plain numbers.
+# Unit of a difference -> printed unit; plain numbers have the unit `1`.
 _UNITS: Final = {"grey": " grey levels", "1": ""}
 
 
 def echo(*lines: str, err: bool = False) -> None:
-    """Print lines, optionally on standard error, with control characters escaped.
+    """Print lines with control characters escaped, optionally on standard error.
 
-    All output of commands is printed here, because names, messages and logs are untrusted.
+    All commands print their output by this function, because names, messages and logs are
+    untrusted.
     """
     for line in lines or ("",):
         click.echo(shown(line), err=err)  # noqa: TID251 - the only place
 
 
 def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool = False) -> None:
-    """Print the diagnostics that limit the results of cells, the most severe first, one per code.
+    """Print the diagnostics of cells, grouped by code, beginning with the most severe.
 
     Args:
         cells: cells of the run.
-        run: folder or record of the run, for the hint on how to print the remaining diagnostics.
-        is_whole: whether to print all of them, including notes.
+        run: folder or record of the run, for a hint on how to print the remaining diagnostics.
+        is_whole: whether to print all diagnostics, including notes.
     """
     from orthoflow.diagnostics import FIRST_SHOWN, grouped, standing
 
@@ -55,19 +56,19 @@ def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool
 
 
 def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under a header in aligned columns; nothing if there are no rows."""
+    """Print rows under a header in aligned columns; print nothing if there are no rows."""
     if rows:
         for line in table_lines(header, rows):
             echo(line)
 
 
 def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows under a header in aligned columns.
+    """Return lines with a header and rows in aligned columns.
 
     >>> table_lines(("step", "time"), [("cloud", "1.0 s")])
     ['step   time', 'cloud  1.0 s']
     """
-    # Escape first, since escapes change the widths.
+    # Escape first, because escape sequences change the widths.
     laid = [[shown(text) for text in row] for row in (header, *rows)]
     widths = [max(len(row[i]) for row in laid) for i in range(len(header))]
     return [
@@ -77,17 +78,18 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[st
 
 
 def echo_json(value: object) -> None:
-    """Print a value as JSON, indented and in a fixed order."""
+    """Print a value as indented JSON."""
     text = shown_json(json.dumps(value, indent=2, ensure_ascii=False))
     click.echo(text)  # noqa: TID251 - control characters are escaped as in JSON
 
 
 def echo_distances(distances: Sequence[ProductDistance], most: int | None = None) -> None:
-    """Print a row per product, the reasons for differences, and how often each verdict occurs.
+    """Print one row per product, the reasons for differences, and the number of each verdict.
 
     Args:
         distances: comparisons of products.
-        most: maximum number of rows (those with differences come first); None for all.
+        most: maximum number of rows, of which those with differences are printed first; None for
+            all rows.
     """
     rows = first_rows(distances, most, lambda item: item.verdict == "identical")
     echo_table(
@@ -114,14 +116,14 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
 def first_rows(
     rows: Sequence[Row], most: int | None, place: Callable[[Row], int | tuple[int, ...]]
 ) -> Sequence[Row]:
-    """Return the rows of a table to print: all, or the first ones by rank if there are too many."""
+    """Return the rows to print; if there are too many, the first ones in the order of `place`."""
     if most is None or len(rows) <= most:
         return rows
     return sorted(rows, key=place)[:most]
 
 
 def echo_left_out(n_rows: int, most: int | None) -> None:
-    """Print how many rows of a table were omitted, and how to see them."""
+    """Print how many rows of a table were omitted, and how to print them."""
     if most is not None and n_rows > most:
         echo(f"and {n_rows - most} more, shown by --all")
 
@@ -158,7 +160,7 @@ def size(n_bytes: float) -> str:
 
 
 def number(value: float) -> str:
-    """Format a number with six significant digits, or a count with all its digits.
+    """Format a number with six significant digits, or an integer with all its digits.
 
     >>> number(2251930.0), number(0.0012345678), number(-3.0)
     ('2251930', '0.00123457', '-3')
@@ -167,7 +169,7 @@ def number(value: float) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Format a count with its noun.
+    """Format a count with its noun in the singular or plural.
 
     >>> counted(1, "step"), counted(3, "step")
     ('1 step', '3 steps')

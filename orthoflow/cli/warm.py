@@ -15,8 +15,8 @@ from orthoflow.cli.tables import counted, echo, echo_json
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
 
-# Shipped recipes that together run all built-in methods on simulated rooms, and settings that make
-# the rooms small.
+# Together, these shipped recipes run all built-in methods on simulated rooms. The settings make the
+# runs short.
 _COARSE: Final = ("room.scan_step_m=0.05", "wall.gsd_m=0.05")
 _WITH_PHOTOS: Final = ("room.scan_step_m=0.004", "room.photo_gsd_m=0.003")
 _RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
@@ -64,7 +64,10 @@ def warm(workflow: str | None, *, as_json: bool) -> int:
 
 
 def _results(catalog: Catalog, wanted: Collection[str]) -> dict[str, str]:
-    """Run the recipes in a temporary store; return why a method failed, or an empty text."""
+    """Run the recipes in a temporary store, and return method -> error message.
+
+    The message is empty if the method succeeded.
+    """
     from orthoflow.cli.progress import Progress
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.scheduler import execute
@@ -81,7 +84,8 @@ def _results(catalog: Catalog, wanted: Collection[str]) -> dict[str, str]:
             cells = {cell.address: cell for cell in expand_cells(loaded, catalog)}
             chosen: set[str] = set()
             for address, cell in cells.items():
-                # Text and Boolean parameters and inputs decide which kernels are used.
+                # String and Boolean parameters and the inputs determine which kernels are used;
+                # numbers do not.
                 words = {k: v for k, v in cell.params_set.items() if isinstance(v, str | bool)}
                 call = (cell.method, frozenset(words.items()), frozenset(cell.inputs))
                 if cell.method in wanted and not cell.skip_reason and call not in seen:

@@ -1,1 +1,1 @@
-"""The writers of `orthoflow export`: table of formats, options, and a module per family."""
+"""The writers of `orthoflow export`, with the table of formats and the options."""

@@ -15,29 +15,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """Options that apply only to some formats; None, False or empty if not given.
+    """Options that apply only to some formats; None, False or empty if an option is not given.
 
     Attributes:
         cell: address of the cell to export.
         license_text: license of an RO-Crate.
         author: author of an RO-Crate.
-        scale: denominator n of the scale 1 : n of sheets.
+        scale: denominator N of the scale 1:N of sheets.
         paper: paper size of sheets.
         grid: spacing of the grid crosses in the unit of the sheets; 0 for none.
         units: unit of numbers on sheets.
-        title_block: file with the office's title block.
-        beside: rasters to show next to the orthoimage on sheets.
-        embed: whether to include every product and input.
-        split: whether to write a record per dataset.
-        inputs: input files, `NAME=PATH`.
+        title_block: file with the title block of the user's office.
+        beside: kinds of rasters to show next to the orthoimage on sheets.
+        embed: whether to include all products and input files in the record.
+        split: whether to write one run folder per dataset.
+        inputs: input files, as `NAME=PATH`.
         store: store with products that the record references but does not contain.
         colour: source of the colours of points.
         wall: number of a single wall to export.
-        box: corners of the part to export, as text.
+        box: two opposite corners of the part to export, as `x,y,z,x,y,z` in metres.
         clean: whether to remove isolated points.
-        relief: whether to model walls from their depths.
-        heights_m: heights of plans above the floor.
-        through: lines of sections, each `x,y,x,y`.
+        relief: whether to model the relief of walls from their depths.
+        heights_m: heights of plans above the floor, in metres.
+        through: lines of sections, each as `x,y,x,y` in metres.
         dimensions: whether to write lengths next to the lines of plans and sections.
         language: language of labels.
         light: azimuth and altitude in degrees of a raking light, e.g. `315,25`.

@@ -1,4 +1,4 @@
-"""Export of the registered cloud: selection of points, colours, and file formats."""
+"""Export of the registered cloud: selection of points, colours and file formats."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _export(
     folder: Path,
     chosen: Choices,
 ) -> str:
-    """Write the cloud to a file with this name, and a description of it to `cloud.json`."""
+    """Write the cloud to a file, and a description of the cloud to `cloud.json`."""
     is_labelled = chosen.cell is not None or any(
         output.type_name == "labels"
         for cell in run.cells.values()
@@ -71,7 +71,8 @@ def _export(
         raise ArgumentError(
             f"the labels have {len(labels.plane_index)} points, but the cloud has {len(cloud)}"
         )
-    # Read only if their colours may be used; an error message lists them in any case.
+    # Read the photos only if their colours may be used. The error message lists the colouring
+    # `photos` in any case.
     is_wanted = chosen.colour in {None, "photos"}
     oriented = _oriented(run, cells, chosen) if is_wanted else ()
     has: dict[Colouring, bool] = {
@@ -138,7 +139,7 @@ def _makers_of_cameras(cells: Any) -> dict[str, Any]:
 
 
 def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
-    """Return the photos and cameras from the last cell of a branch that oriented any photos."""
+    """Return the oriented photos, with their cameras, from the last orientation in some cells."""
     makers = _makers_of_cameras(cells)
     if not makers:
         return ()
@@ -157,7 +158,7 @@ def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, Viewi
 def _photo_colours(
     cloud: PointCloud, oriented: Sequence[tuple[Photo, ViewingCamera]], scratch: Path
 ) -> PointColours:
-    """Return colours that are memory-mapped from files, so that they do not occupy memory."""
+    """Compute the colours in memory-mapped files, so that they do not occupy memory."""
     n_points = len(cloud)
 
     def mapped(name: str, kind: type[np.generic], *more: int) -> NDArray[Any]:
@@ -189,7 +190,10 @@ def _box(text: str | None) -> NDArray[np.float64] | None:
 
 
 def _crs_wkt(walls: Walls | None) -> str:
-    """Return the coordinate system of the scan set in the workflow (`crs` of `raster.grid`)."""
+    """Return the coordinate system of the cloud, which the parameter `crs` of `raster.grid` sets.
+
+    The result is WKT; empty if the system is unknown.
+    """
     if walls is None:
         return ""
     known = {epsg_of(wall.frame.map_crs) for wall in walls.walls} - {None}

@@ -33,7 +33,7 @@ from orthoflow.records.walls import RoomResults, WallResult, room_results
 
 
 def chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:
-    """Return the walls to draw: all, or the selected one."""
+    """Return the selected wall, or all walls if none is selected."""
     if chosen.wall is None:
         return results.walls
     numbered = {wall.number: wall for wall in results.walls}
@@ -41,7 +41,7 @@ def chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:
 
 
 def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `wall_<k>.dxf` and `room.dxf`, and the pictures to which they refer."""
+    """Write `wall_<k>.dxf` and `room.dxf`, and the images to which the drawings refer."""
     results = room_results(run, chosen.cell, chosen.wall)
     walls = chosen_walls(results, chosen)
     lines = _lines(results)
@@ -109,7 +109,7 @@ def _light(text: str | None) -> Light:
 
 
 def export_qgis(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `walls.qgs` and a virtual raster per layer."""
+    """Write `walls.qgs` and one virtual raster per layer."""
     results = room_results(run, chosen.cell)
     walls = [wall for wall in results.walls if wall.frame.raster_axes == "wall"]
     if not walls:

@@ -1,4 +1,4 @@
-"""The table of formats of `orthoflow export`, used by help and error messages."""
+"""The table of formats of `orthoflow export`, and the check of options."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ class Writer(Protocol):
     """Function that writes a format."""
 
     def __call__(self, run: Run, folder: Path, chosen: Choices, /) -> str:
-        """Write to a folder, which `make_empty` creates after all checks; return a summary."""
+        """Write to a folder and return a summary.
+
+        The function creates the folder by `make_empty` when all checks have succeeded.
+        """
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,8 @@ class Format:
 
     Attributes:
         writer: import string `module:function` of a `Writer`, relative to `orthoflow.cli.exports`.
-        summary: what is written, for the help.
-        takes_rasters: whether it reads GeoTIFFs that the run published.
+        summary: description of the written files, for the help.
+        takes_rasters: whether the writer reads GeoTIFFs that the run published.
     """
 
     writer: str
@@ -168,19 +171,19 @@ class FormatOption(click.Option):
         formats: names of the formats to which it applies.
     """
 
-    # Any: the arguments are click's.
+    # The types are `Any` because the arguments are passed on to click.
     def __init__(self, *args: Any, formats: Sequence[str], **more: Any) -> None:
         super().__init__(*args, **more)
         self.formats = formats
 
 
 def _is_given(value: object) -> bool:
-    # `--wall 0` and `--grid 0` count as given; a flag that is not set is False.
+    # An option is given even if its value is 0, as in `--wall 0`; a flag that is not set is False.
     return value is not None and value is not False and value != ()
 
 
 def check_choices(chosen: Choices, target: str | None, options: Sequence[FormatOption]) -> None:
-    """Refuse options that do not apply to the format.
+    """Raise an error if an option does not apply to the format.
 
     Raises:
         ArgumentError: an option does not apply to the format, or no format is given.

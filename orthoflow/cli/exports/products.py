@@ -22,7 +22,7 @@ _Wall = TypeVar("_Wall")
 
 _MOST_NAMED: Final = 5
 
-# Names of product types in errors about cells, and in errors about runs.
+# Product type -> words for error messages about cells, and for those about runs.
 _SAID: Final = {
     "cameras": ("orientations", "contains no oriented photos"),
     "layers": ("layers", "contains no layers (photos projected onto walls)"),
@@ -54,10 +54,10 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
 
 
 def store_of(run: Run, given: Path) -> Path:
-    """Return the store with the products that a record references but does not contain.
+    """Return the store that contains the most products missing in the record.
 
-    If `given` is the default, stores above the run folder are considered, too, because a run may be
-    exported from a folder other than the one in which it was made.
+    If `given` is the default, the stores in parents of the run folder are considered, too, because
+    the user may export a run from another folder than the one where it was executed.
     """
     from orthoflow.engine.store import Store
 
@@ -73,12 +73,14 @@ def store_of(run: Run, given: Path) -> Path:
 
 
 def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
-    """Return the selected cell, or the last one with an output of this type, and the port.
+    """Return the cell and port of an output of a type.
+
+    The cell is the selected one or, if none is selected, the last cell with such an output.
 
     If several cells have such an output, a note names the one that is used.
 
     Raises:
-        ArgumentError: no cell has such an output, or the selected cell does not.
+        ArgumentError: the selected cell, or every cell if none is selected, lacks such an output.
     """
     named, missing = _SAID[type_name]
     found = {
@@ -104,13 +106,13 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
 
 
 def wanted_wall(number: int, known: Mapping[int, _Wall], who: str, does: str) -> _Wall:
-    """Return the wall with the given number, the index of its plane in `planes.json`.
+    """Return the wall with a number, which is the index of its plane in `planes.json`.
 
     Args:
         number: value of `--wall`.
         known: number -> wall.
         who: subject of the error message.
-        does: verb of the error message: `shows`, `has`.
+        does: verb of the error message, such as `shows` or `has`.
 
     Raises:
         ArgumentError: there is no such wall.
@@ -132,7 +134,7 @@ def numbers_of(text: str, count: int, expected: str) -> list[float]:
         expected: the option and the format of its value, for the error message.
 
     Raises:
-        ArgumentError: the text has another format.
+        ArgumentError: the text does not have this format.
     """
     try:
         values = [float(word) for word in text.split(",")]
@@ -156,7 +158,10 @@ def make_empty(folder: Path) -> None:
 
 
 def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:
-    """Return the cells that share the variants, dataset and repeat of a cell, where applicable."""
+    """Return the cells that can be combined with a cell.
+
+    These are the cells whose variants, dataset and repeat do not contradict those of the cell.
+    """
     chosen = run.cell(address)
     return {
         name: cell
@@ -171,7 +176,7 @@ def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:
 def last_product(
     run: Run, cells: Mapping[str, RecordedCell], cls: type[ProductT], store: Path
 ) -> ProductT | None:
-    """Return the product of the given type from the last cell that has one, or None.
+    """Return the last product of a type among the outputs of cells; None if there is none.
 
     Raises:
         ArgumentError: neither the record nor the store contains the product.

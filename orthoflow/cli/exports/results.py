@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write the orientations of a cell."""
+    """Write the orientations of a cell as a COLMAP model."""
     from orthoflow.files.colmap import write_colmap_model
     from orthoflow.products import Cameras
 
@@ -30,7 +30,7 @@ def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
-    """Write all tables."""
+    """Write the tables of a run as CSV files."""
     from orthoflow.records.runs import parts_of
     from orthoflow.records.tables import write_csv_tables
     from orthoflow.report.paired import over_datasets, over_table
@@ -49,7 +49,10 @@ def _write_texts(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write the figures of a cell, or those of all cells, the plan of photos and sweep curves."""
+    """Write the figures of a cell, or the figures of all cells with charts.
+
+    The charts are the plan of the photos and the curves of sweeps.
+    """
     from functools import partial
 
     from orthoflow.records.runs import figure_files, write_files
@@ -60,7 +63,7 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
 
     suffix = chosen.figure_format or "svg"
     addresses = run.cells if chosen.cell is None else (run.cell(chosen.cell).address,)
-    # Invalid names are rejected before a folder is created.
+    # Reject invalid names before a folder is created.
     n_figures = len(figure_files(run, addresses))
     make_empty(folder)
     n_written = write_figures(run, folder, addresses, as_pdf=suffix == "pdf")
@@ -78,7 +81,7 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
-    """Write tables and citations for publications."""
+    """Write the tables and citations of a run for publications."""
     from orthoflow.report.paper_tables import paper_files
 
     files = paper_files(run)
@@ -88,7 +91,7 @@ def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write an RO-Crate, optionally with all products and inputs embedded in its record."""
+    """Write an RO-Crate; its record contains all products and inputs if `embed` is set."""
     from orthoflow.records.archive import NO_LICENSE, write_crate
     from orthoflow.records.runs import REPORT_FILE
     from orthoflow.report import write_page
@@ -96,7 +99,8 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     make_empty(folder)
     license_text = chosen.license_text or NO_LICENSE
     if run.files_folder is not None:
-        # If the folder contained only the record, its rasters were restored to a separate folder.
+        # The rasters were restored to a separate folder, because the run folder contains only the
+        # record. Write the report there.
         write_page(run, run.folder / REPORT_FILE)
     if chosen.embed:
         run = embedded(run, folder, chosen)
@@ -107,7 +111,7 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_layers(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write the layers of a cell."""
+    """Write the layers of a cell as GeoTIFFs."""
     from orthoflow.files.publishing import publish_layers
     from orthoflow.products import Layers
 
@@ -120,7 +124,7 @@ def export_layers(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
-    """Write `prov.json`."""
+    """Write `prov.json`, which describes the provenance of the results."""
     from prov.model import ProvActivity, ProvAgent, ProvEntity
 
     from orthoflow.records.archive import prov_document
@@ -136,7 +140,7 @@ def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
-    """Write `collection.json`, and the orthoimages with an item for each."""
+    """Write `collection.json`, the orthoimages, and a STAC item for each orthoimage."""
     from orthoflow.records.stac import COLLECTION_FILE, write_stac
 
     make_empty(folder)
@@ -145,7 +149,7 @@ def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def embedded(run: Run, folder: Path, chosen: Choices) -> Run:
-    """Write a record that contains every product and input file, and return the opened run."""
+    """Write a record that contains all products and input files, and return the new run."""
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.engine.store import Store
     from orthoflow.records.write import write_embedded

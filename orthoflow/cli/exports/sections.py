@@ -1,4 +1,4 @@
-"""Exports of plans and sections of the planes and the cloud of a run."""
+"""Exports of plans and sections, which cut the planes and the cloud of a run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _THROUGH = "--through must be four numbers in metres, X,Y,X,Y of two points,"
 
 
 def export_plans(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `plan_<n>.dxf`, `.svg` and `.pdf` for each height."""
+    """Write `plan_<n>.dxf`, `plan_<n>.svg` and `plan_<n>.pdf` for each height."""
     results, planes = _room(run, chosen)
     cuts = [
         plan_cut(planes, height, chosen.language or "en")
@@ -40,7 +40,7 @@ def export_plans(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_sections(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `section_<n>.dxf`, `.svg` and `.pdf` for each pair of points."""
+    """Write `section_<n>` as DXF, SVG and PDF for each pair of points."""
     if not chosen.through:
         raise ArgumentError(
             "--to section needs --through X,Y,X,Y, two points of the plan in metres "
@@ -118,7 +118,10 @@ def _write(
 def _points(
     run: Run, address: str, chosen: Choices
 ) -> tuple[PointCloud | None, PointLabels | None]:
-    """Return the cloud in which planes were detected, and its labels; None if not stored."""
+    """Return the cloud in which planes were detected, and its labels.
+
+    Each is None if neither the record nor the store contains it.
+    """
     cells = branch_of(run, address)
     try:
         for cell in reversed(cells.values()):

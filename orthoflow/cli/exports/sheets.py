@@ -1,4 +1,4 @@
-"""Exports of sheets: choice of paper and scale, texts, and division into sheets."""
+"""Exports of sheets: choice of paper and scale, lettering, and division into sheets."""
 
 from __future__ import annotations
 
@@ -59,17 +59,17 @@ def write_drawings(
     alone: str = "{stem}_sheet_{number}",
     several: str = "{stem}_sheet_{number}",
 ) -> tuple[int, int]:
-    """Choose scale and paper of drawings, and write their sheets into a new folder.
+    """Choose the scale and paper of drawings, and write their sheets into a new folder.
 
     Args:
-        folder: output folder, created after the layout.
+        folder: output folder, which is created after the layout.
         drawn: function that returns the drawings at a given scale.
         chosen: the options.
         alone: file name of a drawing that fits on one sheet.
         several: file name of a drawing that needs several sheets.
 
     Returns:
-        The denominator n of the scale 1 : n, and the number of sheets.
+        The denominator N of the scale 1:N, and the number of sheets.
     """
     given = [paper_of(chosen.paper)] if chosen.paper else []
     usual = SCALES_FT if chosen.units == "ft" else SCALES
@@ -86,7 +86,7 @@ def write_drawings(
 
 
 def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()) -> SheetText:
-    """Return the texts on the sheets of a run."""
+    """Return the title block and notes for the sheets of a run."""
     return SheetText(
         name=name,
         block=read_title_block(chosen.title_block) if chosen.title_block else TitleBlock(),
@@ -97,7 +97,7 @@ def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()
 
 
 def origin_of(run: Run, language: Language) -> str:
-    """Return one line about the origin of the drawings."""
+    """Return a line of text that names the run from which the drawings were made."""
     about = run.record
     return label("origin", language, run=about.run_id, name=about.name, program=about.created_by)
 
@@ -140,7 +140,10 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
 def _without_empty(
     walls: Sequence[WallResult], chosen: Choices
 ) -> tuple[Sequence[WallResult], str]:
-    """Leave out walls with an empty orthoimage, unless one was chosen; also return a remark."""
+    """Omit walls with an empty orthoimage, and return a remark on them.
+
+    Nothing is omitted if a wall is selected or all orthoimages are empty.
+    """
     empty = [wall for wall in walls if wall.about and wall.about.painted_share == 0.0]
     if chosen.wall is not None or len(empty) in (0, len(walls)):
         return walls, ""
@@ -167,7 +170,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         raise ArgumentError(f"the run {run.record.run_id} has no vertical walls for an elevation")
     up = results.planes.up
     order, is_inside = unfolded(walls, up)
-    # Accuracy is known per wall; walls with the same notes are listed together.
+    # The accuracy differs between walls; list walls with the same notes together.
     known: dict[str, list[str]] = {}
     for wall in upright:
         about = [wall.about.accuracy if wall.about else Phrase(key="not_checked")]
@@ -194,7 +197,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _warn(walls: Sequence[WallResult]) -> None:
-    """Warn of walls that are drawn although their orthoimages should not be delivered."""
+    """Warn about walls that are drawn although their orthoimages should not be delivered."""
     few = [
         f"{wall.name} ({wall.about.reason})"
         for wall in walls
@@ -205,7 +208,7 @@ def _warn(walls: Sequence[WallResult]) -> None:
 
 
 def _coarse(walls: Sequence[WallResult], scale: int) -> str:
-    """Return which pictures have fewer than 150 pixels per inch, and a scale that avoids this."""
+    """Name the walls with fewer than 150 pixels per inch, and a scale with enough; else ""."""
     coarse = [wall for wall in walls if _ppi(wall, scale) < _LEAST_PPI]
     if not coarse:
         return ""
@@ -219,7 +222,7 @@ def _coarse(walls: Sequence[WallResult], scale: int) -> str:
 
 
 def usual_scale(least: float) -> int:
-    """Return the smallest n of the usual scales 1 : n that is not below the given value.
+    """Return the smallest denominator of the usual scales that is not below a given value.
 
     >>> usual_scale(30.2), usual_scale(20.1), usual_scale(200.0), usual_scale(2.4), usual_scale(9)
     (50, 25, 200, 5, 10)
@@ -232,7 +235,7 @@ def _ppi(wall: WallResult, scale: int) -> float:
 
 
 def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Choices) -> Drawing:
-    """Return the drawing of a wall without a scale."""
+    """Return the drawing of a wall, whose scale is still to be set."""
     language, unit = chosen.language or "en", chosen.units or "m"
     frame = wall.frame
     areas = [_area(wall, opening, chosen) for opening in results.openings_of(wall)]
@@ -279,7 +282,7 @@ def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Ch
 
 
 def _scaled(drawing: Drawing, wall: WallResult, chosen: Choices, scale: int) -> Drawing:
-    """Set the scale of a drawing, and the grid and note on resolution that depend on the scale."""
+    """Set the scale of a drawing, and the grid and note that depend on the scale."""
     ppi = _ppi(wall, scale)
     values = {"mm": f"{1e3 * wall.frame.gsd_m:g}", "ppi": f"{ppi:.0f}"}
     coarse = (Phrase(key="coarse", values={"least": f"{_LEAST_PPI:.0f}"}),)
@@ -289,7 +292,10 @@ def _scaled(drawing: Drawing, wall: WallResult, chosen: Choices, scale: int) -> 
 
 
 def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
-    """Return an opening, relative to the top-left corner of the drawn wall."""
+    """Return the label of an opening, and its outline (n, 2) in metres.
+
+    The origin of the outline is the top-left corner of the drawn wall.
+    """
     frame, language = wall.frame, chosen.language or "en"
     outline_m = frame.gsd_m * frame.wall_from_raster(opening.outline_m)
     unit_m, unit = (FOOT_M, "ft") if chosen.units == "ft" else (1.0, "m")
@@ -299,12 +305,12 @@ def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
 
 
 def _first_kind(wall: WallResult) -> str:
-    """Return `ortho` if the wall has one, or else the kind of a raster of the scan."""
+    """Return `ortho` if the wall has an orthoimage, or else the kind of another raster."""
     return next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
 
 
 def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
-    """Return the kinds of pictures of a wall to draw."""
+    """Return the kinds of rasters to draw for a wall."""
     for kind in chosen.beside:
         if kind not in wall.rasters:
             raise ArgumentError(

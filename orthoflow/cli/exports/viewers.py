@@ -1,4 +1,4 @@
-"""Exports for viewing: a textured model of the room, and orthoimages as tiles with a page."""
+"""Exports for viewers: a textured model of the room, and orthoimages as tiles."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
 def _depths(
     run: Run, address: str, orthos: Sequence[OrthoFile], wall: int | None
 ) -> dict[int, Path]:
-    """Return the published depth rasters of walls by wall number."""
+    """Return wall number -> published depth raster, for all walls with orthoimages."""
     walls = room_results(run, address, wall).walls
     found = {wall.number: wall.rasters["depth"] for wall in walls if "depth" in wall.rasters}
     for ortho in orthos:
@@ -67,7 +67,7 @@ def _depths(
 
 
 def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write the tiles of each orthoimage, and `index.html`."""
+    """Write the tiles of each orthoimage, and `index.html` to view them."""
     address, orthos = _orthos(run, chosen)
     images = {f"wall_{ortho.wall}_ortho": ortho for ortho in orthos}
     make_empty(folder)
@@ -91,7 +91,7 @@ def export_iiif(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _canvas(wall: WallResult, scratch: Path) -> Canvas:
-    """Return the pictures of a wall, including a shaded relief made for this export."""
+    """Return the rasters of a wall, including a shaded relief that is created in `scratch`."""
     rasters = dict(wall.rasters)
     if "depth" in rasters:
         rasters["relief"] = scratch / f"wall_{wall.number}_relief.tif"
@@ -111,7 +111,10 @@ def _canvas(wall: WallResult, scratch: Path) -> Canvas:
 
 
 def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:
-    """Return the published orthoimages of the selected cell, or of the last one that has any."""
+    """Return the cell and its published orthoimages.
+
+    The cell is the selected one or, if none is selected, the last cell with orthoimages.
+    """
     address, _ = output_of(run, "orthoimages", chosen.cell)
     paths = [path for path in run.files.get(address, ()) if path.name.endswith("_ortho.tif")]
     for path in paths:
