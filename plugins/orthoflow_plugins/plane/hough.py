@@ -1,16 +1,16 @@
-"""The Hough transform of `plane.hough2d` and `plane.hough3d`: positions vote for planes.
+"""Hough transform of `plane.hough2d` and `plane.hough3d`: positions vote for planes.
 
-The points of the sample are counted in cells, and each cell votes for the planes through it: for
-each direction of the normal, in the bin of its distance. The 2D transform of markiewicz2015 is the
-special case of horizontal normals and of cells without height; floors and ceilings correspond to
-the special case of the vertical normal.
+The points of the sample are counted in cells. Each cell votes for the planes through it: for each
+direction of the normal, it votes for the bin that contains its distance. The 2D transform of
+markiewicz2015 is the special case of horizontal normals and cells without height. Floors and
+ceilings are found with the vertical normal as the only direction.
 
-Votes are linear: after points have been removed, only the cells that lost points vote again, with
-the change in their votes.
+Votes are additive: after points have been removed, only the cells that lost points vote again, with
+the change in their numbers of votes.
 
-For each direction in the plan, the cells are counted in a vertical image (distance along that
-direction, height). The occupied cells of this image vote for all inclinations; they are far fewer
-than the cells in space.
+For each horizontal direction, the cells are counted in a vertical image whose axes are the distance
+along this direction and the height. The occupied pixels of this image, which are far fewer than the
+cells in space, then vote for all inclinations.
 """
 
 from __future__ import annotations
@@ -31,33 +31,34 @@ from orthoflow_plugins.plane.figures import draw_accumulator, draw_sections, dra
 from orthoflow_plugins.plane.proposing import Accumulator, Candidate, Constraint, Proposer
 from orthoflow_plugins.plane.search import Search
 
-# Minimum votes of a candidate as a share of the required points, because its votes may be
-# distributed over several bins until it is refined.
+# Minimum number of votes for a candidate, as a share of the required number of points. It is low
+# because votes may be distributed over several bins until the candidate is refined.
 _VOTE_CAUTION: Final = 0.25
-# Directions within this angle of a rejected candidate are excluded near its distance, and those
-# within the second angle represent each other in sections; in steps between directions.
+# In steps between directions: around a rejected candidate, directions up to this angle are excluded
+# near its distance; in sections, directions up to the second angle represent each other.
 _NOT_AGAIN_STEPS: Final = 2.2
 _STANDS_FOR_STEPS: Final = 1.5
-# Slopes tested around a maximum, in steps between directions, and the factors by which they are
-# successively reduced.
+# Slopes tested around a maximum, in steps between directions, and factors by which they are reduced
+# in successive rounds.
 _SLOPES: Final = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _FINER: Final = (1.0, 0.4, 0.15)
-# Maximum numbers of entries of the table of votes and of cells of the vertical image; larger scenes
-# have larger cells and bins.
+# Maximum number of entries in the table of votes, and of pixels in the vertical image. For larger
+# scenes, cells and bins are larger.
 _TABLE_MOST: Final = 120_000_000
 _IMAGE_MOST: Final = 4_000_000
-# Thresholds of the edge detector for the 8-bit density image.
+# Thresholds of the edge detector, for the 8-bit density image.
 _EDGE_LOW: Final = 60
 _EDGE_HIGH: Final = 160
-# Sections of the accumulator in markiewicz2015, Figure 13; degrees.
+# Angles, in degrees, of the sections of the accumulator in Figure 13 of markiewicz2015.
 _CUTS_DEG: Final = (0.0, 45.0, 90.0)
-# Best scores, votes over omega and over phi by angle, and maximum distance; see `sections_of`.
+# Result of `sections_of`: best scores, sections over omega and over phi, and maximum distance.
 Sections = tuple[
     NDArray[np.float64], dict[float, NDArray[np.float64]], dict[float, NDArray[np.float64]], float
 ]
 
 
-# Factors of the coordinates of points, angles, orientation of the planes, votes of a cell.
+# A group of normals: factors for the coordinates of points, angles, orientation of the planes, and
+# rule for the votes of a cell.
 Group = tuple[NDArray[np.float64], NDArray[np.float64], Constraint, Accumulator]
 
 
@@ -66,11 +67,12 @@ class Voters:
 
     Attributes:
         positions_m: (3, m) float32 e1, e2 and height from the centre of the box.
-        votes: (m,) int64 current votes of each position.
+        votes: (m,) int64 current number of votes of each position.
         angles_rad: (d, 2) omega and phi of the normals, grouped by omega.
-        constraint: permitted orientation of the planes.
-        slopes: (k, 2) slopes tested around a maximum along u and v of the plane.
-        smear_bins: number of bins over which the votes of a plane are distributed, on each side.
+        constraint: orientation to which the planes are restricted.
+        slopes: (k, 2) slopes along u and v of the plane that are tested around a maximum.
+        smear_bins: number of bins on each side of a maximum over which the votes for a plane are
+            distributed.
     """
 
     def __init__(
@@ -85,12 +87,13 @@ class Voters:
         """Count the sample in cells.
 
         Args:
-            points_m: (s, 3) points of the sample, from the centre of the box; NaN outside.
+            points_m: (s, 3) points of the sample relative to the centre of the box; NaN outside the
+                box.
             bin_m: side of a cell.
-            angles_rad: see class.
+            angles_rad: see `Voters`.
             step_rad: angle between neighbouring normals.
-            constraint: see class.
-            accumulator: votes of a cell; `raw` lets the points themselves vote.
+            constraint: see `Voters`.
+            accumulator: rule for the votes of a cell; with `raw`, points vote instead of cells.
         """
         self.angles_rad, self.constraint, self._accumulator = angles_rad, constraint, accumulator
         inside = np.isfinite(points_m[:, 0])
@@ -106,17 +109,18 @@ class Voters:
         self._position_of_point[inside] = number
         self.positions_m = np.ascontiguousarray(positions_m.T, dtype=np.float32)
         self.votes = np.zeros(len(positions_m), dtype=np.int64)
-        # A single normal is not refined; normals in the plan are refined only about the vertical
+        # A single normal is not refined, and horizontal normals are refined only about the vertical
         # axis.
         is_turned = (len(angles_rad) > 1, bool(angles_rad[:-1, 1].any()))
         slopes = (step_rad * np.array(_SLOPES if turned else (0.0,)) for turned in is_turned)
         self.slopes = np.stack(np.meshgrid(*slopes), axis=-1).reshape(-1, 2)
-        # At half a step, the ends of a plane are in other bins than its centre.
+        # If the normal is wrong by half a step, the ends of a plane are in other bins than its
+        # centre.
         reach_m = float(np.linalg.norm(positions_m, axis=1).max(initial=0.0))
         self.smear_bins = max(1, round(0.3 * reach_m * float(self.slopes.max()) / bin_m))
 
     def recount(self, claims: NDArray[np.int16]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Count the points of the sample not yet assigned, which have negative claims (s,).
+        """Count the unassigned points of the sample: those with negative claims (s,).
 
         Returns:
             The positions (3, k) whose votes have changed, and the changes (k,).
@@ -129,10 +133,10 @@ class Voters:
         return np.take(self.positions_m, index, axis=1), change[index].astype(np.int32)
 
     def _votes_of(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the votes (m,) of positions from their numbers of points (m,).
+        """Return the numbers of votes (m,) of positions, given their numbers of points (m,).
 
-        With one vote per cell, votes are multiplied by the mean number of points, so that they can
-        be compared with the heights, which are counted in points.
+        If each cell has one vote, votes are multiplied by the mean number of points per cell, so
+        that they can be compared with the votes for heights, which are numbers of points.
         """
         if self._accumulator in {"counts", "raw"}:
             return counts
@@ -141,7 +145,7 @@ class Voters:
             import cv2
 
             row, column = (self._cells - self._cells.min(axis=0)).T[:2]
-            # The density image is the logarithm of the counts.
+            # The density image contains the logarithms of the numbers of points.
             grey = np.zeros((row.max() + 1, column.max() + 1))
             grey[row, column] = np.log1p(counts)
             scaled = np.rint(255.0 * grey / max(float(grey.max()), 1e-9)).astype(np.uint8)
@@ -150,13 +154,15 @@ class Voters:
         return chosen * np.int64(max(1, round(mean)))
 
 
-# Any: parameters are those of `Hough2d` and `Hough3d`, whose modules import this one.
+# The type of `params` is Any, because `Hough2d.Params` and `Hough3d.Params` are in modules that
+# import this one.
 class HoughProposer(Proposer):
     """Proposes planes at the maxima of an accumulator.
 
     Attributes:
         bin_m: width of a distance bin and side of a cell.
-        votes: (d, bins) the middle edge is the centre of the box.
+        votes: (d, bins) votes for each direction and distance; the middle edge of the bins is the
+            distance of the centre of the box.
     """
 
     def __init__(
@@ -167,15 +173,14 @@ class HoughProposer(Proposer):
         step_rad: float,
         *groups: Group,
     ) -> None:
-        """Count the sample in cells; voting starts later.
+        """Count the sample in cells; votes are computed by `propose`.
 
         Args:
             search: the search.
-            params: parameters of the transform.
-            cell_m: side of a cell, enlarged if the scene would need too many.
+            params: parameters of the method.
+            cell_m: side of a cell; it is increased if the scene would need too many cells.
             step_rad: angle between neighbouring normals.
-            groups: for each group of normals: factors of the coordinates of the points, angles,
-                orientation of the planes, and votes of a cell.
+            groups: groups of normals (see `Group`).
         """
         cloud = search.cloud
         self._basis, self._parts, self._step_rad = cloud.basis, cloud.parts, step_rad
@@ -210,7 +215,7 @@ class HoughProposer(Proposer):
         self._voted_for, self._last = -1, (0, 0)
 
     def keep_first(self) -> None:
-        """Keep the votes that are drawn, as they are before any plane is removed."""
+        """Keep the votes before any plane is removed, for drawing."""
 
     def propose(self, search: Search) -> Candidate | None:
         """Return the plane with the best score."""
@@ -229,7 +234,7 @@ class HoughProposer(Proposer):
         point = distance_m * normal
         if not self._is_plain:
             normal, point = self._refined(row, distance_m)
-        # Transform from the frame of the box to offsets; normalise once more after rounding.
+        # Transform from the frame of the box to offsets, and normalise again because of rounding.
         world = normal / np.linalg.norm(normal) @ self._basis
         world = world / np.linalg.norm(world)
         offset_m = float(world @ ((point + self._middle_m) @ self._basis))
@@ -237,24 +242,24 @@ class HoughProposer(Proposer):
         return Candidate(plane=Plane(normal=world, offset_m=offset_m), constraint=constraint)
 
     def reject(self) -> None:
-        """Exclude the surroundings of the last maximum."""
+        """Exclude the last maximum and its neighbourhood."""
         row, place = self._last
         cosines = self._normals @ self._normals[row]
         reach, n_bins = self._voters[self._group[row]].smear_bins + 1, self.votes.shape[1]
         near = np.abs(cosines) > math.cos(_NOT_AGAIN_STEPS * self._step_rad)
         self._unscored = np.flatnonzero(near & (self._group == self._group[row]))
         for other in self._unscored:
-            # On the opposite side of the hemisphere, distances change sign.
+            # If a normal has the opposite direction, distances change sign.
             middle = place if cosines[other] > 0.0 else n_bins - 1 - place
             self._barred[other, max(0, middle - reach) : middle + reach + 1] = 1
 
     def _vote(self, search: Search) -> None:
-        """Add the changes of the votes since the last update."""
+        """Add the changes in votes since the last update."""
         tasks = []
         for group, voters in enumerate(self._voters):
             positions_m, change = voters.recount(search.claims)
             reach = np.abs(voters.positions_m).max(axis=1, initial=0.0) / self.bin_m
-            # Even numbers, so that the centre of the box is between two cells.
+            # Use even numbers, so that the centre of the box is between two pixels.
             shape = 2 * np.ceil([reach[2], math.hypot(reach[0], reach[1])]).astype(int) + 2
             angles, votes = voters.angles_rad, self.votes[self._edges[group] :]
             edges = np.flatnonzero(np.diff(angles[:, 0], prepend=-1.0, append=-1.0))
@@ -270,7 +275,7 @@ class HoughProposer(Proposer):
         self._unscored = np.arange(len(self.votes))
 
     def _score(self) -> None:
-        """Find the best bin of each direction whose votes or excluded bins have changed."""
+        """Find the best bin for each direction whose votes or excluded bins have changed."""
         tasks, tables = [], (self._barred, self._scores, self._places)
         for group, voters in enumerate(self._voters):
             half = 0 if self._is_plain else voters.smear_bins
@@ -286,9 +291,10 @@ class HoughProposer(Proposer):
     def _refined(
         self, row: int, distance_m: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Refine a maximum with finer slopes and half bins, using the positions near it.
+        """Refine a maximum with finer slopes and half-width bins, using the positions near it.
 
-        Returns a normal (not a unit vector) and a point relative to the centre of the box.
+        The function returns a normal, which is not a unit vector, and a point relative to the
+        centre of the box.
         """
         voters, normal = self._voters[self._group[row]], self._normals[row]
         axes = wall_axes(normal, np.array([0.0, 0.0, 1.0]))
@@ -314,17 +320,17 @@ class HoughProposer(Proposer):
 
 
 class PlanProposer(HoughProposer):
-    """Proposes walls at maxima of the votes of plan cells, and level planes at those of heights.
+    """Proposes walls from the votes of plan cells, and horizontal planes from those of heights.
 
     Attributes:
-        first: (angles, bins) votes for walls before any plane was removed; None if only level
+        first: (angles, bins) votes for walls before any plane was removed; None if only horizontal
             planes are searched for.
     """
 
     first: NDArray[np.int32] | None = None
 
     def __init__(self, search: Search, params: Any) -> None:
-        """Count the sample in cells of the plan and in heights; voting starts later."""
+        """Count the sample in cells of the plan and in bins of height."""
         n_turns = round(180.0 / params.angle_step_deg)
         step_rad = math.pi / n_turns
         walls = np.column_stack([step_rad * np.arange(n_turns), np.zeros(n_turns)])
@@ -339,7 +345,7 @@ class PlanProposer(HoughProposer):
         super().__init__(search, params, params.cell_m, step_rad, *groups)
 
     def keep_first(self) -> None:
-        """Keep the votes for walls."""
+        """Keep the votes for walls, for drawing."""
         if self._voters[0].constraint == "vertical":
             self.first = self.votes[: len(self._voters[0].angles_rad)].copy()
 
@@ -351,10 +357,10 @@ class PlanProposer(HoughProposer):
 
 
 class SpaceProposer(HoughProposer):
-    """Proposes planes in any direction at maxima of the votes of voxels."""
+    """Proposes planes of any orientation at maxima of the votes of voxels."""
 
     def __init__(self, search: Search, params: Any) -> None:
-        """Count the sample in voxels; voting starts later."""
+        """Count the sample in voxels."""
         coarser = 1.0 if params.search == "full" else 2.0
         n_turns = round(180.0 / (coarser * params.angle_step_deg))
         step_rad = math.pi / n_turns
@@ -363,7 +369,7 @@ class SpaceProposer(HoughProposer):
         super().__init__(search, params, coarser * params.cell_m, step_rad, group)
 
     def keep_first(self) -> None:
-        """Keep sections of the accumulator."""
+        """Keep sections of the accumulator, for drawing."""
         angles_rad = self._voters[0].angles_rad
         self._sections = sections_of(
             angles_rad, self._step_rad, self.votes, self._scores, self.bin_m
@@ -378,19 +384,19 @@ class SpaceProposer(HoughProposer):
 def directions_over(
     n_turns: int, constraint: Constraint, max_tilt_deg: float
 ) -> NDArray[np.float64]:
-    """Return directions evenly distributed over the hemisphere, or over the part needed.
+    """Return directions that are evenly distributed over the hemisphere or the required part of it.
 
-    At phi = 90 degrees, every omega describes the same plane, so a regular table would count a
-    floor once for every omega. Here the number of directions for each phi is proportional to the
-    length of its circle, and the pole occurs once.
+    At phi = 90 degrees, all values of omega describe the same plane, so a regular table would
+    contain a floor once for each omega. Here, the number of directions for each phi is proportional
+    to cos(phi), and the pole occurs only once.
 
     Args:
         n_turns: number of steps between directions in half a turn.
-        constraint: permitted orientation of the planes.
-        max_tilt_deg: tolerance of `constraint`.
+        constraint: orientation to which the planes are restricted.
+        max_tilt_deg: maximum deviation from `constraint`.
 
     Returns:
-        Omega 0..pi and phi -pi/2..pi/2 (d, 2), grouped by omega.
+        (d, 2) with the columns omega, 0 to pi, and phi, -pi/2 to pi/2; grouped by omega.
     """
     step_rad = math.pi / n_turns
     phis = -0.5 * math.pi + step_rad * np.arange(1, n_turns + 1)
@@ -399,7 +405,8 @@ def directions_over(
         phis = phis[np.abs(phis) <= limit_rad]
     elif constraint == "horizontal":
         phis = phis[0.5 * math.pi - np.abs(phis) <= limit_rad]
-    # The pole is the last phi; its cosine is zero except for rounding, so it has one omega.
+    # The last phi is the pole. Its cosine is zero except for rounding, so the pole has a single
+    # omega.
     n_around = np.maximum(1, np.ceil(n_turns * np.cos(phis) - 1e-9)).astype(np.int64)
     turns = np.arange(n_turns)[:, None]
     begins = turns * n_around // n_turns != (turns - 1) * n_around // n_turns
@@ -408,7 +415,7 @@ def directions_over(
 
 
 def normals_of(omega: ArrayLike, phi: ArrayLike) -> NDArray[np.float64]:
-    """Return unit vectors (n, 3) by Equation 3 of markiewicz2015."""
+    """Return the unit vectors (n, 3) of angles, by Equation 3 of markiewicz2015."""
     omega, phi = np.broadcast_arrays(np.asarray(omega, dtype=float), np.asarray(phi, dtype=float))
     level = np.cos(phi)
     return np.stack([level * np.cos(omega), level * np.sin(omega), np.sin(phi)], axis=1)
@@ -424,38 +431,39 @@ def sections_of(
     """Return sections of an accumulator.
 
     Args:
-        angles_rad: (d, 2) omega and phi of its directions.
+        angles_rad: (d, 2) omega and phi of the directions.
         step_rad: angle between neighbouring directions.
-        votes: (d, b) votes per direction and distance.
+        votes: (d, b) votes for each direction and distance.
         scores: (d,) best score of each direction.
         bin_m: width of a distance bin.
 
     Returns:
-        The best score (o, p) of all distances for each omega (0..180 degrees) and phi (-90..90
-        degrees); for each angle of a section in degrees, the votes by omega and distance at this
-        phi; the same by phi and distance at this omega; and the maximum distance on each side.
-        Values for which there is no direction are NaN.
+        Four values: the best scores (o, p) over all distances, for each omega (0 to 180 degrees)
+        and phi (-90 to 90 degrees); sections at a constant phi, by phi in degrees, with the votes
+        for each omega and distance; sections at a constant omega, by omega in degrees, with the
+        votes for each phi and distance; and the maximum distance on each side. Values for which
+        there is no direction are NaN.
     """
     n_turns = round(math.pi / step_rad)
     best = np.full((n_turns, n_turns + 1), np.nan)
     row, column = np.rint((angles_rad + np.array([0.0, 0.5 * math.pi])) / step_rad).astype(int).T
     best[row, column] = scores
-    # Each direction represents the angles omega up to the next direction with the same phi.
+    # Each direction represents all values of omega up to the next direction with the same phi.
     last_asked = np.where(np.isnan(best), 0, np.arange(n_turns)[:, None])
     best = np.take_along_axis(best, np.maximum.accumulate(last_asked, axis=0), axis=0)
     omegas, phis = step_rad * np.arange(n_turns), step_rad * np.arange(n_turns + 1) - 0.5 * math.pi
-    # Distances beyond all points are omitted.
+    # Omit distances without any votes at both ends.
     n_bins, used = votes.shape[1], np.flatnonzero(votes.any(axis=0))
     beyond = int(min(used[0], n_bins - 1 - used[-1])) if len(used) else 0
     votes, normals = votes[:, beyond : n_bins - beyond], normals_of(*angles_rad.T)
 
     def section(omega: ArrayLike, phi: ArrayLike) -> NDArray[np.float64]:
-        """Return votes (n, b) for n directions, taken from the nearest one of the accumulator."""
+        """Return the votes (n, b) for n directions, from the nearest ones in the accumulator."""
         cosines = normals @ normals_of(omega, phi).T
         nearest = np.abs(cosines).argmax(axis=0)
         cosine = cosines[nearest, np.arange(len(nearest))]
         taken: NDArray[np.float64] = votes[nearest].astype(np.float64)
-        # On the opposite side of the hemisphere, distances change sign.
+        # If a normal has the opposite direction, distances change sign.
         taken[cosine < 0.0] = taken[cosine < 0.0, ::-1]
         taken[np.abs(cosine) < math.cos(_STANDS_FOR_STEPS * step_rad)] = np.nan
         return taken
@@ -474,20 +482,20 @@ def _vote(
     bins: NDArray[np.int32],
     votes: NDArray[np.int32],
 ) -> None:
-    """Let positions vote for the planes with a normal.
+    """Add the votes of positions for the planes with a given normal.
 
     Args:
         places: coordinates (m,) of the positions along three axes.
         weights: (m,) votes of each position.
-        normal: factors of the coordinates; the sum is in bins.
-        shift: added to this sum.
+        normal: factors of the coordinates; the sum of the products is a distance in bins.
+        shift: number of bins added to this sum.
         bins: (m,) scratch space.
-        votes: (bins,) added to.
+        votes: (bins,) updated.
     """
     us, vs, heights = places
     a, b, c = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2])
     zero, none, top, d = np.float32(0.0), np.int32(-1), np.float32(votes.size), np.float32(shift)
-    # The loop has no branches, so that the compiler vectorises it.
+    # The loop has no branches, so that the compiler can vectorise it.
     for i in range(weights.size):
         place = c * heights[i] + a * us[i] + b * vs[i] + d
         within = (place >= zero) & (place < top)
@@ -506,15 +514,16 @@ def vote_places(
     bin_m: float,
     votes: NDArray[np.int32],
 ) -> None:
-    """Let positions vote for the planes with some normals.
+    """Add the votes of positions for the planes with given normals.
 
     Args:
         places: (3, m) metres.
         weights: (m,) votes of each position.
-        normals: (t, 3) directions of distances, as in Equation 4 of markiewicz2015.
+        normals: (t, 3) normals, along which distances are measured, as in Equation 4 of
+            markiewicz2015.
         low_m: lower edge of the first bin; positions outside the bins do not vote.
         bin_m: width of a bin.
-        votes: (t, bins) added to.
+        votes: (t, bins) updated.
     """
     bins = np.empty(places.shape[1], dtype=np.int32)
     rows = (places[0], places[1], places[2])
@@ -533,19 +542,21 @@ def vote_planes(
     bin_m: float,
     votes: NDArray[np.int32],
 ) -> None:
-    """Let positions vote for all planes through them, in two stages.
+    """Add the votes of positions for all planes through them, in two stages.
 
-    For each direction in the plan, the positions are counted in a vertical image (distance along
-    that direction, height), whose occupied cells then vote for each phi.
+    For each horizontal direction, the positions are counted in a vertical image whose axes are the
+    distance along this direction and the height. The occupied pixels of the image then vote for
+    each phi.
 
     Args:
         places: (3, m) e1, e2 and height, metres from the centre of the box.
         weights: (m,) votes of each position; negative ones subtract votes.
-        angles: (d, 2) omega and phi of each direction, grouped by omega; radians.
+        angles: (d, 2) omega and phi of each direction in radians, grouped by omega.
         starts: (o + 1,) index of the first direction of each omega.
-        image: (rows, columns) scratch space with zeros; its centre is that of the box.
-        bin_m: side of a cell of the image, width of a bin.
-        votes: (d, bins) added to; the middle edge is distance zero.
+        image: (rows, columns) scratch space, filled with zeros; its centre corresponds to the
+            centre of the box.
+        bin_m: side of a pixel of the image, and width of a bin.
+        votes: (d, bins) updated; the middle edge of the bins is the distance 0.
     """
     n_places, (n_rows, n_columns) = weights.size, image.shape
     bins, counts = np.empty(n_places, dtype=np.int32), np.empty(n_places, dtype=np.int32)
@@ -565,7 +576,7 @@ def vote_planes(
             flat[bins[i]] += weights[i]
         n_cells = 0
         for i in range(n_places):
-            # The first position in a cell takes all its votes.
+            # The first position in a pixel collects all votes of the pixel.
             if flat[bins[i]] != 0:
                 counts[n_cells] = flat[bins[i]]
                 across[n_cells] = np.float32(bins[i] % n_columns) + np.float32(0.5) - half_columns
@@ -588,16 +599,16 @@ def best_bins(
     scores: NDArray[np.int64],
     places: NDArray[np.int64],
 ) -> None:
-    """Find the window in each row with the largest excess over the emptier adjacent window.
+    """Find the window in each row whose votes most exceed those of the emptier adjacent window.
 
     Args:
-        votes: (d, bins).
+        votes: (d, bins) votes for each direction and distance.
         rows: (m,) rows to search.
-        half: a window has 2 half + 1 bins and is separated from adjacent windows by one bin.
+        half: a window has 2 half + 1 bins; one bin separates it from adjacent windows.
         is_plain: whether to ignore adjacent windows.
         barred: (d, bins) 1 for bins that must not be the centre of a window.
-        scores: (d,) set for these rows.
-        places: (d,) set to the middle bin.
+        scores: (d,) output for these rows: the largest excess.
+        places: (d,) output for these rows: the middle bin of the window.
     """
     n_bins = votes.shape[1]
     width = 2 * half + 1
@@ -606,7 +617,7 @@ def best_bins(
     windows = np.empty(n_bins + 2 * gap, dtype=np.int64)
     line = np.empty(n_bins, dtype=np.int64)
     before, middle, after = windows[:n_bins], windows[gap:], windows[2 * gap :]
-    # These are separate loops, so that the compiler vectorises them.
+    # The loops are separate, so that the compiler can vectorise them.
     for d in rows:
         row, is_barred = votes[d], barred[d]
         total = np.int64(0)
@@ -637,7 +648,8 @@ def sharpest(votes: NDArray[np.int32]) -> tuple[int, float]:
     best_bins(votes, np.arange(len(votes)), 1, is_plain, barred, scores, places)
     row = int(np.argmax(scores))
     place = int(places[row])
-    # Vertex of the parabola through the sums of three bins about the maximum and its neighbours.
+    # Compute the vertex of the parabola through the sums of three bins at the maximum and its
+    # neighbours.
     padded = np.pad(votes[row].astype(np.float64), 2)
     before, here, after = np.convolve(padded[place : place + 5], np.ones(3), "valid")
     bend = before - 2.0 * here + after

@@ -1,9 +1,9 @@
-"""`plane.hough2d`: walls from the plan of a cloud, floors and ceilings from its heights.
+"""`plane.hough2d`: walls from the plan of a cloud, and floors and ceilings from its heights.
 
-The cells of the plan (a map of the cloud, 2 cm cells) vote for lines. The number of points in a
-cell is its number of votes, because with one vote per cell, floors and ceilings hide all walls
-(markiewicz2015, Figure 10). From each maximum, the level of its surroundings at the same angle is
-subtracted. This level is due to surfaces that the line crosses, and would favour the longest
+The cells of the plan (a map of the cloud with 2 cm cells) vote for lines. The number of votes of a
+cell is its number of points, because with one vote per cell, floors and ceilings hide all walls
+(markiewicz2015, Figure 10). From each maximum, the votes for adjacent lines with the same angle are
+subtracted. These votes are due to surfaces that the line crosses, and would favour the longest
 diagonal of the room.
 """
 
@@ -25,23 +25,27 @@ if TYPE_CHECKING:
 class Hough2d(Detector):
     """Find walls, floors and ceilings by markiewicz2015's modified 2D Hough transform.
 
-    The points of a sample are counted in the cells of a plan. Every occupied cell votes for all
-    lines through it, with as many votes as it has points. The best line is refined on the sample
-    with a tolerance that decreases from `tolerance_m` to `fit_tolerance_m`. It is bounded by a
-    rectangle and its points are removed. When all planes are found, they are fitted to all points
-    in one pass (total least squares of cell means; for clouds above 24 million points, a random
-    sample is used); a second pass labels all points.
+    The points of a sample are counted in the cells of a plan. Each occupied cell votes for all
+    lines through it, with as many votes as it has points. The best line is a candidate for a wall,
+    which is refined on the sample with a tolerance that decreases from `tolerance_m` to
+    `fit_tolerance_m`. The plane is bounded by a rectangle, and its points are removed from the
+    search. When all planes have been found, they are fitted in one pass to all points, or, in
+    clouds of more than 24 million points, to a random sample (total least squares of cell means). A
+    second pass labels all points.
 
-    Floors, ceilings and other horizontal planes are found in the histogram of heights. They compete
-    with walls by number of votes and are refitted in 3D.
+    Floors, ceilings and other horizontal planes are found in the histogram of heights. Of all
+    candidates for walls and horizontal planes, the one with the most votes is used first. All
+    planes are refitted in 3D.
 
     The covariance of (normal, offset) accounts for errors common to neighbouring points. It is
-    estimated from the scatter of tiles of 10 to 80 cm; the size with the largest variance is used.
+    estimated from the scatter of tiles; of several tile sizes from 10 to 80 cm, the one with the
+    largest variance is used.
 
-    For comparison, `accumulator: unit` gives every occupied cell one vote (no clear maximum, as in
-    the paper), and `canny` one to cells on edges of the density image. With `coordinates: raw`, the
-    points of the sample vote with their coordinates, which takes longer and finds the same planes.
-    `scoring: votes` proposes the maximum itself, as in the paper.
+    Some options are meant for comparison. With `accumulator: unit`, each occupied cell has one vote
+    (as in the paper, there is then no clear maximum); with `canny`, only cells on edges of the
+    density image have one. With `coordinates: raw`, the points of the sample vote instead of cells,
+    which takes longer and finds the same planes. With `scoring: votes`, the maximum of the votes is
+    proposed unchanged, as in the paper.
     """
 
     id = "plane.hough2d"
@@ -49,7 +53,7 @@ class Hough2d(Detector):
     citations = (PAPER,)
 
     class Params(DetectorParams):
-        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned with millimetre point spacing."""
 
         cell_m: float = Field(
             0.02,
@@ -86,7 +90,7 @@ class Hough2d(Detector):
             return self
 
     def proposer(self, search: Search, params: Params, ctx: StepContext) -> PlanProposer:
-        """Return the accumulator of the plan and of heights."""
+        """Return a proposer that counts votes of plan cells and of heights."""
         from orthoflow_plugins.plane.hough import PlanProposer
 
         del ctx

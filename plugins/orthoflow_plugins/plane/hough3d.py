@@ -1,4 +1,4 @@
-"""`plane.hough3d`: planes in any direction from voxels that vote in a 3D accumulator."""
+"""`plane.hough3d`: planes of any orientation, from voxels that vote in a 3D accumulator."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ if TYPE_CHECKING:
 
 
 class Hough3d(Detector):
-    """Find planes by the 3D Hough transform of markiewicz2015: voxels vote with their points.
+    """Find planes of any orientation by the 3D Hough transform of markiewicz2015.
 
-    r = x cos(phi) cos(omega) + y cos(phi) sin(omega) + z sin(phi). The points of a sample are
-    counted in voxels. For each omega, the voxels are first summed in a vertical image, whose
-    occupied cells then vote for all phi. Directions are evenly distributed over the hemisphere, so
-    that a floor is counted once and not for every omega.
+    The points of a sample are counted in voxels, which vote for all planes through them: r = x
+    cos(phi) cos(omega) + y cos(phi) sin(omega) + z sin(phi). For each omega, the voxels are first
+    summed in a vertical image, whose occupied pixels then vote for all phi. Directions are evenly
+    distributed over the hemisphere, so that a floor is counted only once instead of once for each
+    omega.
 
-    `search: coarse-to-fine` votes with twice `cell_m` and twice `angle_step_deg` and refines each
-    maximum; `full` votes with both as given. The other stages are common to all detectors: planes
-    are refined on a sample and fitted to all points, and their points are removed. `scoring: votes`
-    proposes the maximum itself, as in the paper.
+    With `search: coarse-to-fine`, votes are counted with twice `cell_m` and twice `angle_step_deg`,
+    and each maximum is refined; with `full`, both are used as given. The other stages are common to
+    all detectors: planes are refined on a sample and fitted to all points, and their points are
+    removed from the search. With `scoring: votes`, the maximum of the votes is proposed unchanged,
+    as in the paper.
     """
 
     id = "plane.hough3d"
@@ -40,7 +42,7 @@ class Hough3d(Detector):
     )
 
     class Params(DetectorParams):
-        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned with millimetre point spacing."""
 
         cell_m: float = Field(
             0.02, gt=0.0, le=1.0, description="Size of the voxels and of the distance bins."
@@ -65,7 +67,7 @@ class Hough3d(Detector):
         )
 
     def proposer(self, search: Search, params: Params, ctx: StepContext) -> SpaceProposer:
-        """Return the accumulator of all directions."""
+        """Return a proposer that counts votes of voxels."""
         from orthoflow_plugins.plane.hough import SpaceProposer
 
         del ctx

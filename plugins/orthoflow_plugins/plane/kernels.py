@@ -1,15 +1,15 @@
-"""Kernels for points: blocks, slabs, robust fit of a plane, scores of many planes.
+"""Kernels for points: blocks, slabs, the robust fit of a plane, and histograms of distances.
 
-Kernels read float32 offsets as three contiguous arrays, in blocks of `BLOCK_POINTS` with a bounding
-box each. Work is split into parts, one per thread, each with its own tables. All sums over parts
-are sums of integers (distances are multiples of a fixed step), so the result is identical for any
-number of threads.
+Kernels read float32 offsets from three contiguous arrays, which are divided into blocks of
+`BLOCK_POINTS` points. Each block has a bounding box. Work is divided into one part per thread, and
+each part has its own tables. All sums over parts are sums of integers (distances are multiples of a
+fixed step), so results are identical for any number of threads.
 
-A slab is a row of 12 float64: normal (3) and offset in the cloud's own offsets, then the in-plane
-axes u (3) with its origin and v (3) with its origin. Its bounds are a row of 5: the maximum
-distance of points from the plane, then the smallest and largest u and v. Blocks are compared only
-with the slabs that intersect their box, mostly one or two, so sixteen planes take little more time
-than one.
+A slab is a row of 12 float64: normal (3) and offset of the plane, for offsets from the cloud's
+origin; axis u (3) in the plane, and its origin; axis v (3), and its origin. The bounds of a slab
+are a row of 5: maximum distance of points from the plane, smallest and largest u, smallest and
+largest v. The points of a block are compared only with the slabs that intersect its box, usually
+one or two, so sixteen planes take little more time than one.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.slabs import Offsets
 from orthoflow.geometry.threads import even_parts, in_threads
 
-# A block is so small that it is a short piece of one surface and its box excludes most planes, but
-# so large that the boxes of 48 million points fit into the processor's cache.
+# Number of points per block. It is so small that a block is usually a short piece of a single
+# surface, whose box excludes most planes, and so large that the boxes of 48 million points fit into
+# the processor's cache.
 BLOCK_POINTS: Final = 256
-# Distances are summed in steps of the fit tolerance divided by this: half a micrometre at 15 mm;
-# the squares of 48 million points still fit into 64 bits.
+# Distances are summed in steps of the fit tolerance divided by this number (half a micrometre for
+# 15 mm). The sum of the squares of 48 million distances still fits into 64 bits.
 STEPS_PER_TOLERANCE: Final = 32768
-# Number of histogram bins for the deviations of points from their plane.
+# Number of bins in the histogram of the deviations of points from their plane.
 HISTOGRAM_BINS: Final = 200
 
 
 def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> None:
-    """Divide a range at multiples of `BLOCK_POINTS` and run a task on each part, in threads.
+    """Divide a range at multiples of `BLOCK_POINTS`, and run a task on each part in a thread.
 
     Args:
         n_items: length of the range.
@@ -53,9 +54,9 @@ class BlockedPoints(NamedTuple):
 
     Attributes:
         x: (n,) float32 metres from the cloud's origin.
-        y: see x.
-        z: see x.
-        boxes: (blocks, 6) float32 smallest and largest x, y, z of each block.
+        y: (n,) float32 metres from the cloud's origin.
+        z: (n,) float32 metres from the cloud's origin.
+        boxes: (blocks, 6) float32 bounds of the x, y and z coordinates in each block.
     """
 
     x: NDArray[np.float32]
@@ -92,7 +93,7 @@ def in_blocks(offsets: Offsets, *, parts: int) -> BlockedPoints:
 
 @kernel_part
 def _meet(box: NDArray[np.float32], slab: NDArray[np.float64], bounds: NDArray[np.float64]) -> int:
-    """Return 0 if a slab is outside a block's box, 1 if it intersects it, 2 if it contains it."""
+    """Return 0 if a slab and a box are disjoint, 2 if the slab contains the box, otherwise 1."""
     verdict = 2
     for row in range(3):
         centre, half = -slab[4 * row + 3], 0.0
@@ -116,7 +117,7 @@ def _list_active(
     bounds: NDArray[np.float64],
     active: NDArray[np.int64],
 ) -> tuple[int, int]:
-    """List the slabs that intersect a block; return their number and the holder.
+    """List the slabs that intersect the box of a block; return their number and the holder.
 
     The holder is the only intersecting slab if it contains the entire block, otherwise -1.
     """
@@ -136,7 +137,7 @@ def _measure_block(
 ) -> int:
     """Set the distances of a block's points from the plane of a slab; return their number.
 
-    This is a separate loop, so that the compiler vectorises it.
+    This is a separate function, so that the compiler can vectorise the loop.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -157,9 +158,9 @@ def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bund
     nearest: NDArray[np.float64],
     distances: NDArray[np.float64],
 ) -> int:
-    """Set the nearest slab that contains each point of a block (-1 if none) and its distance.
+    """Find the nearest slab that contains each point of a block (-1 if none), and the distances.
 
-    Returns the number of points.
+    The function returns the number of points.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -191,9 +192,9 @@ def _find_cells(
     owner: NDArray[np.int32],
     cells: NDArray[np.int32],
 ) -> None:
-    """Set the table cell of each point of a block that belongs to a slab.
+    """Set the cells, in the tables, of the points of a block that belong to a slab.
 
-    The loop has no branches, so that the compiler vectorises it.
+    The loop has no branches, so that the compiler can vectorise it.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -219,7 +220,7 @@ def _sum_runs(
     counts: NDArray[np.int32],
     sums: NDArray[np.int64],
 ) -> None:
-    """Add points to their cells (-1 for none), one run of points in the same cell at a time."""
+    """Add points to their cells (-1 for none), summing runs of points in the same cell first."""
     per_step = STEPS_PER_TOLERANCE / fit_tolerance_m
     n_find = n_inner = n_fit = total = squares = 0
     for i in range(cells.size):
@@ -250,13 +251,13 @@ def assign_points(
     slabs: NDArray[np.float64],
     bounds: NDArray[np.float64],
 ) -> None:
-    """Assign each point to the nearest slab that contains it; the first one if distances are equal.
+    """Assign each point to the nearest slab that contains it, or the first of equally near ones.
 
     Args:
         points: (n,) offsets in blocks.
-        claims: (n,) set to the slab of each point, -1 for none.
-        slabs: (k, 12) see module.
-        bounds: (k, 5) see module.
+        claims: (n,) output, slab of each point; -1 for points in no slab.
+        slabs: (k, 12) see the module's docstring.
+        bounds: (k, 5) see the module's docstring.
     """
     listed = np.empty(slabs.shape[0], dtype=np.int64)
     owner = np.empty(BLOCK_POINTS, dtype=np.int32)
@@ -266,7 +267,8 @@ def assign_points(
         start = block * BLOCK_POINTS
         taken = claims[start : min(start + BLOCK_POINTS, claims.size)]
         if n_active == 0 or holder >= 0:
-            # Most blocks are a short piece of one wall, so their points need no test.
+            # Most blocks are a short piece of a wall and inside a single slab, so their points need
+            # not be tested.
             taken[:] = np.int8(holder)
             continue
         _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest, distances)
@@ -284,19 +286,20 @@ def sum_assigned(
     counts: NDArray[np.int32],
     sums: NDArray[np.int64],
 ) -> None:
-    """Sum the distances of points in the cells of the nearest slab that contains them.
+    """Sum the distances of points from the nearest slab that contains them, in each of its cells.
 
     Args:
         points: (n,) offsets in blocks.
-        slabs: (k, 12) see module.
-        bounds: (k, 5) see module.
-        rasters: (k, 8) smallest u and v, cells per metre, rows, columns, first cell in the tables,
-            fit tolerance, inner tolerance; the last two are the same for all slabs. Slabs without
-            rows are not summed.
-        drawn: (blocks,) True for blocks that are summed.
-        counts: (cells, 3) numbers of points within the find, inner and fit tolerance; added to.
-        sums: (cells, 2) sums of distances and squared distances of points within the fit tolerance,
-            in steps and squared steps; added to.
+        slabs: (k, 12) see the module's docstring.
+        bounds: (k, 5) see the module's docstring.
+        rasters: (k, 8) smallest u, smallest v, cells per metre, number of rows, number of columns,
+            first cell in the tables, fit tolerance and inner tolerance; the tolerances are the same
+            for all slabs. Points in slabs without rows are not summed.
+        drawn: (blocks,) True for blocks whose points are summed.
+        counts: (cells, 3) numbers of points within the slab, within the inner tolerance, and within
+            the fit tolerance; updated.
+        sums: (cells, 2) sums of distances and squared distances, in steps, of points within the fit
+            tolerance; updated.
     """
     listed = np.empty(slabs.shape[0], dtype=np.int64)
     owner = np.empty(BLOCK_POINTS, dtype=np.int32)
@@ -336,20 +339,20 @@ def measure_deviations(
     histogram: NDArray[np.int64],
     extents: NDArray[np.float64],
 ) -> None:
-    """Sum and bin the distances of points from their planes, and find the extents of the points.
+    """Compute sums and histograms of the points' distances from their planes, and their extents.
 
     Args:
         points: (n,) offsets in blocks.
-        claims: (n,) plane of each point, negative for none.
+        claims: (n,) plane of each point; negative for points on no plane.
         slabs: (k, 12) the planes.
-        limits: (k, 6) find tolerance, fit tolerance, smallest and largest u, smallest and largest
-            v of the plane's rectangle; metres.
-        sums: (k, 6) of points within the find tolerance: number, steps, squared steps, then
-            the same within the fit tolerance; added to.
-        histogram: (k, HISTOGRAM_BINS) number of points per bin, from -find tolerance to find
-            tolerance.
-        extents: (k, 4) smallest and largest u, smallest and largest v of the points within the fit
-            tolerance and the rectangle; widened.
+        limits: (k, 6) tolerance for labelling, fit tolerance, and smallest u, largest u, smallest v
+            and largest v of the plane's rectangle; metres.
+        sums: (k, 6) number, sum of steps and sum of squared steps of points within the tolerance
+            for labelling, then the same within the fit tolerance; updated.
+        histogram: (k, HISTOGRAM_BINS) number of points in bins between minus and plus the tolerance
+            for labelling; updated.
+        extents: (k, 4) smallest u, largest u, smallest v and largest v of the points inside the fit
+            tolerance and the rectangle; updated.
     """
     half = 0.5 * HISTOGRAM_BINS
     for i in range(claims.size):
@@ -378,28 +381,30 @@ def measure_deviations(
 
 # --- planes through points ---
 
-# Constraint of a fit: none, normal perpendicular to up, or normal along up.
+# Constraints on the plane of a fit: none, normal perpendicular to up, and normal along up.
 FREE: Final = 0
 VERTICAL: Final = 1
 LEVEL: Final = 2
 
 _STEPS_MOST: Final = 20
-# A fit has converged if a point ten metres away moves by less than this share of the tolerance.
+# A fit has converged if it moves a point of the plane ten metres away by less than this share of
+# the tolerance.
 _SETTLED_SHARE: Final = 5e-4
-# Points closer to a line than this (RMS) do not determine a rotation about it.
+# Points whose RMS distance from a line is smaller do not determine a rotation about the line.
 _LINE_WIDTH_M: Final = 1e-4
 
 
 @compiled
 def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
-    """Set `plane` (9,) to normal, centroid, and the variances along the three principal axes.
+    """Set `plane` (9,) to the normal, the centroid, and the variances along the principal axes.
 
-    The eigenvalues of the symmetric 3 x 3 matrix are computed in closed form, which is a hundred
-    times as fast as LAPACK.
+    The eigenvalues of the symmetric 3 x 3 matrix are computed in closed form, because LAPACK takes
+    a hundred times as long.
 
     Args:
-        sums: (10,) number of points, sums of a, b, c, and of aa, ab, ac, bb, bc, cc.
-        plane: set; variances are ascending.
+        sums: (10,) number of points, and sums of the coordinates a, b and c, and of the products
+            aa, ab, ac, bb, bc and cc.
+        plane: output; variances are ascending.
     """
     n = sums[0]
     ma, mb, mc = sums[1] / n, sums[2] / n, sums[3] / n
@@ -421,7 +426,8 @@ def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     most = mean + 2.0 * size * math.cos(angle)
     least = mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0)
     plane[6], plane[7], plane[8] = max(least, 0.0), 3.0 * mean - most - least, most
-    # The normal is perpendicular to the rows of (matrix - least); use their longest cross product.
+    # The normal is perpendicular to the rows of (matrix - least), so use the longest cross product
+    # of two rows.
     ra, rb, rc = aa - least, bb - least, cc - least
     longest = 0.0
     for p0, p1, p2 in (
@@ -439,16 +445,16 @@ def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
 def refine_robustly(
     points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float, freedom: int
 ) -> bool:
-    """Move a plane to the densest layer of points near it: total least squares, reweighted.
+    """Move a plane to the densest layer of points near it, by reweighted total least squares.
 
     Args:
-        points: (m, 3) metres; with up as the third axis unless the fit is free.
-        plane: (4,) initial normal and offset; updated.
+        points: (m, 3) metres; unless the fit is free, the third axis must be up.
+        plane: (4,) normal and offset: initial values, updated.
         tolerance_m: points farther away have no weight (Tukey's weights).
         freedom: FREE, VERTICAL or LEVEL.
 
     Returns:
-        Whether the points determine a plane; if not, `plane` is meaningless.
+        Whether the points determine a plane; otherwise, `plane` is undefined.
     """
     sums, fitted = np.empty(10), np.empty(9)
     for _ in range(_STEPS_MOST):
@@ -472,7 +478,7 @@ def refine_robustly(
         if sums[0] <= 0.0:
             return False
         if freedom == VERTICAL:
-            # Moments whose major axis is up, so that the normal is horizontal.
+            # Modify the moments so that the major axis is up and the normal is horizontal.
             x, y, z = sums[1] / sums[0], sums[2] / sums[0], sums[3] / sums[0]
             sums[6], sums[8] = sums[1] * z, sums[2] * z
             sums[9] += sums[4] - sums[1] * x + sums[7] - sums[2] * y
@@ -502,13 +508,13 @@ def bin_distances(
     reach_m: float,
     histograms: NDArray[np.int64],
 ) -> None:
-    """Count the points near many planes in bins of distance.
+    """Add the points near each of several planes to a histogram of distances.
 
     Args:
         points: (3, m) metres.
         planes: (h, 4) normal and offset.
         reach_m: maximum distance.
-        histograms: (h, bins) number of points per bin of 0..reach; added to.
+        histograms: (h, bins) number of points in bins between 0 and `reach_m`; updated.
     """
     n_bins = histograms.shape[1]
     per_m, top = np.float32(n_bins / reach_m), np.float32(n_bins)
@@ -519,7 +525,7 @@ def bin_distances(
         for start in range(0, points.shape[1], BLOCK_POINTS):
             stop = min(start + BLOCK_POINTS, points.shape[1])
             xs, ys, zs = points[0, start:stop], points[1, start:stop], points[2, start:stop]
-            # This is a separate loop, so that the compiler vectorises it.
+            # This is a separate loop, so that the compiler can vectorise it.
             for i in range(xs.size):
                 places[i] = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))
             for i in range(xs.size):
