@@ -42,7 +42,7 @@ class RunSummary:
     """Summary of a run, which is a row in a table of runs.
 
     Attributes:
-        folder: path of the run folder, which begins with the given path.
+        folder: path of the run folder; relative if the user gave a relative path.
         status: `ok`; `failed` if a cell failed; `running` if the run is in progress; `unfinished`
             if it was interrupted; `damaged` if the record cannot be read or its seal is broken.
         reason: first failure, or the reason why there is no readable record; empty if there is
@@ -151,8 +151,8 @@ def _below(folder: Path) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         if RECORD_FILE in files or JOURNAL in files:
             yield Path(place)
-            # Do not search in a run folder unless it was given: other run folders may be below a
-            # given one, such as replays.
+            # Search below a run folder only if the user gave this folder, because replays may be
+            # there.
             if Path(place) != folder:
                 folders.clear()
                 continue

@@ -92,7 +92,7 @@ def doctor(store: Path, *, as_json: bool) -> int:
 
     The exit code is 4 if something essential is missing.
     """
-    # Import each library in a process of its own, which a broken library may crash.
+    # Each library is imported in a process of its own, because it may crash.
     with ThreadPoolExecutor(max_workers=max(2, os.cpu_count() or 1)) as pool:
         libraries = list(pool.map(_library, _libraries()))
     findings = [*_machine(), *_store(store), *libraries, *_plugins()]

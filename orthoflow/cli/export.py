@@ -25,7 +25,7 @@ _EXPORT_FOLDER: Final = "export"
 
 
 class _Scale(click.IntRange):
-    """The denominator N of a scale 1:N, which the user enters as N or as 1:N."""
+    """The denominator N of a scale, which the user enters as N or as 1:N."""
 
     # Click declares the value as `Any`.
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:

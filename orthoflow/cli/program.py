@@ -142,7 +142,7 @@ def take_up_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # The lowest free descriptor, which is that of the closed stream, is used.
+            # The new descriptor is the lowest free one, which is that of the closed stream.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # noqa: FBT003
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8"))  # noqa: SIM115, PTH123

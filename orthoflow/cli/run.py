@@ -309,7 +309,7 @@ def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
 
 
 def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
-    """Count the cells that were cached or computed before an interruption."""
+    """Describe how many cells were cached, or computed before an interruption."""
     counted_cells = [cell for cell in cells if cell.status != "skipped"]
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)

@@ -28,8 +28,7 @@ _UNITS: Final = {"grey": " grey levels", "1": ""}
 def echo(*lines: str, err: bool = False) -> None:
     """Print lines with control characters escaped, optionally on standard error.
 
-    All commands print their output by this function, because names, messages and logs are
-    untrusted.
+    All commands use this function for their output, because names, messages and logs are untrusted.
     """
     for line in lines or ("",):
         click.echo(shown(line), err=err)  # noqa: TID251 - the only place
@@ -88,8 +87,7 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
 
     Args:
         distances: comparisons of products.
-        most: maximum number of rows, of which those with differences are printed first; None for
-            all rows.
+        most: maximum number of rows, beginning with those with differences; None for all rows.
     """
     rows = first_rows(distances, most, lambda item: item.verdict == "identical")
     echo_table(

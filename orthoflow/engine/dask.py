@@ -53,9 +53,8 @@ def look_around(path: str, methods: str) -> tuple[str, str]:
     """Check the environment of a worker; called on each worker before it gets a task.
 
     Returns:
-        The content of the file at `path`, or the reason why it cannot be read; and a description
-        of the first difference between the worker's methods and `methods`, which is empty if they
-        agree.
+        Two strings: the content of the file at `path`, or the reason why it cannot be read; and the
+        first difference between the worker's methods and `methods`, which is empty if they agree.
     """
     try:
         seen = Path(path).read_text(encoding="utf-8")
@@ -127,12 +126,12 @@ def _refused(task: Task, error: StepFailedError | PluginError) -> str:
     return result_to_json(failed_result(task, error))
 
 
-# Name of the Dask resource by which workers report their number of cores for steps.
+# Name of the Dask resource by which workers report their number of cores.
 CORES: Final = "cores"
 _PROOF_FILE: Final = "workers-see-this"
 _CONNECT_S: Final = 15.0
-# How long to wait for the first worker, for a lost scheduler, and for new workers after all are
-# lost.
+# How long to wait for the first worker, for a lost scheduler, and for a new worker after all
+# workers are lost.
 _PATIENCE_S: Final = 60.0
 _WATCH_S: Final = 2.0
 _CLOSE_S: Final = 5.0

@@ -21,7 +21,7 @@ _BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.E
 
 
 def is_broken(error: OSError, folder: Path) -> bool:
-    """Whether an error means that the disk of a folder has failed, rather than that it is full."""
+    """Whether an error means that the disk of a folder has failed, and not that it is full."""
     if error.errno not in _BROKEN:
         return False
     # An error that concerns a file descriptor contains no path.
@@ -124,8 +124,8 @@ def whole_folder(final: Path) -> Iterator[Path]:
     try:
         with writing_to(final):
             if os.path.lexists(aside):
-                # Raise an error if a leftover cannot be removed, because it would become part of
-                # the new folder.
+                # Raise an error if a leftover of an earlier attempt cannot be removed, because it
+                # would become part of the new folder.
                 shutil.rmtree(aside)
             yield aside
             sync_tree(aside)

@@ -22,7 +22,7 @@ from orthoflow.errors import InputError
 from orthoflow.geometry.threads import in_order
 from orthoflow.sdk.lines import one_line, text_of_path
 
-# If a file was changed less than this time before it was hashed, another change may not change its
+# A file that was changed less than this time before it was hashed may change again without a new
 # time stamp.
 _SETTLED_NS: Final = 2_000_000_000
 

@@ -78,7 +78,7 @@ _MOST_MESSAGES: Final = 256
 _LARGEST_MESSAGE: Final = 64 << 20
 _LONGEST_LAST_LINE: Final = 300
 _FROM_OUTSIDE: Final = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-# A record contains only this much of the end of a log, where the errors are.
+# Only this many bytes at the end of a log, where the errors are, become part of a record.
 _KEPT_BYTES: Final = 256 << 10
 _MOST_LINES: Final = 2000
 
@@ -288,7 +288,7 @@ def _variables(task: Task) -> Mapping[str, str]:
 
 
 class _Step:
-    """A task and the process that runs it, as the leader of its own session.
+    """A task, and the process that runs it in a session of its own.
 
     Attributes:
         pipe: receives the messages of the process, see `worker.run_step`.
@@ -477,7 +477,7 @@ class LocalExecutor:
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        """If the machine is running out of memory, kill the step that uses the most."""
+        """If the machine is running out of memory, kill the step that uses the most memory."""
         floor, steps = memory_shortage(), _all_running.copy()
         # Kill one step at a time, because a killed process does not release its memory
         # immediately.

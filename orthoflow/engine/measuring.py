@@ -67,7 +67,7 @@ def is_for_want_of_memory(error: BaseException) -> bool:
 _BOOTSTRAP: Final = cast("Any", importlib)._bootstrap  # noqa: SLF001
 _IMPORTS: Final = ("_find_and_load", "_lock_unlock_module")
 _NUMBA_EVENTS: Final = "numba.core.event"
-# Numba event that lasts while a kernel is compiled or read from its file.
+# Name of the numba event that lasts while a kernel is compiled or read from its file.
 _COMPILER_LOCK: Final = "numba:compiler_lock"
 
 
@@ -117,7 +117,7 @@ class LoadingMeter:
             return self._processor_s
 
     def clock_s(self) -> float:
-        """Return the seconds of a clock that pauses while anything is loaded."""
+        """Return the time in seconds of a clock that pauses while anything is loaded."""
         with self._lock:
             return time.perf_counter() - self.total_s
 

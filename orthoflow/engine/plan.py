@@ -243,7 +243,7 @@ class _Planner:
         if planned.status == "unknown yet" and cell.step in self.force:
             planned = replace(planned, status="will run", reason=_FORCED)
         elif planned.status == "unknown yet" and took_s is None:
-            # If the store contains no results of a method, the cell will run whatever its inputs
+            # If the store contains no results of a method, the cell will run, whatever its inputs
             # are.
             reason = "no result of this method is stored"
             planned = replace(planned, status="will run", reason=reason)

@@ -306,7 +306,7 @@ class _Run:
                 raise DamageError(f"{cell.inputs[port]}, which {cell.address} uses, was damaged")
 
     def _is_under_way(self, key: CellKey) -> bool:
-        """Whether another cell with the same key is running, whose result this cell will share."""
+        """Whether another cell with the same key is running; this cell will share its result."""
         return any(task.key == key.key for task in self._running.values())
 
     def _has_room(self, cell: Cell, capacity: Capacity) -> bool:
@@ -466,7 +466,7 @@ class Interruption:
         self.is_asked = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Record the first signal; raise an error on the second.
+        """Record the first signal, and raise an error on the second.
 
         Raises:
             KeyboardInterrupt: a second signal was received.

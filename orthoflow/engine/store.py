@@ -430,7 +430,7 @@ class Store:
         return folder
 
     def _place(self, aside: Path, final: Path, files: Mapping[str, tuple[int, str]]) -> None:
-        """Rename a finished object to its final name, replacing one that is damaged or differs."""
+        """Rename a finished object to its final name; replace a damaged or different object."""
         if os.path.lexists(final):
             # Keep an intact object, which another run may be reading.
             if _files_of(final) == files and not self._damaged_file(final):
@@ -440,7 +440,7 @@ class Store:
         place_folder(aside, final)
 
     def _remove(self, path: Path) -> None:
-        """Remove a file or folder atomically, so that nobody sees an incomplete folder."""
+        """Remove a file or folder atomically, so that no other process sees a part of it."""
         gone = self._workspace / f"removed-{uuid.uuid4().hex}"
         gone.parent.mkdir(parents=True, exist_ok=True)
         path.rename(gone)

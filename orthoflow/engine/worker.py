@@ -187,7 +187,8 @@ def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None
 
 def _move_to(task: Task, variables: Mapping[str, str]) -> None:
     os.setsid()
-    # Make descendants whose parents end children of this process, even in other sessions.
+    # If the parent of a descendant ends, make the descendant a child of this process, even if it is
+    # in another session.
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     log = os.open(task.log, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
@@ -244,8 +245,8 @@ class _EventPipe:
     def listen(self, event: StepEvent) -> None:
         """Send an event; events other than progress are also written to the log.
 
-        Progress is sent at most ten times a second. Only a progress event that starts a new
-        activity, with a new text but no higher fraction, is always sent.
+        Progress events are sent at most ten times a second, except those that start a new activity
+        (a new text without a higher fraction), which are always sent.
         """
         if event.kind == "progress":
             is_soon = time.monotonic() - self._sent_s < _PROGRESS_EVERY_S

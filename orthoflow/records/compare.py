@@ -227,7 +227,7 @@ def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
 
 
 Side = TypeVar("Side")
-# Methods, too, may report times and memory, which depend on the machine.
+# Methods may also report times and memory, which depend on the machine.
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 
 
@@ -355,7 +355,7 @@ class ComparedMetric:
         is_cached: whether an earlier run computed the cell; if so, costs are those of the earlier
             run.
         environment: id of the environment in which the metric was computed.
-        better: which values are better; empty if neither higher nor lower values are.
+        better: which values are better; empty if the metric has no better direction.
         headline: whether the metric describes the quality of the result.
     """
 
@@ -439,7 +439,7 @@ class RunComparison:
 
     @property
     def of_shared_steps(self) -> str:
-        """Return a phrase that counts the steps both runs have; empty if they have all steps."""
+        """Return a phrase for the number of steps that both runs have; empty if they share all."""
         n_shared = sum(row.is_shared for row in self.cells)
         all_shared = n_shared == len(self.cells)
         counted = "step" if n_shared == 1 else f"{n_shared} steps"
@@ -599,7 +599,8 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
 def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
     """Return the name of a cell of the second run in the comparison.
 
-    This is the address of the corresponding cell of the first run.
+    This is the address of the corresponding cell of the first run, or its own address if there is
+    none.
     """
     if address not in readdressed and address in readdressed.values():
         # No cell of the first run corresponds, and the address belongs to a different cell there.

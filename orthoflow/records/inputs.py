@@ -211,7 +211,7 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[PlacedInputs]:
 
     Args:
         run: the run.
-        beside: folder for the temporary folder, on a disk with enough space; created if missing.
+        beside: parent of the temporary folder, on a disk with enough space; created if missing.
 
     Raises:
         RecordError: the record is damaged.

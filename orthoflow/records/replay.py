@@ -70,8 +70,8 @@ def plan_replay(
         store: store for the results of the replay.
         options: options of the replay.
         inputs: inputs as `NAME=PATH`, as for `--input`.
-        placed: place for extracted and renamed input files, see `embedded_inputs`; None if all
-            files have their recorded names.
+        placed: extracted and renamed input files, see `embedded_inputs`; None if all files have
+            their recorded names.
         earlier: other stores, which may contain paths of the input files.
 
     Raises:

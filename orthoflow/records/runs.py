@@ -310,7 +310,7 @@ class Run:
                 one variant matches. Entries that do not apply to the cell are ignored.
 
         Raises:
-            ArgumentError: the run has no such cell or several.
+            ArgumentError: the run has no such cell, or several cells match.
         """
         if address in self.cells and not variants and not repeat:
             return self.cells[address]
@@ -532,7 +532,7 @@ def record_errors(path: Path) -> Iterator[None]:
     """Convert any error that the block raises while reading a record into a one-sentence error.
 
     Raises:
-        RecordError: the block raised an error other than errors of orthoflow and a missing
+        RecordError: the block raised an error that is neither an error of orthoflow nor a missing
             permission.
     """
     try:

@@ -21,6 +21,6 @@ def sealed_page(text: str, runs: Sequence[Run]) -> str:
 
 
 def page_of(page: str, run: Run) -> str:
-    """Replace the seal of a page, made for another record of a run, by a seal for this record."""
+    """Replace the seal of a page that was written for another record of the same run."""
     text, mark, _ = page.rpartition(f"\n<!-- {PAGE_MARK}")
     return sealed_page(text, [run]) if mark else page

@@ -256,7 +256,7 @@ class Verification:
     Attributes:
         path: the record file.
         findings: one sentence per difference; empty if nothing was changed.
-        wrong: one sentence that summarizes the findings; empty if there are none.
+        wrong: one sentence that summarises the findings; empty if there are none.
         notes: files that could not be checked or do not belong to the record.
         seal: digest that seals the record, as 64 hexadecimal digits, which is also printed on
             sheets; empty if the record itself was changed.
@@ -295,7 +295,7 @@ def verify_run(
 
     Args:
         path: a run folder, or the `run.h5` in this folder.
-        also_published: whether to check also the files next to the record.
+        also_published: whether to check the files next to the record, too.
         signer: file with the public key of the signer; the record must be signed with this key.
 
     Raises:
@@ -415,7 +415,7 @@ def _page_note(folder: Path, name: str) -> Note:
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
-    """Return a sentence on changes of a record since it was sealed; empty if none were found.
+    """Describe the changes to a record since it was sealed; empty if none were found.
 
     By default, this is fast because the arrays of products and the input files are not checked. The
     digest of a product is checked when the product is read (`Run.payloads`), and `verify_run`
@@ -423,8 +423,8 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
 
     Args:
         run: the run.
-        of_all: check the arrays and input files, too, which is necessary before the record is
-            passed on.
+        of_all: whether to check the arrays and input files, too, which is necessary before the
+            record is passed on.
     """
     findings = verify_record(run.path, with_arrays=of_all)
     places = [finding.place for finding in findings if finding.code not in _OWN_FAULTS]
@@ -562,7 +562,7 @@ def _figure_states(run: Run) -> dict[str, bool]:
 
 
 def _is_same_figure(folder: Path, path: str, figure: RecordedFigure) -> bool | None:
-    """Return whether a file shows a figure, even in another format; None without a file."""
+    """Return whether a file shows a figure, in any format; None if there is no such file."""
     try:
         with open_below(folder, path) as stream:
             content = stream.read(LARGEST_PAGE_BYTES)

@@ -187,7 +187,7 @@ class WallResult:
 
 @dataclass(frozen=True, kw_only=True)
 class UncountedPoints:
-    """The case that none of the check points of a run is used.
+    """Reason why none of the check points of a run was used.
 
     Attributes:
         cell: address of the inspection that failed; empty if no inspection has check points as

@@ -48,7 +48,7 @@ class ChartPoint:
         x: value on the horizontal axis.
         y: value on the vertical axis.
         spread: half the length of the error bar; NaN if there is no error bar.
-        is_filled: whether the marker is filled, which marks the baseline.
+        is_filled: whether the marker is filled, which indicates the baseline.
     """
 
     x: float

@@ -41,7 +41,7 @@ class Measured:
         n_all: number of finished repeats of the step, with or without a value.
         unit: `1` for counts and shares.
         environment: id of the environment in which the metric was computed.
-        is_of_sizes: whether `value` is a mean of absolute values.
+        is_of_sizes: whether `value` is the mean of absolute values.
         scatter: `spread`, or 0 for a single value that depends on no seed.
     """
 
@@ -84,7 +84,7 @@ class Combination:
 
     @property
     def missing(self) -> tuple[RecordedCell, ...]:
-        """Cells that were not reached before the run was interrupted."""
+        """Cells that had not run when the run was interrupted."""
         return tuple(cell for cell in self.cells if cell.repeat == 0 and is_missing(cell))
 
     @property
@@ -118,7 +118,7 @@ class Combination:
         spread = float((values - values[0]).std(ddof=1)) if len(values) > 1 else math.nan
         own = next(cell.address for cell in self.cells if cell.step == step)
         varied = {cell.address for cell in self.varied_cells}
-        # Cells without inputs provide the data, which are the same for all compared values.
+        # Cells without inputs provide the data, which are the same for all values compared.
         is_seeded = any(
             cell.determinism == "seeded"
             for cell in self.run.upstream(own)
@@ -218,7 +218,7 @@ def is_check(cell: RecordedCell) -> bool:
 
 
 def is_missing(cell: RecordedCell) -> bool:
-    """Return whether the run was interrupted before this cell ran."""
+    """Return whether a cell had not run when the run was interrupted."""
     return cell.error_type == NOT_YET
 
 

@@ -119,9 +119,10 @@ class ComparisonTable:
 
     @property
     def glance(self) -> tuple[Row, ...]:
-        """The rows, sorted by descending number of best values, then of values near the best.
+        """The rows, beginning with those that have the most best values.
 
-        Rows with a shortfall come last.
+        Among equals, rows with more values near the best come first. Rows with a shortfall come
+        last.
         """
 
         def place(row: Row) -> tuple[bool, int, int]:
@@ -250,7 +251,7 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
 def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
     """Return processor time and memory of the cells that depend on variants.
 
-    Both are empty unless all cells have results.
+    Both are empty if a cell failed or had not run.
     """
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
     if one.failure or one.missing or not varied:
@@ -313,7 +314,7 @@ _Place: TypeAlias = tuple[Path, str, str]
 
 @dataclass(frozen=True, kw_only=True)
 class Origins:
-    """Letters for the environments in which, and the data from which, values were computed.
+    """Letters that identify the environment and the input data of each value.
 
     Attributes:
         environments: groups of equivalent environments.

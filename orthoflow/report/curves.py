@@ -85,8 +85,8 @@ def curves(parts: Sequence[Run]) -> tuple[Curve, ...]:
     a step that call the same method and differ in one number.
 
     Args:
-        parts: the run, or one part per dataset; in the latter case, medians and spreads are
-            computed over the parts.
+        parts: the run, or one part per dataset; medians and spreads are computed over several
+            parts.
     """
     return tuple(islice(_curves(parts), _MOST_CURVES))
 
@@ -221,8 +221,8 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
         for name, line in lines.items()
     }
     every = [point for points in drawn.values() for point in points]
-    # If lower is better and no value is negative, the metric is an absolute error. If higher is
-    # better and all values are between 0 and 1, it is a share.
+    # If lower is better and no value is negative, treat the metric as an absolute error. If higher
+    # is better and all values are between 0 and 1, treat it as a share.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
     notes = [_points_text(lines, column, n_datasets)]

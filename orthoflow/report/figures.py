@@ -36,7 +36,7 @@ _FRAMES: Final[dict[str, dict[str, Any]]] = {
 
 
 def run_graph(run: Run) -> nx.DiGraph[str]:
-    """Return a graph whose nodes are the steps of a run and whose edges are products.
+    """Return a graph whose nodes are the steps of a run, and whose edges are products.
 
     Nodes have the attributes `state`, `about` (methods and time), `row` and `column`. Each step is
     below all steps on which it depends. Wide levels are split into several rows, and skipped steps

@@ -30,7 +30,7 @@ _MAX_MARKS: Final = 600  # per drawing
 _RMS_SHARE: Final = 0.025
 _REFERENCE_SHARE: Final = 0.08
 _STEP_M: Final = 1e-3  # for derivatives; changes a position in a photo by about one pixel
-# Kind of tie -> marker and colour; they are visible on light and dark pictures.
+# Kind of tie -> marker and colour, which are visible on light and dark pictures.
 _MARKERS: Final = {
     "control": ("o", "#3ee066"),
     "check": ("s", "#ffe11f"),

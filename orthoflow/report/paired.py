@@ -44,7 +44,7 @@ _MIN_RANKED: Final = 3
 _MIN_SHOWN: Final = 6
 _SHOWN_P: Final = 0.05
 _MAX_NAMED: Final = 6
-# The steps with variants on which a step depends, as pairs of step and variant.
+# Pairs of step and variant, for the steps with variants on which a step depends.
 _Variants: TypeAlias = tuple[tuple[str, str], ...]
 _Bases: TypeAlias = dict[_Variants, _Variants]
 _TEST: Final = f"p below {_SHOWN_P:g} after Holm's correction"
@@ -89,9 +89,9 @@ class MethodOverDatasets:
 
     Attributes:
         variants: step -> variant; empty if there are no variants.
-        compared_with: name of the variants with which these are compared, which are the variants of
-            the baseline, or variants with the baseline's methods and the same values of swept
-            parameters; empty for the baseline itself, which is the reference.
+        compared_with: name of the variants with which these are compared: those of the baseline, or
+            variants with the baseline's methods and the same values of swept parameters. Empty for
+            the baseline itself, which is the reference.
         n: number of datasets with a value.
         n_failed: number of datasets that are not used because this step or an upstream step failed.
         n_absent: number of datasets without a value, although no step failed.
@@ -387,8 +387,7 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
     )
 
     n, k = badness_of.shape
-    # Friedman's test ranks the values itself, so make equal values of those that differ by
-    # rounding.
+    # Friedman's test ranks the values itself, so make values equal that differ only by rounding.
     badness_of = np.array([_with_ties(row) for row in badness_of])
     means = rankdata(badness_of, axis=1).mean(axis=0)
     is_level = bool((badness_of == badness_of[:, :1]).all())
@@ -484,8 +483,7 @@ def _paired(pairs: Iterable[tuple[Measured, Measured]], column: MetricRow) -> Pa
     worse = []
     for both in pairs:
         own, other = (badness(one.value, column.better) for one in both)
-        # Otherwise, a rank test could find differences by rounding on six datasets to be
-        # significant.
+        # Otherwise, a rank test could report rounding differences on six datasets as significant.
         if math.isfinite(own - other):
             worse.append(0.0 if is_rounding(own, other) else own - other)
     return paired_differences(np.array(worse), column.better, column.unit) if worse else None
@@ -496,7 +494,7 @@ def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1")
 
     Args:
         worse: (n,) finite amounts by which the method is worse than the reference on each dataset,
-            where n is at least 1; 0 if both are equally good.
+            with n at least 1; 0 if both are equally good.
         better: better direction of the metric, which determines the sign of the median difference.
         unit: unit of the metric.
     """
@@ -556,9 +554,8 @@ _OVER: Final = (
 def over_table(over: Sequence[MetricOverDatasets]) -> Table:
     """Return the statistics over all datasets as a table.
 
-    There is one row for each metric and combination.
-
-    Unknown values, such as p for two datasets, are empty.
+    There is one row for each metric and combination. Unknown values, such as p for two datasets,
+    are empty.
     """
     rows = []
     for metric in over:

@@ -80,10 +80,10 @@ def seconds_in_words(seconds: float) -> str:
     return "{} min {:02d} s".format(*divmod(round(seconds), 60))
 
 
-# Relative differences from the best value below this share are ignored if the scatter is unknown,
-# i.e. if there are no repeats or all repeats are identical. For times and memory, the limits are
-# larger, because these scatter from run to run (docs/performance.md) even if the repeats of one run
-# agree.
+# Relative differences from the best value that are smaller than this are ignored if the scatter is
+# unknown, i.e. if there are no repeats or all repeats are identical. The limits for times and
+# memory are larger, because they vary from run to run (docs/performance.md) even if the repeats of
+# one run agree.
 _LEVEL_SHARE: Final = 0.01
 _LEVEL_COST_SHARES: Final = {"s": 0.3, "MiB": 0.1}
 FLAG: Final = "yes/no"
@@ -126,11 +126,11 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
 
     Groups that contain a value of unknown spread are not ranked, because another value may be the
     best on another machine or with another seed. A value is near the best if their difference does
-    not exceed the root of the sum of their squared standard deviations. If the repeats are
-    identical, the limit is 1 % of the best value; it is at least 10 % for memory and 30 % for
-    times. If any value is near the best, the best is also marked as near. A value over fewer items
-    than another value of its group is not ranked, because a method that rejects difficult photos
-    has smaller errors for the remaining photos.
+    not exceed the root of the sum of their squared standard deviations. If repeats are identical or
+    missing, the limit is at least 1 % of the best value; for memory, it is always at least 10 %,
+    and for times 30 %. If any value is near the best, the best is also marked as near. A value over
+    fewer items than another value of its group is not ranked, because a method that rejects
+    difficult photos has smaller errors for the remaining photos.
 
     Args:
         values: values of a column.

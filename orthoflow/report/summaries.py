@@ -40,7 +40,7 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A sentence on a limitation of the result, the cells concerned, and whether they failed."""
+    """A sentence on a limitation of the results, the cells concerned, and whether they failed."""
 
     text: str
     cells: tuple[str, ...]

@@ -79,7 +79,7 @@ def _types(
     input_names: Collection[str],
     log: ProblemLog,
 ) -> Callable[[Location, Reference], str | None]:
-    """Return a function that looks up the product type of a reference."""
+    """Return a function that finds the product type of a reference."""
     given = {step.name: _ports(step, are_given=True) for step in steps}
 
     def type_of(location: Location, reference: Reference) -> str | None:

@@ -73,9 +73,9 @@ class Cell:
         step: name of the step.
         assignment: step -> variant for each step with variants that affects this cell, including
             its own step; preceded by `data` -> dataset and `seed` -> seed if they affect it.
-        repeat: number of the repeat, which is 0 for the first execution. Only steps that the
-            workflow compares, and steps upstream of these, use repeats of other steps; all others
-            use the first execution.
+        repeat: number of the repeat, which is 0 for the first execution. Steps that the workflow
+            compares, and the steps between these and a repeated step, use the same repeat of their
+            inputs; all other steps use the first execution.
         method: method id.
         params: resolved parameters with defaults, as JSON.
         params_set: parameters set in the file or on the command line, as JSON.
@@ -343,7 +343,7 @@ _Choice: TypeAlias = tuple[CellOutput | WorkflowInput | None, Assignment, tuple[
 
 
 class _ExcludedError(Exception):
-    """The workflow excludes this combination from the comparison."""
+    """The workflow excludes a combination from the comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -380,7 +380,7 @@ class _Expansion:
                         for cell in self._repeats(node.cell, cells, is_reached=name in repeated):
                             cells[cell.address] = cell
         _require_few(workflow, len(cells))
-        # Cells need no repeats for the sake of skipped inspections.
+        # A cell that only skipped inspections use needs no repeats.
         judged = [cell.address for cell in cells.values() if cell.step in compared and cell.repeat]
         needed = {*judged, *_reached({name: cell.sources for name, cell in cells.items()}, judged)}
         return tuple(
@@ -587,10 +587,9 @@ class _Expansion:
 def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> set[str]:
     """Return the steps that the workflow compares.
 
-    These steps run once per repeat of an upstream step.
-
-    They are the steps named in `compare.metrics`, and the inspections that match its wildcards.
-    Without `metrics`, they are all inspections.
+    These steps run once per repeat of an upstream step. They are the steps named in
+    `compare.metrics`, and the inspections that match its wildcards. Without `metrics`, they are all
+    inspections.
     """
     metrics = workflow.compare.metrics if workflow.compare else ()
     patterns = [pattern.partition(".")[0] for pattern in metrics] or ["*"]

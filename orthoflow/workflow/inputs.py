@@ -302,7 +302,7 @@ def check_no_step(
 
 @dataclass(frozen=True, kw_only=True)
 class _Origin:
-    """Where the datasets come from.
+    """Source of a list of datasets.
 
     Attributes:
         log: log of the file that contains the datasets.

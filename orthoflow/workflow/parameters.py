@@ -44,8 +44,7 @@ class DraftCall:
         kind: kind of the method, which may be known even if the method cannot be loaded.
         swept: parameter -> value, if a sweep created this variant.
         family: name of the variant in the file, if a sweep created this variant.
-        is_unswept: whether the file sweeps a parameter for which the command line sets a single
-            value.
+        is_unswept: whether the file sweeps a parameter, but the command line sets a single value.
     """
 
     location: Location
@@ -170,7 +169,7 @@ def overrides_of_settings(
 
 
 def joined(*several: Mapping[tuple[str, str], tuple[Override, ...]]) -> Overrides:
-    """Join overrides, of which later ones take precedence."""
+    """Join overrides; later overrides take precedence."""
     found: Overrides = {}
     for overrides in several:
         for call, own in overrides.items():
@@ -310,8 +309,8 @@ def _resolved(
         for loc, message, _ in mistakes(error, model, dict(as_set), draft.id):
             name = str(loc[0]) if loc else ""
             if report := reports.get(name, blame):
-                # The position of the report identifies the parameter but not a key inside its
-                # value. For datasets, it does not even identify the parameter.
+                # The position of a report identifies the parameter but not a key inside its value.
+                # For datasets, it does not even identify the parameter.
                 inside = ProblemLog(file="").path(loc) or f"the parameters of {draft.id}"
                 is_named = name in reports and len(loc) == 1
                 report(message if is_named else f"{inside}: {message}")

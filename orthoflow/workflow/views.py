@@ -34,8 +34,8 @@ from orthoflow.workflow.model import (
 # The values are JSON.
 Schema: TypeAlias = dict[str, Any]
 _SWEEP: Final = {"$ref": "#/$defs/SweepSection"}
-# These parts of a parameter's schema remain at the top level, where editors look for them, if a
-# sweep is allowed.
+# If a sweep is allowed, these parts of a parameter's schema remain at the top level, where editors
+# look for them.
 _SHOWN: Final = ("description", "default")
 
 
@@ -50,7 +50,7 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     """Return the JSON Schema (2020-12) of workflows, for editors and other programs.
 
     Methods that cannot be loaded are omitted. The schema is intended for completion. It checks less
-    than `load_workflow`: it does not check relations between keys, and whether references and ports
+    than `load_workflow`: it checks neither relations between keys nor whether references and ports
     match.
     """
     methods = list(_loadable(catalog))

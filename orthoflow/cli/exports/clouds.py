@@ -139,7 +139,7 @@ def _makers_of_cameras(cells: Any) -> dict[str, Any]:
 
 
 def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
-    """Return the oriented photos, with their cameras, from the last orientation in some cells."""
+    """Return the oriented photos with their cameras, according to the last orientation."""
     makers = _makers_of_cameras(cells)
     if not makers:
         return ()
@@ -158,7 +158,7 @@ def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, Viewi
 def _photo_colours(
     cloud: PointCloud, oriented: Sequence[tuple[Photo, ViewingCamera]], scratch: Path
 ) -> PointColours:
-    """Compute the colours in memory-mapped files, so that they do not occupy memory."""
+    """Compute colours in memory-mapped files, so that the colours do not occupy memory."""
     n_points = len(cloud)
 
     def mapped(name: str, kind: type[np.generic], *more: int) -> NDArray[Any]:

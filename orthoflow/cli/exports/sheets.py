@@ -208,7 +208,11 @@ def _warn(walls: Sequence[WallResult]) -> None:
 
 
 def _coarse(walls: Sequence[WallResult], scale: int) -> str:
-    """Name the walls with fewer than 150 pixels per inch, and a scale with enough; else ""."""
+    """Return a remark on walls whose resolution is too low for printing at a scale.
+
+    The remark contains a scale at which the resolution is sufficient; it is empty if no resolution
+    is too low.
+    """
     coarse = [wall for wall in walls if _ppi(wall, scale) < _LEAST_PPI]
     if not coarse:
         return ""
