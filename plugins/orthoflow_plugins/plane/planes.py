@@ -1,12 +1,12 @@
-"""Products from detected planes: deviations, visible sides, order, names, world rectangles.
+"""Products from detected planes: deviations, visible sides, order, names and rectangles.
 
 Deviations of all points are measured in one pass. markiewicz2015 regards a plane as correct if its
 deviations appear normally distributed (Figures 6c to 14c). With a million points, every formal test
-rejects normality, so measures of the departure from it are reported: skewness, excess kurtosis,
-shares within one, two and three standard deviations, and a quantile-quantile plot.
+rejects normality. Instead, the departure from a normal distribution is reported: skewness, excess
+kurtosis, shares within one, two and three standard deviations, and a quantile-quantile plot.
 
-The visible side of a plane is determined from the scanner stations, or guessed from the points. A
-wrong side mirrors all images of the wall, so guesses are always reported.
+The visible side of a plane is determined from the scanner stations, or guessed from the points. If
+the side is wrong, all images of the wall are mirrored, so guesses are always reported.
 """
 
 from __future__ import annotations
@@ -39,25 +39,28 @@ from orthoflow_plugins.plane.support import SurfaceRaster
 
 Viewpoint = Literal["stations", "view_from", "guess"]
 
-# Minimum number of points for statistics of a distribution.
+# Minimum number of points for the statistics of a distribution.
 _DISTRIBUTION_LEAST: Final = 100
 _PROBABILITIES: Final = (
     0.001, 0.0025, 0.005, 0.01, 0.025, *(0.05 * step for step in range(1, 20)),
     0.975, 0.99, 0.995, 0.9975, 0.999,
 )  # fmt: skip
-# Maximum numbers of points of a plane, and of the cloud, used to determine its visible side.
+# Maximum numbers of points of a plane, and of points of the cloud, from which its visible side is
+# determined.
 _MEMBERS_MOST: Final = 5000
 _WITNESSES_MOST: Final = 40_000
-# Cosine of 20 degrees.
+# Planes are parallel if the cosine of the angle between them exceeds this: cos(20 degrees).
 _PARALLEL: Final = 0.94
 # A station closer to the plane than this does not determine its visible side.
 _CLEAR_M: Final = 0.05
-# The weight of a point in the vote for the side of the room is constant beyond this distance.
+# The weight of a point in the vote for the visible side increases up to this distance from the
+# plane.
 _FULL_VOTE_M: Final = 1.0
-# Points may project this far outside the rectangle, because floor and ceiling are at its edges.
+# The projections of points may be this far outside the rectangle, because the floor and the ceiling
+# are at its edges.
 _BESIDE_M: Final = 0.3
-# Minimum majority of the weighted votes, as a share of the votes if all points were at the minimum
-# distance from the plane.
+# Minimum majority of the weighted votes, as a share of the sum of votes if all points were at the
+# minimum distance from the plane.
 _DOUBT: Final = 0.01
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-unknown",
@@ -75,16 +78,16 @@ class Deviations(Rows):
     """Deviations of points from their planes.
 
     Attributes:
-        n_points: (k,) int64 number of points that belong to the plane.
-        rms_m: (k,) root mean square of their distances.
-        n_fit: (k,) int64 number of these points within the tolerance of the fit.
+        n_points: (k,) int64 number of points of each plane.
+        rms_m: (k,) root mean square of the distances.
+        n_fit: (k,) int64 number of points within the tolerance of the fit.
         rms_fit_m: (k,) root mean square of the distances within the tolerance of the fit.
         mean_fit_m: (k,) mean of the distances within the tolerance of the fit.
-        histogram: (k, bins) number of points per bin from -tolerance_m to tolerance_m.
-        extents_m: (k, 4) smallest and largest u, smallest and largest v of the points within the
-            tolerance of the fit in the plane's rectangle.
+        histogram: (k, bins) number of points in bins between -tolerance_m and tolerance_m.
+        extents_m: (k, 4) smallest u, largest u, smallest v and largest v of the points inside the
+            plane's rectangle and the tolerance of the fit.
         tolerance_m: maximum distance of points that belong to a plane.
-        fit_tolerance_m: maximum distance of points used in the fit.
+        fit_tolerance_m: maximum distance of points that are used in the fit.
     """
 
     n_points: NDArray[np.int64]
@@ -105,10 +108,11 @@ class Normality:
     Attributes:
         mean_m: mean.
         sigma_m: standard deviation.
-        skewness: third standardised moment, 0 for a normal distribution.
-        excess_kurtosis: fourth standardised moment minus 3, 0 for a normal distribution.
-        within: shares within 1, 2 and 3 sigma of the mean; 0.683, 0.954, 0.997 if normal.
-        expected_sigmas: (q,) quantiles of the normal distribution.
+        skewness: third standardised moment; 0 for a normal distribution.
+        excess_kurtosis: fourth standardised moment minus 3; 0 for a normal distribution.
+        within: shares within 1, 2 and 3 sigma of the mean; 0.683, 0.954 and 0.997 for a normal
+            distribution.
+        expected_sigmas: (q,) quantiles of the standard normal distribution.
         found_sigmas: (q,) the same quantiles of the distances, minus the mean and divided by sigma.
     """
 
@@ -121,7 +125,7 @@ class Normality:
     found_sigmas: NDArray[np.float64]
 
     def to_json(self) -> JsonValue:
-        """Return the values for the details of the planes."""
+        """Return the values as recorded in the details of the planes."""
         return {
             "mean_m": self.mean_m,
             "sigma_m": self.sigma_m,
@@ -133,13 +137,13 @@ class Normality:
 
 @dataclass(frozen=True, kw_only=True)
 class FacedPlane:
-    """A plane with its normal towards the viewer and its rectangles, in the cloud's offsets.
+    """A plane whose normal points towards the viewer, and its rectangles, in the cloud's offsets.
 
     Attributes:
         plane: the plane.
         corners_m: (4, 3) corners, top-left first, counter-clockwise for the viewer.
         part_corners_m: (p, 4, 3) corners of each connected part.
-        is_guessed: whether the side was guessed because no station determines it.
+        is_guessed: whether the visible side was guessed, because no station determines it.
     """
 
     plane: Plane
@@ -153,11 +157,11 @@ def assemble(
     prepared: PreparedCloud,
     cloud: PointCloud,
 ) -> tuple[Planes, Deviations, list[Normality | None], NDArray[np.intp]]:
-    """Measure planes on their points, and determine their visible sides, order and names.
+    """Measure the deviations of planes, and determine their visible sides, order and names.
 
     Returns:
-        The planes, the largest first; their deviations; the normality of the deviations, None for a
-        plane with too few points; and the index (k,) of each plane in `found`.
+        The planes, largest first; their deviations; the normality of the deviations (None for a
+        plane with too few points); and the index (k,) of each plane in `found`.
     """
     deviations = measure_planes(
         prepared,
@@ -171,7 +175,7 @@ def assemble(
     for place, (k, side) in enumerate(zip(order, faced, strict=True)):
         candidate, own = found[k].candidate, _raw(found[k], side.plane, cloud)
         if float(side.plane.normal @ found[k].raster.plane.normal) < 0.0:
-            # The normal was reversed, so reverse histogram and mean.
+            # If the normal was reversed, reverse the histogram and the mean.
             ordered.histogram[place] = ordered.histogram[place, ::-1].copy()
             ordered.mean_fit_m[place] *= -1.0
         raw.append(
@@ -185,7 +189,7 @@ def assemble(
         normality(row, tolerance_m=prepared.tolerance_m, fit_tolerance_m=prepared.fit_tolerance_m)
         for row in ordered.histogram
     ]
-    # Normal and offset change sign together, which leaves their covariance unchanged.
+    # If a normal is reversed, the offset changes sign, too, so the covariance does not change.
     covariances = [found[k].adjusted.stated()[0] for k in order]
     is_guessed = [item.is_guessed for item in faced]
     viewpoint: Viewpoint = "guess" if all(is_guessed) else known_viewpoint(cloud)
@@ -219,11 +223,11 @@ def planes_of(
     side_from: tuple[SideSource, ...] = (),
     details: dict[str, JsonValue] | None = None,
 ) -> Planes:
-    """Return the product of planes in this order, with covariances (4, 4) of (normal, offset)."""
+    """Return a product with planes in this order; covariances (4, 4) are of (normal, offset)."""
     normals = np.array([item.plane.normal for item in faced])
     heights_m = np.array([item.corners_m.mean(axis=0) @ cloud.up for item in faced])
     n_parts = [len(item.part_corners_m) for item in faced]
-    # The offset refers to the world's origin.
+    # Convert the offsets to offsets from the world's origin.
     shift = np.eye(4)
     shift[3, :3] = cloud.origin
     moved = shift @ np.array(covariances) @ shift.T
@@ -246,7 +250,7 @@ def planes_of(
 
 
 def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
-    """Return the plane that the detector proposed, in world coordinates, facing the same side."""
+    """Return the plane as proposed by the detector, in world coordinates, with the same side."""
     own = item.candidate.plane
     if float(own.normal @ plane.normal) < 0.0:
         own = own.flipped()
@@ -256,7 +260,7 @@ def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
 def report_planes(
     ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int
 ) -> None:
-    """Report the number of planes, their share of points and the first plane; warn of guesses."""
+    """Report the number of planes, their share of points, the first plane, and guessed sides."""
     omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
     ctx.metric("n_planes", len(planes), "1")
     ctx.metric("labelled_share", float(deviations.n_points.sum()) / n_points, "1")
@@ -277,7 +281,7 @@ def report_first(
     found: FoundPlane,
     cloud: PointCloud,
 ) -> None:
-    """Report the fit of the first plane, and how far it moved the detector's proposal."""
+    """Report the fit of the first plane, and how far it displaced the detector's proposal."""
     raw = _raw(found, planes.plane(0), cloud)
     ctx.metric("first_share", float(planes.n_points[0]) / len(cloud), "1")
     ctx.metric("fit_rms_mm", 1000.0 * float(deviations.rms_fit_m[0]), "mm")
@@ -304,14 +308,15 @@ def report_first(
 def plane_names(
     normals: NDArray[np.float64], heights_m: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[str, ...]:
-    """Name planes by kind: `wall 0`, `floor 1`, `ceiling 2`, `level 4`, `slope 5`.
+    """Name planes by kind, such as `wall 0`, `floor 1`, `ceiling 2`, `level 4` and `slope 5`.
 
-    The number is the plane's position in the product, as in the files wall_<k>_*.tif. The floor is
-    the lowest level plane seen from above, the ceiling the highest seen from below.
+    The number is the position of the plane in the product, as in the files wall_<k>_*.tif. The
+    floor is the lowest horizontal plane seen from above, and the ceiling is the highest one seen
+    from below.
 
     Args:
-        normals: (k, 3) towards the viewer.
-        heights_m: (k,) along up.
+        normals: (k, 3) unit normals, towards the viewer.
+        heights_m: (k,) heights of the planes along up, in metres.
         up: (3,) unit vector.
     """
     rises = normals @ up
@@ -332,12 +337,12 @@ def plane_names(
 def measure_planes(
     cloud: PreparedCloud, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]
 ) -> Deviations:
-    """Measure the deviations of all points on planes in one pass.
+    """Measure the deviations of all points from their planes, in one pass.
 
     Args:
         cloud: the cloud with its claims.
         slabs: (k, 12) the planes.
-        bounds_m: (k, 4) their rectangles, smallest and largest u, smallest and largest v.
+        bounds_m: (k, 4) rectangles of the planes: smallest u, largest u, smallest v and largest v.
     """
     parts, count = cloud.parts, len(slabs)
     sums = np.zeros((parts, count, 6), dtype=np.int64)
@@ -363,7 +368,8 @@ def measure_planes(
         rms_fit_m=np.sqrt(squares_fit / np.maximum(n_fit, 1)) * step_m,
         mean_fit_m=steps_fit / np.maximum(n_fit, 1) * step_m,
         histogram=histogram.sum(axis=0),
-        # All points within the tolerance of the fit may be nearer to another plane.
+        # Use the rectangle of a plane if all points within the tolerance of the fit are nearer to
+        # other planes.
         extents_m=np.where(np.isfinite(reached), reached, bounds_m),
         tolerance_m=cloud.tolerance_m,
         fit_tolerance_m=cloud.fit_tolerance_m,
@@ -373,7 +379,7 @@ def measure_planes(
 def normality(
     histogram: NDArray[np.int64], *, tolerance_m: float, fit_tolerance_m: float
 ) -> Normality | None:
-    """Describe the distances within the fit tolerance, given a histogram over +-tolerance_m.
+    """Describe the distances within the fit tolerance, given their histogram over +-tolerance_m.
 
     Returns:
         The shape of the distribution; None if there are too few distances or all are in one bin.
@@ -389,7 +395,7 @@ def normality(
     mean_m = float(counts @ middles_m) / total
     away_m = middles_m - mean_m
     second, third, fourth = (float(counts @ away_m**power) / total for power in (2, 3, 4))
-    # Sheppard's corrections for the distribution of points within a bin.
+    # Apply Sheppard's corrections for the distribution of points within a bin.
     fourth += -0.5 * second * width_m**2 + 7.0 / 240.0 * width_m**4
     second -= width_m**2 / 12.0
     if second <= 0.0:
@@ -415,7 +421,7 @@ def normality(
 
 
 def known_viewpoint(cloud: PointCloud) -> Viewpoint:
-    """Return the source of the positions from which the cloud was seen."""
+    """Return the source of the viewpoints: `stations`, `view_from`, or `guess` if unknown."""
     if cloud.stations is None or len(cloud.stations) == 0:
         return "guess"
     return "view_from" if cloud.stations_source == "view_from" else "stations"
@@ -424,12 +430,12 @@ def known_viewpoint(cloud: PointCloud) -> Viewpoint:
 def rectangle_m(
     plane: Plane, axes: NDArray[np.float64], bounds_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (4, 3) on a plane: top-left first, counter-clockwise for the viewer.
+    """Return the corners (4, 3) on a plane: top-left first, counter-clockwise for the viewer.
 
     Args:
-        plane: the plane, normal towards the viewer.
+        plane: the plane, with its normal towards the viewer.
         axes: (2, 3) u to the viewer's right and v down (`wall_axes`).
-        bounds_m: (4,) smallest and largest u, smallest and largest v.
+        bounds_m: (4,) smallest u, largest u, smallest v and largest v.
     """
     left, right, top, bottom = bounds_m
     around = np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
@@ -445,9 +451,9 @@ def face(
     *,
     is_guessed: bool,
 ) -> FacedPlane:
-    """Return a plane facing a side, with rectangles of its points (4,) and of its parts (p, 4).
+    """Turn a plane to a side, and return it with rectangles around its points and its parts.
 
-    Parts are multiples of cells, so they are clipped to the extent of the points.
+    Parts consist of whole cells, so they are clipped to the extent of the points.
     """
     parts_m = np.clip(parts_m, extent_m[[0, 0, 2, 2]], extent_m[[1, 1, 3, 3]])
     corners = [rectangle_m(raster.plane, raster.axes, bounds) for bounds in (extent_m, *parts_m)]
@@ -455,7 +461,8 @@ def face(
     axes = wall_axes(plane.normal, up)
     around = []
     for corners_m in corners:
-        # The enclosing rectangle along the new axes; after a flip it is the same rectangle.
+        # Compute the bounding rectangle along the new axes; if the plane was turned, it is the same
+        # rectangle.
         placed = corners_m @ axes.T
         low, high = placed.min(axis=0), placed.max(axis=0)
         around.append(rectangle_m(plane, axes, np.array([low[0], high[0], low[1], high[1]])))
@@ -472,17 +479,17 @@ def side_of_stations(
 ) -> int:
     """Return the side of a plane from which its points were seen.
 
-    Each point of the plane votes for the side of its scan's station; if scans are unknown, the
-    station nearest to the centre of the plane decides.
+    Each point of the plane votes for the side on which the station of its scan is. If scans are
+    unknown, only the station nearest to the centre of the plane is used.
 
     Args:
         plane: the plane in the cloud's offsets.
-        centre_m: (3,) centre of the plane, offset.
+        centre_m: (3,) offset of the centre of the plane.
         cloud: the cloud.
         index: (m,) indices of some points of the plane.
 
     Returns:
-        1 for the side of the normal, -1 for the other, 0 if no station decides.
+        1 for the side of the normal, -1 for the other side, 0 if no station determines the side.
     """
     if cloud.stations is None or len(cloud.stations) == 0:
         return 0
@@ -507,22 +514,24 @@ def side_of_remaining(
     *,
     clear_m: float,
 ) -> int:
-    """Return the side of a plane that has more of the other points and so probably faces the room.
+    """Return the side of a plane with more of the other points, which probably faces the room.
 
-    At first, points on parallel planes are excluded: behind the front of a pilaster is the whole
-    wall, but the room, with its floor, side walls and furniture, is in front of it. Of the
-    remaining points, only those in front of or behind the plane's rectangle vote. Their weight
-    increases with distance up to a metre, because relief and recesses are near and the room is far.
+    Points vote for the side on which they are. At first, points on parallel planes are excluded,
+    because the whole wall is behind the front of a pilaster, although the room is in front of it.
+    Also, only points in front of or behind the plane's rectangle vote. If they do not determine the
+    side, more points are used. The weight of a vote increases with the distance from the plane up
+    to a metre, because relief and recesses are near the plane, but the room is not.
 
     Args:
         plane: the plane in the cloud's offsets.
-        corners_m: (4, 3) rectangle, offsets.
-        points_m: (m, 3) sample of the cloud, offsets.
+        corners_m: (4, 3) offsets of the corners of the plane's rectangle.
+        points_m: (m, 3) offsets of a sample of the cloud.
         is_parallel: (m,) whether a point belongs to a plane parallel to this one.
-        clear_m: points closer to the plane than this belong to it.
+        clear_m: points closer to the plane than this are on the plane and do not vote.
 
     Returns:
-        1 for the side of the normal, -1 for the other, 0 if the points do not decide.
+        1 for the side of the normal, -1 for the other side, 0 if the points do not determine the
+        side.
     """
     relative = points_m - corners_m[0]
     within = np.ones(len(points_m), dtype=bool)
@@ -534,7 +543,7 @@ def side_of_remaining(
     clear = np.abs(distances_m) > clear_m
     for chosen in (within & ~is_parallel, within, ~is_parallel, np.ones_like(within)):
         verdict = float(np.clip(distances_m[chosen & clear], -_FULL_VOTE_M, _FULL_VOTE_M).sum())
-        # Gross outliers on both sides of a bare wall leave a small, meaningless difference.
+        # Ignore small majorities, which gross outliers on both sides of a bare wall cause.
         if abs(verdict) > _DOUBT * len(points_m) * clear_m:
             return 1 if verdict > 0.0 else -1
     return 0
@@ -552,7 +561,8 @@ def _faced(
     corners_m = rectangle_m(plane, raster.axes, extent_m)
     claims = prepared.sample_claims
     members = prepared.sample.index[claims == claim]
-    # Thin evenly, because the first points of a plane may all be from one scan.
+    # Use points distributed over the whole plane, because its first points may all be from one
+    # scan.
     members = members[:: max(1, len(members) // _MEMBERS_MOST)]
     side = side_of_stations(plane, corners_m.mean(axis=0), cloud, members)
     is_guessed = side == 0

@@ -1,4 +1,4 @@
-"""Parameters of every detector, and what a detector contributes to the search."""
+"""Parameters of all detectors, and the base class of proposers."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from orthoflow.sdk import MethodParams, StepContext
 
 # Orientation of the planes to search for.
 Constraint = Literal["any", "vertical", "horizontal"]
-# Lowest and highest intensity of each material.
+# Lowest and highest intensity of each material, by name.
 Materials = Mapping[str, tuple[float, float]]
-# Votes of a cell of the plan.
+# Rule for the votes of a cell of the plan.
 Accumulator = Literal["counts", "unit", "canny"]
 
-# Tolerances for a clean scan: that of markiewicz2015, and one that excludes mouldings.
+# Tolerances for a cloud with little noise: that of markiewicz2015, and that of the fit, which
+# excludes mouldings.
 _TOLERANCE_M: Final = 0.05
 _FIT_TOLERANCE_M: Final = 0.015
 # Ratio of the tolerances to the standard deviation of the noise.
@@ -30,7 +31,7 @@ _NOISE_TIMES: Final = 4.0
 
 
 class DetectorParams(MethodParams):
-    """Parameters of every detector; the defaults suit rooms and facades scanned at millimetres."""
+    """Parameters of all detectors; defaults suit rooms and facades with millimetre spacing."""
 
     tolerance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
         "auto",
@@ -126,17 +127,18 @@ class DetectorParams(MethodParams):
         return self
 
     def tolerances_m(self, single_m: float, shared_m: float) -> tuple[float, float]:
-        """Return `tolerance_m` and `fit_tolerance_m` for a cloud with the given noise.
+        """Return `tolerance_m` and `fit_tolerance_m` for a cloud with a given noise.
 
-        A plane differs from a filled slab in the concentration of its points in the inner half of
-        the tolerance. With a normal distribution this half contains 95 % of them if the tolerance
-        is four standard deviations, but only 80 %, which is rejected, if it is 2.5. Errors common
-        to neighbouring points bend a surface, so they count fully for `tolerance_m`, and by half
-        for the fit, which averages bends over the whole plane.
+        Unlike the points of a filled slab, those of a plane concentrate in the inner half of the
+        tolerance. If deviations are normally distributed, this half contains 95 % of the points if
+        the tolerance is four standard deviations, but only 80 % if it is 2.5, so that the plane is
+        rejected. Errors common to neighbouring points bend a surface. They are fully included in
+        `tolerance_m`, but only half of them in `fit_tolerance_m`, because a fit averages bends over
+        the whole plane.
 
         Args:
-            single_m: noise of single points, standard deviation; 0 if unknown.
-            shared_m: the same, including errors that are common to neighbouring points.
+            single_m: standard deviation of the noise of single points; 0 if unknown.
+            shared_m: the same, including errors common to neighbouring points.
         """
         if self.fit_tolerance_m == "auto":
             fit_m = max(_FIT_TOLERANCE_M, _NOISE_TIMES * single_m, 0.5 * _NOISE_TIMES * shared_m)
@@ -152,10 +154,10 @@ class Candidate:
     """A plane that a detector proposes.
 
     Attributes:
-        plane: the plane in the cloud's offsets, accurate to a few centimetres or a degree.
-        constraint: permitted orientation of the fitted plane.
-        own_tolerance_m: tolerance estimated by the detector, or None.
-        start: initial plane of the common fit; None for `plane`.
+        plane: the plane in the cloud's offsets, accurate to a few centimetres and about a degree.
+        constraint: orientation to which the fitted plane is restricted.
+        own_tolerance_m: tolerance that the detector estimated; None if it estimates none.
+        start: initial plane of the common fit; if None, `plane` is used.
     """
 
     plane: Plane
@@ -165,21 +167,21 @@ class Candidate:
 
 
 class Proposer:
-    """What a detector contributes to the search, which all detectors share."""
+    """Proposes planes; each detector has its own proposer for the common search."""
 
-    # Any stands for `search.Search`, here and below, because its module imports this one.
+    # In this class, Any stands for `search.Search`, whose module imports this one.
     @abstractmethod
     def propose(self, search: Any) -> Candidate | None:
-        """Return the best candidate among the points not yet assigned, or None."""
+        """Return the best candidate for the points not yet assigned; None if there is none."""
 
     def reject(self) -> None:
         """Exclude the last candidate from further proposals."""
 
     def relabel(self, found: Any, cloud: Any) -> None:
-        """Change the claims of the cloud after all points are labelled."""
+        """Change the claims of the cloud's points after all points have been labelled."""
 
     def draw(self, ctx: StepContext, planes: Planes, cloud: PointCloud) -> None:
-        """Report and draw the results specific to this detector."""
+        """Report and draw results that are specific to this detector."""
 
 
 def leans_as_asked(
@@ -188,7 +190,7 @@ def leans_as_asked(
     constraint: Constraint,
     max_tilt_deg: float,
 ) -> NDArray[np.bool_]:
-    """Return whether (n,) planes with normals (n, 3) satisfy a constraint within `max_tilt_deg`."""
+    """Return a mask (n,) of planes with normals (n, 3) that satisfy a constraint."""
     tilts_deg = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0)))
     if constraint == "any":
         return np.ones(len(normals), dtype=bool)

@@ -1,18 +1,19 @@
 """`plane.ransac`: planes with the largest consensus in a sample, fitted to all points.
 
-Three points drawn from an entire room are on the same small wall once in a million draws. The
-sample is therefore ordered along a space-filling curve, and the points of a hypothesis are drawn
-from one section of the curve. Its length is random too: short sections find small planes, long
-sections determine large planes well.
+If three points are drawn from an entire room, they are on the same small wall only once in a
+million draws. The sample is therefore sorted along a space-filling curve, and the points of a
+hypothesis are drawn from the same section of the curve. The length of the section is random, too:
+short sections find small planes, and long sections determine large planes well.
 
-The score of a hypothesis is computed from the distances of points.
+The score of a hypothesis is computed from the distances of points from the plane:
 
-- count (Max-Consensus): number of points within the tolerance.
-- msac: a point within the tolerance counts 1 - (distance / tolerance)^2 (Torr and Zisserman 2000).
+- count (Max-Consensus): the number of points within the tolerance.
+- msac: the sum of 1 - (distance / tolerance)^2 over points within the tolerance (Torr and Zisserman
+  2000).
 - a-contrario (AC-RANSAC): minus the logarithm of the number of false alarms, at the tolerance that
-  minimises it, which is returned (Moisan and Stival 2004; Moisan, Moulon, Monasse 2012). The
-  probability that a background point is within a distance of the plane is the share of the scene's
-  box inside the slab.
+  minimises this number and is also returned (Moisan and Stival 2004; Moisan, Moulon, Monasse 2012).
+  The probability that a background point is within a given distance of the plane is the share of
+  the scene's box that is inside the slab.
 """
 
 from __future__ import annotations
@@ -44,56 +45,62 @@ if TYPE_CHECKING:
 Model = Literal["3d", "2d"]
 Scoring = Literal["count", "msac", "a-contrario"]
 
-# Number of hypotheses for the first plane; half as many for each further plane.
+# Number of hypotheses for the first plane; for each further plane, half as many are drawn.
 _HYPOTHESES: Final = 1000
 # Number of bins for distances from 0 to the tolerance.
 _BINS: Final = 100
-# Maximum number of points from which hypotheses are drawn, and on which they are scored.
+# Maximum number of points from which hypotheses are drawn, and maximum number of points with which
+# they are scored.
 _DRAWN_MOST: Final = 50_000
 _ASKED_MOST: Final = 150_000
-# Number of points with which all hypotheses are scored, and with which the best are scored again.
+# Number of points with which all hypotheses are scored, number with which the best are scored
+# again, and share and minimum number of these.
 _FIRST_POINTS: Final = 2_000
 _SECOND_POINTS: Final = 20_000
 _SECOND_SHARE: Final = 0.1
 _SECOND_LEAST: Final = 50
-# Planes through few points are inaccurate, so this additional tilt is tolerated.
+# Additional tilt that is tolerated, because planes through a few points are inaccurate.
 _LEAN_CAUTION_DEG: Final = 5.0
-# Share of the required points that suffices, because hypotheses are inaccurate.
+# Minimum number of points of a hypothesis, as a share of the required number; it is low because
+# hypotheses are inaccurate.
 _SUPPORT_CAUTION: Final = 0.4
 _POLISHED: Final = 4
-# Maximum number of similar hypotheses that are scored again to find the best of them.
+# Maximum number of similar hypotheses that are scored again to find the best one.
 _SIMILAR_MOST: Final = 5
-# Minimum share of the points within the tolerance that are in its inner part; 0.4 is expected by
-# chance.
+# Minimum share of the points within the tolerance that must be in its inner part; the share
+# expected by chance is 0.4.
 _CROWDED_SHARE: Final = 0.5
-# Number of new draws after all hypotheses are rejected.
+# Number of times that new hypotheses are drawn after all have been rejected.
 _REDRAWS: Final = 2
-# Minimum number of points of a section; possible lengths are halved repeatedly.
+# Minimum number of points in a section. The possible lengths are the total number of points, half
+# of it, a quarter, and so on.
 _STRETCH_LEAST: Final = 32
-# Minimum ratio of height to longest side of a triangle.
+# Minimum ratio of the height of a triangle to its longest side.
 _FLATTEST: Final = 0.02
 _CURVE_BITS: Final = 10
-# Shifts and masks that move the bits of a number to every third position.
+# Shifts and masks that spread the bits of a number to every third position.
 _SPREADS: Final = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
-# A hypothesis within this angle and within the tolerance of a rejected one is proposed again only
-# if this share of the points near it has been removed.
+# A hypothesis is similar to another if the angle between them is smaller than this and their
+# distance is within the tolerance. After a hypothesis has been rejected, similar ones are proposed
+# again only if the second value, a share of the points near it, has been removed.
 _SIMILAR_DEG: Final = 2.0
 _LOST_SHARE: Final = 0.05
 
 
 class Ransac(Detector):
-    """Find planes by random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or the plan.
+    """Find planes by random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or in plan.
 
-    Planes through random points are scored with a sample of the cloud. The best is refined with a
-    tolerance that decreases from `tolerance_m` to `fit_tolerance_m`, and enough points must
-    concentrate on it. When all planes are found in the sample, they are fitted to all points in one
-    pass (for clouds above 24 million points, a random sample is used); a second pass labels all
-    points.
+    Planes through random points are scored with a sample of the cloud. The best plane is refined
+    with a tolerance that decreases from `tolerance_m` to `fit_tolerance_m`, and enough points must
+    concentrate on it. When all planes have been found in the sample, they are fitted in one pass to
+    all points, or, in clouds of more than 24 million points, to a random sample. A second pass
+    labels all points.
 
-    `model: 2d` draws vertical planes through two points of the plan, as in markiewicz2015, and
-    finds only walls. `scoring: a-contrario` estimates a tolerance up to `tolerance_m`: the one at
-    which the points are least likely to be near the plane by chance. It is stored with each plane,
-    and reported as `own_tolerance_mm` for the first; the common fit still uses `fit_tolerance_m`.
+    With `model: 2d`, as in markiewicz2015, vertical planes are drawn through two points in plan, so
+    that only walls are found. With `scoring: a-contrario`, the tolerance is estimated: it is the
+    tolerance, up to `tolerance_m`, at which the points are least likely to be near the plane by
+    chance. The estimated tolerance is recorded for each plane, and reported as `own_tolerance_mm`
+    for the first plane. The common fit still uses `fit_tolerance_m`.
     """
 
     id = "plane.ransac"
@@ -113,7 +120,7 @@ class Ransac(Detector):
     )
 
     class Params(DetectorParams):
-        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned with millimetre point spacing."""
 
         model: Model = Field(
             "3d", description="3d: planes through three points; 2d: vertical planes through two."
@@ -132,7 +139,7 @@ class Ransac(Detector):
             return self
 
     def proposer(self, search: Search, params: Params, ctx: StepContext) -> ConsensusProposer:
-        """Return a proposer that draws from the step's random numbers."""
+        """Return a proposer that uses the random generator of the step."""
         return ConsensusProposer(search, params, ctx.rng)
 
 
@@ -141,9 +148,10 @@ class Scores(Rows):
     """Scores of hypotheses.
 
     Attributes:
-        value: (h,) score, higher is better; for a-contrario, positive if meaningful.
-        tolerance_m: (h,) maximum distance of the counted points.
-        n_points: (h,) number of counted points.
+        value: (h,) score; higher is better. For a-contrario, it is positive if the plane is
+            meaningful.
+        tolerance_m: (h,) maximum distance of the points that are counted.
+        n_points: (h,) number of points that are counted.
     """
 
     value: NDArray[np.float64]
@@ -152,31 +160,32 @@ class Scores(Rows):
 
 
 class ConsensusProposer(Proposer):
-    """Proposes planes that contain many points of a sample.
+    """Proposes planes through random points that are near many points of a sample.
 
-    Hypotheses are rows (h, 4) of a unit normal and an offset, relative to the median of the sample.
-    Good ones are kept for the next plane and scored again with the remaining points. Rejected ones
-    are excluded until points near them are removed, because the verification depends only on these
-    points.
+    Hypotheses are rows (h, 4), each a unit normal and an offset, relative to the median of the
+    sample. Good hypotheses are kept for the next plane and scored again with the remaining points.
+    Rejected hypotheses are excluded until points near them are removed, because their verification
+    depends only on these points.
     """
 
     def __init__(self, search: Search, params: Ransac.Params, rng: np.random.Generator) -> None:
-        """Order the sample along a curve; `rng` draws the hypotheses."""
+        """Sort the sample along a curve; `rng` is used to draw hypotheses."""
         self._params, self._rng = params, rng
         points_m = search.cloud.sample.offsets_m
         self._centre_m = np.median(points_m, axis=0)
         self._points_m = points_m - self._centre_m
-        # The order is random, so that any initial part of the remaining points represents all of
+        # The order is random, so that any first part of the remaining points represents all of
         # them.
         self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
         drawn = self._shuffled[:_DRAWN_MOST]
         self._order = drawn[curve_order(points_m[drawn])]
         corners = search.box_corners_m
         self._box_m = corners.max(axis=0) - corners.min(axis=0)
-        # Scores of the hypotheses, the best first, for the points in `_asked_m`.
+        # Hypotheses, the best first, and their scores for the points in `_asked_m`.
         self._hypotheses, self._scores = np.zeros((0, 4)), Scores(*np.zeros((3, 0)))
         self._asked_m = self._points_m[:0]
-        # Rejected hypotheses, and the number of points near each when it was rejected.
+        # Rejected hypotheses, and the number of points that were near each of them when it was
+        # rejected.
         self._rejected, self._n_near = np.zeros((0, 4)), np.zeros(0, dtype=np.int64)
         self._drawn_for = -1
 
@@ -203,17 +212,18 @@ class ConsensusProposer(Proposer):
         self._n_near = np.append(self._n_near, self._count_near(hypothesis[None], search))
 
     def _count_near(self, hypotheses: NDArray[np.float64], search: Search) -> NDArray[np.int64]:
-        """Return the number (h,) of remaining test points near each hypothesis."""
+        """Return the number (h,) of remaining sample points near each hypothesis."""
         asked = self._shuffled[:_SECOND_POINTS]
         free_m = self._points_m.take(asked[search.claims[asked] < 0], axis=0)
         apart_m = np.abs(free_m @ hypotheses[:, :3].T - hypotheses[:, 3])
         return np.asarray(np.sum(apart_m <= search.cloud.tolerance_m, axis=0, dtype=np.int64))
 
     def _best(self, search: Search) -> Candidate | None:
-        """Return the best hypothesis with enough points that concentrate on its plane.
+        """Return the best hypothesis with enough points, if they concentrate on its plane.
 
-        A plane through mouldings and clutter has many points too, but they are distributed over its
-        slab. Such planes are excluded here, because the full verification takes ten times as long.
+        A plane through mouldings and clutter is also near many points, but these are distributed
+        over the whole slab. Such planes are excluded here, because full verification takes ten
+        times as long.
         """
         from orthoflow_plugins.plane.fit import refine_plane
         from orthoflow_plugins.plane.support import INNER_SHARE
@@ -249,7 +259,7 @@ class ConsensusProposer(Proposer):
         return None
 
     def _draw(self, search: Search) -> None:
-        """Draw hypotheses; score these and earlier ones with few points, and the best with more."""
+        """Draw hypotheses. Score new and earlier ones with few points, and the best with more."""
         claims, up, params = search.claims, search.cloud.up, self._params
         free = self._order[claims[self._order] < 0]
         earlier, self._hypotheses = self._hypotheses, self._hypotheses[:0]
@@ -301,7 +311,7 @@ class ConsensusProposer(Proposer):
         return Plane(normal=plane.normal, offset_m=offset_m)
 
     def _polished(self, search: Search) -> tuple[NDArray[np.float64], float]:
-        """Fit to the points within the tolerance and re-estimate it, while the score improves."""
+        """Fit the last hypothesis to the points within its tolerance while its score improves."""
         hypothesis, points_m = self._last, self._points_m[search.claims < 0]
         best = self._scored(hypothesis[None], points_m, search)
         for _ in range(_POLISHED):
@@ -318,7 +328,7 @@ class ConsensusProposer(Proposer):
 
 
 def plane_of(hypothesis: NDArray[np.float64]) -> Plane:
-    """Return the plane of a row (4,)."""
+    """Return the plane of a hypothesis (4,)."""
     normal = hypothesis[:3]
     return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(hypothesis[3]))
 
@@ -326,16 +336,16 @@ def plane_of(hypothesis: NDArray[np.float64]) -> Plane:
 def are_near(
     hypotheses: NDArray[np.float64], others: NDArray[np.float64], tolerance_m: float
 ) -> NDArray[np.bool_]:
-    """Return a mask (h, o): whether hypotheses (h, 4) are similar to others (o, 4)."""
+    """Return a mask (h, o) of hypotheses (h, 4) that are similar to other hypotheses (o, 4)."""
     cosines = hypotheses[:, :3] @ others[:, :3].T
     apart_m = np.abs(hypotheses[:, 3, None] - np.copysign(1.0, cosines) * others[:, 3])
     return (np.abs(cosines) > math.cos(math.radians(_SIMILAR_DEG))) & (apart_m < tolerance_m)
 
 
 def _distinct(ranked: NDArray[np.float64], tolerance_m: float) -> list[int]:
-    """Return the places of the best of ranked hypotheses (h, 4), with few similar ones."""
+    """Return the indices of the best hypotheses, of ranked ones (h, 4), with few similar ones."""
     n_most = max(_SECOND_LEAST, round(_SECOND_SHARE * len(ranked)))
-    # These nearly always include enough different ones.
+    # This part nearly always contains enough different hypotheses.
     asked = ranked[: _SIMILAR_MOST * n_most]
     near = are_near(asked, asked, tolerance_m)
     kept: list[int] = []
@@ -354,14 +364,14 @@ def draw_hypotheses(
     up: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Draw planes through points; return unit normals and offsets (h, 4).
+    """Draw planes through random points; return unit normals and offsets (h, 4).
 
     Args:
-        points_m: (m, 3) in curve order.
-        count: number of draws; degenerate ones are omitted.
-        model: `3d`: through three points; `2d`: vertical, through two points.
+        points_m: (m, 3) metres, in the order of `curve_order`.
+        count: number of draws; degenerate planes are omitted.
+        model: `3d` for planes through three points, `2d` for vertical planes through two points.
         up: (3,) unit vector.
-        rng: random numbers.
+        rng: random generator.
     """
     n_points = len(points_m)
     n_lengths = max(1, int(np.log2(max(1.0, n_points / _STRETCH_LEAST))) + 1)
@@ -382,7 +392,7 @@ def draw_hypotheses(
 
 
 def curve_order(points_m: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the order of points (m, 3) along a Morton curve, on which neighbours are close."""
+    """Return the order of points (m, 3) along a Morton curve, which keeps near points together."""
     low, high = np.quantile(points_m, (0.01, 0.99), axis=0)
     scale = (2**_CURVE_BITS - 1) / max(float((high - low).max()), 1e-9)
     cells = np.clip((points_m - low) * scale, 0, 2**_CURVE_BITS - 1).astype(np.uint32)
@@ -402,14 +412,14 @@ def fewest_false_alarms(
     extents_m: NDArray[np.float64],
     n_corners: int,
 ) -> Scores:
-    """Score hypotheses at the tolerance at which their points are least likely due to chance.
+    """Score hypotheses at the tolerance at which points are least likely to be near by chance.
 
     Args:
-        histograms: (h, bins) number of points per distance bin, 0..reach.
+        histograms: (h, bins) number of points in bins of distance between 0 and `reach_m`.
         reach_m: maximum tolerance.
         n_points: total number of points.
         extents_m: (h,) extent of the scene's box along each normal.
-        n_corners: number of points that determine a hypothesis.
+        n_corners: number of points through which a hypothesis is drawn.
     """
     within = np.cumsum(histograms, axis=1, dtype=np.int64)
     n_bins = within.shape[1]
@@ -441,7 +451,7 @@ def _log_choose(
 def _fitted(
     points_m: NDArray[np.float64], model: Model, up: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Return the total least squares plane (4,); vertical for the 2D model."""
+    """Return the total least squares plane (4,) of points (n, 3); vertical for the 2D model."""
     if len(points_m) < 4:
         return None
     mean = points_m.mean(axis=0)
