@@ -1,8 +1,8 @@
-"""`plane.region`: regions grown over neighbouring points with similar normals on a common plane.
+"""`plane.region`: regions of neighbouring points with similar normals on a common plane.
 
-Regions consist of voxels. They are grown over neighbours, or formed by grouping normals alone. The
-region with the most unassigned points is proposed first. Points may also be labelled by their
-region.
+Regions consist of voxels. They are grown over neighbouring voxels, or formed by grouping normals
+alone. The region with the most unassigned points is proposed first. Points can also be labelled by
+their region.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
     from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels, VoxelTable
 
-# Values of `preset: paper` for parameters that are not set (markiewicz2015, 4.1.2).
+# Values that `preset: paper` gives to parameters that are not set (markiewicz2015, 4.1.2).
 _PAPER_PRESET: Final[dict[str, object]] = {
     "criterion": "normal",
     "neighbourhood": "cube",
@@ -42,49 +42,51 @@ _PAPER_PRESET: Final[dict[str, object]] = {
     "labels": "region",
     "stop_unclassified_share": 0.1,
 }
-# Number of points of a neighbourhood for `knn`.
+# Number of points in a neighbourhood for `knn`.
 _N_NEAREST: Final = 30
-# Maximum distance of a cell's centroid from the region's plane, unless noise is larger.
+# Maximum distance of a voxel's centroid from the plane of a region; it is larger if the noise is
+# high.
 _DISTANCE_M: Final = 0.015
-# Share of the required points that a region needs, because the parts of a wall are separate
-# regions, which may have enough points only together.
+# Minimum number of points of a region, as a share of the required number. It is low because the
+# parts of a wall are separate regions, which may have enough points only together.
 _PART_SHARE: Final = 0.2
-# Additional tilt tolerated for the plane of a region, because the fit may reduce it.
+# Additional tilt that is tolerated for the plane of a region, because the fit may reduce the tilt.
 _LEAN_CAUTION_DEG: Final = 3.0
-# Values of voxels in no region: _FREE if they may be added to one, _NONE if not.
+# Values for voxels in no region: _FREE if they may be added to a region, _NONE if not.
 _FREE: Final = -2
 _NONE: Final = -1
-# Maximum ratio of the deviation from a neighbourhood's plane to its shorter extent.
+# Maximum ratio of the deviation from the plane of a neighbourhood to the shorter extent of the
+# neighbourhood.
 _ROUNDEST: Final = 0.5
-# Minimum width of a neighbourhood, in sides of a voxel; a narrower one is a line.
+# Minimum width of a neighbourhood, in sides of a voxel; a narrower neighbourhood is a line.
 _NARROWEST: Final = 0.2
-# Seeds are ordered by flatness, in steps of this share of a voxel.
+# Seeds are sorted by flatness, in steps of this share of a voxel's side.
 _FLATNESS_STEP: Final = 1.0 / 2000.0
 _MEAN_SHIFTS: Final = 12
-# Maximum number of times that voxels are doubled in width. They are doubled if neighbourhoods have
-# fewer points than this multiple of the number that a normal needs.
+# Maximum number of times that the width of voxels is doubled. It is doubled if neighbourhoods have
+# fewer points than the second value times the number needed for a normal.
 _WIDENINGS: Final = 2
 _THIN: Final = 3.0
 
 
 class Region(Detector):
-    """Find planes by region growing with normals of neighbourhoods, using all points.
+    """Find planes by region growing with the normals of neighbourhoods, using all points.
 
-    The points are summed into cells once; the sums of neighbouring cells give the normal of each
-    neighbourhood. Starting from the flattest cell, neighbours are added whose normal is similar to
-    the region's and whose centroid is near its plane, which is refitted as the region grows. The
-    planes of the regions, largest first, are then processed as for every detector: they are refined
-    on a sample and fitted to all points, parts of one plane are joined, and points are labelled by
-    the nearest plane.
+    The points are summed in voxels once; the sums of neighbouring voxels give the normal of each
+    neighbourhood. Starting from the flattest voxel, a region grows by adding neighbours whose
+    normals are similar to the normal of the region and whose centroids are near its plane. This
+    plane is refitted as the region grows. The planes of the regions, largest first, are then
+    processed as for all detectors: they are refined on a sample and fitted to all points, parts of
+    the same plane are joined, and points are labelled by the nearest plane.
 
-    `criterion: normal` uses only the normal and ignores the position of a cell, as in
+    With `criterion: normal`, only the normals of voxels are used, not their positions, as in
     markiewicz2015; with `labels: region`, a niche of any depth then belongs to its wall. `preset:
-    paper` sets both and the other values of that paper (10 mm cube, 1 degree, every 10th point,
-    stop at 10 % unclassified), each of which can be overridden.
+    paper` sets both options and the other values of that paper (a cube of 10 mm, 1 degree, every
+    10th point, and a stop when 10 % of the points are unclassified). Each value can be overridden.
 
-    If a neighbourhood would have too few points because the cloud is sparse, it is enlarged;
-    `neighbourhood_mm` reports the size. `normal_scatter_deg` reports the scatter of the normals of
-    the first plane: a smaller `angle_deg` results in fragments.
+    If neighbourhoods would have too few points because the cloud is sparse, they are enlarged;
+    `neighbourhood_mm` reports their size. `normal_scatter_deg` reports the scatter of the normals
+    of the first plane; if `angle_deg` is smaller than this, planes are split into fragments.
     """
 
     id = "plane.region"
@@ -105,7 +107,7 @@ class Region(Detector):
     )
 
     class Params(DetectorParams):
-        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned with millimetre point spacing."""
 
         preset: Literal["none", "paper"] = Field(
             "none",
@@ -150,13 +152,13 @@ class Region(Detector):
         @model_validator(mode="before")
         @classmethod
         def _preset_fills_in(cls, given: Any) -> Any:
-            # Any, because the input of the user has not been validated yet.
+            # The type is Any, because the user's input has not been validated yet.
             if isinstance(given, dict) and given.get("preset") == "paper":
                 return {**_PAPER_PRESET, **given}
             return given
 
         def neighbourhood_of(self, fit_tolerance_m: float) -> Neighbourhood:
-            """Return the neighbourhood for a given tolerance of the fit."""
+            """Return the neighbourhood for normals, given the tolerance of the fit."""
             from orthoflow_plugins.plane.voxels import Neighbourhood
 
             auto_m = min(2.0, max(0.1, 3.0 * fit_tolerance_m))
@@ -170,18 +172,18 @@ class Region(Detector):
             )
 
     def proposer(self, search: Search, params: Params, ctx: StepContext) -> RegionProposer:
-        """Grow the regions of a cloud."""
+        """Return a proposer that grows the regions of the cloud."""
         ctx.progress(0.1, "growing regions")
         return RegionProposer(search, params)
 
 
 class RegionProposer(Proposer):
-    """Proposes the planes of regions grown on all points.
+    """Proposes the planes of regions, which are grown using all points.
 
     Attributes:
-        n_points: (r,) int64 number of points of each region.
-        planes: total least squares planes of the regions with enough points, by region, in the
-            cloud's offsets.
+        n_points: (r,) int64 number of points in each region.
+        planes: total least squares planes, in the cloud's offsets, of the regions with enough
+            points, by region.
     """
 
     def __init__(self, search: Search, params: Region.Params) -> None:
@@ -190,12 +192,12 @@ class RegionProposer(Proposer):
 
         cloud, self._params = search.cloud, params
         self._voxels = surface_voxels(cloud, params.neighbourhood_of(search.cloud.fit_tolerance_m))
-        # Minimum size of a region.
         least_points = _PART_SHARE * params.min_share * len(cloud.claims)
         if params.criterion == "normal":
             regions = _grouped(self._voxels, params.angle_deg, least_points, cloud.viewpoint_m)
         else:
-            # Noise must not keep cells from the plane that they are on.
+            # Increase the distance for noisy clouds, so that noise does not exclude voxels from
+            # their plane.
             distance_m = max(_DISTANCE_M, 0.5 * search.cloud.fit_tolerance_m)
             regions = _grown(self._voxels, params.angle_deg, distance_m, least_points)
         self._region_of_voxel, n_regions = regions
@@ -211,7 +213,7 @@ class RegionProposer(Proposer):
         self._last = -1
 
     def _region_of(self, cloud: PreparedCloud) -> NDArray[np.int32]:
-        """Return the regions (s,) of the points of a cloud's sample, -1 for none."""
+        """Return the regions (s,) of the points of a cloud's sample; -1 for points in no region."""
         from orthoflow_plugins.plane.cloud import blocked
 
         # The last entry is for points in no voxel.
@@ -231,8 +233,8 @@ class RegionProposer(Proposer):
             if plane is None or region in self._barred:
                 continue
             leans = leans_as_asked(plane.normal[None], search.cloud.up, constraint, limit_deg).all()
-            # If only the normal counts, a region is proposed once, even if many of its points are
-            # off its plane.
+            # If only normals are used, propose a region only once, because many of its points may
+            # be off its plane and thus remain unassigned.
             if by_normal or not leans:
                 self._barred.add(region)
             if leans:
@@ -247,10 +249,10 @@ class RegionProposer(Proposer):
         self._barred.add(self._last)
 
     def relabel(self, found: list[FoundPlane], cloud: PreparedCloud) -> None:
-        """Assign each point to the plane of its region instead of the nearest plane, if requested.
+        """If requested, assign each point to the plane of its region instead of the nearest plane.
 
-        A region belongs to the plane that contains most of its points, if more than half of its
-        points are on a plane.
+        The plane of a region is the one with the most points of the region, provided that more than
+        half of its points are on any plane.
         """
         from orthoflow_plugins.plane.kernels import each_part, piece_of
 
@@ -262,7 +264,7 @@ class RegionProposer(Proposer):
         np.add.at(joint, (region_of_sample[near], claims[near]), 1)
         n_sampled = np.bincount(region_of_sample[region_of_sample >= 0], minlength=len(joint))
         owner = np.where(joint.sum(axis=1) * 2 > n_sampled, joint.argmax(axis=1), -1)
-        # The last entries are for voxels in no region, and for points in no voxel.
+        # The appended entries are for voxels in no region, and for points in no voxel.
         owners = np.append(np.append(owner, -1)[self._region_of_voxel], -1).astype(np.int8)
 
         def claim(_part: int, piece: slice) -> None:
@@ -272,7 +274,7 @@ class RegionProposer(Proposer):
         each_part(len(cloud.claims), cloud.parts, claim)
 
     def draw(self, ctx: StepContext, planes: Planes, cloud: PointCloud) -> None:
-        """Report the scatter of the normals and draw them."""
+        """Report and draw the scatter of the normals."""
         from orthoflow_plugins.plane.figures import draw_normals
 
         draw_normals(ctx, self._voxels, len(self.planes), planes, cloud)
@@ -285,10 +287,10 @@ def _grown(
     least_points: float,
     n_widenings: int = _WIDENINGS,
 ) -> tuple[NDArray[np.int32], int]:
-    """Grow regions; in a sparse cloud, also grow regions of larger voxels.
+    """Grow regions; in sparse parts of a cloud, use larger voxels.
 
     Returns:
-        The region (m,) of each voxel, negative for none, and the number of regions.
+        The region (m,) of each voxel, negative for voxels in no region; and the number of regions.
     """
     from orthoflow_plugins.plane.voxels import POINTS_LEAST, SurfaceVoxels, grow_regions
 
@@ -298,7 +300,7 @@ def _grown(
     may_join = (deviation <= reach) & (deviation <= _ROUNDEST * width) & (width > _NARROWEST)
     regions = np.where(may_join, np.int32(_FREE), np.int32(_NONE))
     seeds = np.flatnonzero(may_join)
-    # 16-bit numbers, for which numpy uses a radix sort.
+    # Use 16-bit integers, which NumPy sorts by radix sort.
     flatness = np.minimum(deviation[seeds] / _FLATNESS_STEP, 65535.0).astype(np.uint16)
     n_regions = grow_regions(
         table.places,
@@ -312,7 +314,7 @@ def _grown(
     )
 
     def small(own: NDArray[np.int32], counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether voxels are in no region, or in one with too few points."""
+        """Return a mask of voxels in no region or in a region with too few points."""
         is_small = np.bincount(own + 1, counts) < least_points
         return np.asarray(is_small[own + 1] | (own < 0))
 
@@ -333,10 +335,10 @@ def _grown(
 def _grouped(
     voxels: SurfaceVoxels, angle_deg: float, least_points: float, viewer_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], int]:
-    """Group voxels by the most frequent direction, and repeat with the remaining voxels."""
+    """Group voxels whose normals have the most frequent direction; repeat with remaining voxels."""
     usable = (voxels.spreads[:, 0] <= _ROUNDEST * voxels.spreads[:, 1]) & (voxels.counts >= 1)
     usable &= voxels.spreads[:, 1] > _NARROWEST
-    # Normals point towards the viewer.
+    # Make normals point towards the viewer.
     normals: NDArray[np.float64] = voxels.normals.astype(np.float64)
     to_viewer = voxels.table.basis @ viewer_m - voxels.table.centroids()
     normals *= np.where(np.einsum("ij,ij->i", normals, to_viewer) < 0.0, -1.0, 1.0)[:, None]
@@ -359,7 +361,7 @@ def _grouped(
 def _common_direction(
     normals: NDArray[np.float64], weights: NDArray[np.float64], angle_deg: float
 ) -> NDArray[np.float64]:
-    """Return the most frequent direction by mean shift, starting at the fullest bin."""
+    """Return the most frequent direction, by mean shift from the bin with the largest weight."""
     step = 2.0 * math.sin(0.5 * math.radians(max(angle_deg, 0.5)))
     bins = np.round(normals / step).astype(np.int64) + 4096
     keys, bin_of = np.unique(
@@ -395,7 +397,7 @@ def _plane(sums: NDArray[np.float64], table: VoxelTable) -> Plane | None:
 
 
 def _densest(voxels: SurfaceVoxels, member: NDArray[np.bool_], plane: Plane) -> Plane:
-    """Return the plane with the mean normal of a group, at the distance of its densest layer."""
+    """Return the plane with the mean normal of a group of voxels, through their densest layer."""
     table, weights = voxels.table, voxels.counts[member].astype(np.float64)
     normals = voxels.normals[member].astype(np.float64)
     best = int(np.argmax(np.abs(normals @ (table.basis @ plane.normal))))

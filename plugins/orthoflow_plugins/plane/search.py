@@ -1,11 +1,11 @@
-"""The search common to all detectors: candidates are refined, verified, fitted and labelled.
+"""The search common to all detectors: candidates are refined, verified and fitted.
 
-Detectors therefore differ in how they propose planes, not in how planes are fitted. A candidate is
+Detectors differ only in the way in which they propose planes, not in the fit. A candidate is
 refined, with a decreasing tolerance, on the points of the sample that are not yet assigned to a
-plane (free points). It must have enough points in cells where they concentrate on the plane, and is
-fitted to these cells. All planes are then fitted to all points in one pass. For clouds above 24
-million points, randomly drawn blocks are used: errors are common to neighbouring points, so the
-other blocks would add little information.
+plane (free points). It is accepted if there are enough points in cells in which points concentrate
+on the plane, and is fitted to these cells. Finally, all planes are fitted to all points in one
+pass. For clouds of more than 24 million points, randomly drawn blocks are used: neighbouring points
+have common errors, so the other blocks would add little information.
 """
 
 from __future__ import annotations
@@ -63,48 +63,52 @@ from orthoflow_plugins.plane.support import (
 )
 from orthoflow_plugins.plane.thickness import measure_thickness, report_thickness, row_points
 
-# Minimum share of the points in a plane's slab and rectangle that are in crowded cells.
+# Minimum share of the points within a plane's tolerance and rectangle that are in cells in which
+# points concentrate on the plane.
 _CROWDED_LEAST: Final = 0.5
-# Minimum width of a plane in cells; narrower strips do not determine the rotation of the plane
-# about their axis.
+# Minimum width of a plane in cells; a narrower strip does not determine the rotation of the plane
+# about the axis of the strip.
 _STRIP_CELLS: Final = 2.5
-# Surfaces with a smaller radius than this are not planes if their curvature explains at least the
-# second value as a share of the variance of their cells.
+# A surface is rejected as curved if its radius is smaller than the first value and its curvature
+# explains at least the second value, a share, of the variance of its cells.
 _RADIUS_LEAST_M: Final = 5.0
 _BENT_SHARE: Final = 0.3
-# Maximum number of passes over the points for one plane, and the share of the fit tolerance by
-# which a fit may move without another pass.
+# Maximum number of passes over the points for a plane. Another pass is needed if a fit moves the
+# plane by more than the second value, a share of the fit tolerance.
 _PASSES_MOST: Final = 3
 _SETTLED_SHARE: Final = 0.1
-# Convergence limit for planes of the sample, which are fitted to all points later.
+# Convergence limit for planes in the sample, which are fitted to all points later.
 _SETTLED_ON_SAMPLE_M: Final = 2e-5
-# Share of the required points that suffices before the cells of a candidate are fitted.
+# Minimum number of points before the cells of a candidate are fitted, as a share of the required
+# number.
 _SAMPLE_CAUTION: Final = 0.7
-# Parts belong to one plane if, on the largest part, the common fit is not much worse than the fit
-# to this part alone.
+# Parts belong to the same plane if, on the largest part, the common fit is not much worse than a
+# fit to this part alone: at most this ratio of the residuals, and a tolerance.
 _ASKEW: Final = 1.5
 _SAME_M: Final = 2e-4
-# Number of points used to move a candidate to the nearby surface; later fits, to cells of the
+# Number of points used to move a candidate to the surface near it. Later fits, to cells of the
 # sample and then of the cloud, use all points.
 _FIT_POINTS: Final = 20_000
-# Number of points used to estimate the extent of a candidate.
+# Number of points from which the extent of a candidate is estimated.
 _SPREAD_POINTS: Final = 5_000
-# With this number of points, planes are determined better than their surfaces are flat, so a part
-# of larger clouds suffices.
+# With this number of points, the uncertainty of planes is smaller than the deviations of surfaces
+# from a plane, so only part of a larger cloud is used.
 _FITTED_MOST: Final = 12_000_000
-# In small clouds, the minimum area is reduced to this share of the largest face of the box.
+# For small scenes, the minimum area is reduced to this share of the largest face of the box.
 _SIDE_SHARE: Final = 0.02
-# Maximum number of rectangles per plane (a frame has four sides), and of slabs, since claims are
-# bytes.
+# Maximum number of rectangles per plane (a frame has four sides), and of slabs, whose indices are
+# stored in bytes.
 _RECTANGLES_MOST: Final = 8
 _SLABS_MOST: Final = 127
 # Number of consecutive rejected candidates after which the search ends.
 _REJECTED_MOST: Final = 60
 
-# Reasons to reject a candidate: too few points, too small an area, no points that concentrate on
-# it, a narrow strip, points that only pass through it, a curved surface, or an unwanted tilt.
+# Reasons to reject a candidate: too few points, too small an area, no concentration of points on
+# the plane, a narrow strip, points that only pass through the plane, a curved surface, or a tilt
+# outside the constraint.
 Criterion = Literal["few", "small", "scattered", "strip", "smear", "bent", "tilt"]
-# Candidates rejected for these reasons contain no plane of the required size.
+# If a candidate is rejected for one of these reasons, its points contain no plane of the required
+# size.
 _SET_ASIDE: Final[frozenset[Criterion]] = frozenset({"small", "strip", "bent"})
 
 _NO_PLANE: Final = (
@@ -128,7 +132,8 @@ _ADVICE: Final = (
     "small planes, min_share for sparse ones, or raise max_tilt_deg"
 )
 _ADVICE_WIDER: Final = "with tolerance_m {wider:.3g} one is found"
-# Larger tolerances tried for the message, as multiples of the one that found nothing.
+# Multiples of the tolerance with which no plane was found; planes are searched for with these to
+# give advice.
 _WIDER: Final = (1.5, 2.0, 3.0, 4.0, 6.0)
 _NO_INTENSITY: Final = (
     "materials are distinguished by the intensity of points, which this cloud does not have: omit "
@@ -148,16 +153,15 @@ UNEXPLAINED: Final = DiagnosticSpec(
 
 @dataclass(kw_only=True)
 class Search:
-    """State of a greedy search: the points of the sample that are not yet assigned to a plane.
+    """State of a greedy search for planes in a sample.
 
     Attributes:
         cloud: the cloud.
         params: criteria for planes and for the end of the search.
-        claims: (m,) int16 plane of each point of the sample, -1 if not yet assigned.
-        n_taken: number of planes and clutter whose points were assigned.
+        claims: (m,) int16 plane of each point of the sample; -1 if not yet assigned.
+        n_taken: number of planes, including rejected candidates, to which points were assigned.
         n_points: number of points of the sample that are not yet assigned.
-        refusals: for each rejected candidate, the criterion and the candidate's share of all
-            points.
+        refusals: the criterion for each rejected candidate, and its share of all points.
     """
 
     cloud: PreparedCloud
@@ -176,27 +180,27 @@ class Search:
 
     @property
     def min_area_m2(self) -> float:
-        """Return the minimum area of a plane."""
+        """Minimum area of a plane."""
         _, middle, high = np.sort(self.cloud.extent_m - 2.0 * MARGIN_M)
         return min(self.params.min_area_m2, _SIDE_SHARE * float(middle * high))
 
     @property
     def least_points(self) -> float:
-        """Return the minimum number of sample points on a plane."""
+        """Minimum number of sample points on a plane."""
         return self.params.min_share * len(self.claims)
 
     def free(self) -> tuple[NDArray[np.float64], BlockedPoints]:
-        """Return the points that belong to no plane, as offsets (m, 3) and in blocks."""
+        """Return the points that are not yet assigned, as offsets (m, 3) and in blocks."""
         if self._free is None:
             offsets_m = self.cloud.sample.offsets_m.take(np.flatnonzero(self.claims < 0), axis=0)
             self._free = offsets_m, blocked(offsets_m)
         return self._free
 
     def claim(self, raster: SurfaceRaster, support: Support) -> None:
-        """Assign points to a plane, except points that are nearer to an earlier plane."""
+        """Assign points to a plane, except those that are nearer to an earlier plane."""
         points_m, bounds_m = self.cloud.sample.offsets_m, self.cloud.bounds_of(support.bounds_m)
         (x, y, z), (a, b, c) = points_m.T, raster.plane.normal
-        # This is faster than a matrix product.
+        # The sum of products is faster than a matrix product.
         away_m = np.abs(a * x + b * y + c * z - raster.plane.offset_m)
         near = np.flatnonzero((away_m <= bounds_m[0]) & (away_m < self._away_m))
         u, v = (points_m[near] @ raster.axes.T).T
@@ -208,7 +212,7 @@ class Search:
         self._free = None
 
     def refuse(self, criterion: Criterion, n_points: float = 0.0) -> None:
-        """Record the criterion that rejects a candidate with `n_points` of the sample."""
+        """Record the criterion that rejects a candidate with `n_points` points of the sample."""
         self.refusals.append((criterion, n_points / max(1, len(self.claims))))
 
 
@@ -220,7 +224,7 @@ def detect(
     *,
     method: str,
 ) -> tuple[Planes, PointLabels]:
-    """Find the planes of a cloud and turn them into products.
+    """Find the planes of a cloud, and return them as products.
 
     Args:
         cloud: the cloud.
@@ -232,7 +236,7 @@ def detect(
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
         MethodError: the points determine no plane, no plane has enough points, or `materials` is
-            set for a cloud without intensity.
+            set although the cloud has no intensity.
     """
     if params.materials and cloud.intensity is None:
         raise MethodError(_NO_INTENSITY.format(method=method))
@@ -281,7 +285,7 @@ def _products(
     """Measure, assemble, report and draw the detected planes."""
     ctx.progress(0.8, "measuring deviations")
     planes, deviations, normalities, order = assemble(found, whole, cloud)
-    # The last name is for points on no plane, which have a claim of -1.
+    # The last entry is for points on no plane, whose claim is -1.
     names = np.append(np.argsort(order), -1).astype(np.int16)
     labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
     whole.write_labels(names, labels)
@@ -319,7 +323,7 @@ def find_planes(
     Args:
         search: the search; its claims and those of its cloud are set.
         proposer: the detector.
-        on_found: function called after each plane with the number of planes so far.
+        on_found: function that is called after each plane, with the number of planes so far.
     """
     found = fit_to_all(greedy_search(search, proposer, on_found), search)
     label(found, search.cloud)
@@ -351,12 +355,13 @@ def greedy_search(
 
 
 def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
-    """Refine a candidate and check whether the free points form a plane there.
+    """Refine a candidate, and check whether the free points near it form a plane.
 
-    Returns None if they do not, and adds the criterion to `search.refusals`. Clutter near the
-    scanner has more points than a distant wall, and its many slightly different candidates would
-    hide the wall. Points of candidates rejected for their size or shape are therefore removed from
-    the search. Those that are on a plane are assigned to it when all points are labelled.
+    If they do not, the result is None, and the criterion is added to `search.refusals`. Clutter
+    near the scanner has more points than a distant wall, and its many slightly different candidates
+    would delay or prevent finding the wall. If a candidate is rejected for its size or shape, its
+    points are therefore removed from the search. When all points are labelled, those of them that
+    are on a plane are assigned to it.
     """
     up, params = search.cloud.up, search.params
     leans = partial(leans_as_asked, up=up, max_tilt_deg=params.max_tilt_deg)
@@ -382,7 +387,7 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
                 search.claim(raster, support)
             return None
         plane, cell_m = adjusted.plane, raster.cell_m
-        # If the plane has moved, its points were selected by a tilted slab, so repeat.
+        # If the fit moved the plane, its points were selected around a wrong plane, so repeat.
         if _is_settled(adjusted, search) or nth == _PASSES_MOST - 1:
             raster = raster.moved_to(plane, up)
             return FoundPlane(raster, support, adjusted, candidate, freedom)
@@ -396,7 +401,7 @@ def _is_settled(adjusted: AdjustedPlane, search: Search) -> bool:
 def _observed(
     search: Search, plane: Plane, cell_m: float
 ) -> tuple[SurfaceRaster, CellSums, Support | None]:
-    """Return a raster on a plane, the sums of the free points per cell, and the plane's cells."""
+    """Return a raster on a plane, sums of the free points in its cells, and the plane's cells."""
     raster = SurfaceRaster.over(plane, search.box_corners_m, search.cloud.up, cell_m)
     (sums,) = measure_cells(search.cloud, [raster], points=search.free()[1])
     join_parts = search.params.join_parts
@@ -406,9 +411,9 @@ def _observed(
 def _refined(
     candidate: Candidate, search: Search, freedom: Constraint
 ) -> tuple[Plane, float] | None:
-    """Move a candidate to the nearby surface; return the plane and a suitable cell size.
+    """Move a candidate to the surface near it; return the plane and a suitable cell size.
 
-    Returns None if too few points of the sample concentrate there.
+    The result is None if too few points of the sample concentrate on this surface.
     """
     cloud, free_points = search.cloud, search.free()[0]
     fit = partial(refine_plane, freedom=freedom, up=cloud.up)
@@ -420,7 +425,7 @@ def _refined(
         return None
     near = np.abs(free_points @ plane.normal - plane.offset_m) <= cloud.tolerance_m
     near_m = free_points.take(np.flatnonzero(near), axis=0)
-    # The cell size depends on the extent of the points.
+    # Compute the cell size from the extent of the points.
     placed = _some(near_m @ wall_axes(plane.normal, cloud.up).T, _SPREAD_POINTS)
     low, high = np.quantile(placed, (0.02, 0.98), axis=0) if len(near_m) else np.zeros((2, 2))
     cell_m = max(cloud.tolerance_m, cell_for(len(near_m), float(np.prod(high - low))))
@@ -428,8 +433,8 @@ def _refined(
     if support is None or support.n_points < _SAMPLE_CAUTION * search.least_points:
         search.refuse("scattered" if support is None else "few", support.n_points if support else 0)
         return None
-    # A door and a niche at different depths may both be near a slightly tilted plane that passes
-    # through both; a fit to the largest part alone reveals this.
+    # A slightly tilted plane may pass near both a door and a niche at different depths; this is
+    # detected by a fit to the largest part alone.
     near_m = _some(near_m, _FIT_POINTS)
     together = fit(near_m[raster.covers(near_m, support.cells)], plane, first, *rest)
     if len(support.parts_m) > 1:
@@ -449,7 +454,7 @@ def _refined(
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Return every n-th of points (m, 3), about `most` points."""
+    """Return every n-th of the points (m, 3), about `most` in total."""
     return points[:: max(1, len(points) // most)]
 
 
@@ -463,16 +468,17 @@ def _judged(
     every: float | None = None,
     settled_m: float = SETTLED_M,
 ) -> AdjustedPlane | None:
-    """Fit a plane to its cells, or record the criterion that rejects it.
+    """Fit a plane to its cells, or record the criterion by which it is rejected.
 
     Args:
-        raster: cells on the plane.
-        sums: sums of the points per cell.
-        support: the cells that belong to the plane.
+        raster: raster on the plane.
+        sums: sums over the points in each cell.
+        support: cells that belong to the plane.
         search: receives the criterion.
-        freedom: orientation that the fit keeps exactly.
-        every: number of points of the cloud per summed point; None for free points of the sample.
-        settled_m: the fit has converged if no cell moves by more than this.
+        freedom: constraint on the orientation, which the fit keeps exactly.
+        every: number of points of the cloud per point in the sums; None if the sums are over free
+            points of the sample.
+        settled_m: the fit has converged if it moves no cell by more than this.
     """
     if support is None:
         search.refuse("scattered")
@@ -500,7 +506,7 @@ def _judged(
             freedom=freedom,
             settled_m=settled_m,
         )
-    # The surface may be a column or barrel that the plane only touches.
+    # The surface may be a column or a barrel vault that the plane only touches.
     if adjusted is None or (
         adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
     ):
@@ -510,10 +516,11 @@ def _judged(
 
 
 def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
-    """Fit planes of the sample to all points; omit planes that are not confirmed by them."""
+    """Fit planes of the sample to all points; omit planes that these points do not confirm."""
     cloud = search.cloud
     every = max(1, len(cloud.claims) // _FITTED_MOST)
-    # A fixed step would coincide with scan columns and omit stripes.
+    # Draw blocks at random, because a fixed step could coincide with the columns of a scan and omit
+    # stripes.
     drawn = np.random.default_rng(0).permutation(len(cloud.points.boxes)) % every == 0
     settled = [False] * len(found)
     for _ in range(_PASSES_MOST):
@@ -535,7 +542,7 @@ def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
 def _refitted(
     part: tuple[FoundPlane, SurfaceRaster, CellSums], search: Search, every: int
 ) -> FoundPlane | None:
-    """Return a plane fitted to its cells; unchanged if nothing was summed, None if rejected."""
+    """Return a plane fitted to its cells; unchanged without sums, None if it is rejected."""
     item, raster, sums = part
     if not math.prod(raster.shape):
         return item
@@ -549,7 +556,7 @@ def _refitted(
 
 
 def _fine_raster(item: FoundPlane, cloud: PreparedCloud, every: int) -> SurfaceRaster:
-    """Return a raster of the plane's rectangle, as fine as the number of points permits."""
+    """Return a raster over the plane's rectangle, as fine as the number of points allows."""
     area_m2 = float(item.support.cells.sum()) * item.raster.cell_m**2
     share = cloud.sample.n_represented / every
     cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
@@ -560,7 +567,7 @@ def _fine_raster(item: FoundPlane, cloud: PreparedCloud, every: int) -> SurfaceR
 
 
 def _bounds(found: list[FoundPlane], cloud: PreparedCloud) -> list[NDArray[np.float64]]:
-    """Return bounds (r, 5) of each plane: one rectangle, or several if that is sparsely covered."""
+    """Return bounds (r, 5) of each plane: a rectangle, or several if it is sparsely covered."""
     bounds, n_spare = [], _SLABS_MOST - len(found)
     for item in found:
         most = min(_RECTANGLES_MOST, n_spare + 1)
@@ -571,18 +578,18 @@ def _bounds(found: list[FoundPlane], cloud: PreparedCloud) -> list[NDArray[np.fl
 
 
 def label(found: list[FoundPlane], cloud: PreparedCloud) -> None:
-    """Assign each point to the nearest plane whose rectangles contain it."""
+    """Assign each point to the nearest plane that has a rectangle around the point."""
     bounds = _bounds(found, cloud)
     plane_of_slab = np.repeat(np.arange(len(found)), [len(own) for own in bounds])
     slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)[plane_of_slab]
     cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]))
     if len(slabs) > len(found):
-        # The last entry is for a claim of -1.
+        # The last entry is for points on no plane, whose claim is -1.
         cloud.write_labels(np.append(plane_of_slab, -1).astype(np.int8), cloud.claims)
 
 
 def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
-    """Return the plane that the detector proposed, with the detected rectangle."""
+    """Return the plane as proposed by the detector, with the rectangle that was found."""
     plane = item.candidate.plane
     if float(plane.normal @ item.raster.plane.normal) < 0.0:
         plane = plane.flipped()
@@ -592,7 +599,7 @@ def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
 def _wider_tolerance_m(
     search: Search, noise_m: tuple[float, float], proposer_of: Callable[[Search], Proposer]
 ) -> float | None:
-    """Return a larger `tolerance_m` with which a plane is found, None if there is none."""
+    """Return a larger `tolerance_m` with which a plane is found; None if there is none."""
     for times in _WIDER:
         update = {"n_planes_max": 1, "tolerance_m": times * search.cloud.tolerance_m}
         params = search.params.model_copy(update=update)
@@ -605,7 +612,7 @@ def _wider_tolerance_m(
 
 
 def _why_none(cloud: PointCloud, search: Search, wider_m: float | None, method: str) -> str:
-    """Return the message for no plane: why the largest candidate was rejected, and advice."""
+    """Return the error message if no plane was found: why candidates were rejected, and advice."""
     why, tolerance_m = _NO_CANDIDATE, search.cloud.tolerance_m
     if search.refusals:
         criterion, share = max(search.refusals, key=lambda refusal: refusal[1])
@@ -626,12 +633,12 @@ def _why_none(cloud: PointCloud, search: Search, wider_m: float | None, method: 
 
 
 def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
-    """Report the times of a detection without loading, as in Table 1 of markiewicz2015.
+    """Report the times of a detection, excluding loading, as in Table 1 of markiewicz2015.
 
     Args:
         ctx: receives the metrics.
-        passed_s: (n, 2) elapsed and processor seconds: one row for the time spent on each plane,
-            then one for the time from the last plane until all points are labelled.
+        passed_s: (n, 2) elapsed and processor seconds: a row for each plane, and a row for the time
+            from the last plane until all points are labelled.
     """
     times_s = {"detection": passed_s.sum(axis=0), "first_plane": passed_s[0]}
     if len(passed_s) > 2:

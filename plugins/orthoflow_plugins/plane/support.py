@@ -1,8 +1,8 @@
-"""Support of a plane: a coarse raster on it, the cells that belong to it, parts, rectangles.
+"""Support of a plane: a coarse raster, the cells that belong to the plane, parts and rectangles.
 
-A cell belongs to the plane if its points concentrate near the plane. Points of clutter, or of a
-floor that a vertical plane intersects, are distributed evenly over the slab instead. This
-distinguishes walls from planes that cut floors and ceilings.
+A cell belongs to the plane if its points concentrate near the plane. In contrast, points of
+clutter, or of a floor that a vertical plane intersects, are distributed evenly over the tolerance.
+The test distinguishes walls from planes that intersect floors and ceilings.
 """
 
 from __future__ import annotations
@@ -27,31 +27,33 @@ from orthoflow_plugins.plane.kernels import (
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
-# Mean number of points per cell needed for the test of concentration.
+# Mean number of points per cell that the test for concentration needs.
 _POINTS_PER_CELL: Final = 12.0
-# Thickness of the inner slab as a share of the tolerance, and minimum share of points in it.
+# Thickness of the inner slab as a share of the tolerance, and minimum share of the points in the
+# inner slab.
 INNER_SHARE: Final = 0.4
 _CROWDED_SHARE: Final = 0.6
-# A part with a smaller share of the plane's cells than this is accidental, not a piece of the wall.
+# Minimum share of the plane's cells in a part; a smaller part is there by chance and does not
+# belong to the wall.
 PART_SHARE: Final = 0.03
-# Cells are connected over gaps of up to twice this number of cells.
+# Cells are connected across gaps of up to twice this number of cells.
 _GAP_CELLS: Final = 2
-# A plane whose cells cover a smaller share of its rectangle than this is a frame or consists of
-# separate parts.
+# If the cells of a plane cover a smaller share of its rectangle than this, the plane is a frame or
+# consists of separate parts.
 _FILLED_SHARE: Final = 0.5
-# Maximum number of cells along a side in the search for cuts.
+# Maximum number of cells along each side of the raster in which cuts are searched for.
 _CUT_CELLS: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceRaster:
-    """A raster on a plane, in the cloud's offsets: columns along u, rows along v.
+    """A raster on a plane, in the cloud's offsets, with columns along u and rows along v.
 
     Attributes:
         plane: the plane.
         axes: (2, 3) unit vectors u and v (`wall_axes`).
         low_m: (2,) smallest u and v, metres.
-        cell_m: side of a cell.
+        cell_m: side of a cell in metres.
         shape: rows and columns.
     """
 
@@ -65,7 +67,7 @@ class SurfaceRaster:
     def over(
         cls, plane: Plane, box_corners: NDArray[np.float64], up: NDArray[np.float64], cell_m: float
     ) -> SurfaceRaster:
-        """Return a raster of limited size on a plane that covers a box with corners (8, 3)."""
+        """Return a raster of limited size on a plane; it covers a box with corners (8, 3)."""
         axes = wall_axes(plane.normal, up)
         placed = box_corners @ axes.T
         low, high = placed.min(axis=0), placed.max(axis=0)
@@ -75,15 +77,15 @@ class SurfaceRaster:
         return cls(plane=plane, axes=axes, low_m=low, cell_m=cell_m, shape=(rows, columns))
 
     def moved_to(self, plane: Plane, up: NDArray[np.float64]) -> SurfaceRaster:
-        """Return the same cells on the plane after a small correction."""
+        """Return the same cells on a plane that differs slightly."""
         return replace(self, plane=plane, axes=wall_axes(plane.normal, up))
 
     def slab(self) -> NDArray[np.float64]:
-        """Return the row of 12 numbers for kernels, see `kernels`; u and v have origin 0."""
+        """Return the row (12,) that represents the plane in `kernels`; u and v have origin 0."""
         return slab_of(self.plane, self.axes)
 
     def bounds_m(self, cells: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-        """Return (4,) smallest and largest u, smallest and largest v of cells; all by default."""
+        """Return (4,) smallest u, largest u, smallest v and largest v of cells; all by default."""
         edges = np.array([0, self.shape[1], 0, self.shape[0]], dtype=np.float64)
         if cells is not None:
             rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
@@ -91,7 +93,7 @@ class SurfaceRaster:
         return np.repeat(self.low_m, 2) + edges * self.cell_m
 
     def centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return u and v (rows, columns) of the cell centres, metres."""
+        """Return u and v (rows, columns) of the centres of cells, in metres."""
         rows, columns = np.indices(self.shape)
         return (
             self.low_m[0] + (columns + 0.5) * self.cell_m,
@@ -99,20 +101,20 @@ class SurfaceRaster:
         )
 
     def covers(self, points: NDArray[np.float64], cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return whether (m,) points project into the given cells (rows, columns)."""
+        """Return a mask (m,) of points whose projections are in the given cells (rows, columns)."""
         placed = np.floor((points @ self.axes.T - self.low_m) / self.cell_m).astype(np.int64)
         row = np.clip(placed[:, 1], 0, self.shape[0] - 1)
         return cells[row, np.clip(placed[:, 0], 0, self.shape[1] - 1)]
 
 
 class CellSums(NamedTuple):
-    """Sums over the points in each cell of a surface raster, (rows, columns) int64 each.
+    """Sums over the points in each cell of a surface raster; each is (rows, columns) int64.
 
     Attributes:
         n_near: number of points within the tolerance.
         n_inner: number of points within `INNER_SHARE` of the tolerance.
         n_fit: number of points within the tolerance of the fit.
-        steps: sum of distances within the tolerance of the fit, in steps.
+        steps: sum of the distances of points within the tolerance of the fit, in steps.
         squared_steps: sum of squares of these distances, in squared steps.
     """
 
@@ -129,11 +131,11 @@ class Support:
 
     Attributes:
         cells: (rows, columns) bool, True for cells that belong to the plane.
-        part_of_cell: (rows, columns) int32 part of each cell, -1 for none.
-        parts_m: (p, 4) smallest u, largest u, smallest v, largest v of each connected part, the
-            part with the most points first.
-        bounds_m: (4,) bounds of all parts together.
-        n_points: number of points within the tolerance in these cells.
+        part_of_cell: (rows, columns) int32 part of each cell; -1 for cells in no part.
+        parts_m: (p, 4) smallest u, largest u, smallest v and largest v of each connected part; the
+            part with the most points is first.
+        bounds_m: (4,) the same for all parts together.
+        n_points: number of points within the tolerance in the cells of the plane.
     """
 
     cells: NDArray[np.bool_]
@@ -144,18 +146,18 @@ class Support:
 
     @property
     def area_m2(self) -> float:
-        """Return the total area of the parts' rectangles, because their cells may be empty."""
+        """Total area of the parts' rectangles, which may contain empty cells."""
         sides_m = self.parts_m[:, 1::2] - self.parts_m[:, ::2]
         return float(np.prod(sides_m, axis=1).sum())
 
 
 def slab_of(plane: Plane, axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the row of 12 numbers that represents a plane in kernels, see `kernels`."""
+    """Return the row (12,) that represents a plane in `kernels`."""
     return np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
 
 
 def cell_for(n_points: float, area_m2: float) -> float:
-    """Return a cell size in metres with enough points per cell, for points spread over an area."""
+    """Return a cell size in metres at which cells have enough points, given number and area."""
     if n_points <= 0.0 or area_m2 <= 0.0:
         return CELL_LEAST_M
     return max(CELL_LEAST_M, math.sqrt(_POINTS_PER_CELL * area_m2 / n_points))
@@ -169,14 +171,16 @@ def measure_cells(
     bounds_m: Sequence[NDArray[np.float64]] | None = None,
     drawn: NDArray[np.bool_] | None = None,
 ) -> list[CellSums]:
-    """Sum the points near planes per cell in one pass, each point on its nearest plane.
+    """Sum the points near planes in cells, in one pass; each point is added to its nearest plane.
 
     Args:
         cloud: the cloud.
-        rasters: cells on each plane; planes without rows receive points, but these are not summed.
-        points: points that are summed; those of the cloud by default.
-        bounds_m: (r, 5) rectangles of each plane that contain its points; by default its raster.
-        drawn: (blocks,) True for blocks that are summed; None for all.
+        rasters: raster on each plane. Points may also be nearest to planes without rows, but these
+            points are not summed.
+        points: points to sum; all points of the cloud by default.
+        bounds_m: for each plane, the bounds (r, 5) of its points (see `kernels`); by default those
+            of its raster.
+        drawn: (blocks,) True for blocks whose points are summed; None for all blocks.
     """
     points = cloud.points if points is None else points
     if bounds_m is None:
@@ -214,23 +218,23 @@ def measure_cells(
 
 
 def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
-    """Return the cells whose points concentrate on the plane instead of filling the slab.
+    """Return the cells whose points concentrate on the plane instead of filling the tolerance.
 
-    A cell needs three points, and significantly more of them in the inner slab than expected by
-    chance. Three of its eight neighbours must meet the same criteria, which excludes scattered
-    clutter.
+    A cell needs at least three points, of which significantly more must be in the inner slab than
+    expected by chance. At least three of its eight neighbours must meet the same criteria; this
+    excludes scattered clutter.
     """
     wanted = _CROWDED_SHARE * sums.n_near + 0.5 * np.sqrt(sums.n_near)
     crowded = (sums.n_near >= 3) & (sums.n_inner >= wanted)
     if crowded.any():
-        # Cells with far fewer points than usual contain stray echoes and no wall.
+        # Cells with far fewer points than usual contain only stray points.
         crowded &= sums.n_near >= 0.02 * np.median(sums.n_near[crowded])
     # The sum includes the cell itself.
     return crowded & (summed_around(crowded) >= 4)
 
 
 def summed_around(values: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the sum of each value of an array (rows, columns) and its eight neighbours."""
+    """Return the sums of each value in an array (rows, columns) and its eight neighbours."""
     import cv2
 
     zero = cv2.BORDER_CONSTANT
@@ -246,14 +250,14 @@ def support_of(
     join_parts: bool = True,
     part_share: float = PART_SHARE,
 ) -> Support | None:
-    """Group cells into connected parts and compute their rectangles.
+    """Group cells into connected parts, and compute the rectangles of these.
 
-    Cells are connected over gaps of up to four cells. All parts with `part_share` of the cells are
-    kept, so that the rectangle contains the entire wall, even if a pilaster divides it; without
-    `join_parts`, only the part with the most points is kept.
+    Cells are connected across gaps of up to four cells. All parts with at least `part_share` of the
+    cells are kept, so that the rectangle contains the entire wall, even if a pilaster divides it.
+    Without `join_parts`, only the part with the most points is kept.
 
     Returns:
-        The support, or None if no cell belongs to the plane or no part is large enough.
+        The support; None if no cell belongs to the plane or no part is large enough.
     """
     import cv2
     from scipy import ndimage
@@ -287,11 +291,11 @@ def support_of(
 def covering_rectangles(
     raster: SurfaceRaster, cells: NDArray[np.bool_], most: int
 ) -> NDArray[np.float64]:
-    """Return rectangles (r, 4) that cover cells: smallest and largest u, smallest and largest v.
+    """Return rectangles (r, 4) that cover cells: smallest and largest u, and the same for v.
 
-    A well-covered rectangle is not divided. Otherwise, the cut that leaves the smallest area is
-    repeated until `_FILLED_SHARE` is reached, so that a frame does not receive points of the wall
-    inside it.
+    If the cells cover at least `_FILLED_SHARE` of the rectangle around them, it is not divided.
+    Otherwise, rectangles are repeatedly divided by the cut that leaves the smallest area, until
+    this share is reached. A frame therefore does not get points of the wall inside it.
     """
     every = max(1, math.ceil(max(cells.shape) / _CUT_CELLS))
     rows, columns = (math.ceil(side / every) for side in cells.shape)
@@ -315,7 +319,7 @@ _Rectangle = tuple[int, int, int, int]
 
 
 def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangle]:
-    """Divide a rectangle into the two smallest that cover its cells; return it if no cut helps."""
+    """Divide a rectangle into the two smallest ones that cover its cells, if this saves area."""
     top, bottom, left, right = rectangle
     part = cells[top:bottom, left:right]
     row, column = (
@@ -333,7 +337,7 @@ def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangl
 
 
 def _heads(lines: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the area (n,) of the smallest rectangle around the cells of the first 1 to n lines."""
+    """Return areas (n,) of the smallest rectangles around cells in the first 1 to n lines."""
     held, places = lines.any(axis=1), np.arange(1, len(lines) + 1)
     low = np.where(held, lines.argmax(axis=1), lines.shape[1])
     high = np.where(held, lines.shape[1] - lines[:, ::-1].argmax(axis=1), 0)
@@ -344,7 +348,7 @@ def _heads(lines: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _tight(cells: NDArray[np.bool_], rectangle: _Rectangle) -> _Rectangle:
-    """Return the smallest rectangle that contains the cells; its area is zero if there are none."""
+    """Return the smallest rectangle around the cells in a rectangle; of area 0 without cells."""
     top, bottom, left, right = rectangle
     part = cells[top:bottom, left:right]
     rows, columns = (np.flatnonzero(part.any(axis=axis)).tolist() for axis in (1, 0))

@@ -1,10 +1,10 @@
-"""Thickness of the cloud on each plane, and along one row of a scan.
+"""Thickness of the cloud on each plane, and along a row of a scan.
 
 Thickness is the noise of the scanner on the wall; markiewicz2015 recommends inspecting it first
-(3.1, Figure 3). Relief and bow do not count as thickness, so distances refer to the mean of a small
-tile of the wall. Thickness is measured on the sample and, in addition, along one scan row of the
-whole cloud. Other rows and stations do not contribute to the latter, so only the noise of single
-distances remains, which is reported for each material along the row.
+(3.1, Figure 3). Relief and bow are not part of the thickness, so distances are measured from the
+mean of a small tile of the wall. Thickness is measured on the sample and also along a scan row of
+the whole cloud. The scatter along a row contains only the noise of single distances, because other
+rows and stations do not contribute to it. It is reported for each material along the row.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.proposing import Materials
 
-# Side of the tiles of a wall, and length of the pieces of a row, to whose means distances refer.
+# Side of the tiles of a wall, and length of the pieces of a row, from whose means distances are
+# measured.
 _TILE_M: Final = 0.1
 _TILE_LEAST: Final = 4
 # Minimum number of points for a standard deviation.
 _SPREAD_LEAST: Final = 50
 _INCIDENCE_DEG: Final = tuple(float(edge) for edge in range(0, 91, 10))
-# Number of classes of range with equal numbers of points.
+# Number of classes of range, which have equal numbers of points.
 _CLASSES: Final = 6
-# Share of the distances outside the reported width, on each side.
+# Share of the distances that are outside the reported width on each side.
 _TAIL: Final = 0.025
 # Minimum number of points of a scan row on a plane.
 _ROW_LEAST: Final = 20
@@ -38,13 +39,13 @@ _ROW_LEAST: Final = 20
 
 @dataclass(frozen=True, kw_only=True)
 class RowPoints:
-    """The points of one row of one scan on the first plane.
+    """The points of a row of a scan that are on the first plane.
 
     Attributes:
         row: index of the row.
         scan: index of the scan.
-        along_m: (n,) position along the plane, to the viewer's right; ascending.
-        distance_m: (n,) distance from the plane, positive towards the viewer.
+        along_m: (n,) position along the plane, to the viewer's right, in metres; ascending.
+        distance_m: (n,) distance from the plane in metres, positive towards the viewer.
         intensity: (n,) intensity, 0 to 1; None if the cloud has no intensity.
     """
 
@@ -55,7 +56,7 @@ class RowPoints:
     intensity: NDArray[np.float64] | None
 
     def measured(self, materials: Materials) -> ScanRow:
-        """Return the thickness of the row, and of each material on it."""
+        """Return the thickness of the row, in total and for each material."""
         piece = np.floor((self.along_m - self.along_m[0]) / _TILE_M).astype(np.int64)
         crowded, deviation_m, _ = _from_tiles(self.distance_m, piece, np.bincount(piece))
         material: tuple[Spread, ...] = ()
@@ -81,7 +82,7 @@ def measure_thickness(
 
     Args:
         planes: the planes, in world coordinates.
-        plane_of_sample: (s,) plane of each sample point, -1 for none.
+        plane_of_sample: (s,) plane of each sample point; -1 for points on no plane.
         prepared: the prepared cloud with its sample.
         cloud: the cloud.
         materials: lowest and highest intensity of each material.
@@ -91,12 +92,12 @@ def measure_thickness(
         members = np.flatnonzero(plane_of_sample == k)
         offset_m = planes.offset[k] - float(normal @ cloud.origin)
         distance_m = sample.offsets_m[members] @ normal - offset_m
-        # Points farther from the plane are relief or belong to other surfaces.
+        # Ignore points farther from the plane, which are on relief or other surfaces.
         near = np.abs(distance_m) <= prepared.fit_tolerance_m
         members, distance_m = members[near], distance_m[near]
         axes = wall_axes(normal, planes.up)
         placed = np.floor(sample.offsets_m[members] @ axes.T / _TILE_M).astype(np.int64)
-        # Use one number per tile, because sorting pairs takes many times as long.
+        # Use a single number per tile, because sorting pairs takes many times as long.
         keys = placed[:, 0] * 2**31 + placed[:, 1]
         _, tile, count = np.unique(keys, return_inverse=True, return_counts=True)
         crowded, deviation_m, usual = _from_tiles(distance_m, tile, count)
@@ -134,7 +135,7 @@ def measure_thickness(
 def row_points(
     planes: Planes, plane_of_sample: NDArray[np.int64], prepared: PreparedCloud, cloud: PointCloud
 ) -> RowPoints | None:
-    """Return the scan row with the most points on the first plane; None if there are no rows."""
+    """Return the scan row with the most points on the first plane; None without rows or points."""
     members = prepared.sample.index[plane_of_sample == 0]
     if cloud.row is None or not len(members):
         return None
@@ -187,23 +188,23 @@ def _from_tiles(
     Args:
         distance_m: (m,) distances.
         tile: (m,) index of the tile of each distance.
-        count: (t,) number of points of each tile.
+        count: (t,) number of points in each tile.
 
     Returns:
-        Whether distances (m,) are in tiles with enough points, the deviations of those that are,
-        and the median number of points of such a tile.
+        A mask (m,) of the distances in tiles with enough points, the deviations of these distances,
+        and the median number of points in these tiles.
     """
     mean_m = np.bincount(tile, distance_m) / np.maximum(count, 1)
     crowded = count[tile] >= _TILE_LEAST
     tile = tile[crowded]
-    # Deviations from the mean of n values are too small by this factor.
+    # Deviations from the mean of n values are too small, by the factor sqrt(1 - 1 / n).
     deviation_m = (distance_m[crowded] - mean_m[tile]) / np.sqrt(1.0 - 1.0 / count[tile])
     usual = float(np.median(count[count >= _TILE_LEAST])) if len(tile) else 0.0
     return crowded, deviation_m, usual
 
 
 def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.float64] | None:
-    """Return the station of each point, offsets (m, 3) or (3,) for one station; None if unknown."""
+    """Return the offsets of points' stations, (m, 3), or (3,) for a single one; None if unknown."""
     stations = cloud.stations
     if stations is None or len(stations) == 0 or cloud.stations_source == "view_from":
         return None
@@ -217,7 +218,7 @@ def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.floa
 def _spreads(
     values: NDArray[np.float64], edges: NDArray[np.float64], deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Return the spread of each class of points; classes with too few points are omitted."""
+    """Return the spread for each class of points; classes with too few points are omitted."""
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     found = (
         _spread(None, float(edges[k]), float(edges[k + 1]), deviation_m[place == k])
@@ -229,7 +230,7 @@ def _spreads(
 def _by_material(
     intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Return the spread on each material; materials with too few points are omitted."""
+    """Return the spread for each material; materials with too few points are omitted."""
     found = (
         _spread(name, low, high, deviation_m[(intensity >= low) & (intensity <= high)])
         for name, (low, high) in materials.items()

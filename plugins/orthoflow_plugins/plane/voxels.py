@@ -1,17 +1,17 @@
-"""Voxels of a cloud with moments of their points, planes of neighbourhoods, and regions.
+"""Voxels of a cloud with the moments of their points, planes of neighbourhoods, and regions.
 
-Region growing needs the neighbours of each point. Voxels make this fast: one pass adds each point
-to ten sums of its voxel, and the sums of neighbouring voxels give the exact plane through all their
-points. A room with fifty million points has half a million voxels.
+Region growing needs the neighbours of each point. Voxels make this fast: a single pass adds each
+point to the ten sums of its voxel, and the sums of neighbouring voxels give the exact plane of best
+fit to all their points. A room with fifty million points has half a million voxels.
 
-Voxels are stored in bricks of 8 x 8 x 8, and only bricks with points are stored, because a full
+Voxels are grouped into bricks of 8 x 8 x 8. Only bricks with points are stored, because a full
 table of 2 cm voxels would be larger than the scan. Moments are sums of integer steps from the
-centre of a voxel, so they depend neither on the number of threads nor on the order of points.
-Lengths in kernels are in units of the side of a voxel.
+centre of a voxel, so they depend neither on the number of threads nor on the order of points. In
+kernels, the unit of length is the side of a voxel.
 
-A cloud that is dense on one wall may have one point per decimetre on another, where regions of
-small voxels are fragmented. Moments are additive, so such voxels are merged into larger ones
-without another pass over the points.
+A cloud that is dense on one wall may have a point spacing of a decimetre on another wall, on which
+regions of small voxels are fragmented. Moments are additive, so such voxels can be merged into
+larger ones without another pass over the points.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from orthoflow_plugins.plane.kernels import (
 
 BRICK_SIDE: Final = 8
 VOXELS: Final = BRICK_SIDE**3
-# Number of half steps from the centre of a voxel to its sides. A step is 20 micrometres in 2 cm
-# voxels, and its centre is an odd number of half steps from the centre of the voxel.
+# Number of half steps from the centre of a voxel to its sides. In a voxel of 2 cm, a step is 20
+# micrometres. The centre of a step is an odd number of half steps from the centre of the voxel.
 HALF_STEPS: Final = 1024
-# Sums of a voxel: number of points, half steps along a, b, c, and their products aa, ab, ac, bb,
-# bc, cc.
+# Number of sums of a voxel: the number of points, the half steps along a, b and c, and their
+# products aa, ab, ac, bb, bc and cc.
 N_SUMS: Final = 10
-# The products among the moments, as pairs of axes.
+# Pairs of axes of the products among the moments.
 _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-# Maximum number of bricks of a scene; larger scenes have larger voxels.
+# Maximum number of bricks in a scene; larger scenes have larger voxels.
 _BRICKS_MOST: Final = 8_000_000
-# Minimum number of points of a neighbourhood for a reliable normal.
+# Minimum number of points in a neighbourhood for a reliable normal.
 POINTS_LEAST: Final = 16.0
-# Maximum side of a voxel as a share of the size of the scene.
+# Maximum side of a voxel, as a share of the size of the scene.
 _VOXEL_SHARE_MOST: Final = 0.05
-# Initial numbers of rows and voxels of tables.
+# Initial numbers of rows and voxels in tables.
 _ROWS_FIRST: Final = 2_048
 _VOXELS_FIRST: Final = 131_072
-# Maximum reach of a neighbourhood in voxels on each side, for 9 x 9 x 9 voxels.
+# Maximum number of voxels from the centre of a neighbourhood to each side (9 x 9 x 9 voxels).
 _REACH_MOST: Final = 4
-# The plane of a region is refitted whenever the region has grown by this share.
+# The plane of a region is refitted each time the region has grown by this share.
 _REFIT_SHARE: Final = 0.2
 # Maximum number of passes over the voxels of a region.
 _SWEEPS_MOST: Final = 3
@@ -66,7 +66,7 @@ class Neighbourhood:
     """The points from which a normal is computed.
 
     Attributes:
-        shape: a cube, a sphere, or the nearest voxels with `n_points`.
+        shape: a cube, a sphere (`radius`), or the nearest voxels with `n_points` points (`knn`).
         size_m: side of the cube, or radius of the sphere; not used by `knn`.
         n_points: minimum number of points for `knn`.
         voxel_m: side of a voxel.
@@ -78,7 +78,7 @@ class Neighbourhood:
     voxel_m: float
 
     def around(self) -> NDArray[np.int32]:
-        """Return (o, 4) steps to the voxels of the neighbourhood by distance, and their shells."""
+        """Return (o, 4): steps to the voxels of the neighbourhood, nearest first, and shells."""
         across = self.size_m / self.voxel_m
         reaches = {
             "cube": round(0.5 * (across - 1.0)),
@@ -97,27 +97,27 @@ class Neighbourhood:
         return np.column_stack([steps[order], shell[order]]).astype(np.int32)
 
     def width_voxels(self) -> float:
-        """Return the width in voxels; its square is the number of voxels of a surface."""
+        """Return the width in voxels; its square is the number of voxels on a surface."""
         if self.shape == "knn":
             return 3.0
         return 2.0 * float(np.abs(self.around()[:, :3]).max(initial=0)) + 1.0
 
     def with_voxels(self, voxel_m: float) -> Neighbourhood:
-        """Return the same neighbourhood in voxels of another size."""
+        """Return the neighbourhood with voxels of another size, scaled by the same factor."""
         return replace(self, voxel_m=voxel_m, size_m=self.size_m * (voxel_m / self.voxel_m))
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelTable:
-    """The non-empty voxels of a cloud, numbered by position.
+    """The occupied voxels of a cloud, numbered by position.
 
     Attributes:
-        basis: (3, 3) rows e1, e2, up, the axes of the voxels.
-        low_m: (3,) lower corner of the first voxel in the (e1, e2, up) frame of the offsets.
+        basis: (3, 3) rows e1, e2 and up, the axes of the voxels.
+        low_m: (3,) lower corner of the first voxel, as offsets in the (e1, e2, up) frame.
         voxel_m: side of a voxel.
-        bricks: (a, b, c) int32 row of each brick in `numbers`, -1 for bricks without points.
-        numbers: (rows, VOXELS) int32 number of each voxel, -1 for voxels without points.
-        places: (m, 3) int32 position of each voxel along e1, e2, up.
+        bricks: (a, b, c) int32 row of each brick in `numbers`; -1 for bricks without points.
+        numbers: (rows, VOXELS) int32 number of each voxel; -1 for voxels without points.
+        places: (m, 3) int32 position of each voxel along e1, e2 and up.
         sums: (m, N_SUMS) int64 moments.
     """
 
@@ -131,9 +131,9 @@ class VoxelTable:
 
     @classmethod
     def over(cls, cloud: PreparedCloud, voxel_m: float) -> VoxelTable:
-        """Sum the points of a cloud into voxels over its box; enlarge these if there are too many.
+        """Sum the points of a cloud in voxels over its box; enlarge voxels if there are too many.
 
-        Each part of the pass has its own tables, which are then merged.
+        Each part of the pass has its own tables, which are merged afterwards.
         """
         brick_m3 = float(np.prod(cloud.extent_m + BRICK_SIDE * voxel_m)) / _BRICKS_MOST
         voxel_m = max(voxel_m, math.cbrt(brick_m3) / BRICK_SIDE)
@@ -196,7 +196,7 @@ class VoxelTable:
         )
 
     def coarser(self, member: NDArray[np.int64]) -> tuple[VoxelTable, NDArray[np.int64]]:
-        """Merge voxels (k,) into voxels twice as wide; return these and (k,) their new voxels."""
+        """Merge voxels (k,) into voxels twice as wide; return these, and their indices (k,)."""
         places, odd = np.divmod(self.places[member].astype(np.int64), 2)
         shape = tuple(-(-size // 2) for size in self.bricks.shape)
         brick, within = np.divmod(places, BRICK_SIDE)
@@ -210,7 +210,7 @@ class VoxelTable:
         bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
         numbers = np.full((len(occupied), VOXELS), -1, dtype=np.int32)
         numbers[rows, keys % VOXELS] = np.arange(len(keys), dtype=np.int32)
-        # Half steps are twice as long, and are counted from the centre of the larger voxel.
+        # In the larger voxel, half steps are twice as long and are counted from its centre.
         moved = _moved(self.sums[member], (2 * odd - 1) * HALF_STEPS)
         moved *= 0.5 ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
         sums = np.rint(_totals(moved, of_member, len(keys))).astype(np.int64)
@@ -225,7 +225,7 @@ class VoxelTable:
         return wider, of_member
 
     def sums_of(self, regions: NDArray[np.int32], n_regions: int) -> NDArray[np.float64]:
-        """Return moments (r, N_SUMS) of regions (m,) relative to the grid's corner, in voxels."""
+        """Return moments (r, N_SUMS) of regions relative to the grid's corner, in voxels."""
         held = np.flatnonzero(regions >= 0)
         unit = 1.0 / (2 * HALF_STEPS)
         moved = _moved(self.sums[held], (2 * self.places[held] + 1) * HALF_STEPS)
@@ -233,13 +233,13 @@ class VoxelTable:
         return _totals(moved, regions[held], n_regions)
 
     def centroids(self) -> NDArray[np.float64]:
-        """Return centroids (m, 3) of voxels along e1, e2, up, in metres from the cloud's origin."""
+        """Return centroids (m, 3) of voxels along e1, e2 and up, metres from the origin."""
         half_steps = self.sums[:, 1:4] / self.sums[:, :1]
         middles = self.places + 0.5 + half_steps / (2 * HALF_STEPS)
         return self.low_m + self.voxel_m * middles
 
     def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
-        """Return the voxels (n,) of points, -1 for none."""
+        """Return the voxels (n,) of points; -1 for points in no voxel."""
         found = np.empty(len(points.x), dtype=np.int32)
         frame = _frame(self.basis, self.low_m, self.voxel_m)
         find_voxels(points, frame, self.bricks, self.numbers, found)
@@ -249,7 +249,7 @@ class VoxelTable:
 def _frame(
     basis: NDArray[np.float64], low_m: NDArray[np.float64], voxel_m: float
 ) -> NDArray[np.float32]:
-    """Return F (3, 4) for the position of an offset p in voxels: `F[:, :3] @ p - F[:, 3]`."""
+    """Return F (3, 4); the position of an offset p is `F[:, :3] @ p - F[:, 3]`, in voxels."""
     return (np.column_stack([basis, low_m]) / voxel_m).astype(np.float32, order="C")
 
 
@@ -261,7 +261,7 @@ def _with_room(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
 
 
 def _moved(sums: NDArray[np.int64], shift: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-    """Return the moments (k, N_SUMS) about origins shifted by -shift (k, 3)."""
+    """Return the moments (k, N_SUMS) about origins displaced by -shift (k, 3)."""
     number, linear, away = sums[:, 0], sums[:, 1:4], shift.astype(np.float64)
     columns = [number, *(linear + number[:, None] * away).T]
     for k, (i, j) in enumerate(_PAIRS):
@@ -282,11 +282,12 @@ class SurfaceVoxels:
     """Voxels and the planes of their neighbourhoods.
 
     Attributes:
-        neighbourhood: points used for normals; the voxels may be larger than requested.
+        neighbourhood: neighbourhood used for normals; its voxels may be larger than requested.
         table: the voxels.
-        normals: (m, 3) float32 normals of the neighbourhoods along e1, e2, up, with arbitrary sign.
-        spreads: (m, 3) float32 standard deviations across the neighbourhood's plane and along it,
-            in sides of a voxel.
+        normals: (m, 3) float32 normals of the neighbourhoods along e1, e2 and up, with arbitrary
+            sign.
+        spreads: (m, 3) float32 standard deviations of the points of the neighbourhood, in sides of
+            a voxel: across its plane, and along the two axes of the plane.
     """
 
     neighbourhood: Neighbourhood
@@ -300,7 +301,8 @@ class SurfaceVoxels:
         neighbourhood = wanted.with_voxels(table.voxel_m)
         places, around = table.places, neighbourhood.around()
         normals, spreads = np.empty((2, len(places), 3), dtype=np.float32)
-        # Number of points that completes a knn neighbourhood; the others use all their voxels.
+        # Number of points at which a knn neighbourhood is complete; other neighbourhoods use all
+        # voxels.
         enough = neighbourhood.n_points if neighbourhood.shape == "knn" else 2**62
 
         def fit(_part: int, piece: slice) -> None:
@@ -313,12 +315,12 @@ class SurfaceVoxels:
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """Return the numbers of points (m,) of voxels."""
+        """Return the numbers of points (m,) in voxels."""
         return self.table.sums[:, 0]
 
 
 def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels:
-    """Sum a cloud into voxels, and fit a plane to the neighbourhood of each.
+    """Sum a cloud in voxels, and fit a plane to the neighbourhood of each voxel.
 
     If the cloud is so sparse that neighbourhoods would have too few points, voxels and
     neighbourhoods are larger than requested.
@@ -329,7 +331,7 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
     shape = np.ceil(cloud.extent_m / wanted.voxel_m).astype(np.int64) + 1
     keys = np.sort(np.ravel_multi_index(tuple(placed[inside].astype(np.int64).T), tuple(shape)))
     counts = np.diff(np.flatnonzero(np.diff(keys, prepend=-1, append=-1)))
-    # Mean number of other sample points in the voxel of a point.
+    # Mean number of other sample points in the voxel of a sample point.
     others = float((counts * (counts - 1)).sum()) / max(1, len(sample.index))
     in_neighbourhood = others * sample.n_represented * wanted.width_voxels() ** 2
     voxel_m = wanted.voxel_m * max(1.0, math.sqrt(POINTS_LEAST / max(in_neighbourhood, 1e-9)))
@@ -342,9 +344,10 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
 def _place_block(
     points: BlockedPoints, start: int, frame: NDArray[np.float32], places: NDArray[np.float32]
 ) -> int:
-    """Set the positions (3, BLOCK_POINTS) of a block's points, in voxels; return their number.
+    """Set the positions (3, BLOCK_POINTS), in voxels, of a block's points; return their number.
 
-    The loops have no branches and each writes one array, so that the compiler vectorises them.
+    The loops have no branches, and each writes to one array, so that the compiler can vectorise
+    them.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -360,7 +363,7 @@ def _place_block(
 def _set_keys(
     places: NDArray[np.float32], shape: tuple[int, int, int], keys: NDArray[np.int64]
 ) -> None:
-    """Set keys (BLOCK_POINTS,): brick times VOXELS plus the voxel in the brick; -1 outside."""
+    """Set keys (BLOCK_POINTS,): brick * VOXELS + voxel in the brick; -1 outside the grid."""
     zero, low = np.float32(0.0), np.int32(BRICK_SIDE - 1)
     top_a = np.float32(shape[0] * BRICK_SIDE)
     top_b = np.float32(shape[1] * BRICK_SIDE)
@@ -374,7 +377,7 @@ def _set_keys(
         p = np.int32(a if within else zero)
         q = np.int32(b if within else zero)
         r = np.int32(c if within else zero)
-        # A brick has eight voxels along each side, which are three bits.
+        # A brick has eight voxels along each side, so the position in it has three bits per axis.
         brick = np.int32(((p >> np.int32(3)) * n_b + (q >> np.int32(3))) * n_c + (r >> np.int32(3)))
         voxel = np.int32(((p & low) * side + (q & low)) * side + (r & low))
         keys[i] = brick * voxels + voxel if within else nowhere
@@ -384,7 +387,7 @@ def _set_keys(
 def _voxel(
     key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32], n_used: NDArray[np.int64]
 ) -> int:
-    """Return the number of the voxel with a key; assign a number to new voxels."""
+    """Return the number of the voxel with a given key; new voxels are numbered."""
     brick, voxel = key // VOXELS, key % VOXELS
     row = bricks[brick]
     if row < 0:
@@ -411,23 +414,24 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
     sums: NDArray[np.int64],
     n_used: NDArray[np.int64],
 ) -> int:
-    """Add points to the moments of their voxels, adding voxels as needed, until tables are full.
+    """Add points to the moments of their voxels, and new voxels to the tables until these are full.
 
-    Consecutive points of a scan are often in the same voxel, so their sums are added when the voxel
-    changes.
+    Consecutive points of a scan are often in the same voxel, so sums are added to the table only
+    when the voxel changes.
 
     Args:
         points: (n,) offsets in blocks.
         start: first point, at the start of a block.
-        frame: (3, 4) voxel of a point: `frame[:, :3] @ p - frame[:, 3]`.
-        shape: bricks along a, b, c.
-        bricks: (a * b * c,) row of each brick in `numbers`, -1 if not yet assigned.
-        numbers: (rows, VOXELS) number of each voxel, -1 if not yet assigned.
+        frame: (3, 4) transform from an offset p to a position in voxels: `frame[:, :3] @ p -
+            frame[:, 3]`.
+        shape: numbers of bricks along a, b and c.
+        bricks: (a * b * c,) row of each brick in `numbers`; -1 if not yet assigned.
+        numbers: (rows, VOXELS) number of each voxel; -1 if not yet assigned.
         sums: (voxels, N_SUMS) updated.
         n_used: numbers of rows and voxels in use.
 
     Returns:
-        The first point that was not added, or the number of points.
+        The index of the first point that was not added, or the number of points.
     """
     keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     places = np.zeros((3, BLOCK_POINTS), dtype=np.float32)
@@ -470,7 +474,7 @@ def find_voxels(
     numbers: NDArray[np.int32],
     found: NDArray[np.int32],
 ) -> None:
-    """Set `found` (n,) to the voxel of each point, -1 outside."""
+    """Set `found` (n,) to the voxel of each point; -1 for points in no voxel."""
     keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     places = np.zeros((3, BLOCK_POINTS), dtype=np.float32)
     flat = bricks.reshape(bricks.size)
@@ -484,7 +488,7 @@ def find_voxels(
 
 @kernel_part
 def _voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
-    """Return the number of the voxel at a position, -1 for none."""
+    """Return the number of the voxel at a position; -1 if there is none."""
     if a < 0 or b < 0 or c < 0:
         return -1
     p, q, r = a >> 3, b >> 3, c >> 3
@@ -500,7 +504,7 @@ def _voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArra
 def _add_moments(
     total: NDArray[np.float64], sums: NDArray[np.int64], k: int, at: tuple[float, float, float]
 ) -> None:
-    """Add voxel k with centre `at` to the moments `total` (10,), in voxels."""
+    """Add the moments of voxel k, whose centre is `at`, to `total` (10,), in voxels."""
     n, (a, b, c) = float(sums[k, 0]), at
     unit = 1.0 / (2 * HALF_STEPS)
     sa, sb, sc = sums[k, 1] * unit, sums[k, 2] * unit, sums[k, 3] * unit
@@ -537,13 +541,11 @@ def fit_neighbourhoods(  # noqa: PLR0913, PLR0917 - compiled code has no objects
         bricks: (a, b, c) number of each brick.
         numbers: (bricks, VOXELS) number of each voxel.
         sums: (n, N_SUMS) moments of all voxels.
-        around: (o, 4) steps to the voxels of a neighbourhood, ordered by distance, and their
-            shells.
-        enough: a neighbourhood is complete with the shell in which it reaches this number of
-            points.
-        normals: (m, 3) set; arbitrary sign.
-        spreads: (m, 3) set to the standard deviations across the plane and along it, in sides of a
-            voxel; the first is infinite if there are fewer than three points.
+        around: (o, 4) steps to the voxels of a neighbourhood, sorted by distance, and their shells.
+        enough: a neighbourhood ends with the shell in which it reaches this number of points.
+        normals: (m, 3) output, with arbitrary sign.
+        spreads: (m, 3) output, standard deviations across the plane and along its two axes, in
+            sides of a voxel; the first is infinite if there are fewer than three points.
     """
     total, plane = np.empty(10), np.empty(9)
     for i in range(places.shape[0]):
@@ -581,7 +583,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
     limits: NDArray[np.float64],
     regions: NDArray[np.int32],
 ) -> int:
-    """Grow regions over neighbouring voxels that have similar normals and are near their plane.
+    """Grow regions of neighbouring voxels that have similar normals and are near a common plane.
 
     The plane is fitted to all points of the region and refitted as the region grows. When no more
     voxels are added, all neighbours of the region are tested again with the last plane.
@@ -592,9 +594,11 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
         numbers: (bricks, VOXELS) number of each voxel.
         sums: (n, N_SUMS) moments.
         normals: (n, 3) normals of the neighbourhoods.
-        seeds: (s,) voxels that may belong to a region, in the order in which they become seeds.
-        limits: smallest cosine between normals, and largest distance in sides of a voxel.
-        regions: (n,) -2 for voxels that may be added; set to the region.
+        seeds: (s,) voxels that may belong to a region, in the order in which they are used as
+            seeds.
+        limits: smallest cosine of the angle between normals, and largest distance from the plane,
+            in sides of a voxel.
+        regions: (n,) -2 for voxels that may be added to a region; set to the region.
 
     Returns:
         The number of regions.
@@ -611,8 +615,8 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
         regions[seed] = n_regions
         queue[0] = seed
         length = 1
-        # Moments are relative to the seed, so that regions far from the corner of the box lose no
-        # precision.
+        # Compute moments relative to the seed, so that no precision is lost for regions far from
+        # the corner of the box.
         oa, ob, oc = places[seed, 0], places[seed, 1], places[seed, 2]
         total[:] = 0.0
         _add_moments(total, sums, seed, (0.0, 0.0, 0.0))
@@ -656,7 +660,8 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
                 if length >= refit:
                     flattest(total, plane)
                     refit = int((1.0 + _REFIT_SHARE) * length) + 1
-            # Earlier planes may have excluded voxels that the current one includes.
+            # Test all neighbours again: earlier planes may have excluded voxels that are near the
+            # last one.
             if length == before:
                 break
             if length >= 8:
