@@ -201,7 +201,7 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
     if inputs.walls.intensity_source == "luminance":
         return (
             "the walls have no laser intensity, so the grey of the scan's colours is used instead; "
-            "if the scan was coloured from the same photos, wrong orientations do not show"
+            "if the scan was coloured from the same photos, wrong orientations are not detected"
         )
     return "the walls have neither intensity nor colour to compare with"
 

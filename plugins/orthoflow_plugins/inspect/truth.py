@@ -157,8 +157,8 @@ NOT_COMPARED: Final = DiagnosticSpec(
 NOT_TRACED: Final = DiagnosticSpec(
     code="truth-not-traced",
     severity="warning",
-    text="displacements of cells coloured by {names} are not traced: the cameras contain no "
-    "oriented photo of that name",
+    text="for cells coloured from {names}, displacements are not computed, since the cameras "
+    "contain no oriented photo with this name",
     rank_by="n",
 )
 
@@ -510,7 +510,7 @@ def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
             f"wall_{image.number}_displacement",
             partial(displacement_map, verdict.length_m / image.frame.gsd_m, image.frame),
             f"{image.name}: true displacement of the {1e3 * image.frame.gsd_m:g} mm cells "
-            "coloured by photos. Dark is good; a bright area with a sharp border comes from a "
+            "coloured from photos. Dark is good; a bright area with a sharp border comes from a "
             "photo that is oriented less accurately than its neighbours.",
         )
 

@@ -57,7 +57,7 @@ def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[Named
         if polygon.name not in sources:
             raise InputError(
                 f"seams in the input {files.name} refer to the photo {polygon.name}, but the "
-                f"layers are of {', '.join(sorted(sources))}"
+                f"layers come from {', '.join(sorted(sources))}"
             )
         wall = polygon.properties.get("wall")
         if not isinstance(wall, int) or isinstance(wall, bool):

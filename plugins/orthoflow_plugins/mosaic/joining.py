@@ -127,7 +127,7 @@ def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
     unknown = [name for name in priority if name not in sources]
     if unknown:
         raise MethodError(
-            f"priority refers to {', '.join(unknown)}, but the layers are of "
+            f"priority refers to {', '.join(unknown)}, but the layers come from "
             f"{', '.join(sorted(sources))} (mosaic.seams)"
         )
 

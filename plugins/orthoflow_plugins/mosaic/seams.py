@@ -88,7 +88,8 @@ PLAIN: Final = DiagnosticSpec(
 UNCHECKED: Final = DiagnosticSpec(
     code="accuracy-not-checked",
     severity="note",
-    text="{subject}: the accuracy of its orthoimage is unknown, since no photo has a tie on it",
+    text="{subject}: the accuracy of its orthoimage is unknown, since no photo has a tie on this "
+    "wall",
     remedy="measure points on this wall in a photo (input ties), or take a photo that shows it "
     "together with a wall that has ties",
 )

@@ -550,7 +550,7 @@ GATES: Final = (
         value=lambda c: c.poor_quarter[0] if c.poor_quarter else None,
         limit="min_quadrant_ties",
         reason=lambda c, value, limit: (
-            f"a quarter of the photo has {value} ties; each needs at least "
+            f"a quarter of the photo has {value} ties; each quarter needs at least "
             f"{limit:g}{c.poor_quarter[1] if c.poor_quarter else ''}"
         ),
     ),

@@ -15,7 +15,7 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
-    "no oriented photo shows a wall: the cameras are behind the walls, look past them, or "
+    "no oriented photo shows a wall: the cameras are behind the walls or do not face them, or "
     "objects hide the walls; check cameras.json and planes.json"
 )
 NO_PHOTO: Final = DiagnosticSpec(

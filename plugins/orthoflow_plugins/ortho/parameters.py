@@ -51,7 +51,7 @@ class DirectParams(MethodParams):
     ] = Field(
         default=(7, 23, 46),
         description="A void cell is filled if the 3x3, 5x5 and 7x7 windows around it contain at "
-        "most this many void cells, counting itself and cells outside the image.",
+        "most this many void cells. The cell itself and cells outside the image count as void.",
     )
     colouring: Literal["topmost", "centre", "gaussian", "median"] = Field(
         default="topmost",
@@ -62,11 +62,11 @@ class DirectParams(MethodParams):
     )
     skip_below_grey: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="Points darker than this in all channels are treated as having no colour, "
-        "which many files store as black: they keep their depth, but give no cell its "
-        "colour. 1: pure black; 10: also almost black; 0: none. By default, pure black "
-        "points are ignored if they are specks: at most a tenth of all points, and more than "
-        "the almost black points.",
+        description="Points darker than this in all channels are treated as points without a "
+        "colour, since many files store these as black: their depths are used, but their colours "
+        "are not. 1: pure black; 10: also almost black; 0: none. By default, the colours of pure "
+        "black points are ignored if these are at most a tenth of all points and more numerous "
+        "than almost black points.",
     )
     balance_scans: bool = Field(
         default=True,
@@ -75,9 +75,9 @@ class DirectParams(MethodParams):
     )
     inpaint: Inpainting = Field(
         default="between",
-        description="How gaps are filled. between: interpolated between the covered cells around "
-        "them; telea, navier-stokes: inpainted by OpenCV, as in skarlatos2012; none: not at "
-        "all.",
+        description="How gaps are filled. between: by interpolation between the covered cells "
+        "around them; telea, navier-stokes: by OpenCV's inpainting, as in skarlatos2012; none: "
+        "gaps are not filled.",
     )
     inpaint_radius_px: float = Field(
         default=3.0,

@@ -208,7 +208,7 @@ def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
     plain = [photo.name for photo in photos if (stated_bits(photo.encoded) or 0) <= _PLAIN_BITS]
     if len(plain) == len(photos):
         return np.uint8
-    ctx.log("photos have 16 bits per channel; so do layers and orthoimages")
+    ctx.log("photos, layers and orthoimages have 16 bits per channel")
     if plain:
         names = ", ".join(plain[:3]) + (" ..." if len(plain) > 3 else "")
         ctx.report(MIXED_BITS, n=len(plain), n_photos=len(photos), names=names)

@@ -95,7 +95,7 @@ class ReadCameras(Method):
         """Parameters that are not in the files."""
 
         unit: Unit = Field(
-            "m", description="Unit of the files' coordinates; the poses are in metres."
+            "m", description="Unit of the coordinates in the files; poses are converted to metres."
         )
 
     class In(Ports):
@@ -289,7 +289,7 @@ def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> Giv
     if len(best) == 1 and (is_only or max(scores) > 0 or not own):
         return best[0]
     names = first_few([camera.name for camera in best])
-    count = f"{len(best)} cameras of its name ({names})" if len(best) > 1 else f"only {names}"
+    count = f"{len(best)} cameras with its name ({names})" if len(best) > 1 else f"only {names}"
     return GivenCamera(
         name=found[0].name,
         reason=f"the camera files contain {count}, and the folder names do not tell which one "

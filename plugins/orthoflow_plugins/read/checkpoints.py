@@ -42,7 +42,7 @@ class ReadCheckpoints(Method):
         """Parameters that are not in the files."""
 
         unit: Unit = Field(
-            "m", description="Unit of x, y, z in the files; the points are in metres."
+            "m", description="Unit of x, y, z in the files; points are converted to metres."
         )
 
     class In(Ports):

@@ -26,7 +26,8 @@ UNUSED: Final = DiagnosticSpec(
 )
 NO_MASKS: Final = DiagnosticSpec(
     code="files-are-no-masks",
-    text="files ignored, because masks are images (PNG, JPEG, TIFF) or polygons (GeoJSON): {names}",
+    text="files ignored, because only images (PNG, JPEG, TIFF) and polygons (GeoJSON) can be "
+    "masks: {names}",
     rank_by="n",
 )
 

@@ -303,9 +303,9 @@ class _Cubes:
             lens = PanoramaLens(width=width, height=height)
         if (width, height) != (lens.width, lens.height):
             raise InputError(
-                f"photo {name} has {width} x {height} pixels, but its wide lens is for "
-                f"{lens.width} x {lens.height}: calibrate at the size of the photos as they are "
-                "stored, without the EXIF rotation"
+                f"photo {name} has {width} x {height} pixels, but its panorama or fisheye lens is "
+                f"for {lens.width} x {lens.height}: calibrate at the size of the photos as they "
+                "are stored, without the EXIF rotation"
             )
         mask = self.masks.encoded(name, (width, height))
         given = None if mask is None else decode_mask(mask, f"the mask of {name}")
@@ -398,9 +398,9 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
     ]
     if raw:
         raise InputError(
-            f"the input {input_name} contains camera raw, which is not supported: {_counted(raw)}; "
-            f"{HOW_TO_DEVELOP}, so that a calibration stays valid, or list only the other photos, "
-            "e.g. 'FOLDER/*.jpg'"
+            f"the input {input_name} contains camera raw files, which are not supported: "
+            f"{_counted(raw)}; {HOW_TO_DEVELOP}, so that a calibration stays valid, or list only "
+            "the other photos, e.g. 'FOLDER/*.jpg'"
         )
 
 

@@ -39,7 +39,9 @@ class ReadTies(Method):
     class Params(MethodParams):
         """Parameters that are not in the files."""
 
-        unit: Unit = Field("m", description="Unit of x, y, z in the files; the ties are in metres.")
+        unit: Unit = Field(
+            "m", description="Unit of x, y, z in the files; ties are converted to metres."
+        )
         sigma_px: float = Field(
             1.0,
             gt=0,
@@ -48,8 +50,8 @@ class ReadTies(Method):
         sigma_m: float = Field(
             0.002,
             ge=0,
-            description="Standard deviation of each world coordinate, metres: of the survey, or of "
-            "a point picked in the scan.",
+            description="Standard deviation of each world coordinate in metres, which results from "
+            "the survey or from picking the point in the scan.",
         )
 
     class In(Ports):

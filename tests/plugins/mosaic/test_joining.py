@@ -185,7 +185,7 @@ def test_layers_of_a_wall_share_its_raster() -> None:
         with pytest.raises(MethodError, match=r"a\.jpg and b\.jpg of wall 0 have different"):
             joining.require_one_raster(layers, "wall 0")
     with pytest.raises(
-        MethodError, match=r"^priority refers to c\.jpg, but the layers are of a\.jpg, b"
+        MethodError, match=r"^priority refers to c\.jpg, but the layers come from a\.jpg, b"
     ):
         joining.require_sources([other, one], ["b.jpg", "c.jpg"])
     joining.require_sources([other, one], ["b.jpg"])

@@ -436,7 +436,7 @@ def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
 @pytest.mark.parametrize(
     ("photo", "wall", "said"),
     [
-        ("photo 9", 0, "refer to the photo photo 9, but the layers are of photo 0, photo 1"),
+        ("photo 9", 0, "refer to the photo photo 9, but the layers come from photo 0, photo 1"),
         ("photo 1", "west", 'needs the property "wall", the number of a wall; got'),
     ],
 )

@@ -172,7 +172,9 @@ def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
     # A raw photo next to its JPEG is ignored.
     paths = made.write(tmp_path, {**developed, "A.CR2": b"II*\0", f"b{suffix}": b"MM\0*"})
     raw = f"photo b{suffix}" if developed else rf"2 photos \(A.CR2, b{suffix}\)"
-    with pytest.raises(InputError, match=f"camera raw, .*: {raw}; develop it first to 16-bit TIFF"):
+    with pytest.raises(
+        InputError, match=f"camera raw files, .*: {raw}; develop it first to 16-bit TIFF"
+    ):
         read(*paths)
 
 
@@ -406,7 +408,7 @@ def test_masks_of_no_photo_and_files_that_are_none_are_named(tmp_path: Path) -> 
     assert (
         "masks that match no photo: c.png, x*.jpg: a mask must have the name of its photo" in said
     )
-    assert "masks are images (PNG, JPEG, TIFF) or polygons (GeoJSON): notes.txt" in said
+    assert "only images (PNG, JPEG, TIFF) and polygons (GeoJSON) can be masks: notes.txt" in said
 
 
 def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
