@@ -22,7 +22,7 @@ from orthoflow_plugins.inspect.patches import (
     unrefined,
 )
 
-# One key point is used per this many cells at most, since weaker key points are noise.
+# At most one key point per this many cells is used, since weaker key points are noise.
 _CELLS_PER_POINT: Final = 200
 _POINTS_LEAST, _POINTS_MOST = 500, 40_000
 _SCALES_DIFFER_MOST: Final = 1.5
@@ -71,7 +71,7 @@ def find_key_pairs(
 
     Args:
         shown: the image to inspect.
-        reference: the image to compare it with.
+        reference: the image with which `shown` is compared.
         radius_cells: maximum displacement.
         threads: number of threads.
 
@@ -184,7 +184,7 @@ def _key_points(image: GreyImage, *, n_most: int) -> _KeyPoints:
     from mahotas.features import surf
 
     # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 descriptor values. As
-    # in OpenCV, coordinates refer to the centres of cells.
+    # in OpenCV, integer coordinates are the centres of cells.
     found = surf.surf(image.grey, threshold=_SURF_THRESHOLD, max_points=n_most)
     places = from_opencv(found[:, 1::-1])
     rows, columns = image.shape

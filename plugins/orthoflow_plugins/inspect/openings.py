@@ -35,7 +35,7 @@ _RIM_LEAST: Final = 0.5
 _SAME_IOU: Final = 0.5
 # Distance on either side of an outline within which the true border is searched for.
 _REACH_CELLS: Final = 10.0
-# Sampling interval of this search.
+# Sampling interval of this search, in cells.
 _STEP_CELLS: Final = 1.0 / 16.0
 # Number of lines perpendicular to a side along which the border is searched for.
 _LINES: Final = 33

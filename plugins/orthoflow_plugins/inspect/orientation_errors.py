@@ -41,8 +41,8 @@ _LEAST_COSINE: Final = 0.9
 _WRONG_SIGMAS: Final = 5.0
 # A tie is wrong if its error exceeds this many cells of the wall.
 _WRONG_CELLS: Final = 1.5
-# Number of rays along the longer side of a photo with which the wall that covers most of the photo
-# is found.
+# Number of rays along the longer side of a photo that are traced to find the wall that covers most
+# of the photo.
 _RAYS: Final = 32
 
 

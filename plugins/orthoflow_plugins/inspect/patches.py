@@ -400,7 +400,7 @@ class _Sampler:
         expected, slope_u = (_filtered(rows, weights, 2) for weights in right)
         slope_v = _filtered(row_slopes, right[0], 2)
         flat = (len(shift), -1)
-        # The derivative of true(x - shift) by the shift is the negative gradient.
+        # The derivative of true(x - shift) with respect to the shift is the negative gradient.
         design = np.empty((*expected.reshape(flat).shape, 3))
         design[..., 0], design[..., 1] = -slope_u.reshape(flat), -slope_v.reshape(flat)
         design[..., 2] = 1.0

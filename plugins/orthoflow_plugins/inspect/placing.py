@@ -21,7 +21,7 @@ _SAME_DIRECTION_DEG: Final = 2.0
 
 
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
-    """Set the `wall` of orthoimages to the index of their wall among the given walls.
+    """Return orthoimages whose `wall` is the index of their wall among the given walls.
 
     Orthoimages from other programs, and those of walls that were rasterised in another step, only
     refer to a plane.

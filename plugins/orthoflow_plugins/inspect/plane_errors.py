@@ -19,7 +19,7 @@ _FOUND_OFFSET_M: Final = 0.015
 # Maximum differences between the plane of a wall and the true plane that it matches.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
-# Names of label scores in metrics and in labels.
+# Name of each label score in metric names, and its text in metric labels.
 LABEL_SCORES: Final = {"precision": "precision", "recall": "recall", "f1": "F1", "iou": "IoU"}
 MAIN_MISSED: Final = DiagnosticSpec(
     code="main-wall-missed",

@@ -1,4 +1,4 @@
-"""Diagnostics for check points that no image shows, or that have another unit or system."""
+"""Diagnostics of check points that no image shows, or with a wrong unit or coordinate system."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FAR_POINTS: Final = DiagnosticSpec(
 
 
 def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
-    """Return a mask (n,) of points whose surveyed coordinates equal the coordinates clicked."""
+    """Return a mask (n,) of points whose surveyed coordinates equal the clicked coordinates."""
     if surveyed.shown_world is None:
         return np.zeros(len(surveyed.names), dtype=np.bool_)
     return np.asarray((surveyed.shown_world == surveyed.points_world).all(axis=1), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Positions of check points in images: measured, found as targets, or by the true scene."""
+"""Positions of check points in images: measured, found as targets, or found by the true scene."""
 
 from __future__ import annotations
 

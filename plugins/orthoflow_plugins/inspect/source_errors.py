@@ -120,7 +120,7 @@ def trace_sources(
     truth: Truth,
     views: SceneCameras,
 ) -> SourceErrors:
-    """Find the scene point that the source pixel of each cell coloured from a photo shows.
+    """Find the scene point that each cell coloured from a photo actually shows.
 
     The point of the cell on the measured surface is projected with the estimated camera, as in the
     computation of the orthoimage. The ray through this pixel of the true camera is intersected with

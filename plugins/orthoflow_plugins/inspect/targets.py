@@ -121,7 +121,7 @@ def _symmetric(
     slopes = [np.gradient(window.grey, axis=axis) for axis in (1, 0)]
     place = start.copy()
     for _ in range(_ROUNDS):
-        # As in OpenCV, coordinates in scipy refer to the centres of cells.
+        # In scipy, as in OpenCV, integer coordinates are the centres of cells.
         ways = [to_opencv(place + sign * aside).T[::-1] for sign in (1.0, -1.0)]
         greys = [map_coordinates(window.grey, way, order=3, mode="nearest") for way in ways]
         valid = [

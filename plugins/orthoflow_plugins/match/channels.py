@@ -257,7 +257,7 @@ class WallTarget:
 
     @cached_property
     def grain(self) -> NDArray[np.float32]:
-        """Number of cells per measured cell, as returned by `grain_of`."""
+        """Ratio of known to measured cells, as returned by `grain_of`."""
         return grain_of(self.wall)
 
     @property
@@ -303,7 +303,7 @@ def least_step_m(wall: Wall) -> float:
 
 
 def grain_of(wall: Wall) -> NDArray[np.float32]:
-    """Return the number of cells per measured cell around each cell (rows, cols); at least 1.
+    """Return the ratio of known to measured cells around each cell (rows, cols), at least 1.
 
     Filled cells are interpolated from measured cells and share their errors, so they add no
     information.

@@ -49,8 +49,8 @@ class MatchGuided(Method):
 
     Only the visible part of a wall is searched, within a small radius (an extension of the mask of
     markiewicz2015). Since laser and camera have different wavelengths, oriented gradients, grey
-    values and combinations of the colours of the photo are compared. For each photo, the channels
-    are selected whose ties have the smallest held-out error in relation to their number and spread.
+    values and combinations of the colours of the photo are compared. The channels used for a photo
+    are those with the smallest held-out error in relation to the number and spread of their ties.
     Cells finer than the point spacing are joined. Patches at relief steps are excluded, as are
     patches hidden by objects in front of the walls if the cloud is connected. The pose is estimated
     and the photo projected repeatedly, until held-out ties no longer improve. Photos without a pose
@@ -237,7 +237,7 @@ def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
         spacing_m=walls.points_apart_m(),
         stations_world=cloud.stations,
         n_least=_MIN_POINTS,
-        # Several photos are processed in parallel.
+        # One thread is enough, since several photos are processed in parallel.
         threads=1,
     )
     return Before(occluders=occluders, front_m=tuple(slab.front_m for slab in slabs))

@@ -26,7 +26,7 @@ from orthoflow_plugins.match.pictures import CLIP_LIMIT, equalised, wall_picture
 
 # A photo is first matched at this size, which is doubled until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
-# This many key points in a photo, and this many on each wall, are enough to recognise the walls.
+# These numbers of key points, in a photo and on each wall, are enough to recognise the walls.
 _FIRST_IN_PHOTO: Final = 3000
 _FIRST_ON_WALL: Final = 4000
 # Tolerance relative to the diagonal of the photo, since a homography is only approximate on relief.

@@ -118,8 +118,8 @@ def places_of(
 ) -> list[Placed]:
     """Return the possible positions of a photo on the walls, starting with the best.
 
-    Only the first position may be clear. All four orientations are tried if EXIF does not give the
-    orientation of the photo.
+    Only the first position may be marked as clear. All four orientations are tried if EXIF does not
+    give the orientation of the photo.
 
     Args:
         index: index of the photo.

@@ -157,8 +157,8 @@ class FaceByPhotos(Method):
     ) -> NDArray[np.intp]:
         """Count the inliers (planes, 2) on the front and on the back of each plane.
 
-        The photos are matched in grey. If this determines no plane, the first mixture of colours
-        that does is used.
+        The photos are matched in grey. If this does not determine the side of any plane, the first
+        mixture of colours that determines one is used.
         """
         counts = np.zeros((len(pictures), 2), dtype=np.intp)
 

@@ -232,7 +232,7 @@ def _traced(
     content: str,
     lens: LensFreedom | None = None,
 ) -> tuple[Trace, View]:
-    """Match a photo in one set of channels; return the result and the final projection."""
+    """Match a photo by one set of channels; return the result and the final projection."""
     view, radius = start
     known = None if lens is None else (lens, view.camera)
     best: _Round | None = None

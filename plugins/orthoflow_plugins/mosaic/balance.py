@@ -59,7 +59,7 @@ _SAME_ZOOM: Final = 0.1
 _LEAST_BLOCKS: Final = 4
 # Overlaps with more blocks than this are sampled.
 _BLOCKS_MOST: Final = 200
-# Maximum number of independent blocks that an overlap counts for.
+# An overlap counts as at most this many independent blocks.
 _INDEPENDENT: Final = 50.0
 # Minimum standard deviation of the brightness difference between two photos in a block.
 _SPREAD_LEAST: Final = 0.01
@@ -186,8 +186,8 @@ def _radii(
         pixels = camera.viewing().project(frame.world_from_wall(middles, depths_m))[:, :2]
         half = np.array([0.5 * lens.width, 0.5 * lens.height])
         radii = np.linalg.norm(pixels - half, axis=1) / np.linalg.norm(half)
-        # Coloured cells are inside the photo. All other cells, including those at NaN, get the
-        # radius of the corner.
+        # Coloured cells are inside the photo. All other cells, and cells whose distance is NaN, get
+        # the distance of the corner.
         radii = np.fmin(radii, 1.0).astype(np.float32)
         values = radii.reshape(len(rows), len(columns))
         found.append(Radii(values=values, lens=lenses.setdefault(key, len(lenses))))
@@ -203,10 +203,10 @@ def _depths_at(wall: Wall, middles: NDArray[np.float64]) -> NDArray[np.float64]:
 def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -> Balance:
     """Add corrections that blend the remaining differences between layers near their seams.
 
-    Near a seam, each layer is shifted towards the mean of the layers on both sides, weighted by
-    their shares of the nearby cells. Blocks with depth edges, and blocks in which two layers show
-    different objects, do not contribute. Where no difference is known, the correction fades to
-    zero.
+    Near a seam, the brightness of each layer approaches the mean of the layers on both sides,
+    weighted by their shares of the nearby cells. Blocks with depth edges, and blocks in which two
+    layers show different objects, do not contribute. Where no difference is known, the correction
+    fades to zero.
 
     Args:
         balance: the colour balance of the layers.
@@ -373,7 +373,7 @@ class Exposures:
 
 @dataclass(frozen=True, kw_only=True)
 class _Overlap:
-    """Blocks that are in both of two layers.
+    """Blocks that two layers have in common.
 
     Attributes:
         layers: indices of the two layers.

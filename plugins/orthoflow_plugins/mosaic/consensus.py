@@ -33,9 +33,9 @@ _BLOCK_CELLS: Final = (4, 32)
 _LEAST_PAINTED: Final = 0.5
 # This is added to brightness, so that noise in almost black cells does not count as a difference.
 _DARK: Final = 0.02
-# Two observations contradict each other if the logarithms of their brightness differ by at least
-# the first value. If the second value times the standard deviation over all blocks is greater, it
-# is the limit, but the limit is at most twice the first value.
+# Two observations contradict each other if the logarithms of their brightness differ by at least a
+# limit. The limit is the second value times the standard deviation over all blocks, but it is at
+# least the first value and at most twice the first value.
 _APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
 # In the core of a contradicted region, differences exceed the limit by at least this factor.
@@ -230,7 +230,7 @@ def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
 
 
 def _in_light_of(scan: _Witness, photo: _Witness) -> _Witness:
-    """Remove from a photo its smooth difference in brightness from the scan."""
+    """Remove the smooth brightness difference between a photo and the scan from the photo."""
     box = common(scan.box, photo.box)
     if box is None:
         return photo

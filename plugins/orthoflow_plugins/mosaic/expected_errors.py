@@ -2,10 +2,10 @@
 
 Three independent causes displace the content of a cell along the wall. The first is the error of
 the pose of the photo (its covariance, propagated to the wall). The second is the error of the depth
-of the cell, times the tangent of the viewing angle. The third is estimated from displacements
-between overlapping photos that the first two do not explain. Overlaps separate depth errors from
-the third cause, because depth errors displace photos taken from different sides in different
-directions.
+of the cell, times the tangent of the viewing angle. The third is unknown and is estimated from the
+displacements between overlapping photos that the first two causes do not explain. Overlaps separate
+depth errors from the third cause, because depth errors displace photos taken from different sides
+in different directions.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _SPREAD_TIMES: Final = 2.0
 # Depth errors of clouds from photos are correlated over this distance.
 _PATCH_M: Final = 0.05
 # Depth errors count as correlated if depth differences over this distance exceed those between
-# neighbouring cells by this factor. Relief of rooms explains a factor of up to 1.35, except in a
-# stereo cloud: neighbouring and distant cells differ by 0.98 and 1.3 mm in the simulated room, by
-# 1.2 and 2.4 mm in a stuccoed hall, and by 1.7 and 5.2 mm in a stereo cloud of a fountain.
+# neighbouring cells by this factor. Relief of rooms explains a factor of up to 1.35. For example,
+# the depths of neighbouring and of distant cells differ by 0.98 and 1.3 mm in the simulated room,
+# by 1.2 and 2.4 mm in a stuccoed hall, and by 1.7 and 5.2 mm in a stereo cloud of a fountain.
 _PATCHY_TIMES: Final = 1.5
 # Depth errors can be estimated from overlaps if the tangents of the two viewing angles differ by at
 # least the first value in at least the second number of patches.

@@ -220,7 +220,7 @@ def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float6
 
     Args:
         block: the block.
-        alone: whether to include also the uncertainty of points that several photos see.
+        alone: whether to also include the uncertainty of points that several photos see.
     """
     seen = block.seen
     covariances = (seen.sigma_px**2)[:, None, None] * np.eye(2)

@@ -91,9 +91,9 @@ _SAME_PLACE_M: Final = 1e-6
 # Photos without EXIF may or may not share a lens. A series is usually taken with one lens, and many
 # photos determine a lens far better than one photo does. However, the photographer may have zoomed,
 # and a photo may have been rotated or cropped. Therefore, the focal length computed from the ties
-# of each photo is compared with the shared one. They differ by more than this share if the
-# photographer zoomed, but by less if only scan errors are correlated (up to 0.7 % for
-# photogrammetric clouds with 10 to 30 mm of noise).
+# of each photo is compared with the shared one. Zooming changes the focal length by more than this
+# share; correlated scan errors change it by less (up to 0.7 % for photogrammetric clouds with 10 to
+# 30 mm of noise).
 _MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
 # The photo with the largest difference distorts the shared lens, so that other photos contradict
@@ -388,7 +388,7 @@ def adjust_block(
 
 
 def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
-    """Find photos whose separate focal length contradicts a lens shared because of image size only.
+    """Find photos that contradict a lens that they share only because of the image size.
 
     Args:
         photos: photos of the block.
@@ -447,7 +447,7 @@ def _block(
     state: tuple[tuple[ViewingCamera, ...], NDArray[np.float64], NDArray[np.float64]],
     weights: _Weights,
 ) -> Block:
-    """Return the block of scan ties, ties between photos, and the current cameras and points."""
+    """Assemble the block from scan ties, ties between photos, and current cameras and points."""
     cameras, positions, middle = state
     seen = [
         item.tied.seen.take(chosen) for item, chosen in zip(photos, weights.agreeing, strict=True)

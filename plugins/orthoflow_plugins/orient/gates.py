@@ -645,7 +645,7 @@ def warnings_for(candidate: Candidate) -> list[Note]:
 
 
 def hull_area(pixels: NDArray[np.float64]) -> float:
-    """Return the area of the convex hull of points (n, 2); 0 if it has no area."""
+    """Return the area of the convex hull of points (n, 2); 0 if they are collinear."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(pixels) < 3:

@@ -168,7 +168,7 @@ reduced the accuracy and underestimated the error by a further 10 %.
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
 _MAX_TRIALS: Final = 20_000
-# The standard deviation of unit weight has converged if it changes relatively by less than this.
+# The standard deviation of unit weight has converged if its relative change is below this.
 _SETTLED_SHARE: Final = 0.02
 _SIGMA0_RANGE: Final = (0.1, 3.0)
 _MAX_CHANCE_SHARE: Final = 0.1

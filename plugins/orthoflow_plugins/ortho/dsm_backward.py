@@ -34,10 +34,11 @@ class DsmBackward(Method):
 
     The depth of a cell gives its point in the world, and the camera with its distortion gives the
     position of that point in the photo. The cell takes the colour at this position unless something
-    hides the cell. Relief of the wall is found by tracing the ray from the cell to the camera over
-    the raster. Objects in front of the depth range of the wall are found with a depth buffer of the
-    cloud in the photo, which ignores isolated points as outliers. If the photo has a higher
-    resolution than the wall, colours are averaged over the cell.
+    hides the cell. To find cells hidden by the relief of the wall, the ray from each cell to the
+    camera is traced over the raster. To find cells hidden by objects in front of the depth range of
+    the wall, a depth buffer of the cloud is computed for the photo; isolated points are ignored as
+    outliers. If the photo has a higher resolution than the wall, colours are averaged over the
+    cell.
 
     The quality of a cell is the number of photo pixels that it covers, which is the cosine of the
     angle of incidence times the squared ratio of cell size to photo GSD. It decreases to 0 at the

@@ -36,15 +36,15 @@ def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> N
 
     The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, including
     the cell itself; all three counts must be within their limits. Cells outside the image count as
-    void, so fewer cells are filled along its border and the image is never extrapolated. The rule
-    is applied once.
+    void, so fewer cells are filled along the image border and the image is never extrapolated. The
+    rule is applied once.
 
     Args:
-        is_void: (rows, cols).
+        is_void: (rows, cols) cells without a colour.
         limits: maximum counts in the three windows.
 
     Returns:
-        (rows, cols).
+        (rows, cols) mask of the cells to fill.
     """
     is_fillable = is_void.copy()
     for window, limit in zip(_WINDOWS, limits, strict=True):
@@ -53,7 +53,7 @@ def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> N
 
 
 def void_counts(is_void: NDArray[np.bool_], window: int) -> NDArray[np.uint8]:
-    """Count void cells (rows, cols) in a window around each cell; cells outside count as void."""
+    """Count the void cells in a window around each cell; cells outside the image are void."""
     import cv2
 
     reach = window // 2

@@ -44,7 +44,7 @@ _POINTS_AT_ONCE: Final = 1 << 24
 _PLACE_M: Final = 0.05
 # Minimum number of points that each scan must have in a square.
 _POINTS_LEAST: Final = 4
-# Points with a level below or above these limits are almost black or clipped.
+# Levels below the first value are almost black, and levels above the second value are clipped.
 _DARKEST: Final = 10
 _BRIGHTEST: Final = 245
 # Scans that share fewer squares than this with other scans are ignored.

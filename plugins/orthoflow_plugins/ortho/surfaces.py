@@ -50,7 +50,7 @@ class Surface:
         frame: grid of the cells.
         relief: depths of the cells, and the surface that hides other cells.
         front_m: largest depth of the relief; the depth buffer contains only points in front of it.
-        tolerance_m: height above a ray from which the surface blocks the ray.
+        tolerance_m: minimum height above a ray at which the surface blocks that ray.
     """
 
     frame: WallFrame

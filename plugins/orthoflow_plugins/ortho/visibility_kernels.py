@@ -39,7 +39,7 @@ class WallView(NamedTuple):
         height_m: height of the projection centre above the plane.
         gsd_m: side of a cell.
         front_m: largest depth of the relief; the depth buffer contains only points in front of it.
-        tolerance_m: height above a ray from which the surface blocks the ray.
+        tolerance_m: minimum height above a ray at which the surface blocks that ray.
         cosine_least: smallest cosine of the angle of incidence of visible cells.
         border_px: width of the strip along the image border in which quality decreases to 0.
     """
@@ -283,7 +283,7 @@ def _hide_low_cells(
     depths: NDArray[np.float32],
     mask: NDArray[np.uint8],
 ) -> None:
-    """Trace the rays from the cells of a row that are not yet hidden towards the camera.
+    """Trace rays towards the camera from the cells of a row that are not yet hidden.
 
     Tracing ends at the height `top`. A ray advances by one row or one column at a time, along the
     axis on which it is longer.
@@ -291,7 +291,7 @@ def _hide_low_cells(
     Args:
         surface: (cells of the wall,) occluding surface, flattened.
         eye: row, column and height of the projection centre.
-        tolerance_m: height above a ray from which the surface blocks the ray.
+        tolerance_m: minimum height above a ray at which the surface blocks that ray.
         top: height above which nothing can hide the cells.
         place: row and first column of the cells; number of rows and columns of the wall.
         depths: (n,) depths of the cells.

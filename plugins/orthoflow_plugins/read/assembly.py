@@ -230,7 +230,7 @@ class CloudAssembly:
         if part.stop > self._capacity:
             raise InputError(f"{count.file} contains more points than its header declares")
         if scan > 0 and "scan" not in self._arrays:
-            # All previous points belong to scan 0.
+            # The array starts with zeros, since all previous points belong to scan 0.
             self._arrays["scan"] = self._new("scan", np.uint16)
         if self.n_points == 0:
             # Distant stray points have no effect on the median, so they do not reduce the precision
@@ -363,7 +363,7 @@ def resolution_m(farthest_m: float) -> float:
 
 
 def _make_ready(array: NDArray[Any], part: slice) -> None:
-    """Request all pages of a memory-mapped file that will be written next in a single call.
+    """Request in one call all pages of a memory-mapped file that will be written next.
 
     This is four times as fast as one page fault per page.
     """

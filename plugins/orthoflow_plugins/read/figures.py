@@ -28,8 +28,8 @@ _WALL_STEP_DEG: Final = 2.0
 _WALL_FARTHEST_M: Final = 1000.0
 _WALL_CELL_M: Final = 0.05
 _WALL_REACH_M: Final = 0.15
-# Neighbouring points of a line are not connected if their distance exceeds this many median
-# distances.
+# Neighbouring points of a line are not connected if their distance exceeds the median distance by
+# this factor.
 _BREAK_STEPS: Final = 6.0
 
 # Width of a journal column at 300 dpi, with 6-point text.
@@ -88,7 +88,7 @@ def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
 def polar_view_png(cloud: PointCloud) -> bytes | None:
     """Return a PNG of the intensity by row and column of the scan with the most points.
 
-    The image is a view in scan angles, in which straight edges are curved (Figure 2 of
+    The axes of the image are the angles of the scanner, so straight edges are curved (Figure 2 of
     markiewicz2015). If the station is known, up and left in the image are up and left as seen from
     the station. The result is None if the cloud has no grid or no intensity.
     """

@@ -100,11 +100,11 @@ class ReadPhotos(Method):
     If photos in several folders have the same file name, their names include the path within the
     input.
 
-    A panorama, which is contained in an E57 file or listed in `panoramas`, is split into six photos
-    without distortion, the faces of a cube, which are stored as PNG files. Photos are split in the
-    same way if they have a fisheye lens (OpenCV's model) or are panoramas according to the
-    calibration or the given cameras. Of a fisheye photo, only the parts of the faces that the photo
-    shows are used.
+    A panorama that is in an E57 file or listed in `panoramas` is split into the six faces of a
+    cube. The faces are photos without distortion, stored as PNG files. Photos are split in the same
+    way if they have a fisheye lens (OpenCV's model) or are panoramas according to the calibration
+    or the given cameras. Of a fisheye photo, only the parts of the faces that the photo shows are
+    used.
 
     The content of the files is kept unchanged and never re-encoded. Pixels are those of the stored
     array; the EXIF orientation is recorded but not applied. If a TIFF file has several pages, the

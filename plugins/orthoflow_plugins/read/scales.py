@@ -189,7 +189,7 @@ def correlation_with_grey(
     rgb: NDArray[np.uint8],
     has_rgb: NDArray[np.bool_] | None = None,
 ) -> float | None:
-    """Return the correlation of an intensity with the brightness if it is a copy of that.
+    """Return the correlation between intensity and brightness if the intensity is a copy.
 
     Returns:
         The correlation; None if intensity and brightness differ by more than rounding errors, or if
