@@ -174,7 +174,7 @@ _RELIEF_SHARE: Final = 0.16
 # Minimum distance between textured positions. They are selected in turn from the fields of a grid.
 _APART_CELLS: Final = 5
 HALF_PATCH_CELLS: Final = 10
-"""Compared patches are (2 h + 1) cells wide."""
+"""Half width h of compared patches, which are 2 h + 1 cells wide."""
 _GRID: Final = 16
 
 

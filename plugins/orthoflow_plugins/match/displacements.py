@@ -330,7 +330,7 @@ def _improvement(
 # Patches in which a smaller share of the cells is known are not measured.
 _MIN_KNOWN: Final = 0.6
 CORRELATION_AREA_CELLS: Final = 6.0
-"""Residuals of smoothed pictures are correlated: there is one independent cell per this many."""
+"""Smoothing correlates residuals, so this many cells count as one independent cell."""
 _MAX_DRIFT_CELLS: Final = 1.5
 _MAX_DISAGREEMENT_CELLS: Final = 0.5
 # Margin of cut-out patches, for the drift of a patch and for the neighbours used in interpolation.

@@ -55,7 +55,7 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
     "negative": (-0.299, -0.587, -0.114),
     "red less green": (1.0, -1.0, 0.0),
 }
-"""Weights of red, green and blue by name, in the order in which they are tried."""
+"""Weights of red, green and blue, by name of the mixture; mixtures are tried in this order."""
 
 # In rooms with inverted contrast, up to 15 matches agreed on a wrong position, and 19 in one case.
 # A mixture needs more than 15 matches, since several mixtures are tried.

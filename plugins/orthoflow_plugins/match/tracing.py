@@ -48,7 +48,7 @@ from orthoflow_plugins.match.ties import (
 from orthoflow_plugins.match.warping import Before, Projection, View, view_of
 
 _Painted = tuple[Wall, Features | None]
-"""A wall whose intensity is taken from photos, NaN where no photo shows it, and its key points."""
+"""A wall with the intensity of photos (NaN where no photo shows the wall), and its key points."""
 
 
 _NEIGHBOURS: Final = 12
@@ -152,8 +152,8 @@ _Round = tuple[list[TiePiece], int]
 _Known = tuple[LensFreedom, ViewingCamera]
 """Free parameters of a lens, and a camera with the prior of the lens."""
 _Refitted = tuple[ViewingCamera, float, _Known | None]
-"""A pose from the ties of a round, the RMS residual per coordinate of held-out ties in pixels, and
-the free parameters of the lens.
+"""A pose from the ties of a round; the RMS residual per coordinate of the held-out ties, in pixels;
+and the free parameters of the lens.
 """
 
 

@@ -347,8 +347,8 @@ def correlation_notes(
 
 
 _Rows = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]
-"""Equations in units of standard deviations, with the points eliminated: columns (c,) of the
-unknowns, Jacobian (r, c) and residuals (r,).
+"""Whitened equations after elimination of the points: columns (c,) of the unknowns, Jacobian (r, c)
+and residuals (r,).
 """
 
 

@@ -70,8 +70,8 @@ HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
 
 
 _Fit = tuple[float, Resection, ViewingCamera]
-"""An adjustment to some ties: the probability of larger residuals given their standard deviations,
-the camera, and the prior of its lens.
+"""An adjustment to some ties: the probability of residuals that are larger by chance, the adjusted
+camera, and the prior of its lens.
 """
 
 

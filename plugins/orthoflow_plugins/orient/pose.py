@@ -162,8 +162,8 @@ MAX_ROUNDS: Final = 8
 SOFT_LIMIT: Final = 3.0
 """Residuals beyond this many standard deviations get less weight (Huber).
 
-This affects one in a hundred normally distributed ties. A limit of 2 affects one in seven, which
-reduced the accuracy and underestimated the error by a further 10 %.
+This affects one in a hundred normally distributed ties. A limit of 2 affects one in seven;
+it made results less accurate and underestimated their error by a further 10 %.
 """
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
@@ -182,7 +182,8 @@ _MIN_FOCAL_OFF: Final = 0.03
 _FOCAL_OFF_SIGMAS: Final = 5.0
 _LEAST_FOR_FOCAL: Final = 25
 MIN_EXIF_OFF: Final = 0.15
-"""EXIF is wrong if ln f deviates by more than this and many more ties agree with the other value.
+"""EXIF is wrong if its ln f differs from that of the ties by more than this, and many more ties
+agree with the latter.
 
 Correct EXIF values are accurate to a few percent.
 """
