@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, NonNegativeFloat, NonNegativeInt
 
 from orthoflow.files.drawings.words import Phrase
@@ -38,6 +39,8 @@ class WallDescription(BaseModel):
         expected_mm_p95: 95th percentile of the expected error over the image.
         n_withheld_ties: number of withheld tie points on this wall; 0 if there is no image.
         errors: errors in the run because of which the orthoimage should not be delivered.
+        near: centre of the image in scan coordinates, in metres, which selects the wall if it is
+            added to the parameter `near` of the wall step.
         orthoimage: path of the GeoTIFF, relative to the file with this description.
     """
 
@@ -57,6 +60,7 @@ class WallDescription(BaseModel):
     expected_mm_p95: NonNegativeFloat | None = None
     n_withheld_ties: NonNegativeInt = 0
     errors: tuple[str, ...] = ()
+    near: tuple[float, float, float] | None = None
     orthoimage: str | None = None
 
     @property
@@ -74,7 +78,7 @@ class WallDescription(BaseModel):
         if self.recommended:
             return None
         if self.errors:
-            return Phrase(key="run_error")
+            return Phrase(key="run_error", values={"error": "; ".join(self.errors)})
         if (share := self.painted_share or 0.0) < _MIN_PAINTED_SHARE:
             return Phrase(key="barely_painted", values={"percent": f"{100.0 * share:.0f}"})
         return Phrase(key="no_ties")
@@ -82,7 +86,8 @@ class WallDescription(BaseModel):
     @property
     def sentence(self) -> str:
         """Size, covered share, expected error, and any reason not to deliver the image."""
-        parts = [self.accuracy.text()]
+        is_known = self.expected_mm_median is not None
+        parts = [self.accuracy.text() if is_known else "expected error not known"]
         if self.painted_share is not None:
             parts.insert(0, f"{self.width_m:.2f} x {self.height_m:.2f} m")
             parts.insert(1, f"{self.painted_share:.0%} covered")
@@ -128,7 +133,8 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
         reason += ", accuracy not checked: there is no tie point on this wall"
     else:
         is_recommended = True
-        reason += "" if median is None else f", expected error {median:.1f} mm"
+        error = "not known" if median is None else f"{median:.1f} mm"
+        reason += f", expected error {error}"
     gsd_m = _number(sidecar.get("gsd_m")) or 0.0
     width, height = (_number(sidecar.get(key)) or 0.0 for key in ("width", "height"))
     return WallDescription(
@@ -146,6 +152,7 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
         expected_mm_p95=high,
         n_withheld_ties=int(_number(accuracy.get("n_check_points")) or 0),
         errors=errors,
+        near=_centre(sidecar.get("corners_world")),
         orthoimage=path.name,
     )
 
@@ -158,3 +165,11 @@ def _number(value: object) -> float | None:
     """Return a sidecar's value as a number; None if it is not a finite number."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(str(value)) if is_number and abs(float(str(value))) < 1e15 else None
+
+
+def _centre(corners: object) -> tuple[float, float, float] | None:
+    try:
+        x, y, z = np.array(corners, dtype=np.float64).reshape(4, 3).mean(axis=0).round(2).tolist()
+    except (TypeError, ValueError):
+        return None
+    return x, y, z

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -227,6 +228,7 @@ def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
 
 
 Side = TypeVar("Side")
+_WALL: Final = re.compile(r"wall_(\d{1,5})_depth\.tif$")
 # Methods may also report times and memory, which depend on the machine.
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 
@@ -444,6 +446,20 @@ class RunComparison:
         all_shared = n_shared == len(self.cells)
         counted = "step" if n_shared == 1 else f"{n_shared} steps"
         return "" if all_shared else f", of the {counted} that both have"
+
+    @property
+    def first_walls(self) -> str:
+        """Return which walls the metrics of the first wall refer to, if the runs differ in it."""
+        left, right = (
+            min(
+                (int(found[1]) for file in record.published if (found := _WALL.search(file.path))),
+                default=None,
+            )
+            for record in (self.left, self.right)
+        )
+        if left is None or right is None or left == right:
+            return ""
+        return f"; the first wall is wall {left} in A and wall {right} in B"
 
     def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
         """Return the rows without those of cells that exist in only one run."""

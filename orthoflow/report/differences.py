@@ -77,7 +77,7 @@ def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
             step_of,
             different=moved,
             change=_change,
-            whose=of_shared,
+            whose=f"{of_shared}{comparison.first_walls}",
         ),
     )
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from orthoflow_provenance.document import RecordedCell
+from orthoflow_provenance.document import PublishedFile, RecordedCell
 
 from orthoflow.engine.store import Store
 from orthoflow.records.compare import Pair, compare_runs
@@ -38,6 +38,19 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     table = comparison.metric_table()
     assert table.difference.tolist()[:3] == [0.5, 0.0, 5.0]
     assert table.isna().to_numpy().sum(axis=1).tolist() == [0, 0, 0, 2]
+    assert comparison.first_walls == ""
+    sides = {
+        side: record(
+            [], published=[PublishedFile(path=path, size_bytes=0, sha256="") for path in paths]
+        )
+        for side, paths in {
+            "left": ["products/wall/wall_11_depth.tif", "products/wall/wall_3_depth.tif"],
+            "right": ["products/wall/floor_wall_4_depth.tif", "products/wall/wall_0_ortho.tif"],
+        }.items()
+    }
+    assert replace(comparison, **sides).first_walls == (
+        "; the first wall is wall 3 in A and wall 4 in B"
+    )
     assert table.unit.tolist() == ["mm", "1", "mm", "mm"]
     # What differs by rounding is not counted.
     near = Pair(cell="plane", name="offset_mm", left=number(1.0), right=number(1.0 + 1e-12))

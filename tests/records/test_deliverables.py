@@ -106,6 +106,7 @@ def test_walls_are_ranked_with_what_speaks_for_and_against_them(tmp_path: Path) 
     assert by_number[3]["painted_share"] == 0.2
     assert by_number[2]["reason"] == "already included in wall 0"
     assert by_number[2]["orthoimage"] is None
+    assert by_number[0]["near"] == pytest.approx(np.mean(FRAME.corners_world(), axis=0), abs=0.01)
 
 
 def test_an_error_of_the_run_speaks_against_every_wall(tmp_path: Path) -> None:
@@ -122,4 +123,4 @@ def test_an_error_of_the_run_speaks_against_every_wall(tmp_path: Path) -> None:
         json.loads((tmp_path / "mosaic/wall_0_ortho.json").read_text()),
     ).objection
     assert sheet is not None
-    assert sheet.text("de").startswith("nicht empfohlen: der Bericht")
+    assert sheet.text("de").endswith("eines Fehlers im Lauf: all is down: turn it")

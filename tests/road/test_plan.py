@@ -96,7 +96,7 @@ def test_the_report_states_what_was_read(plan: Path) -> None:
     page = html.unescape((plan / "report.html").read_text())
     inputs = page.partition("Inputs and environment</h2>")[2].partition("</p>")[0]
     (scan,) = json.loads((plan / "products" / "cloud" / "scans.json").read_text())["scans"]
-    assert f"LAS/LAZ: 1 scan, {scan['n_points']:,} points; fields used: X, Y, Z" in inputs
+    assert f"LAS/LAZ: 1 scan, {scan['n_points']:,} points; fields read: X, Y, Z" in inputs
     assert "unit: m (assumed); up: z; extent" in inputs
 
 

@@ -30,7 +30,7 @@ SUMMARY: Final = DiagnosticSpec(
     code="scan-summary",
     severity="note",
     is_summary=True,
-    text="{format}: {n_scans} scan{plural}, {n_points:,} points; fields used: {used}; not used: "
+    text="{format}: {n_scans} scan{plural}, {n_points:,} points; fields read: {used}; ignored: "
     "{not_used}; unit: {unit}; up: {up}; extent: {extent} m; points left out: {left_out}",
 )
 NO_EFFECT: Final = DiagnosticSpec(
