@@ -201,10 +201,10 @@ def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
 def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask (n,) of the lengths that exceed twice the RMS of all other lengths.
 
-    At most a quarter of the lengths are removed. Without this limit, if one kind of point is worse
-    than another, such as points at edges and points on flat parts, the iteration would remove all
-    points of the worse kind; `cap_binds` detects this. Comparisons should therefore use the rule
-    that is applied once.
+    At most a quarter of the lengths are removed. If there are two kinds of points, such as points
+    at edges and points on flat parts, the iteration would remove all points of the worse kind
+    without this limit; `cap_binds` detects this. Comparisons should therefore use the rule that is
+    applied once.
     """
     return _iterated(length_m, _OUTLIERS_MOST)
 

@@ -81,7 +81,7 @@ class InspectSurf(Method):
     walls together, and those with `surf_` describe the pairs before the refinement.
 
     Without laser intensity, the comparison is meaningless, since the colours of the scan may come
-    from the same photos. It then fails, or is skipped with a warning.
+    from the same photos. The inspection then fails, or is skipped with a warning.
     """
 
     id: ClassVar[str] = "inspect.surf"

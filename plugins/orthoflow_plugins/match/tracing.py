@@ -330,8 +330,8 @@ def _piece(
     """Return the ties of one photo with one wall.
 
     Residuals are correlated for two reasons: filled cells share the error of a measured cell, and
-    the smoothing kernel covers several cells. These are independent, so the two correlation areas
-    are added.
+    the smoothing kernel covers several cells. The two effects are independent, so their correlation
+    areas are added.
     """
     moved, projection = found
     alone = grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64)

@@ -37,7 +37,7 @@ _OUTSIDE_PX: Final = -10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Projection:
-    """Positions in a photo of the cells of a wall, for the part of the wall that the photo shows.
+    """Photo positions of the cells of a wall, for the part of the wall that the photo shows.
 
     Attributes:
         part: rows and columns of the raster that the arrays cover.

@@ -1,4 +1,4 @@
-"""Removal of people and vehicles from photos that are contradicted by other photos or the scan.
+"""Removal of people and vehicles: photos are not used where other photos or the scan disagree.
 
 Photos of the same area, and the colours of the scan, are independent observations of brightness.
 They are compared in blocks of a few centimetres, after smooth differences (lighting, exposure) have

@@ -118,7 +118,7 @@ class Block:
     def is_joint(self) -> NDArray[np.bool_]:
         """Mask (k,) of the points that several photos see; only these points are adjusted.
 
-        The uncertainty of each other point is added to that of its pixel.
+        The uncertainty of any other point is added to that of its pixel.
         """
         return np.bincount(self.seen.point, minlength=len(self.points)) > 1
 

@@ -110,9 +110,9 @@ NO_BLOCK: Final = DiagnosticSpec(
 class OrientColmapBundle(Method):
     """Orient all photos together by a bundle adjustment with the scan as control.
 
-    Each photo is first oriented separately. Photos are excluded if their ties do not agree with the
-    pose better than by chance. Key points are then matched between overlapping photos. COLMAP's
-    cost functions and the Ceres solver adjust poses, lenses and points together. Ties to walls are
+    Each photo is first oriented separately. Photos are excluded if their ties agree with the pose
+    no better than by chance. Key points are then matched between overlapping photos. COLMAP's cost
+    functions and the Ceres solver adjust poses, lenses and points together. Ties to walls are
     weighted by the standard deviations from the matching step, and ties between photos by the
     standard deviation of their residuals. The initial values of uncalibrated lenses are taken from
     EXIF. Photos with the same focal length in EXIF share a lens, and so do photos without EXIF

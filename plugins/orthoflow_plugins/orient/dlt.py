@@ -83,7 +83,7 @@ DLT_MISFIT: Final = DiagnosticSpec(
 
 
 class OrientDlt(Method):
-    """Orient each photo from its ties only, by eleven parameters or more with distortion.
+    """Orient each photo from its ties only, by eleven parameters, or by more with distortion.
 
     Calibration and EXIF are used only to reject wrong ties; `prior: none` does not use them at all.
     The linear solution gives the initial values of a weighted adjustment of pose, fx, fy, principal

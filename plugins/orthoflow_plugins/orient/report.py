@@ -239,7 +239,7 @@ def hand_over(
 
 
 def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
-    """Report the expected errors on the wall, for cameras for which they are known."""
+    """Report the expected error on the wall for each camera for which it is known."""
     sigmas = [camera.sigma_wall_m for camera in cameras if camera.sigma_wall_m is not None]
     _sum_up(ctx, "sigma_wall_mm", [1000.0 * sigma for sigma in sigmas], "mm")
 

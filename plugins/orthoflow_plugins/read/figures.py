@@ -261,7 +261,7 @@ def _ways_of_grid(
     row: NDArray[np.int64],
     column: NDArray[np.int64],
 ) -> tuple[bool, bool]:
-    """Return whether rows run upwards, and whether columns run to the left, for the station."""
+    """Return whether rows run upwards, and columns to the left, as seen from the station."""
     station = _station(cloud, scan)
     if station is None:
         return True, False
