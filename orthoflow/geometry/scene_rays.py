@@ -41,11 +41,13 @@ class PaintTable(NamedTuple):
         frames: (r, 9) float64: centre, axis a and axis b of each rectangle, as in `Scene`.
         kinds: (r,) int32 `TextureKind`.
         params: (r, 8) float64 texture parameters.
+        bends: (r, 4) float64 curvature and normal of each rectangle.
     """
 
     frames: NDArray[np.float64]
     kinds: NDArray[np.int32]
     params: NDArray[np.float64]
+    bends: NDArray[np.float64]
 
 
 class Pattern(NamedTuple):
@@ -249,9 +251,10 @@ def paint_points(
     """Set `painted` (4, n) to red, green, blue (0..255) and reflectance (0..1) of points (3, n).
 
     Columns of points with rectangle -1 remain unchanged. A point that is not on the plane of its
-    rectangle gets the colour of its projection onto that plane.
+    rectangle gets the colour of its projection onto that plane, or of its radial projection onto a
+    bent rectangle.
     """
-    frames = table.frames
+    frames, bends = table.frames, table.bends
     for i in range(rectangle.shape[0]):
         index = rectangle[i]
         if index < 0:
@@ -261,6 +264,11 @@ def paint_points(
             offset = points[axis, i] - frames[index, axis]
             a += offset * frames[index, 3 + axis]
             b += offset * frames[index, 6 + axis]
+        if bends[index, 0] != 0.0:
+            towards = 0.0
+            for axis in range(3):
+                towards += (points[axis, i] - frames[index, axis]) * bends[index, 1 + axis]
+            a = _arc_length(bends[index, 0], a, towards)
         shade = colour_at(table.kinds[index], table.params[index], a, b)
         painted[0, i] = shade.red
         painted[1, i] = shade.green
@@ -268,8 +276,22 @@ def paint_points(
         painted[3, i] = shade.reflectance
 
 
+@kernel_part
+def _arc_length(curvature: float, along: float, towards: float) -> float:
+    """Return the arc length a of a place on a bent rectangle.
+
+    Args:
+        curvature: reciprocal radius of the rectangle.
+        along: distance from the centre of the rectangle along axis a.
+        towards: distance from it along the normal.
+    """
+    return math.atan2(curvature * along, 1.0 - curvature * towards) / curvature
+
+
 Index: TypeAlias = int | np.int64
 
+# Number of points along a bent rectangle that determine its box.
+_RING_POINTS: Final = 33
 # Minimum distance of a hit, so that rays do not hit the surface from which they start.
 _NEAREST: Final = 1e-9
 
@@ -279,8 +301,8 @@ class CastTable(NamedTuple):
 
     Attributes:
         axes: (3, 3) float64 rotation from the scene's axes to the axes of the boxes.
-        rectangles: (r, 18) float64: centre, axis a, axis b and normal (3 numbers each), extent (4),
-            index of its first hole, and index after its last hole.
+        rectangles: (r, 19) float64: centre, axis a, axis b and normal (3 numbers each), extent (4),
+            index of its first hole, index after its last hole, and curvature.
         holes: (h, 4) float64 extents of the holes.
         nodes: (m, 9) float64 nodes of the tree: lower and upper corner of the box (3 numbers each);
             next node for rays that miss the box; first index and end index of its rectangles in
@@ -308,12 +330,56 @@ class Ray(NamedTuple):
 
 
 @kernel_part
+def _contains(
+    r: NDArray[np.float64], holes: NDArray[np.float64], index: Index, a: float, b: float
+) -> bool:
+    """Return whether a place is inside the extent of a rectangle and in none of its holes."""
+    if a < r[index, 12] or a > r[index, 13] or b < r[index, 14] or b > r[index, 15]:
+        return False
+    for h in range(int(r[index, 16]), int(r[index, 17])):
+        if holes[h, 0] < a < holes[h, 1] and holes[h, 2] < b < holes[h, 3]:
+            return False
+    return True
+
+
+@kernel_part
+def _bent_distance(
+    r: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
+) -> float:
+    """Return the distance to a rectangle bent to a cylinder, as `_hit_distance`."""
+    bend = r[index, 18]
+    x, y, z = ray.x - r[index, 0], ray.y - r[index, 1], ray.z - r[index, 2]
+    along = x * r[index, 3] + y * r[index, 4] + z * r[index, 5]
+    b = x * r[index, 6] + y * r[index, 7] + z * r[index, 8]
+    towards = x * r[index, 9] + y * r[index, 10] + z * r[index, 11]
+    d_along = ray.dx * r[index, 3] + ray.dy * r[index, 4] + ray.dz * r[index, 5]
+    d_b = ray.dx * r[index, 6] + ray.dy * r[index, 7] + ray.dz * r[index, 8]
+    d_towards = ray.dx * r[index, 9] + ray.dy * r[index, 10] + ray.dz * r[index, 11]
+    # The circle: along^2 + towards^2 - 2 towards / bend = 0.
+    square = d_along * d_along + d_towards * d_towards
+    half = along * d_along + (towards - 1.0 / bend) * d_towards
+    root = half * half - square * (along * along + towards * (towards - 2.0 / bend))
+    if square < 1e-24 or root < 0.0:
+        return math.inf
+    root = math.sqrt(root)
+    for sign in (-1.0, 1.0):
+        t: float = (sign * root - half) / square
+        if t >= _NEAREST:
+            a = _arc_length(bend, along + t * d_along, towards + t * d_towards)
+            if _contains(r, holes, index, a, b + t * d_b):
+                return t
+    return math.inf
+
+
+@kernel_part
 def _hit_distance(
     rectangles: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
     """Return the distance along a ray to a rectangle, in units of the ray's direction, or inf."""
     # Use scalars, because an array for the row would be reference-counted at each use.
     r = rectangles
+    if r[index, 18] != 0.0:
+        return _bent_distance(rectangles, holes, index, ray)
     facing = r[index, 9] * ray.dx + r[index, 10] * ray.dy + r[index, 11] * ray.dz
     if abs(facing) < 1e-12:
         return math.inf
@@ -324,12 +390,7 @@ def _hit_distance(
     x, y, z = t * ray.dx - x, t * ray.dy - y, t * ray.dz - z
     a = x * r[index, 3] + y * r[index, 4] + z * r[index, 5]
     b = x * r[index, 6] + y * r[index, 7] + z * r[index, 8]
-    if a < r[index, 12] or a > r[index, 13] or b < r[index, 14] or b > r[index, 15]:
-        return math.inf
-    for h in range(int(r[index, 16]), int(r[index, 17])):
-        if holes[h, 0] < a < holes[h, 1] and holes[h, 2] < b < holes[h, 3]:
-            return math.inf
-    return t
+    return t if _contains(r, holes, index, a, b) else math.inf
 
 
 @kernel_part
@@ -449,6 +510,7 @@ class SceneRays:
             frames=np.ascontiguousarray(np.hstack([scene.centre, scene.axis_a, scene.axis_b])),
             kinds=np.array(scene.texture),
             params=np.array(scene.texture_params),
+            bends=np.column_stack([scene.curvatures_per_m, scene.normal]),
         )
 
     def cast(
@@ -520,6 +582,7 @@ def _cast_table(scene: Scene) -> CastTable:
                 turned.extent,
                 holes[:-1],
                 holes[1:],
+                turned.curvatures_per_m,
             ]
         ),
         holes=np.array(scene.hole_extent),
@@ -550,6 +613,9 @@ class _BoxTree:
         # not empty.
         self._low = corners.min(axis=1) - 1e-6
         self._high = corners.max(axis=1) + 1e-6
+        for index in np.flatnonzero(scene.curvatures_per_m).tolist():
+            ring = _enclosing_ring(scene, index) @ self.axes.T
+            self._low[index], self._high[index] = ring.min(axis=0), ring.max(axis=0)
         self._add(np.arange(len(scene)))
 
     def _add(self, members: NDArray[np.int64]) -> None:
@@ -589,6 +655,21 @@ class _BoxTree:
         best = np.zeros(len(members), dtype=np.bool_)
         best[order[: last[axis] + 1, axis]] = True
         return best
+
+
+def _enclosing_ring(scene: Scene, index: int) -> NDArray[np.float64]:
+    """Return points (n, 3) whose box contains a bent rectangle: corners of prisms around it."""
+    bend = float(scene.curvatures_per_m[index])
+    a = np.linspace(scene.extent[index, 0], scene.extent[index, 1], _RING_POINTS)
+    # Between two points of the arc, the arc is inside the box of the points moved outwards by the
+    # sagitta.
+    radius_m = 1.0 / abs(bend)
+    sagitta_m = radius_m * (1.0 - math.cos(0.5 * abs(bend) * float(a[1] - a[0])))
+    rectangle = np.full(2 * len(a), index)
+    b = np.repeat(scene.extent[index, 2:], len(a))
+    points = scene.points_m(rectangle, np.tile(a, 2), b)
+    steps = (sagitta_m + 1e-6) * np.concatenate([-np.eye(3), np.eye(3)])
+    return np.asarray((points[:, None] + steps).reshape(-1, 3))
 
 
 def _surfaces_m2(sides: NDArray[np.float64]) -> NDArray[np.float64]:

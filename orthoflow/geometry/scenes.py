@@ -1,5 +1,7 @@
 """Simulated scenes that consist of textured rectangles.
 
+A rectangle may be bent to a part of a cylinder, so that vaults and towers consist of few parts.
+
 Random numbers are functions of a lattice cell, a seed and an index (`draw`), so they do not depend
 on the order of computation or the number of threads. The formulas are those of `scene_rays`,
 applied to arrays.
@@ -73,6 +75,10 @@ class Scene:
         hole_rectangle: (h,) int32 index of the rectangle that contains the hole, ascending.
         hole_extent: (h, 4) float64 metres, as in `extent`; the edge of a hole belongs to the
             rectangle.
+        curvature_per_m: (r,) float64 reciprocal radii of rectangles that are bent about an axis
+            parallel to `axis_b`, without stretching, so that a is the length of an arc. It is
+            positive if a rectangle is bent towards its normal, and 0 if it is flat. None if all
+            are flat.
     """
 
     origin: NDArray[np.float64]
@@ -86,6 +92,7 @@ class Scene:
     texture_params: NDArray[np.float64]
     hole_rectangle: NDArray[np.int32]
     hole_extent: NDArray[np.float64]
+    curvature_per_m: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.centre)
@@ -100,6 +107,7 @@ class Scene:
             "texture": (self.texture.shape, (count,)),
             "texture_params": (self.texture_params.shape, (count, N_TEXTURE_PARAMS)),
             "hole_extent": (self.hole_extent.shape, (len(self.hole_rectangle), 4)),
+            "curvature_per_m": (self.curvatures_per_m.shape, (count,)),
         }
         for name, (shape, expected) in shapes.items():
             if shape != expected:
@@ -115,8 +123,46 @@ class Scene:
         """Unit normals (r, 3), axis_a x axis_b, in world axes."""
         return np.cross(self.axis_a, self.axis_b)
 
+    @property
+    def curvatures_per_m(self) -> NDArray[np.float64]:
+        """Curvatures (r,), 0 for flat rectangles."""
+        bent = self.curvature_per_m
+        return np.zeros(len(self.centre)) if bent is None else bent
+
+    def points_m(
+        self, rectangle: NDArray[np.int64], a: NDArray[np.float64], b: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the points (n, 3) at (a, b) of rectangles (n,), metres from `origin`."""
+        points = self.centre[rectangle] + b[:, None] * self.axis_b[rectangle]
+        bent = self.curvatures_per_m[rectangle]
+        radius = 1.0 / np.where(bent == 0.0, 1.0, bent)
+        along = np.where(bent == 0.0, a, radius * np.sin(a * bent))
+        towards = np.where(bent == 0.0, 0.0, radius * (1.0 - np.cos(a * bent)))
+        points += along[:, None] * self.axis_a[rectangle]
+        return points + towards[:, None] * self.normal[rectangle]
+
+    def normals_at(
+        self, rectangle: NDArray[np.int32], points: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the unit normals (n, 3) of rectangles (n,) at points (3, n) on them.
+
+        Points are in metres from `origin`.
+        """
+        normals = self.normal[rectangle]
+        bent = self.curvatures_per_m[rectangle]
+        chosen = np.flatnonzero(bent)
+        if len(chosen):
+            own = rectangle[chosen]
+            offset = points[:, chosen].T - self.centre[own]
+            offset -= np.einsum("ni,ni->n", offset, self.axis_b[own])[:, None] * self.axis_b[own]
+            normals[chosen] -= bent[chosen, None] * offset
+        return normals
+
     def corners_m(self) -> NDArray[np.float64]:
-        """Return the corners (r, 4, 3) of the rectangles in cyclic order, metres from `origin`."""
+        """Return the corners (r, 4, 3) of the rectangles in cyclic order, if flat, in metres.
+
+        They are relative to `origin`.
+        """
         a = self.extent[:, [0, 1, 1, 0], None] * self.axis_a[:, None, :]
         b = self.extent[:, [2, 2, 3, 3], None] * self.axis_b[:, None, :]
         return self.centre[:, None, :] + a + b

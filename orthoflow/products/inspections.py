@@ -19,6 +19,7 @@ from orthoflow.products.product import (
     Tolerance,
     require_shapes,
 )
+from orthoflow.products.surfaces import Surfaces
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +101,7 @@ class Truth(Product):
         n_spoilt: number of points that are gross outliers or mixed pixels.
         cameras: true orientations of the photos, or None if there are no photos.
         photos: geometry of the photos, in the order of `cameras`.
+        surfaces: curved surfaces that a detector should find, or None if all are flat.
         details: parameters of the simulation as JSON (such as scan step, noise and relief),
             intended only for users.
     """
@@ -116,6 +118,7 @@ class Truth(Product):
     n_spoilt: int = 0
     cameras: Cameras | None = None
     photos: tuple[TakenPhoto, ...] = ()
+    surfaces: Surfaces | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 

@@ -122,6 +122,49 @@ def test_rays_hit_what_trying_every_rectangle_says(seed: int) -> None:
     assert np.all(np.isinf(hits.t[~hit]))
 
 
+@pytest.mark.parametrize("seed", seeds(2))
+def test_bent_rectangles_are_hit_like_the_narrow_flat_ones_along_them(seed: int) -> None:
+    rng, n_flat = np.random.default_rng(seed), 4000
+    extent, hole = np.array([-0.9, 1.6, -0.5, 0.7]), (0.3, 0.8, -0.2, 0.4)
+    rows, bends = [], np.array([1.1, -1.3, 0.6])
+    for _ in bends:
+        turn = scenes.random_rotation(rng)
+        centre = rng.uniform(-1.0, 1.0, 3)
+        rows.append({"centre": centre, "a": turn[0], "b": turn[1], "extent": extent, "kind": 1})
+    bent = replace(a_scene(rows, [(0, hole)]), curvature_per_m=bends)
+    width = (extent[1] - extent[0]) / n_flat
+    along = extent[0] + width * (np.arange(n_flat) + 0.5)
+    flat_rows = []
+    for index in range(len(bent)):
+        own = np.full(n_flat, index)
+        middles = bent.points_m(own, along, np.zeros(n_flat))
+        for a, centre, normal in zip(along, middles, bent.normals_at(own, middles.T), strict=True):
+            is_cut = index == 0 and hole[0] < a < hole[1]
+            for low, high in ((-0.5, -0.2), (0.4, 0.7)) if is_cut else ((-0.5, 0.7),):
+                side = {"extent": (-width / 2, width / 2, low, high)}
+                axis = bent.axis_b[index]
+                flat_rows.append({"centre": centre, "a": np.cross(axis, normal), "b": axis} | side)
+    flat = a_scene(flat_rows, [])
+    origins, directions = rng.uniform(-2, 2, (3000, 3)), rng.normal(size=(3000, 3))
+    hits, near = cast(bent, origins, directions), cast(flat, origins, directions)
+    is_close = np.isclose(hits.t, near.t, atol=1e-4)
+    assert 0.1 < np.isfinite(hits.t).mean() < 0.9
+    assert is_close.mean() > 0.995  # apart from rays along edges
+    points = origins + np.where(np.isfinite(hits.t), hits.t, 0.0)[:, None] * directions
+    facing = bent.normals_at(hits.rectangle, points.T)
+    agree = np.abs(np.sum(facing * flat.normal[near.rectangle], axis=1))
+    assert agree[is_close & np.isfinite(hits.t)].min() > 0.999
+
+
+def test_a_bent_rectangle_is_painted_like_the_flat_one_that_was_bent() -> None:
+    row: dict[str, object] = {**WALL, "kind": TextureKind.FRESCO}
+    flat, bent = a_scene([row], []), replace(a_scene([row], []), curvature_per_m=np.array([0.7]))
+    a, b = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 500))
+    index = np.zeros(500, np.int32)
+    colours = [colours_at(scene, index, scene.points_m(index, a, b)).rgb for scene in (flat, bent)]
+    assert np.isclose(*colours, atol=0.1).mean() > 0.99
+
+
 def test_a_shift_and_a_turn_of_the_world_change_no_colour() -> None:
     scene = random_scene(1)
     rng = np.random.default_rng(5)

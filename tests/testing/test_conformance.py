@@ -23,6 +23,7 @@ from tests.undrawn_charts import blank_charts
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
 QUICK: dict[str, dict[str, object]] = {
     "simulate.room": {"scan_step_m": 0.1},
+    "simulate.curved": {"scan_step_m": 0.1},
     "raster.grid": {"gsd_m": 0.05},
     "match.sift": {"max_features": 1000},
     "match.guided": {"max_ties": 400},

@@ -44,7 +44,7 @@ class Paint:
 
 
 class Surface(NamedTuple):
-    """A rectangle of a scene under construction."""
+    """A rectangle of a scene under construction, flat or bent."""
 
     centre: NDArray[np.float64]
     axis_a: NDArray[np.float64]
@@ -54,6 +54,7 @@ class Surface(NamedTuple):
     role: SurfaceRole
     plane: int = -1
     holes: Sequence[Extent] = ()
+    curvature_per_m: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +92,7 @@ class SceneDraft:
                 ones.
         """
         surfaces = self.surfaces
+        bends = np.array([surface.curvature_per_m for surface in surfaces])
         holes = [(i, hole) for i, surface in enumerate(surfaces) for hole in surface.holes]
         return Scene(
             origin=np.zeros(3),
@@ -106,6 +108,7 @@ class SceneDraft:
             ),
             hole_rectangle=np.array([index for index, _ in holes], dtype=np.int32),
             hole_extent=np.array([hole for _, hole in holes], dtype=np.float64).reshape(-1, 4),
+            curvature_per_m=bends if bends.any() else None,
         )
 
 

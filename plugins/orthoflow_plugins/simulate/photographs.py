@@ -40,7 +40,7 @@ _FREE_HIGH_M: Final = (2.3, 1.95, 1.3)
 # Up to this height above the room's origin, there is furniture in the half of the room that is
 # farther from the main wall.
 _FURNITURE_M: Final = -0.45
-_WORST_ROLL_DEG: Final = 3.0
+WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
 # Legs and upper body of a person: heights of the lower and upper ends above the room's origin, and
@@ -134,21 +134,7 @@ def planned_shots(
         return ()
     footprint_m, distance_m, targets = _LAYOUTS[layout]
     sides = geometry.sides(SceneDraft())
-    width, height = (max(16, round(side / gsd_m)) for side in footprint_m)
-    off_centre = rng.uniform(-0.006, 0.006, 2) * width
-    scatter = np.append(rng.uniform(-1.0, 1.0, 4), 0.0)
-    distortion = np.array([-0.08, 0.02, 0.0, 0.0, 0.0])
-    distortion += np.array([0.01, 0.005, 0.0005, 0.0005, 0.0]) * scatter
-    lens = Intrinsics(
-        width=width,
-        height=height,
-        fx=distance_m / gsd_m,
-        fy=distance_m / gsd_m,
-        cx=float(width / 2 + off_centre[0]),
-        cy=float(height / 2 + off_centre[1]),
-        distortion=tuple(distortion.tolist()),
-        source="truth",
-    )
+    lens = draw_lens(rng, footprint_m, distance_m, gsd_m)
     shots = []
     for place, (wall, *target) in enumerate(targets):
         side = sides[wall]
@@ -160,19 +146,58 @@ def planned_shots(
         centre = place_to_stand(
             aim + distance_m * (math.cos(tilt) * side.normal + math.sin(tilt) * aside)
         )
-        roll_deg = float(rng.uniform(-_WORST_ROLL_DEG, _WORST_ROLL_DEG))
-        cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
-        about_axis = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        rotation = about_axis @ looking_at(centre, aim, _UP)
-        taken = TakenPhoto(
-            photo=f"photo_{place:02d}.jpg",
-            wall=_WALL_NAMES[wall],
-            gsd_m=float(np.linalg.norm(aim - centre)) / lens.fx,
-            obliquity_deg=math.degrees(math.acos(min(1.0, float(-rotation[2] @ side.normal)))),
-            roll_deg=roll_deg,
-        )
-        shots.append(Shot(taken=taken, camera=lens.posed(rotation, -rotation @ centre)))
+        roll_deg = float(rng.uniform(-WORST_ROLL_DEG, WORST_ROLL_DEG))
+        name = f"photo_{place:02d}.jpg"
+        shots.append(shot_at(name, _WALL_NAMES[wall], lens, centre, (aim, side.normal), roll_deg))
     return tuple(shots)
+
+
+def draw_lens(
+    rng: np.random.Generator, footprint_m: tuple[float, float], distance_m: float, gsd_m: float
+) -> Intrinsics:
+    """Draw a lens with Brown distortion that shows an area at a distance with this pixel size."""
+    width, height = (max(16, round(side / gsd_m)) for side in footprint_m)
+    off_centre = rng.uniform(-0.006, 0.006, 2) * width
+    scatter = np.append(rng.uniform(-1.0, 1.0, 4), 0.0)
+    distortion = np.array([-0.08, 0.02, 0.0, 0.0, 0.0])
+    distortion += np.array([0.01, 0.005, 0.0005, 0.0005, 0.0]) * scatter
+    return Intrinsics(
+        width=width,
+        height=height,
+        fx=distance_m / gsd_m,
+        fy=distance_m / gsd_m,
+        cx=float(width / 2 + off_centre[0]),
+        cy=float(height / 2 + off_centre[1]),
+        distortion=tuple(distortion.tolist()),
+        source="truth",
+    )
+
+
+def shot_at(
+    name: str,
+    wall: str,
+    lens: Intrinsics,
+    centre: NDArray[np.float64],
+    aim: tuple[NDArray[np.float64], NDArray[np.float64]],
+    roll_deg: float,
+) -> Shot:
+    """Return a photo that is taken from a centre, aimed at a point with a normal, and rotated.
+
+    The upper side of a camera that looks straight up or down is along x.
+    """
+    target, normal = aim
+    cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
+    about_axis = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    is_level = np.linalg.norm((target - centre)[:2]) > 1e-6
+    rotation = about_axis @ looking_at(centre, target, _UP if is_level else np.eye(3)[0])
+    taken = TakenPhoto(
+        photo=name,
+        wall=wall,
+        gsd_m=float(np.linalg.norm(target - centre)) / lens.fx,
+        obliquity_deg=math.degrees(math.acos(min(1.0, float(-rotation[2] @ normal)))),
+        roll_deg=roll_deg,
+    )
+    return Shot(taken=taken, camera=lens.posed(rotation, -rotation @ centre))
 
 
 def with_passers_by(

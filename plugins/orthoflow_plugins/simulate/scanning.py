@@ -284,7 +284,6 @@ class Scanner:
 
     def __init__(self, scene: Scene, errors: Errors) -> None:
         self._rays = SceneRays(scene)
-        self._normal = scene.normal
         self._is_cloth = scene.texture == TextureKind.TEXTILE
         self._errors = errors
         self._scene = scene
@@ -308,7 +307,9 @@ class Scanner:
         hits = self._rays.cast(start, ways)
         is_hit = hits.rectangle >= 0
         distance = np.where(is_hit, hits.t, 1.0)
-        cosine = np.abs(np.einsum("ni,in->n", self._normal[hits.rectangle], ways))
+        points = points_on(start, ways, hits)
+        facing = self._scene.normals_at(hits.rectangle, points)
+        cosine = np.abs(np.einsum("ni,in->n", facing, ways))
         into = scanned.take(slice(first * sweep.n_rows, last * sweep.n_rows))
         into.rectangle[:] = hits.rectangle
         # Noise increases with range and incidence angle, and is higher on cloth.
@@ -327,7 +328,6 @@ class Scanner:
         is_gross = (uniforms(states, 0) < errors.outlier_share) & is_hit
         measured[is_gross] = gross[is_gross]
         into.rectangle[is_gross] = SPOILT
-        points = points_on(start, ways, hits)
         off = shared_errors(points, sweep.station, errors)
         for along, coordinate in enumerate((into.x, into.y, into.z)):
             coordinate[:] = sweep.station[along] + measured * ways[along] + off[along]

@@ -1,0 +1,452 @@
+"""Simulated buildings with curved walls: vault, cross vault, apse, round tower, column.
+
+All dimensions are drawn. The frame of a building is in metres, z up, with the origin at eye level.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Cylinder
+from orthoflow.geometry.frames import rotation_from_vector
+from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from orthoflow_plugins.simulate.building import (
+    Extent,
+    Paint,
+    SceneDraft,
+    Side,
+    Surface,
+    TruePlane,
+    add_block,
+    flat_side,
+    wall_side,
+)
+
+Subject = Literal["barrel-vault", "cross-vault", "apse", "tower", "column"]
+
+FLOOR_M: Final = -1.6
+_UP: Final = np.array([0.0, 0.0, 1.0])
+_STUCCO: Final = Paint(TextureKind.PLAIN, (214, 206, 190), 0.7, 0.18, seed=21)
+_OAK: Final = Paint(TextureKind.WOOD, (132, 92, 58), 0.35, 0.4, 0.12, 23)
+_STONE: Final = Paint(TextureKind.TILES, (176, 160, 132), 0.5, 0.3, 0.4, 24)
+_FRESCO: Final = Paint(TextureKind.FRESCO, (196, 176, 148), 0.5, period_m=0.36, seed=25)
+_FLOOR: Final = Paint(TextureKind.TILES, (150, 138, 122), 0.35, period_m=0.35, seed=26)
+# A building is tilted by up to this angle.
+_TILT_DEG: Final = 1.0
+# The faces across the axis of a moulding are flat pieces that cover at most this angle.
+_PIECE_RAD: Final = math.radians(3.0)
+# Width of the strips between the groins of a cross vault.
+_STRIP_M: Final = 0.03
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrueCylinder:
+    """A cylinder that a detector should find.
+
+    Attributes:
+        shape: the cylinder, whose point is at the middle of the surface.
+        zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
+        arc_rad: range of the angles.
+        along_m: range along the axis.
+    """
+
+    shape: Cylinder
+    zero: NDArray[np.float64]
+    arc_rad: tuple[float, float]
+    along_m: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Building:
+    """A finished building.
+
+    Attributes:
+        scene: its surfaces.
+        planes: its large planes; `scene.plane_index` is an index into them.
+        cylinders: its curved surfaces.
+        on_cylinder: (r,) index of the cylinder of each rectangle of the scene; -1 for none.
+        stations: (s, 3) positions from which it is scanned.
+        photographed: targets of photos: points, normals and distances of the camera.
+    """
+
+    scene: Scene
+    planes: tuple[TruePlane, ...]
+    cylinders: tuple[TrueCylinder, ...]
+    on_cylinder: NDArray[np.int16]
+    stations: NDArray[np.float64]
+    photographed: tuple[tuple[NDArray[np.float64], NDArray[np.float64], float], ...]
+
+
+@dataclass(kw_only=True)
+class _Bend:
+    """A cylindrical wall under construction.
+
+    Places on it are (a, b): length of arc from angle 0, and distance along the axis. Depths are
+    positive towards the viewer.
+
+    Attributes:
+        draft: the draft to which rectangles are added.
+        shape: the cylinder.
+        zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
+        extents: extents of all parts of the wall itself.
+        rows: indices of these parts in the draft.
+    """
+
+    draft: SceneDraft
+    shape: Cylinder
+    zero: NDArray[np.float64]
+    extents: list[Extent] = field(default_factory=list)
+    rows: list[int] = field(default_factory=list)
+
+    def place(
+        self,
+        extent: Extent,
+        depth_m: float,
+        paint: Paint,
+        role: SurfaceRole,
+        holes: Sequence[Extent] = (),
+    ) -> None:
+        """Add a bent rectangle, whose extent is given on the wall itself."""
+        sign = -1.0 if self.shape.is_concave else 1.0
+        radius_m = self.shape.radius_m + sign * depth_m
+        scale = radius_m / self.shape.radius_m
+        self.draft.surfaces.append(
+            Surface(
+                self.shape.point_world + radius_m * self.zero,
+                sign * np.cross(self.shape.axis_world, self.zero),
+                self.shape.axis_world,
+                _scaled(extent, sign * scale),
+                paint,
+                role,
+                holes=[_scaled(hole, sign * scale) for hole in holes],
+                curvature_per_m=-sign / radius_m,
+            )
+        )
+        if role == SurfaceRole.WALL:
+            self.extents.append(extent)
+            self.rows.append(len(self.draft.surfaces) - 1)
+
+    def box(self, extent: Extent, depths_m: tuple[float, float], paint: Paint) -> None:
+        """Add a moulding or a recess between the depth of the wall and another one."""
+        role = SurfaceRole.RELIEF if depths_m[1] > 0.0 else SurfaceRole.RECESS
+        self.place(extent, depths_m[1], paint, role)
+        a0, a1, b0, b1 = extent
+        for a in (a0, a1):
+            foot, _, normal = self.at(a, 0.0)
+            span = (b0, b1, min(depths_m), max(depths_m))
+            self.draft.surfaces.append(
+                Surface(foot, self.shape.axis_world, normal, span, paint, role)
+            )
+        n_pieces = math.ceil(abs(a1 - a0) / (_PIECE_RAD * self.shape.radius_m))
+        half_m = 0.5 * (a1 - a0) / n_pieces
+        for b in (b0, b1):
+            for a in a0 + half_m * (2.0 * np.arange(n_pieces) + 1.0):
+                foot, along, normal = self.at(float(a), b)
+                span = (-half_m, half_m, min(depths_m), max(depths_m))
+                self.draft.surfaces.append(Surface(foot, along, normal, span, paint, role))
+
+    def at(
+        self, a: float, b: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the point at (a, b), the direction in which a increases, and the normal."""
+        angle, aside = a / self.shape.radius_m, np.cross(self.shape.axis_world, self.zero)
+        outwards = math.cos(angle) * self.zero + math.sin(angle) * aside
+        along = math.cos(angle) * aside - math.sin(angle) * self.zero
+        point = self.shape.point_world + self.shape.radius_m * outwards + b * self.shape.axis_world
+        return point, along, -outwards if self.shape.is_concave else outwards
+
+    def true_cylinder(self) -> TrueCylinder:
+        """Return the cylinder with the extent of the wall itself."""
+        a0, a1, b0, b1 = np.array(self.extents).T
+        arc = np.array([a0.min(), a1.max()]) / self.shape.radius_m
+        return TrueCylinder(
+            shape=self.shape,
+            zero=self.zero,
+            arc_rad=(float(arc[0]), float(arc[1])),
+            along_m=(float(b0.min()), float(b1.max())),
+        )
+
+
+def _scaled(extent: Extent, scale: float) -> Extent:
+    """Return an extent whose a is multiplied by a scale, which may be negative."""
+    a0, a1, b0, b1 = extent
+    return min(scale * a0, scale * a1), max(scale * a0, scale * a1), b0, b1
+
+
+def build(subject: Subject, rng: np.random.Generator, *, relief: float, gap: float) -> Building:
+    """Build a drawn building.
+
+    Args:
+        subject: kind of building.
+        rng: random generator for all dimensions.
+        relief: scale of all mouldings.
+        gap: spectral gap of the textures (see `TextureKind`).
+    """
+    draft = SceneDraft()
+    bends, stations = _BUILDERS[subject](draft, rng, relief)
+    on_cylinder = np.full(len(draft.surfaces), -1, dtype=np.int16)
+    for index, bend in enumerate(bends):
+        for row in bend.rows:
+            on_cylinder[row] = index
+    tilt = np.append(rng.uniform(-1.0, 1.0, 2) * math.radians(_TILT_DEG), 0.0)
+    turn = rotation_from_vector(tilt) @ rotation_from_vector(
+        np.array([0.0, 0.0, rng.uniform(0.0, 2.0 * math.pi)])
+    )
+    scene = draft.finished(spectral_gap=gap)
+    photographed = [target for bend in bends for target in _targets(bend)]
+    return Building(
+        scene=scene.turned(turn),
+        planes=tuple(
+            TruePlane(
+                name=item.name,
+                plane=replace(item.plane, normal=turn @ item.plane.normal),
+                outline=item.outline @ turn.T,
+            )
+            for item in draft.planes
+        ),
+        cylinders=tuple(_turned(bend.true_cylinder(), turn) for bend in bends),
+        on_cylinder=on_cylinder,
+        stations=stations @ turn.T,
+        photographed=tuple((turn @ point, turn @ normal, d) for point, normal, d in photographed),
+    )
+
+
+def _turned(true: TrueCylinder, turn: NDArray[np.float64]) -> TrueCylinder:
+    shape = replace(
+        true.shape,
+        point_world=turn @ true.shape.point_world,
+        axis_world=turn @ true.shape.axis_world,
+    )
+    return replace(true, shape=shape, zero=turn @ true.zero)
+
+
+def _targets(bend: _Bend) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
+    """Yield targets over the wall: three around the axis times two or more along it."""
+    true, radius_m = bend.true_cylinder(), bend.shape.radius_m
+    distance_m = min(0.9 * radius_m, 3.0) if bend.shape.is_concave else 3.0
+    n_along = max(2, math.ceil((true.along_m[1] - true.along_m[0]) / 1.5))
+    n_around = max(3, math.ceil((true.arc_rad[1] - true.arc_rad[0]) * radius_m / 1.8))
+    for b in np.linspace(*true.along_m, 2 * n_along + 1)[1::2]:
+        for angle in np.linspace(*true.arc_rad, 2 * n_around + 1)[1::2]:
+            point, _, normal = bend.at(float(angle * radius_m), float(b))
+            yield point, normal, distance_m
+
+
+def _wall(
+    draft: SceneDraft,
+    name: str,
+    omega_deg: float,
+    distance_m: float,
+    extent: Extent,
+    paint: Paint,
+    holes: Sequence[Extent] = (),
+) -> Side:
+    """Add a vertical wall whose outward direction has an azimuth."""
+    wall = wall_side(draft, omega_deg=omega_deg, phi_deg=0.0, distance_m=distance_m)
+    plane = wall.true_plane(name, extent)
+    wall.place(extent, 0.0, paint, SurfaceRole.WALL, plane=plane, holes=holes)
+    return wall
+
+
+def _level(draft: SceneDraft, name: str, height_m: float, reach: tuple[float, float]) -> None:
+    """Add a floor or, above the origin, a ceiling."""
+    sign = 1.0 if height_m < 0.0 else -1.0
+    level = flat_side(draft, normal=(0.0, 0.0, sign), height_m=height_m)
+    extent = (-reach[0], reach[0], -reach[1], reach[1])
+    plane = level.true_plane(name, extent)
+    level.place(extent, 0.0, _FLOOR, SurfaceRole.WALL, plane=plane)
+
+
+def _furniture(draft: SceneDraft, rng: np.random.Generator, places: Sequence[float]) -> None:
+    for x, y in np.reshape(places, (-1, 2)):
+        size_m = tuple(rng.uniform((0.5, 0.4, 0.6), (1.2, 0.8, 1.2)).tolist())
+        yaw_deg = float(rng.uniform(0.0, 90.0))
+        base = np.array([x, y, FLOOR_M])
+        add_block(draft, base=base, yaw_deg=yaw_deg, size_m=size_m, paint=_OAK)
+
+
+def _vaulted_hall(
+    draft: SceneDraft,
+    rng: np.random.Generator,
+    half_wide_m: float,
+    half_long_m: float,
+    top_m: float,
+) -> None:
+    """Add floor, furniture and four walls; those at the ends reach up to `top_m`."""
+    spring_m = 1.0
+    door: Extent = (-0.5, 0.6, FLOOR_M - 0.1, 0.6)
+    for name, omega_deg in (("right wall", 0.0), ("left wall", 180.0)):
+        extent = (-half_long_m, half_long_m, FLOOR_M, spring_m)
+        wall = _wall(draft, name, omega_deg, half_wide_m, extent, _STUCCO, [door])
+        wall.recess(door, 0.2, _OAK)
+    for name, omega_deg in (("end wall", 90.0), ("entrance wall", 270.0)):
+        extent = (-half_wide_m, half_wide_m, FLOOR_M, top_m)
+        _wall(draft, name, omega_deg, half_long_m, extent, _FRESCO)
+    _level(draft, "floor", FLOOR_M, (half_wide_m, half_long_m))
+    aside, along = half_wide_m - 0.9, half_long_m - 1.0
+    _furniture(draft, rng, (aside, along, -aside, 0.3 * along, 0.5 * aside, -along))
+
+
+def _barrel_vault(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    radius_m, half_long_m = rng.uniform(2.7, 3.3), rng.uniform(2.5, 4.0)
+    half_rad = math.radians(rng.uniform(72.0, 78.0))
+    half_wide_m = radius_m * math.sin(half_rad)
+    axis_m = 1.0 - radius_m * math.cos(half_rad)
+    shape = Cylinder(
+        point_world=np.array([0.0, 0.0, axis_m]),
+        axis_world=np.array([0.0, 1.0, 0.0]),
+        radius_m=radius_m,
+        is_concave=True,
+    )
+    vault, reach_m = _Bend(draft=draft, shape=shape, zero=_UP), half_rad * radius_m
+    vault.place((-reach_m, reach_m, -half_long_m, half_long_m), 0.0, _FRESCO, SurfaceRole.WALL)
+    if relief > 0.0:
+        for b in rng.uniform(-0.5, 0.5, 2) + np.array([-0.5, 0.5]) * half_long_m:
+            rib = (-reach_m, reach_m, b - 0.15, b + 0.15)
+            vault.box(rib, (0.0, 0.06 * relief), _STUCCO)
+        for a in rng.uniform(-0.6, 0.6, 4) * reach_m:
+            b = rng.uniform(-0.8, 0.8) * half_long_m
+            vault.box((a - 0.2, a + 0.2, b - 0.2, b + 0.2), (0.0, 0.03 * relief), _STUCCO)
+    _vaulted_hall(draft, rng, half_wide_m, half_long_m, axis_m + radius_m)
+    stations = rng.uniform(-0.4, 0.4, (2, 3)) + np.outer((-0.45, 0.45), (0.0, half_long_m, 0.0))
+    return [vault], stations
+
+
+def _cross_vault(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    del relief
+    radius_m = rng.uniform(2.7, 3.3)
+    half_rad = math.radians(rng.uniform(62.0, 72.0))
+    half_m, axis_m = radius_m * math.sin(half_rad), 1.0 - radius_m * math.cos(half_rad)
+    bends = []
+    for number, axis in enumerate(((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))):
+        shape = Cylinder(
+            point_world=np.array([0.0, 0.0, axis_m]),
+            axis_world=np.array(axis),
+            radius_m=radius_m,
+            is_concave=True,
+        )
+        bend = _Bend(draft=draft, shape=shape, zero=_UP)
+        paint, reach_m = replace(_FRESCO, seed=31 + number), half_rad * radius_m
+        edges = np.linspace(-reach_m, reach_m, 2 * math.ceil(reach_m / _STRIP_M) + 1)
+        for a0, a1 in itertools.pairwise(edges.tolist()):
+            groin_m = abs(radius_m * math.sin(0.5 * (a0 + a1) / radius_m))
+            for ends in ((-half_m, -groin_m), (groin_m, half_m)):
+                bend.place((a0, a1, *ends), 0.0, paint, SurfaceRole.WALL)
+        bends.append(bend)
+    for omega_deg in (0.0, 90.0, 180.0, 270.0):
+        extent = (-half_m, half_m, FLOOR_M, axis_m + radius_m)
+        _wall(draft, f"wall {omega_deg:.0f}", omega_deg, half_m, extent, _STUCCO)
+    _level(draft, "floor", FLOOR_M, (half_m, half_m))
+    _furniture(draft, rng, (half_m - 0.8, half_m - 0.9, -half_m + 0.9, 0.2))
+    return bends, rng.uniform(-0.3, 0.3, (2, 3)) + np.array([[-1.0, -0.8, 0.0], [1.0, 0.9, 0.0]])
+
+
+def _apse(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    radius_m, half_rad = rng.uniform(1.6, 2.4), math.radians(rng.uniform(80.0, 90.0))
+    top_m, start_m = rng.uniform(2.0, 3.0), 2.5
+    opening_m = radius_m * math.sin(half_rad)
+    axis_m = start_m - radius_m * math.cos(half_rad)
+    shape = Cylinder(
+        point_world=np.array([0.0, axis_m, 0.0]), axis_world=_UP, radius_m=radius_m, is_concave=True
+    )
+    apse = _Bend(draft=draft, shape=shape, zero=np.array([0.0, 1.0, 0.0]))
+    reach_m = half_rad * radius_m
+    window: Extent = (-0.3, 0.3, 0.4, 1.5)
+    extent = (-reach_m, reach_m, FLOOR_M, top_m)
+    apse.place(extent, 0.0, _FRESCO, SurfaceRole.WALL, [window])
+    apse.box(window, (0.0, -0.25), _STUCCO)
+    if relief > 0.0:
+        apse.box((-reach_m, reach_m, 1.7, 1.85), (0.0, 0.05 * relief), _STUCCO)
+    half_wide_m = opening_m + rng.uniform(0.8, 1.5)
+    hole: Extent = (-opening_m, opening_m, FLOOR_M - 0.1, top_m + 0.1)
+    sides: Extent = (-half_wide_m, half_wide_m, FLOOR_M, top_m)
+    _wall(draft, "apse wall", 90.0, start_m, sides, _STUCCO, [hole])
+    _wall(draft, "entrance wall", 270.0, 3.0, sides, _STUCCO)
+    for name, omega_deg in (("right wall", 0.0), ("left wall", 180.0)):
+        _wall(draft, name, omega_deg, half_wide_m, (-3.0, 3.0, FLOOR_M, top_m), _STONE)
+    for name, height_m in (("floor", FLOOR_M), ("ceiling", top_m)):
+        _level(draft, name, height_m, (half_wide_m, 6.0))
+    _furniture(draft, rng, (0.0, axis_m, half_wide_m - 0.7, -1.0))
+    return [apse], rng.uniform(-0.3, 0.3, (2, 3)) + np.array([[-0.9, 0.2, 0.0], [0.9, 0.5, 0.0]])
+
+
+def _tower(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    radius_m, top_m = rng.uniform(2.5, 4.0), rng.uniform(6.0, 9.0)
+    shape = Cylinder(point_world=np.zeros(3), axis_world=_UP, radius_m=radius_m, is_concave=False)
+    tower = _Bend(draft=draft, shape=shape, zero=np.array([1.0, 0.0, 0.0]))
+    turn_m = math.pi * radius_m
+    windows = [(a - 0.3, a + 0.3, 1.0, 2.2) for a in rng.uniform(-0.8, 0.8, 2) * turn_m]
+    windows = windows[: 1 if abs(windows[0][0] - windows[1][0]) < 1.0 else 2]
+    extent = (-turn_m, turn_m, FLOOR_M, top_m)
+    tower.place(extent, 0.0, _STONE, SurfaceRole.WALL, windows)
+    for window in windows:
+        tower.box(window, (0.0, -0.25), _OAK)
+    if relief > 0.0:
+        tower.box((-turn_m, turn_m, 3.0, 3.2), (0.0, 0.06 * relief), _STUCCO)
+    _level(draft, "floor", FLOOR_M, (16.0, 16.0))
+    # A house that touches the tower hides about 60 degrees of it.
+    add_block(
+        draft,
+        base=np.array([-radius_m - 2.2, 0.0, FLOOR_M]),
+        yaw_deg=0.0,
+        size_m=(5.0, radius_m, top_m + 4.0),
+        paint=_STUCCO,
+    )
+    _furniture(draft, rng, (radius_m + 2.0, 1.0, 0.0, radius_m + 1.5))
+    away_m = radius_m + rng.uniform(5.0, 7.0, 4)
+    azimuth = np.radians(np.array([-120.0, -40.0, 40.0, 120.0]) + rng.uniform(-10.0, 10.0, 4))
+    places = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(4)], axis=1)
+    return [tower], away_m[:, None] * places
+
+
+def _column(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    del relief
+    radius_m, top_m = rng.uniform(0.18, 0.35), 1.9
+    place = np.array([*rng.uniform(-0.3, 0.3, 2), 0.0])
+    shape = Cylinder(point_world=place, axis_world=_UP, radius_m=radius_m, is_concave=False)
+    column = _Bend(draft=draft, shape=shape, zero=np.array([1.0, 0.0, 0.0]))
+    turn_m = math.pi * radius_m
+    column.place((-turn_m, turn_m, FLOOR_M, top_m), 0.0, _FRESCO, SurfaceRole.WALL)
+    for low_m, high_m in ((FLOOR_M, FLOOR_M + 0.25), (top_m - 0.3, top_m)):
+        side_m = 2.3 * radius_m
+        size_m = (side_m, side_m, high_m - low_m)
+        base = place + low_m * _UP
+        add_block(draft, base=base, yaw_deg=10.0, size_m=size_m, paint=_STUCCO)
+    walls = (("right wall", 0.0), ("end wall", 90.0), ("left wall", 180.0), ("entrance", 270.0))
+    for name, omega_deg in walls:
+        _wall(draft, name, omega_deg, 3.2, (-3.2, 3.2, FLOOR_M, top_m), _STUCCO)
+    for name, height_m in (("floor", FLOOR_M), ("ceiling", top_m)):
+        _level(draft, name, height_m, (3.2, 3.2))
+    # A screen beside the column hides a part of it from the second station.
+    base = np.array([place[0] + radius_m + 0.3, place[1] - 0.9, FLOOR_M])
+    add_block(draft, base=base, yaw_deg=0.0, size_m=(0.5, 0.1, 2.4), paint=_OAK)
+    _furniture(draft, rng, (-2.0, -2.0, 2.2, 1.5))
+    return [column], rng.uniform(-0.2, 0.2, (2, 3)) + np.array(
+        [[-0.9, -2.0, 0.0], [1.0, -2.1, 0.1]]
+    )
+
+
+_BUILDERS: Final = {
+    "barrel-vault": _barrel_vault,
+    "cross-vault": _cross_vault,
+    "apse": _apse,
+    "tower": _tower,
+    "column": _column,
+}
