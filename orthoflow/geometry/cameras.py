@@ -133,7 +133,6 @@ class ViewingCamera:
         return projected
 
     def _project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project points (3, n) by the formula of `camera_kernels.project_point`."""
         k1, k2, p1, p2, k3 = self.distortion
         # Suppress NumPy's warnings: infinite and missing points become NaN.
         with np.errstate(all="ignore"):
@@ -471,7 +470,6 @@ def _bent(a: NDArray[np.float64], b: NDArray[np.float64], distortion: NDArray[np
 def _lens_columns(
     a: NDArray[np.float64], b: NDArray[np.float64], bent: _Bent
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return derivatives of the distorted ray by all lens parameters except the principal point."""
     r2 = a * a + b * b
     return {
         "focal": (bent.a, bent.b),

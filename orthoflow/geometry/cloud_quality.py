@@ -39,7 +39,6 @@ def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
 
 
 def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Return sums of 2 x 2 blocks; an odd last row or column is kept."""
     rows, columns = blocks.shape
     sums = np.zeros((-(-rows // 2), -(-columns // 2)), dtype=np.uint32)
     for first_row in (0, 1):
@@ -193,7 +192,6 @@ def judge_quality(
 def _indices_of_pieces(
     offsets: Sequence[NDArray[np.float32]], side_m: float
 ) -> Iterator[NDArray[np.intp]]:
-    """Return the indices of the points in cubes around some of the points."""
     n_points = len(offsets[0])
     lows = tuple(axis.min() for axis in offsets)
     one_of = -(-n_points // _LOOKED_AT_MOST)
@@ -234,7 +232,6 @@ def _cubes(
     *,
     axes: Sequence[int] = (0, 1, 2),
 ) -> list[NDArray[np.uint32]]:
-    """Return the indices of cubes along axes, counted from the lowest coordinates."""
     return [
         ((offsets[axis][chosen] - lows[axis]) * np.float32(1.0 / side_m)).astype(np.uint32)
         for axis in axes
@@ -262,7 +259,6 @@ def _scans(scan: NDArray[np.uint16] | None, chosen: NDArray[np.intp]) -> NDArray
 def _measured(
     points: NDArray[np.float64], scan: NDArray[np.uint16], side_m: float
 ) -> _Piece | None:
-    """Measure a piece; return None if it is not a single surface."""
     numbers, counts = np.unique(scan, return_counts=True)
     enough = numbers[counts >= _POINTS_LEAST]
     if not len(enough):

@@ -87,7 +87,6 @@ class _KernelCache(FunctionCache):
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled code for argument types, or None."""
         self._open_files()
         return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
@@ -195,7 +194,6 @@ def _decisive(function: FunctionType) -> tuple[object, ...]:
 
 
 def _described(value: object) -> bytes:
-    """Return bytes that represent a value other than a function."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}".encode() + value.tobytes()
     if isinstance(value, type):
@@ -209,7 +207,6 @@ def _described(value: object) -> bytes:
 
 
 def _all_code(code: CodeType) -> Iterator[CodeType]:
-    """Yield the code of a function and of the functions defined in it."""
     yield code
     for value in code.co_consts:
         if isinstance(value, CodeType):
@@ -268,7 +265,6 @@ class _Compilation(event.Listener):
         report_compiling(f"compiling {name} ({self._n_begun} so far)")
 
     def on_end(self, event: event.Event) -> None:
-        """Report the end of compilation."""
         self._depth -= 1
         if self._depth == 0:
             report_compiling("")

@@ -94,7 +94,6 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
 
 
 def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
-    """Average over kinds, lengths and sizes of common errors; see `honest_covariance`."""
     is_one, extent_m = not points.photo.any(), max(points.extent_m, 1e-9)
     cells = _cells(points, extent_m, _MAX_CELLS if is_one else _MAX_CELLS_OF_SEVERAL)
     counts = np.bincount(cells)

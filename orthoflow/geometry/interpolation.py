@@ -131,16 +131,12 @@ def _offsets_within(radius_cells: float) -> NDArray[np.int64]:
 
 
 class _Wanted(NamedTuple):
-    """The cells to interpolate, their neighbourhood, and a mask of interpolated cells."""
-
     cells: NDArray[np.int64]
     offsets: NDArray[np.int64]
     is_found: NDArray[np.bool_]
 
 
 class _Lenders(NamedTuple):
-    """Buffers for the positions, distances and weights of the neighbours of a cell."""
-
     cells: NDArray[np.int64]
     across: NDArray[np.float64]
     down: NDArray[np.float64]

@@ -398,7 +398,6 @@ def _distances(
     i: NDArray[np.intp],
     j: NDArray[np.intp],
 ) -> NDArray[np.float32]:
-    """Return the squared distances (n,) of pairs."""
     distances = np.empty(len(i), dtype=np.float32)
     for start in range(0, len(i), _PAIRS_AT_ONCE):
         some = slice(start, start + _PAIRS_AT_ONCE)

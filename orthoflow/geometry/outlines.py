@@ -184,7 +184,6 @@ def _common(first: list[Interval], second: list[Interval]) -> Iterator[Interval]
 
 
 def _distance(edge: Edge, point: NDArray[np.float64]) -> float:
-    """Return the distance between a point and a line segment."""
     begin, end = edge.ends_world
     along = float(np.clip((point - begin) @ (end - begin) / edge.length_m**2, 0.0, 1.0))
     return float(np.linalg.norm(point - begin - along * (end - begin)))
@@ -295,7 +294,6 @@ def _level(
 def _bounding(
     planes: Sequence[Plane], corners: NDArray[np.float64], basis: NDArray[np.float64]
 ) -> list[_Wall]:
-    """Return the walls that are not relief on an earlier wall."""
     limit = math.sin(math.radians(LEVEL_LIMIT_DEG))
     upright = [
         _Wall(
@@ -352,7 +350,6 @@ def _joints(walls: Sequence[_Wall]) -> dict[_End, _End]:
 
 
 def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
-    """Return the intersection of two walls in plan."""
     along = [wall.ends[1] - wall.ends[0] for wall in (first, second)]
     matrix = np.column_stack([along[0], -along[1]])
     size = first.length_m * second.length_m

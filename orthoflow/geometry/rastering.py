@@ -221,7 +221,6 @@ def entries_inside(
 
 
 def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[tuple[int, int]]:
-    """Yield the first and end indices of chunks that may contain points inside the slab."""
     n_points, boxes_m = points.x.size, points.boxes_m
     if boxes_m is None:
         edges = np.array([[0, n_points]])

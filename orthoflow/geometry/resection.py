@@ -347,7 +347,6 @@ class _Problem:
         return normal
 
     def _from_prior(self, camera: ViewingCamera) -> NDArray[np.float64]:
-        """Return the prior minus the current values of the free lens parameters."""
         return lens_values(self._prior, self.lens) - lens_values(camera, self.lens)
 
 

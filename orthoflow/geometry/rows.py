@@ -31,8 +31,6 @@ class Rows:
 
 
 class _Raster(Protocol):
-    """A dataclass with a frame and arrays of its cells."""
-
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property

@@ -187,7 +187,6 @@ def _grain(a: float, b: float, period: float, seed: int) -> float:
 
 @kernel_part
 def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Pattern:
-    """Return the pattern at (a, b)."""
     period, seed = params[5], int(params[6])
     light = _stains(a, b, period, seed)
     warmth = 0.7 * _value_noise((a + 11.0) / period, (b - 7.0) / period, seed + 10)
@@ -395,7 +394,6 @@ def _hit_distance(
 
 @kernel_part
 def _misses_box(nodes: NDArray[np.float64], node: Index, ray: Ray, t_max: float) -> bool:
-    """Return whether a ray, given by its start and inverse direction, misses a box."""
     near, far = (nodes[node, 0] - ray.x) * ray.dx, (nodes[node, 3] - ray.x) * ray.dx
     low, high = min(near, far), max(near, far)
     near, far = (nodes[node, 1] - ray.y) * ray.dy, (nodes[node, 4] - ray.y) * ray.dy
@@ -567,7 +565,6 @@ def points_on(
 
 
 def _cast_table(scene: Scene) -> CastTable:
-    """Prepare a scene for ray casting, with its tree of bounding boxes."""
     tree = _BoxTree(scene)
     holes = np.searchsorted(scene.hole_rectangle, np.arange(len(scene) + 1))
     turned = scene.turned(tree.axes)

@@ -248,7 +248,6 @@ class _Renderer:
     def shows_something(
         self, cells: NDArray[np.int64], wanted: NDArray[np.bool_] | None
     ) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the requested cells that show a surface."""
         shows: NDArray[np.bool_] = self._rectangle[cells] >= 0
         return shows if wanted is None else shows & wanted.reshape(-1)[cells]
 

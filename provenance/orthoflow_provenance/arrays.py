@@ -292,7 +292,6 @@ def _check_payload(payload: PayloadLike) -> None:
 
 
 def _write_content(group: h5py.Group, payload: PayloadLike) -> None:
-    """Write everything except the digest."""
     set_attributes(
         group,
         type=payload.type_name,

@@ -367,7 +367,6 @@ def bytes_behind_end(path: Path) -> int:
 
 
 def _require_format(file: h5py.File, file_name: str, name: str) -> None:
-    """Check the format of a file and the version of the format."""
     with reading(file_name):
         found, version = (_short_text(file, one) for one in ("format", "format_version"))
     if found is None or version is None:
@@ -395,8 +394,6 @@ def _short_text(file: h5py.File, name: str) -> str | None:
 
 
 class _Inspection:
-    """Inspection of all links, objects and attributes of a file."""
-
     def __init__(self, file: h5py.File, path: Path) -> None:
         self._file = file
         self._name = path.name

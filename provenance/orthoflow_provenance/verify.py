@@ -128,7 +128,6 @@ def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Findin
 
 
 def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
-    """Check the seal against the bytes of the file."""
     n_bytes = bytes_behind_end(path)
     if n_bytes:
         after = f"there are {n_bytes} bytes after"
@@ -272,7 +271,6 @@ def _product_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
 
 
 def _run_findings(record: RunRecord) -> Iterator[Finding]:
-    """Check fields and names of the run, its inputs and its published files."""
     for name in ("run_id", "name", "created_by", "started", "ended", "workflow_source"):
         if not getattr(record, name):
             yield Finding("field", "/", f"{name} must not be empty")
@@ -287,7 +285,6 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
 
 
 def _name_findings(record: RunRecord) -> Iterator[Finding]:
-    """Check names that are used for folders and files."""
     named = [("/@name", record.name), ("/@run_id", record.run_id)]
     for entry in record.inputs:
         place = f"/inputs/{entry.name}"
@@ -349,7 +346,6 @@ def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
 
 
 def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Iterator[Finding]:
-    """Check that digests are valid, and that each input has the digest of its source."""
     for folder, products in (("inputs", cell.inputs), ("outputs", cell.outputs)):
         for port, product in products.items():
             place, digest = f"/{CELLS}/{cell.address}/{folder}/{port}", product.digest

@@ -35,8 +35,6 @@ _LARGE_STEP: Final = 32 * 3 * _BLOCK_PX**2
 
 
 class _View(NamedTuple):
-    """A photo and its camera."""
-
     photo: Photo
     camera: ViewingCamera
 

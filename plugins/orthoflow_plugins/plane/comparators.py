@@ -62,8 +62,6 @@ def load_open3d(purpose: str) -> Any:
 
 
 class _Open3dMethod(Detector):
-    """Base class of methods that use open3d."""
-
     determinism = "loose"
 
     @classmethod

@@ -250,7 +250,6 @@ def _draw_bars(
 
 
 def _draw_row(axes: Axes, planes: Planes, row: RowPoints, materials: Materials) -> None:
-    """Draw the distances of the points of a scan row from the first plane, coloured by material."""
     axes.plot(row.along_m, 1000.0 * row.distance_m, ".", markersize=1, color="#333333")
     if row.intensity is not None:
         for name, (low, high) in materials.items():
@@ -420,7 +419,6 @@ def draw_space(
 
 
 def _around(first_deg: float, end_deg: float, count: int) -> tuple[float, float]:
-    """Return the limits of an axis on which pixels are centred at evenly spaced angles."""
     half_deg = 0.5 * (end_deg - first_deg) / count
     return first_deg - half_deg, end_deg - half_deg
 

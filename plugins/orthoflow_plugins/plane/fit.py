@@ -340,7 +340,6 @@ def _solved(
     mixture_m2: NDArray[np.float64],
     settled_m: float,
 ) -> CellFit | None:
-    """Solve by reweighted least squares, and estimate the variances of cells."""
     solution = np.zeros(design.shape[1])
     solution[0] = _densest_layer(heights_m)[0]
     usual_m2 = float(np.median(noise_m2 + mixture_m2))
@@ -483,7 +482,6 @@ def jackknife_covariance(
 
 
 def _flattening(fit: CellFit, weights: NDArray[np.float64]) -> float:
-    """Return the ratio of the derivative of the influence function to the weights."""
     design, faded = fit.design, fit.faded()
     inside = 1.0 - faded**2
     ratios = fit.residuals_m() / fit.limit_m

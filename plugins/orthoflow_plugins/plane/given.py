@@ -210,7 +210,6 @@ class GivenPlane(Method):
 def _all_placed(
     params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud, ctx: StepContext
 ) -> list[tuple[FacedPlane, str]]:
-    """Return each plane with its rectangle, and the source of its visible side."""
     placed_planes = []
     for nth, stated in enumerate(params.planes or (params,)):
         try:

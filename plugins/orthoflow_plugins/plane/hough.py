@@ -254,7 +254,6 @@ class HoughProposer(Proposer):
             self._barred[other, max(0, middle - reach) : middle + reach + 1] = 1
 
     def _vote(self, search: Search) -> None:
-        """Add the changes in votes since the last update."""
         tasks = []
         for group, voters in enumerate(self._voters):
             positions_m, change = voters.recount(search.claims)
@@ -275,7 +274,6 @@ class HoughProposer(Proposer):
         self._unscored = np.arange(len(self.votes))
 
     def _score(self) -> None:
-        """Find the best bin for each direction whose votes or excluded bins have changed."""
         tasks, tables = [], (self._barred, self._scores, self._places)
         for group, voters in enumerate(self._voters):
             half = 0 if self._is_plain else voters.smear_bins
@@ -458,7 +456,6 @@ def sections_of(
     votes, normals = votes[:, beyond : n_bins - beyond], normals_of(*angles_rad.T)
 
     def section(omega: ArrayLike, phi: ArrayLike) -> NDArray[np.float64]:
-        """Return the votes (n, b) for n directions, from the nearest ones in the accumulator."""
         cosines = normals @ normals_of(omega, phi).T
         nearest = np.abs(cosines).argmax(axis=0)
         cosine = cosines[nearest, np.arange(len(nearest))]

@@ -250,7 +250,6 @@ def planes_of(
 
 
 def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
-    """Return the plane as proposed by the detector, in world coordinates, with the same side."""
     own = item.candidate.plane
     if float(own.normal @ plane.normal) < 0.0:
         own = own.flipped()

@@ -212,7 +212,6 @@ class ConsensusProposer(Proposer):
         self._n_near = np.append(self._n_near, self._count_near(hypothesis[None], search))
 
     def _count_near(self, hypotheses: NDArray[np.float64], search: Search) -> NDArray[np.int64]:
-        """Return the number (h,) of remaining sample points near each hypothesis."""
         asked = self._shuffled[:_SECOND_POINTS]
         free_m = self._points_m.take(asked[search.claims[asked] < 0], axis=0)
         apart_m = np.abs(free_m @ hypotheses[:, :3].T - hypotheses[:, 3])
@@ -288,7 +287,6 @@ class ConsensusProposer(Proposer):
     def _scored(
         self, hypotheses: NDArray[np.float64], points_m: NDArray[np.float64], search: Search
     ) -> Scores:
-        """Score hypotheses by the distances of points."""
         from orthoflow_plugins.plane.kernels import bin_distances
 
         rows = hypotheses.astype(np.float32)
@@ -343,7 +341,6 @@ def are_near(
 
 
 def _distinct(ranked: NDArray[np.float64], tolerance_m: float) -> list[int]:
-    """Return the indices of the best hypotheses, of ranked ones (h, 4), with few similar ones."""
     n_most = max(_SECOND_LEAST, round(_SECOND_SHARE * len(ranked)))
     # This part nearly always contains enough different hypotheses.
     asked = ranked[: _SIMILAR_MOST * n_most]

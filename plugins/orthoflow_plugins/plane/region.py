@@ -213,7 +213,6 @@ class RegionProposer(Proposer):
         self._last = -1
 
     def _region_of(self, cloud: PreparedCloud) -> NDArray[np.int32]:
-        """Return the regions (s,) of the points of a cloud's sample; -1 for points in no region."""
         from orthoflow_plugins.plane.cloud import blocked
 
         # The last entry is for points in no voxel.
@@ -314,7 +313,6 @@ def _grown(
     )
 
     def small(own: NDArray[np.int32], counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return a mask of voxels in no region or in a region with too few points."""
         is_small = np.bincount(own + 1, counts) < least_points
         return np.asarray(is_small[own + 1] | (own < 0))
 

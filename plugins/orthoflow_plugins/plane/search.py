@@ -282,7 +282,6 @@ def _products(
     search: Search,
     ctx: StepContext,
 ) -> tuple[Planes, PointLabels]:
-    """Measure, assemble, report and draw the detected planes."""
     ctx.progress(0.8, "measuring deviations")
     planes, deviations, normalities, order = assemble(found, whole, cloud)
     # The last entry is for points on no plane, whose claim is -1.
@@ -589,7 +588,6 @@ def label(found: list[FoundPlane], cloud: PreparedCloud) -> None:
 
 
 def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
-    """Return the plane as proposed by the detector, with the rectangle that was found."""
     plane = item.candidate.plane
     if float(plane.normal @ item.raster.plane.normal) < 0.0:
         plane = plane.flipped()
@@ -599,7 +597,6 @@ def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
 def _wider_tolerance_m(
     search: Search, noise_m: tuple[float, float], proposer_of: Callable[[Search], Proposer]
 ) -> float | None:
-    """Return a larger `tolerance_m` with which a plane is found; None if there is none."""
     for times in _WIDER:
         update = {"n_planes_max": 1, "tolerance_m": times * search.cloud.tolerance_m}
         params = search.params.model_copy(update=update)
@@ -612,7 +609,6 @@ def _wider_tolerance_m(
 
 
 def _why_none(cloud: PointCloud, search: Search, wider_m: float | None, method: str) -> str:
-    """Return the error message if no plane was found: why candidates were rejected, and advice."""
     why, tolerance_m = _NO_CANDIDATE, search.cloud.tolerance_m
     if search.refusals:
         criterion, share = max(search.refusals, key=lambda refusal: refusal[1])

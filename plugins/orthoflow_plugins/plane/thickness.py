@@ -218,7 +218,6 @@ def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.floa
 def _spreads(
     values: NDArray[np.float64], edges: NDArray[np.float64], deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Return the spread for each class of points; classes with too few points are omitted."""
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     found = (
         _spread(None, float(edges[k]), float(edges[k + 1]), deviation_m[place == k])
@@ -230,7 +229,6 @@ def _spreads(
 def _by_material(
     intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Return the spread for each material; materials with too few points are omitted."""
     found = (
         _spread(name, low, high, deviation_m[(intensity >= low) & (intensity <= high)])
         for name, (low, high) in materials.items()

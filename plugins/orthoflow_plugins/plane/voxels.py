@@ -254,7 +254,6 @@ def _frame(
 
 
 def _with_room(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
-    """Enlarge a table unless it has `n_free` free rows."""
     if n_used + n_free <= len(values):
         return values
     return np.concatenate([values, np.zeros_like(values)])
@@ -387,7 +386,6 @@ def _set_keys(
 def _voxel(
     key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32], n_used: NDArray[np.int64]
 ) -> int:
-    """Return the number of the voxel with a given key; new voxels are numbered."""
     brick, voxel = key // VOXELS, key % VOXELS
     row = bricks[brick]
     if row < 0:
@@ -488,7 +486,6 @@ def find_voxels(
 
 @kernel_part
 def _voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
-    """Return the number of the voxel at a position; -1 if there is none."""
     if a < 0 or b < 0 or c < 0:
         return -1
     p, q, r = a >> 3, b >> 3, c >> 3

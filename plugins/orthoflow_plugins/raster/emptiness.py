@@ -174,7 +174,6 @@ def _blocked(
     sight: Sight,
     stations: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the tiles (n,) that objects hide from every station."""
     every = -(-len(tiles) // _RAYS_MOST)
     asked = tiles[::every]
     places = np.column_stack([asked % frame.width, asked // frame.width]).astype(np.float64) + 0.5
@@ -246,7 +245,6 @@ class _Room:
         return enter_m, leave_m
 
     def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the positions (n, 3) that are in voxels with points."""
         voxels = np.floor((places - self.low_m) / self.side_m).astype(np.int64)
         inside = ((voxels >= 0) & (voxels < self.occupied.shape)).all(axis=1)
         held = np.zeros(len(places), dtype=np.bool_)

@@ -516,7 +516,6 @@ def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
 
 
 def _searched_m(set_m: float | None, most_m: float) -> float:
-    """Return the depth to search in front of or behind a wall."""
     return most_m + _BEYOND_MOST_M if set_m is None else min(set_m, most_m)
 
 

@@ -273,7 +273,6 @@ def _frames(
 def _report_doubts(
     chosen: list[int], planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> None:
-    """Report walls cut off by oblique planes, and points of `near` far from all walls."""
     for index in chosen:
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - params.margin_m

@@ -75,7 +75,6 @@ def interpolate_net(
 def _interpolate(
     delaunay: Delaunay, table: NDArray[np.float64], slab: Slab, found: NDArray[np.float32]
 ) -> None:
-    """Interpolate values (cells, channels) inside triangles from those of the vertices."""
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import ConvexHull
 

@@ -286,5 +286,4 @@ def _rounded_up(depth_m: float) -> float | None:
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
-    """Return the rows of a raster, or only some of them if it is large."""
     return values[:: max(1, values.size // _CELLS_ASKED)]

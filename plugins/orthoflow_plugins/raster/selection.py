@@ -143,7 +143,6 @@ def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> Wa
 
 
 def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> float:
-    """Return the distance between a point (3,) and a rectangle (4, 3)."""
     sides = np.array([corners[3] - corners[0], corners[1] - corners[0]])
     shares = (place - corners[0]) @ sides.T / np.maximum((sides**2).sum(axis=1), 1e-12)
     nearest = corners[0] + np.clip(shares, 0.0, 1.0) @ sides

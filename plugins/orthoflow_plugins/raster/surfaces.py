@@ -164,7 +164,6 @@ def carried_to_centres(
 def _surface_of_winners(
     cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """Compute a surface in one pass, with the depth, intensity and colour of one point per cell."""
     winners = empty_winners(slab.n_cells)
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=threads):
@@ -315,7 +314,6 @@ def _sort_depths(
     *,
     threads: int,
 ) -> None:
-    """Sort the depths of each cell in place, and set the medians of the layers with most points."""
     task = partial(kernels.median_depths, ends, depths_m, layer_m, medians_m)
     in_parts(task, medians_m.size, threads=threads)
 
@@ -662,7 +660,6 @@ def _points_on(
     *,
     threads: int,
 ) -> NDArray[np.uint32]:
-    """Return the indices of points on the surface, in the cells of a mask (cells,)."""
     found = [np.empty(0, dtype=np.uint32)]
     for entries in entries_inside(cloud, slab, threads=threads):
         beside = is_near[entries.cells]

@@ -143,7 +143,6 @@ class _Side:
 
     @property
     def length(self) -> float:
-        """Length in cells."""
         return float(np.linalg.norm(self.end - self.begin))
 
 
@@ -233,7 +232,6 @@ def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
 
 
 def _joined(ring: NDArray[np.float64], sides: list[_Side]) -> list[_Side]:
-    """Join neighbouring sides that are nearly collinear."""
     joined = list(sides)
     while len(joined) > 3:
         corners = _corners(joined)
@@ -251,7 +249,6 @@ def _joined(ring: NDArray[np.float64], sides: list[_Side]) -> list[_Side]:
 
 
 def _corners(sides: list[_Side]) -> NDArray[np.float64]:
-    """Return the corners (n, 2) at which the sides begin."""
     return np.array([_corner(sides[k - 1], sides[k]) for k in range(len(sides))])
 
 
@@ -280,7 +277,6 @@ def _meeting(first: _Side, second: _Side) -> NDArray[np.float64] | None:
 
 
 def _sigma(side: _Side, spacing: float) -> float:
-    """Return sigma of a side, from cell size, point spacing and the scatter of its border."""
     scatter = side.scatter
     if side.middle is not None:
         scatter /= math.sqrt(max(1.0, side.length / spacing))
@@ -288,7 +284,6 @@ def _sigma(side: _Side, spacing: float) -> float:
 
 
 def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the shares (n,) of the sides along which the wall's face was measured."""
     rows, columns = is_face.shape
     shares = np.zeros(len(corners))
     for k, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
@@ -396,7 +391,6 @@ def _middle(slopes: NDArray[np.float64], top: int) -> float:
 
 
 def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners after moving each side outwards."""
     ways = np.roll(corners, -1, axis=0) - corners
     along = ways / np.linalg.norm(ways, axis=1, keepdims=True)
     outwards = np.column_stack([-along[:, 1], along[:, 0]])

@@ -285,7 +285,6 @@ class _Spots(Rows):
         return _Spots(rectangle=self.rectangle, in_rectangle=self.in_rectangle + step)
 
     def points(self, scene: Scene) -> NDArray[np.float64]:
-        """Return points (n, 3) relative to the scene's origin."""
         chosen = self.rectangle
         return (
             scene.centre[chosen]
@@ -373,7 +372,6 @@ def _corners(
 def _are_seen(
     scene: Scene, views: SceneCameras, spots: _Spots, stations: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the positions that are visible from at least one station."""
     points = spots.points(scene)
     seen = np.zeros(len(points), dtype=np.bool_)
     for station in stations:

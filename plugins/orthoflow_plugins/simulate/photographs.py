@@ -326,7 +326,6 @@ def place_to_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
 def _developed(
     image: NDArray[np.float32], film: Film, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Apply vignetting, add noise, and round to grey levels."""
     height, width = image.shape[:2]
     rows = (np.arange(height, dtype=np.float32) + 0.5) / height - 0.5
     columns = (np.arange(width, dtype=np.float32) + 0.5) / width - 0.5

@@ -299,7 +299,6 @@ def _build_wall(
     relief: float,
     cloths: list[Extent],
 ) -> None:
-    """Build a designed wall."""
     name, _, _, ground = _WALLS[number]
     recesses, mouldings = _DESIGNS[number]
     plane = wall.true_plane(name, _FULL)
@@ -484,7 +483,6 @@ def _overlap(one: Extent, other: Extent) -> bool:
 
 
 def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
-    """Return a random extent of a cloth with a given share of the main wall; None for 0."""
     if share <= 0.0:
         return None
     a0, a1 = _WALLS[0][2]
