@@ -105,7 +105,8 @@ class DiagnosticSpec:
         rank = plain.get(self.rank_by.removeprefix("-"))
         if self.rank_by and (isinstance(rank, str) or rank is None):
             raise ProductError(
-                f"diagnostic {self.code} is ranked by {self.rank_by}, not a number: {rank!r}"
+                f"diagnostic {self.code} is ranked by {self.rank_by}, which must be a number, got "
+                f"{rank!r}"
             )
         return Diagnostic(
             code=self.code,

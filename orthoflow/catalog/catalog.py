@@ -210,7 +210,9 @@ class Catalog:
             raise PluginError(f"{broken}{entry.spec.target} must be a subclass of Product")
         own = getattr(cls, "type_name", None)
         if own != type_name:
-            raise PluginError(f"{broken}the type_name of {entry.spec.target} is {own!r}")
+            raise PluginError(
+                f"{broken}the type_name of {entry.spec.target} must be {type_name}, got {own!r}"
+            )
         return cls
 
     def publisher(self, type_name: str) -> Publisher | None:

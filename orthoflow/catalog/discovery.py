@@ -126,10 +126,14 @@ def _announced(entry: EntryPoint) -> list[MethodSpec | KindSpec | ProductSpec]:
     ):
         for answer in answers:
             if not isinstance(answer, list | tuple):
-                raise PluginError(f"expected a list of {spec_class.__name__}, got {answer!r}")
+                raise PluginError(
+                    f"a hook must return a list of {spec_class.__name__}, got {answer!r}"
+                )
             for item in answer:
                 if not isinstance(item, spec_class):
-                    raise PluginError(f"expected a {spec_class.__name__}, got {item!r}")
+                    raise PluginError(
+                        f"a hook must return a list of {spec_class.__name__}, got an item {item!r}"
+                    )
                 _check(item)
                 specs.append(item)
     if not specs:
@@ -142,14 +146,17 @@ def _announced(entry: EntryPoint) -> list[MethodSpec | KindSpec | ProductSpec]:
 def _check(spec: MethodSpec | KindSpec | ProductSpec) -> None:
     ports = (*spec.inputs.items(), *spec.outputs.items()) if isinstance(spec, KindSpec) else ()
     if not all(isinstance(text, str) for port in ports for text in port):
-        raise PluginError(f"ports of kind {_name(spec)} must be names of product types")
+        raise PluginError(f"ports and product types of kind {_name(spec)} must be strings")
     name = _name(spec)
     if isinstance(spec, MethodSpec) and not _METHOD_ID.fullmatch(name):
         raise PluginError(
             f"method id must be kind.method in lower case, e.g. plane.mine, got {name!r}"
         )
     if not (isinstance(spec, MethodSpec) or _KIND.fullmatch(name)):
-        raise PluginError(f"kind and product names must match {NAME_PATTERN}, got {name!r}")
+        raise PluginError(
+            "the name of a kind or product must be at most 32 lower-case letters, digits, `_` and "
+            f"`-`, begin with a letter and not be a device name of Windows, got {name!r}"
+        )
     targets = [] if isinstance(spec, KindSpec) else [spec.target]
     if isinstance(spec, ProductSpec) and spec.publisher:
         targets.append(spec.publisher)

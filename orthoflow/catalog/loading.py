@@ -78,7 +78,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     citations: object = method.citations
     metrics: object = method.metrics
     rules = {
-        f"the id of its class is {own_id!r}": own_id == spec.id,
+        f"the id of its class must be {spec.id}, got {own_id!r}": own_id == spec.id,
         "its Params must be a subclass of MethodParams": _is_subclass(
             getattr(method, "Params", None), MethodParams
         ),

@@ -189,13 +189,13 @@ class _Lens(BaseModel):
         side = sides[info.field_name == "cy"]
         if info.field_name in ("fx", "fy") and not value >= 0.1 * max(sides):
             raise ValueError(
-                "expected the focal length in pixels, at least a tenth of the image's "
-                f"{max(sides)}, got {value:g}"
+                "expected the focal length in pixels, at least a tenth of the longer side of the "
+                f"image ({max(sides)}), got {value:g}"
             )
         if info.field_name in ("cx", "cy") and side and not -side <= value <= 2 * side:
             raise ValueError(
-                f"expected the principal point in pixels, in or near the image's {side}, got "
-                f"{value:g}"
+                "expected the principal point in pixels, inside or near the image "
+                f"({side} pixels), got {value:g}"
             )
         return value
 

@@ -163,11 +163,16 @@ def problem_of(lens: WideLens) -> str:
 def _problem_of_numbers(lens: FisheyeLens) -> str:
     values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew, *lens.radial, *lens.tangential)
     if not all(map(math.isfinite, values)) or min(lens.fx, lens.fy) <= 0.0:
-        return f"focal length {lens.fx:g}, {lens.fy:g}"
+        return (
+            f"its parameters must be finite and its focal lengths positive, got {lens.fx:g} and "
+            f"{lens.fy:g}"
+        )
     if not (1 <= lens.width <= MOST_PX and 1 <= lens.height <= MOST_PX):
-        return f"expected a photo of 1 to {MOST_PX} columns and rows"
+        return (
+            f"it has {lens.width} x {lens.height} pixels; the limit is {MOST_PX} columns and rows"
+        )
     if not 0.0 < lens.field_of_view_deg < _FULL_TURN_DEG:
-        return f"a field of view of {lens.field_of_view_deg:g} degrees, expected one below 360"
+        return f"its field of view is {lens.field_of_view_deg:g} degrees, not between 0 and 360"
     return ""
 
 
@@ -184,7 +189,7 @@ def _problem_of_faces(lens: FisheyeLens) -> str:
         )
     finest = max(lens.finest_px(0.0), lens.finest_px(0.5 * math.pi))
     if not finest < MOST_PX:
-        return f"{finest:.0f} pixels per radian; the limit is {MOST_PX}"
+        return f"it has {finest:.0f} pixels per radian; the limit is {MOST_PX}"
     faces = face_lenses(lens)
     large = [
         face
@@ -192,8 +197,8 @@ def _problem_of_faces(lens: FisheyeLens) -> str:
         if max(face.width, face.height) > MOST_PX or face.width * face.height > MOST_PIXELS
     ]
     if large:
-        return f"its faces would have {large[0].width} x {large[0].height} pixels"
-    return "" if faces else "it shows nothing inside the image"
+        return f"its faces would be too large: {large[0].width} x {large[0].height} pixels"
+    return "" if faces else "it shows no direction inside the image"
 
 
 def _radial(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -120,7 +120,11 @@ def mistakes(
         form = _list_form(model, str(name)) if kinds & _OF_LISTS else ""
         # All errors within one malformed list count as one mistake.
         if form and isinstance(data, dict):
-            yield (name,), f"{name} is written {form}, got {_shown(data.get(str(name)))}", True
+            yield (
+                (name,),
+                f"{name} must be written as {form}, got {_shown(data.get(str(name)))}",
+                True,
+            )
             for key in group:
                 del places[key]
     keys = {loc for loc, at_key in places if at_key}

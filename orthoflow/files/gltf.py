@@ -280,7 +280,7 @@ def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
     with RasterParts(depth) as raster:
         if raster.shape != frame.shape:
             raise InputError(
-                f"{depth} has {raster.shape[1]} x {raster.shape[0]} cells, expected the "
+                f"{depth} has {raster.shape[1]} x {raster.shape[0]} cells; expected the "
                 f"{columns} x {rows} of the orthoimage"
             )
         depths, shown = raster.read((0.0, 0.0, float(columns), float(rows)), shape)

@@ -316,7 +316,7 @@ class _Converter:
                 f"the document has more than {self.most_values} values once aliases are expanded",
             )
         if id(node) in self.open_nodes:
-            raise _UnreadableError(position, "the value contains itself through its anchor")
+            raise _UnreadableError(position, "the value contains itself through an alias")
         if len(at) > DEEPEST:
             raise _UnreadableError(position, f"the document is nested deeper than {DEEPEST} levels")
         self.places[at] = position

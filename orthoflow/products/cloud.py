@@ -154,6 +154,6 @@ class PointCloud(Product):
             # float64 here. Unlike `np.isfinite(values)`, it needs no array as large as the cloud.
             if not np.isfinite(np.sum(values, dtype=np.float64)):
                 raise ProductError(
-                    f"the cloud has coordinates in {name} that are NaN or infinite: read it with "
+                    f"cloud.{name} contains NaN or infinite coordinates: read the cloud with "
                     "read.scan, which drops such points"
                 )

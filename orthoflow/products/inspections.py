@@ -53,7 +53,10 @@ class CheckPoints(Product):
     def __post_init__(self) -> None:
         count = len(self.names)
         if len(self.classes) != count:
-            raise ProductError(f"checkpoints: {count} names, but {len(self.classes)} classes")
+            raise ProductError(
+                f"checkpoints.classes must have one class per name, got {len(self.classes)} "
+                f"classes for {count} names"
+            )
         require_shapes(
             "checkpoints",
             {

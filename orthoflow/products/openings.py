@@ -89,8 +89,8 @@ class Opening:
         )
         if count < _CORNERS_LEAST or not is_near:
             raise ProductError(
-                f"an opening needs at least {_CORNERS_LEAST} corners with coordinates below "
-                f"{FARTHEST_M:g}, got {count}"
+                f"an opening must have at least {_CORNERS_LEAST} corners, all with coordinates "
+                f"below {FARTHEST_M:g} m, got {count} corners"
             )
         if self.kind not in get_args(OpeningKind):
             raise ProductError(

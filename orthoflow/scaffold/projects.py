@@ -100,8 +100,9 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
 def _check(project: Project, folder: Path, catalog: Catalog) -> None:
     if not _NAME.fullmatch(project.name) or keyword.iskeyword(project.package):
         raise ArgumentError(
-            "a plugin's name must be 2 to 32 lower-case letters, digits and hyphens, start with "
-            f"a letter, and not be a Python keyword, e.g. my-detector, got {project.name!r}"
+            "a plugin's name must consist of 2 to 32 lower-case letters, digits and hyphens, start "
+            "with a letter, and not be a Python keyword, e.g. my-detector, got "
+            f"{project.name!r}"
         )
     if project.is_new_kind:
         _check_new_kind(project, catalog)

@@ -291,5 +291,6 @@ def _suffix(picture: bytes, name: str) -> str:
     if picture[:4] == b"RIFF" and picture[8:12] == b"WEBP":
         return ".webp"
     raise ProductError(
-        f"figure {name} must be a PNG or a WebP; its content begins with {picture[:_HEAD_BYTES]!r}"
+        f"figure {name} must be a PNG or WebP file; its content begins with "
+        f"{picture[:_HEAD_BYTES]!r}"
     )

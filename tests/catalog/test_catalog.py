@@ -83,8 +83,12 @@ def test_a_strangers_distribution_is_found_by_its_metadata(
         ("leaving", "raise SystemExit(3)", "SystemExit: 3"),
         ("raising", "raise ValueError('a\\nb')", "ValueError: a b"),
         ("mute", "x = 1", "PluginError: mute_hooks declares nothing"),
-        ("listless", hooks().replace("return []", "return 3", 1), "expected a list of MethodSpec"),
-        ("mixed", hooks(methods="'plane.mine'"), "expected a MethodSpec, got 'plane.mine'"),
+        (
+            "listless",
+            hooks().replace("return []", "return 3", 1),
+            "a hook must return a list of MethodSpec",
+        ),
+        ("mixed", hooks(methods="'plane.mine'"), "list of MethodSpec, got an item 'plane.mine'"),
         ("speechless", SPEECHLESS, "Speechless: a Speechless without a message"),
         ("long", "raise ValueError('x' * 10**6)", "... (1000000 characters)"),
         ("interrupting", "raise KeyboardInterrupt", "KeyboardInterrupt"),
@@ -283,7 +287,11 @@ class Mine(Method):
 """
 RUN = "    def run("
 CHANGES = {
-    "other id": ('"plane.mine"', '"plane.yours"', "the id of its class is 'plane.yours'"),
+    "other id": (
+        '"plane.mine"',
+        '"plane.yours"',
+        "the id of its class must be plane.mine, got 'plane.yours'",
+    ),
     "no Params": ("    Params = MethodParams\n", "", "Params must be a subclass of MethodParams"),
     "no run": ("def run(", "def go(", "it has no method run"),
     "no Method": ("class Mine(Method):", "class Mine:", "must be a subclass of Method"),
@@ -325,7 +333,9 @@ def test_publishers_are_loaded_by_name(tmp_path: Path, monkeypatch: pytest.Monke
     press = {"press_files": "def publish(product, folder, digest):\n    return digest\n"}
     catalog = with_plugin("press", text, tmp_path, monkeypatch, **press)
     assert catalog.publisher("notes") is not None
-    with pytest.raises(PluginError, match=r"notes of press .* the type_name of .* is .planes."):
+    with pytest.raises(
+        PluginError, match=r"notes of press .* the type_name of .* must be .*, got .planes."
+    ):
         catalog.product_class("notes")
 
 

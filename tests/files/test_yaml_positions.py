@@ -97,7 +97,7 @@ NO_YAML = "this is not YAML: "
         ("a: !foo {b: 1}", (1, 4, "a"), "tags are not allowed, got !foo"),
         ("b: !foo [1]", (1, 4, "b"), "tags are not allowed, got !foo"),
         (f"a: 0x{'1' * 999}", (1, 4, "a"), f"'0x{'1' * 98}...' is not a valid int"),
-        ("a: &b {c: *b}", (1, 4, ""), "the value contains itself through its anchor"),
+        ("a: &b {c: *b}", (1, 4, ""), "the value contains itself through an alias"),
         ("%YAML 1.1\n---\na: 1", (1, 1, ""),
          "expected YAML 1.2, got a %YAML line that asks for another version"),
         ("a: {b: 0,003}", (1, 8, "a.b"), f"0,003{COMMA}0.003"),

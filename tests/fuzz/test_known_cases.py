@@ -192,7 +192,7 @@ KNOWN: Final = {
     "E57 with 60,000 elements in a structure": ("E57", "a.e57",
         _with_xml(b"</e57Root>",
             b"".join(b'<b%d type="Integer"/>' % i for i in range(60_000)) + b"</e57Root>"),
-        "elements have more than 500 names"),
+        "elements have more than 500 different names"),
     # The engine's own files.
     "a journal of brackets": ("JOURNAL_FILE", "journal.jsonl", "[" * 50_000 + "\n", "damaged"),
     "a resolved workflow of brackets": ("RESOLVED", "r.json", "[" * 50_000,

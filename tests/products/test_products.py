@@ -220,7 +220,7 @@ def test_a_cloud_with_few_points_or_coordinates_that_are_not_finite_is_refused()
         CLOUD.require_points(4)
     for bad in (np.nan, np.inf, -np.inf):
         y = np.array([0.0, 0.0, bad], dtype=np.float32)
-        with pytest.raises(ProductError, match="coordinates in y that are NaN or infinite"):
+        with pytest.raises(ProductError, match=r"cloud\.y contains NaN or infinite coordinates"):
             dataclasses.replace(CLOUD, y=y).require_points(3)
 
 

@@ -138,7 +138,7 @@ def test_check_points_have_a_row_each(name: str) -> None:
     for wrong in (right[:2], np.concatenate([right, right], axis=right.ndim - 1)):
         with pytest.raises(ProductError, match=f"checkpoints.*{name}"):
             points_of(**{name: wrong})
-    with pytest.raises(ProductError, match="3 names, but 2 classes"):
+    with pytest.raises(ProductError, match="2 classes for 3 names"):
         points_of(classes=("", ""))
 
 
@@ -159,7 +159,7 @@ def test_the_error_of_all_sides_counts_those_that_were_seen() -> None:
     [
         ({"outline_world": np.zeros((3, 3))}, "opening.outline_world must have shape"),
         ({"side_source": np.zeros(3, dtype=np.uint8)}, "opening.side_source must have shape"),
-        ({"outline_m": np.full((4, 2), np.nan)}, "at least 3 corners with coordinates below"),
+        ({"outline_m": np.full((4, 2), np.nan)}, "at least 3 corners, all with coordinates below"),
         ({"kind": "hole"}, "must be one of through, niche, no data, got 'hole'"),
         ({"side_source": np.full(4, 9, dtype=np.uint8)}, "opening.side_source must be at most 2"),
     ],

@@ -59,7 +59,7 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
         assert f"`{kind}: {{use: {project.method_id}" in readme_text
 
 
-@pytest.mark.parametrize("kind", ["simulate", "face", "dense"])
+@pytest.mark.parametrize("kind", ["simulate", "segment", "face", "dense"])
 def test_a_new_plugin_passes_the_suite_as_it_is(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,8 +145,8 @@ PARTS = {"kind": "part", "product": "parts", "takes": ("cloud",)}
         ({**PARTS, "kind": "my-parts"}, "lower-case letters, digits and underscores, got 'my-par"),
         ({**PARTS, "product": "planes"}, "product planes is already registered"),
         ({**PARTS, "takes": ("clouds",)}, r"no product type clouds \(did you mean cloud\?\)"),
-        ({"name": "My Detector"}, "a plugin's name must be 2 to 32 lower-case letters"),
-        ({"name": "x"}, "a plugin's name must be 2 to 32 lower-case letters"),
+        ({"name": "My Detector"}, "a plugin's name must consist of 2 to 32 lower-case letters"),
+        ({"name": "x"}, "a plugin's name must consist of 2 to 32 lower-case letters"),
         (
             {"kind": "plain"},
             r"no installed plugin declares the kind plain \(did you mean plane\?\)",

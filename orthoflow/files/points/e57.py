@@ -270,7 +270,11 @@ def check_xml(path: Path) -> None:
         for count, most, reason in (
             (depth, DEEPEST_XML, f"it is nested deeper than {DEEPEST_XML} elements"),
             (n_elements, MOST_XML_ELEMENTS, f"it has more than {MOST_XML_ELEMENTS} elements"),
-            (len(names), MOST_XML_NAMES, f"its elements have more than {MOST_XML_NAMES} names"),
+            (
+                len(names),
+                MOST_XML_NAMES,
+                f"its elements have more than {MOST_XML_NAMES} different names",
+            ),
         ):
             if count > most:
                 raise _refusal(path, reason)

@@ -91,8 +91,8 @@ def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     if columns is None:
         listed = "; ".join(f"{name}: {' '.join(labels)}" for name, _, labels, _ in elements)
         raise InputError(
-            f"{path.name} has no element vertex with single x, y and z, but {listed[:300]}: "
-            "expected a point cloud; export it as points"
+            f"{path.name} has no element vertex with the scalar properties x, y and z, but "
+            f"{listed[:300]}: expected a point cloud; export it as points"
         )
     columns = replace(columns, labels=tuple(names))
     before, what = elements[:position], "vertex element"
@@ -176,7 +176,7 @@ def open_pcd(path: Path, *, intensity_field: str | None = None) -> ScanFile:
         return _open_pcd(path, entries, comments, offset, intensity_field)
     except (ValueError, KeyError, IndexError, TypeError) as error:
         missing = [key for key in _PCD_KEYS if key not in entries]
-        reason = f"without {', '.join(missing)}" if missing else str(error)
+        reason = f"it lacks {', '.join(missing)}" if missing else str(error)
         raise InputError(
             f"{path.name} has no readable PCD header ({reason}); export it again"
         ) from error
@@ -207,20 +207,20 @@ def _open_pcd(
     single = [label if count == 1 else "" for label, count in zip(labels, counts, strict=True)]
     columns = columns_of_names(single, intensity_field=intensity_field)
     if columns is None:
-        raise ValueError(f"its fields are {' '.join(labels)[:300]}, expected x, y and z")
+        raise ValueError(f"its fields are {' '.join(labels)[:300]}; expected x, y and z")
     columns = replace(columns, labels=tuple(labels))
     data = entries["DATA"][0].lower()
     if data not in {"ascii", "binary", "binary_compressed"}:
-        raise ValueError(f"data are {data}, expected ascii, binary or binary_compressed")
+        raise ValueError(f"data are {data}; expected ascii, binary or binary_compressed")
     if "POINTS" in entries:
         entries = {"WIDTH": entries["POINTS"], "HEIGHT": ["1"]} | entries
     width, height = int(entries["WIDTH"][0]), int(entries["HEIGHT"][0])
     n_points = int(entries.get("POINTS", [str(width * height)])[0])
     if height > 1 and width * height != n_points:
-        raise ValueError(f"it has {height} rows of {width} points, but {n_points} points")
+        raise ValueError(f"it declares {height} rows of {width} points, but {n_points} points")
     pose = [float(item) for item in entries.get("VIEWPOINT", ["0"] * 7)]
     if len(pose) < 3:
-        raise ValueError(f"VIEWPOINT has {len(pose)} numbers, expected 7")
+        raise ValueError(f"VIEWPOINT has {len(pose)} numbers; expected 7")
     if data == "binary_compressed":
         read = partial(_compressed, path, row, columns, offset, n_points)
     else:
