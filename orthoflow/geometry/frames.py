@@ -186,10 +186,10 @@ class Bend:
     """The curvature of a raster that unrolls a part of a circular cylinder.
 
     Attributes:
-        along: `u` if rows of the raster follow the arc, with columns parallel to the axis of the
-            cylinder (towers, columns, apses); `v` if columns follow it (barrel vaults).
-        radius_m: radius, positive if the axis is on the viewer's side of the surface (seen from
-            inside), negative if the surface is seen from outside.
+        along: `u` if rows of the raster follow the arc and columns are parallel to the axis of the
+            cylinder (towers, columns and apses); `v` if columns follow the arc (barrel vaults).
+        radius_m: radius in metres; positive if the surface is seen from inside, so that the axis is
+            on the viewer's side, and negative if it is seen from outside.
     """
 
     along: Literal["u", "v"]
@@ -205,15 +205,15 @@ class Bend:
 
 @dataclass(frozen=True, kw_only=True)
 class WallFrame:
-    """A raster on a plane or cylinder: u to the right of the viewer, v down, n to the viewer.
+    """A raster on a plane or cylinder: u to the right of the viewer, v down, n towards the viewer.
 
     On a plane, the world coordinates of a position (column, row) at a given depth are
     `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`. The centre
     of cell (row, column) is at (column + 0.5, row + 0.5); `u x v = -n`.
 
-    On a cylinder, this holds at the top-left corner only; u or v is the length of the arc on the
-    cylinder, and the depth is the distance from it along its local normal. Every position has axes
-    of its own (see `axes_at`).
+    On a cylinder, the axes depend on the position (see `axes_at`), and `u_world`, `v_world` and
+    `normal_world` are those at the top-left corner. One coordinate is the arc length on the
+    cylinder, and the depth is the distance from the cylinder along the local normal.
 
     Attributes:
         origin_world: (3,) float64 metres, outer corner of the top-left cell, on the surface.
@@ -229,7 +229,7 @@ class WallFrame:
         name: name of the wall, used in the name of the raster's coordinate system.
         left_m: distance along the wall from its left edge to the left edge of this raster, if the
             raster shows only part of the wall.
-        bend: curvature of a raster on a cylinder; None on a plane.
+        bend: curvature of a raster on a cylinder; None for a raster on a plane.
     """
 
     origin_world: NDArray[np.float64]
@@ -257,7 +257,7 @@ class WallFrame:
         if not np.allclose(np.cross(self.u_world, self.v_world), -self.normal_world, atol=1e-9):
             raise GeometryError("a wall frame needs u x v = -n, but these axes mirror the image")
         if self.bend is not None:
-            # Blocks of cells may exceed a whole turn by a part of a block.
+            # A raster of whole blocks of cells may exceed a full turn by a part of a block.
             n_cells = self.width if self.bend.along == "u" else self.height
             if (n_cells - 1) * self.gsd_m > math.tau * abs(self.bend.radius_m):
                 raise GeometryError(
@@ -280,7 +280,7 @@ class WallFrame:
         the top edge. For floors and ceilings, X and Y are the horizontal world axes. Y of a ceiling
         increases with the row number, so that the ceiling can be superimposed on the floor. For
         sloping planes, and if up is unknown, X and Y are distances from the top-left corner.
-        Cylinders with an upright axis are treated as walls, others as sloping planes.
+        Cylinders with a vertical axis are treated as walls, and others as sloping planes.
         """
         if self.map_crs is not None:
             return "map"
@@ -333,7 +333,7 @@ class WallFrame:
 
     @property
     def plane(self) -> Plane:
-        """Plane that contains the raster; of a cylinder, the tangent plane at its middle."""
+        """Plane that contains the raster; for a cylinder, the tangent plane at its middle."""
         if self.bend is not None:
             normal = self.facing_world
             return Plane(normal=normal, offset_m=float(normal @ self.middle_world))
@@ -343,13 +343,13 @@ class WallFrame:
 
     @property
     def middle_world(self) -> NDArray[np.float64]:
-        """Point (3,) of the surface at the middle of the raster."""
+        """Point (3,) on the surface at the middle of the raster, in metres."""
         middle: NDArray[np.float64] = self.world_from_wall(0.5 * self._size)[0]
         return middle
 
     @property
     def facing_world(self) -> NDArray[np.float64]:
-        """Unit normal (3,) at the middle of the raster, the same everywhere on a plane."""
+        """Unit normal (3,) at the middle of the raster."""
         normal: NDArray[np.float64] = self.axes_at(0.5 * self._size)[0, 2]
         return normal
 
@@ -372,7 +372,8 @@ class WallFrame:
         """Return the frame of another part of the same surface.
 
         Args:
-            corner: column and row of its top-left corner; they may be outside the raster.
+            corner: column and row of the top-left corner of the part, which may be outside this
+                raster.
             width: number of columns.
             height: number of rows.
         """
@@ -387,7 +388,8 @@ class WallFrame:
         """Return whether both frames have the same cells, to within 0.001 cells at the corners."""
         if self.shape != other.shape or (self.bend is None) != (other.bend is None):
             return False
-        # Cylinders of different radii or sides may share their corners, but not their middle.
+        # Rasters on cylinders with different radii or sides may have the same corners, but not the
+        # same middle.
         apart = max(
             np.abs(self.corners_world() - other.corners_world()).max(),
             0.0 if self.bend is None else np.abs(self.middle_world - other.middle_world).max(),
@@ -421,7 +423,7 @@ class WallFrame:
         )
 
     def axes_at(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the axes u, v, n (n, 3, 3), as rows, at positions (n, 2) = (column, row)."""
+        """Return the axes u, v and n, as rows (n, 3, 3), at positions (n, 2) = (column, row)."""
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         axes = np.array([self.u_world, self.v_world, self.normal_world])
         if self.bend is None:
@@ -437,7 +439,7 @@ class WallFrame:
     def metres_per_cell(self, depths_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sizes (n, 2) of cells along u and v at depths (n,), in metres.
 
-        In front of a cylinder seen from inside, cells are narrower along the arc.
+        In front of a cylinder that is seen from inside, cells are shorter along the arc.
         """
         sizes = np.full((len(depths_m), 2), self.gsd_m)
         if self.bend is not None:
@@ -464,13 +466,14 @@ class WallFrame:
         return points
 
     def _from_cylinder(self, bend: Bend, relative: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return wall positions (n, 3); the cut of the cylinder is opposite the raster's middle."""
+        """Return wall positions (n, 3); the cylinder is cut opposite the middle of the raster."""
         bent, straight = (0, 1) if bend.along == "u" else (1, 0)
         axes, side = (self.u_world, self.v_world), math.copysign(1.0, bend.radius_m)
         aside = side * (relative @ axes[bent])
         away = side * (bend.radius_m - relative @ self.normal_world)
         middle = 0.5 * self.gsd_m * float(self._size[0, bent]) / bend.radius_m
-        # Angles are measured from the middle, because they jump by a turn opposite of it.
+        # Measure angles from the middle of the raster, because they jump by a full turn at the
+        # opposite side.
         cosine, sine = math.cos(middle), math.sin(middle)
         angles = middle + np.arctan2(cosine * aside - sine * away, cosine * away + sine * aside)
         on_wall = np.empty((len(relative), 3))

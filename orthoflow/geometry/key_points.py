@@ -22,7 +22,7 @@ from orthoflow.geometry.rows import Rows
 _OPENCV_CONTRAST: Final = 0.04
 # Contrast threshold; half of the default still gives correct matches.
 _MIN_CONTRAST: Final = 0.02
-# OpenCV's default ratio of curvatures.
+# Maximum ratio of the curvatures at a key point; OpenCV's default.
 _MAX_EDGE_RATIO: Final = 10.0
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
 # SIFT doubles the size of an image and keeps all scales in memory, which takes 0.23 GB per million

@@ -27,8 +27,8 @@ _STEPS: Final = 1 << 16
 # An image has a single tone if at least this share of its cells is almost black, almost white, or
 # differs from the median by at most one of 256 levels.
 _PLAIN_SHARE: Final = 0.98
-# Cells are almost black or almost white if they differ from it by less than this share of the
-# brightness of white.
+# Cells are almost black (or white) if they differ from black (or white) by less than this share of
+# the brightness of white.
 _DARK: Final = 0.03
 _LEVEL: Final = 0.5 / 255.0
 _TONE_SAMPLE: Final = 40_000

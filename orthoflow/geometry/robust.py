@@ -38,7 +38,7 @@ def least_absolute(
     Args:
         design: (n, k) design matrix.
         wanted: (n,) observations.
-        held: (k,) weights that pull the unknowns towards 0.
+        held: (k,) regularisation weights; a larger weight keeps an unknown closer to 0.
     """
     weights = np.ones(len(wanted))
     solution: NDArray[np.float64] = np.zeros(design.shape[1])

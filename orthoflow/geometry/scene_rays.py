@@ -277,19 +277,19 @@ def paint_points(
 
 @kernel_part
 def _arc_length(curvature: float, along: float, towards: float) -> float:
-    """Return the arc length a of a place on a bent rectangle.
+    """Return the arc length a of a position on a bent rectangle.
 
     Args:
         curvature: reciprocal radius of the rectangle.
-        along: distance from the centre of the rectangle along axis a.
-        towards: distance from it along the normal.
+        along: position relative to the centre of the rectangle, along axis a.
+        towards: position relative to the centre, along the normal.
     """
     return math.atan2(curvature * along, 1.0 - curvature * towards) / curvature
 
 
 Index: TypeAlias = int | np.int64
 
-# Number of points along a bent rectangle that determine its box.
+# Number of points along the arc of a bent rectangle from which its bounding box is computed.
 _RING_POINTS: Final = 33
 # Minimum distance of a hit, so that rays do not hit the surface from which they start.
 _NEAREST: Final = 1e-9
@@ -332,7 +332,7 @@ class Ray(NamedTuple):
 def _contains(
     r: NDArray[np.float64], holes: NDArray[np.float64], index: Index, a: float, b: float
 ) -> bool:
-    """Return whether a place is inside the extent of a rectangle and in none of its holes."""
+    """Return whether a position is inside the extent of a rectangle and in none of its holes."""
     if a < r[index, 12] or a > r[index, 13] or b < r[index, 14] or b > r[index, 15]:
         return False
     for h in range(int(r[index, 16]), int(r[index, 17])):
@@ -345,7 +345,7 @@ def _contains(
 def _bent_distance(
     r: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
-    """Return the distance to a rectangle bent to a cylinder, as `_hit_distance`."""
+    """Like `_hit_distance`, but for a rectangle that is bent to a part of a cylinder."""
     bend = r[index, 18]
     x, y, z = ray.x - r[index, 0], ray.y - r[index, 1], ray.z - r[index, 2]
     along = x * r[index, 3] + y * r[index, 4] + z * r[index, 5]
@@ -354,7 +354,7 @@ def _bent_distance(
     d_along = ray.dx * r[index, 3] + ray.dy * r[index, 4] + ray.dz * r[index, 5]
     d_b = ray.dx * r[index, 6] + ray.dy * r[index, 7] + ray.dz * r[index, 8]
     d_towards = ray.dx * r[index, 9] + ray.dy * r[index, 10] + ray.dz * r[index, 11]
-    # The circle: along^2 + towards^2 - 2 towards / bend = 0.
+    # The equation of the circle is along^2 + towards^2 - 2 towards / bend = 0.
     square = d_along * d_along + d_towards * d_towards
     half = along * d_along + (towards - 1.0 / bend) * d_towards
     root = half * half - square * (along * along + towards * (towards - 2.0 / bend))
@@ -655,11 +655,11 @@ class _BoxTree:
 
 
 def _enclosing_ring(scene: Scene, index: int) -> NDArray[np.float64]:
-    """Return points (n, 3) whose box contains a bent rectangle: corners of prisms around it."""
+    """Return points (n, 3) whose bounding box contains a bent rectangle: corners of prisms."""
     bend = float(scene.curvatures_per_m[index])
     a = np.linspace(scene.extent[index, 0], scene.extent[index, 1], _RING_POINTS)
-    # Between two points of the arc, the arc is inside the box of the points moved outwards by the
-    # sagitta.
+    # Between two of its points, the arc is inside the box around these points and their
+    # displacements outwards by the sagitta.
     radius_m = 1.0 / abs(bend)
     sagitta_m = radius_m * (1.0 - math.cos(0.5 * abs(bend) * float(a[1] - a[0])))
     rectangle = np.full(2 * len(a), index)

@@ -1,6 +1,6 @@
 """Simulated scenes that consist of textured rectangles.
 
-A rectangle may be bent to a part of a cylinder, so that vaults and towers consist of few parts.
+Rectangles can be bent to parts of cylinders, so that vaults and towers consist of few rectangles.
 
 Random numbers are functions of a lattice cell, a seed and an index (`draw`), so they do not depend
 on the order of computation or the number of threads. The formulas are those of `scene_rays`,
@@ -75,10 +75,10 @@ class Scene:
         hole_rectangle: (h,) int32 index of the rectangle that contains the hole, ascending.
         hole_extent: (h, 4) float64 metres, as in `extent`; the edge of a hole belongs to the
             rectangle.
-        curvature_per_m: (r,) float64 reciprocal radii of rectangles that are bent about an axis
-            parallel to `axis_b`, without stretching, so that a is the length of an arc. It is
-            positive if a rectangle is bent towards its normal, and 0 if it is flat. None if all
-            are flat.
+        curvature_per_m: (r,) float64 reciprocal radii, in 1 / metre, of rectangles that are bent
+            about an axis parallel to `axis_b` without being stretched, so that a is an arc length.
+            The curvature is positive if a rectangle is bent towards its normal, and 0 if it is
+            flat. None if all rectangles are flat.
     """
 
     origin: NDArray[np.float64]
@@ -125,14 +125,14 @@ class Scene:
 
     @property
     def curvatures_per_m(self) -> NDArray[np.float64]:
-        """Curvatures (r,), 0 for flat rectangles."""
+        """Curvatures (r,) in 1 / metre; 0 for flat rectangles."""
         bent = self.curvature_per_m
         return np.zeros(len(self.centre)) if bent is None else bent
 
     def points_m(
         self, rectangle: NDArray[np.int64], a: NDArray[np.float64], b: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the points (n, 3) at (a, b) of rectangles (n,), metres from `origin`."""
+        """Return the points (n, 3) at (a, b) of rectangles (n,), in metres from `origin`."""
         points = self.centre[rectangle] + b[:, None] * self.axis_b[rectangle]
         bent = self.curvatures_per_m[rectangle]
         radius = 1.0 / np.where(bent == 0.0, 1.0, bent)
@@ -144,7 +144,7 @@ class Scene:
     def normals_at(
         self, rectangle: NDArray[np.int32], points: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the unit normals (n, 3) of rectangles (n,) at points (3, n) on them.
+        """Return the unit normals (n, 3) of rectangles (n,) at points (3, n) on these.
 
         Points are in metres from `origin`.
         """
@@ -159,7 +159,7 @@ class Scene:
         return normals
 
     def corners_m(self) -> NDArray[np.float64]:
-        """Return the corners (r, 4, 3) of the rectangles in cyclic order, if flat, in metres.
+        """Return the corners (r, 4, 3) of the rectangles, in metres, as if all were flat.
 
         They are relative to `origin`.
         """

@@ -1,4 +1,4 @@
-"""Curved surfaces in the world: circular cylinders and cones, seen from inside or from outside."""
+"""Curved surfaces in the world: circular cylinders and cones, seen from inside or outside."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from orthoflow.geometry.frames import basis_from_up
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder:
-    """A circular cylinder without ends.
+    """A circular cylinder of infinite length.
 
     Attributes:
-        point_world: (3,) float64 metres, a point of the axis.
+        point_world: (3,) float64 metres, a point on the axis.
         axis_world: (3,) float64 unit vector of the axis.
         radius_m: radius in metres.
-        is_concave: whether it is seen from inside, like a vault or an apse; towers and columns are
-            seen from outside.
+        is_concave: whether the cylinder is seen from inside, like a vault or an apse; towers and
+            columns are seen from outside.
     """
 
     point_world: NDArray[np.float64]
@@ -35,13 +35,13 @@ class Cylinder:
             raise GeometryError(f"a cylinder needs a positive radius, got {self.radius_m}")
 
     def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return signed distances (n,) of points (n, 3), metres, positive towards the viewer."""
+        """Return signed distances (n,) of points (n, 3) in metres, positive towards the viewer."""
         _, across = along_and_across(points_world, self.point_world, self.axis_world)
         outwards = np.linalg.norm(across, axis=1) - self.radius_m
         return np.asarray(-outwards if self.is_concave else outwards)
 
     def normals(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return unit normals (n, 3) towards the viewer, at the places nearest to points (n, 3)."""
+        """Return unit normals (n, 3), towards the viewer, at the places nearest to points."""
         _, across = along_and_across(points_world, self.point_world, self.axis_world)
         outwards = across / np.linalg.norm(across, axis=1, keepdims=True)
         return np.asarray(-outwards if self.is_concave else outwards)
@@ -49,13 +49,13 @@ class Cylinder:
 
 @dataclass(frozen=True, kw_only=True)
 class Cone:
-    """One half of a circular cone, which opens from its apex in the direction of its axis.
+    """One nappe of a circular cone, which opens from the apex in the direction of the axis.
 
     Attributes:
         apex_world: (3,) float64 metres.
         axis_world: (3,) float64 unit vector from the apex into the cone.
         half_angle_rad: angle between the axis and the surface, between 0 and 90 degrees, radians.
-        is_concave: whether it is seen from inside.
+        is_concave: whether the cone is seen from inside.
     """
 
     apex_world: NDArray[np.float64]
@@ -72,9 +72,9 @@ class Cone:
             )
 
     def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return signed distances (n,) of points (n, 3), metres, positive towards the viewer.
+        """Return signed distances (n,) of points (n, 3) in metres, positive towards the viewer.
 
-        They are perpendicular to the nearest generatrix, which is extended beyond the apex.
+        Distances are measured perpendicular to the nearest generatrix, extended beyond the apex.
         """
         along, across = along_and_across(points_world, self.apex_world, self.axis_world)
         radius = np.linalg.norm(across, axis=1)
@@ -82,7 +82,7 @@ class Cone:
         return np.asarray(-outwards if self.is_concave else outwards)
 
     def normals(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return unit normals (n, 3) towards the viewer, at the places nearest to points (n, 3)."""
+        """Return unit normals (n, 3), towards the viewer, at the places nearest to points."""
         _, across = along_and_across(points_world, self.apex_world, self.axis_world)
         radial = across / np.linalg.norm(across, axis=1, keepdims=True)
         outwards = radial * math.cos(self.half_angle_rad)
@@ -95,11 +95,11 @@ def along_and_across(
     point_world: NDArray[np.float64],
     axis_world: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split points (n, 3) into positions (n,) along an axis and vectors (n, 3) from the axis.
+    """Return the positions (n,) of points along an axis, and vectors (n, 3) from the axis to them.
 
     Args:
         points_world: (n, 3) points.
-        point_world: (3,) point of the axis, where positions along it begin.
+        point_world: (3,) point on the axis from which positions are measured.
         axis_world: (3,) unit vector.
     """
     relative = points_world - point_world
@@ -108,11 +108,11 @@ def along_and_across(
 
 
 def zero_direction(axis_world: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit vector (3,) perpendicular to an axis from which angles around it count.
+    """Return the direction (3,) of angle 0 around an axis, a unit vector perpendicular to it.
 
-    For axes at most 45 degrees from vertical, it is the horizontal direction e1 of
-    `basis_from_up`, made perpendicular to the axis. For others, it is `up`, made perpendicular, so
-    that angle 0 is the crown of a vault.
+    If the axis is at most 45 degrees from the vertical, the result is the component of the
+    horizontal direction e1 (see `basis_from_up`) perpendicular to the axis. Otherwise, it is that
+    of `up`, so that angle 0 is at the crown of a vault.
 
     Args:
         axis_world: (3,) unit vector of the axis.
@@ -130,11 +130,11 @@ def angles_around(
     axis_world: NDArray[np.float64],
     zero_world: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return angles (n,) of points (n, 3) around an axis by the right-hand rule, -pi to pi.
+    """Return the angles (n,), -pi to pi, of points (n, 3) around an axis, by the right-hand rule.
 
     Args:
         points_world: (n, 3) points.
-        point_world: (3,) point of the axis.
+        point_world: (3,) point on the axis.
         axis_world: (3,) unit vector of the axis.
         zero_world: (3,) unit vector perpendicular to the axis, the direction of angle 0.
     """

@@ -114,7 +114,7 @@ class Metric:
 
     Attributes:
         name: name of the metric; it ends with the unit if there is one.
-        value: value; finite.
+        value: finite number.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
         label: name in tables if the method declares one; otherwise empty.
         better: values that are better: `lower`, `higher` or `one` (closest to 1); empty if no

@@ -232,7 +232,7 @@ def document_text(record: RunRecord) -> str:
 
 
 def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
-    """Return, by path, the objects that the document determines: those that repeat parts of it.
+    """Return the objects that repeat parts of the document, by path.
 
     Parents precede their children. Products, files and the seal are not included.
 

@@ -25,7 +25,7 @@ Vector = tuple[float, float, float]
 # Share of the points below the default horizontal plane, which is below the scene but above stray
 # points.
 _GROUND_SHARE: Final = 0.01
-# A share of points outside the rectangle that exceeds this is reported.
+# A warning is reported if a larger share of the points is outside the rectangle.
 _STRAY_REPORTED: Final = 1e-3
 # Buffer of skarlatos2012: three tolerances on each side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0

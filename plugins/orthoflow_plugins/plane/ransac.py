@@ -218,7 +218,7 @@ class ConsensusProposer(Proposer):
         return np.asarray(np.sum(apart_m <= search.cloud.tolerance_m, axis=0, dtype=np.int64))
 
     def _best(self, search: Search) -> Candidate | None:
-        """Return the best hypothesis with enough points, if they concentrate on its plane.
+        """Return the best hypothesis for which enough points concentrate on its plane.
 
         A plane through mouldings and clutter is also near many points, but these are distributed
         over the whole slab. Such planes are excluded here, because full verification takes ten

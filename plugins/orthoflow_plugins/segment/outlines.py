@@ -59,8 +59,8 @@ _EDGE_SHARE: Final = 0.2
 # Minimum standard deviation of an edge. Errors of the depths also affect edges in the orthoimage,
 # because it was computed with these depths.
 _SIGMA_LEAST_CELLS: Final = 0.5
-# An edge in the orthoimage differs from the edge in depth if the distance between the two exceeds
-# this number of standard deviations of the latter.
+# An edge in the orthoimage does not correspond to the edge in depth if the distance between the two
+# exceeds this number of standard deviations of the edge in depth.
 _APART_SIGMAS: Final = 1.5
 # The edge is ambiguous if the slope of another edge in the profile exceeds this share of the
 # steepest slope.
@@ -147,7 +147,7 @@ class _Side:
 
 
 def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return midpoints (n, 2) of the cell sides on the border, counter-clockwise for viewers."""
+    """Return midpoints (n, 2) of cell sides on the border, counter-clockwise for the viewer."""
     from orthoflow.files.polygons import outlines
 
     found = outlines(cells.astype(np.int16) - 1)

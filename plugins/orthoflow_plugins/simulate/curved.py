@@ -1,4 +1,4 @@
-"""`simulate.curved`: scans and photos of a simulated vault, apse, tower or column, with truth."""
+"""`simulate.curved`: scans and photos of a simulated curved building, with ground truth."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from orthoflow_plugins.simulate.photographs import (
 if TYPE_CHECKING:
     from orthoflow_plugins.simulate.deliverables import Delivery
 
-# Elevations that the scanner measures; vaults are above it.
+# Range of elevations that the scanner measures, which includes vaults above the scanner.
 _LOWEST_RAD: Final = math.radians(-60.0)
 _HIGHEST_RAD: Final = math.radians(88.0)
-# Distance from the scanner to which `scan_step_m` refers.
+# Distance from the scanner at which the point spacing is `scan_step_m`.
 _STEP_AT_M: Final = 3.0
 _FOOTPRINT_M: Final = (2.7, 2.0)
 _GAP: Final = 0.3
 
 
 class SimulateCurved(Method):
-    """Scan and photograph a building with curved walls, whose dimensions are drawn.
+    """Scan and photograph a building with curved walls and random dimensions.
 
-    Barrel vault, cross vault, apse, round tower seen from outside, or a column that is half hidden;
-    with furniture, mouldings and painted textures. Scanner and photos have the errors of
-    `simulate.room`.
+    The building is a barrel vault, a cross vault, an apse, a round tower seen from outside, or a
+    column of which half is hidden. It has furniture, mouldings and painted textures. Errors of the
+    scanner and the photos are those of `simulate.room`.
     """
 
     id: ClassVar[str] = "simulate.curved"
@@ -98,7 +98,7 @@ class SimulateCurved(Method):
         """No inputs."""
 
     class Out(Ports):
-        """The scan, the photos and their truth; `cameras` are the true orientations."""
+        """The scan, the photos and the ground truth; `cameras` are the true poses."""
 
         cloud: PointCloud
         photos: Photos
@@ -108,11 +108,11 @@ class SimulateCurved(Method):
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Numba and NumPy for the points, OpenCV for the JPEG files."""
+        """Return numba and NumPy, which compute the points, and OpenCV, which writes JPEG files."""
         return {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Build the scene, scan and photograph it, and return the truth."""
+        """Build the scene, simulate scans and photos, and return these with the ground truth."""
         del inputs
         from orthoflow.geometry.scene_views import SceneCameras
         from orthoflow_plugins.simulate.deliverables import (

@@ -1,6 +1,7 @@
-"""Simulated buildings with curved walls: vault, cross vault, apse, round tower, column.
+"""Simulated buildings with curved walls: barrel vault, cross vault, apse, tower and column.
 
-All dimensions are drawn. The frame of a building is in metres, z up, with the origin at eye level.
+All dimensions are random. Coordinates in the frame of a building are in metres, with z upwards and
+the origin at eye level.
 """
 
 from __future__ import annotations
@@ -38,9 +39,10 @@ _OAK: Final = Paint(TextureKind.WOOD, (132, 92, 58), 0.35, 0.4, 0.12, 23)
 _STONE: Final = Paint(TextureKind.TILES, (176, 160, 132), 0.5, 0.3, 0.4, 24)
 _FRESCO: Final = Paint(TextureKind.FRESCO, (196, 176, 148), 0.5, period_m=0.36, seed=25)
 _FLOOR: Final = Paint(TextureKind.TILES, (150, 138, 122), 0.35, period_m=0.35, seed=26)
-# A building is tilted by up to this angle.
+# Maximum tilt of a building.
 _TILT_DEG: Final = 1.0
-# The faces across the axis of a moulding are flat pieces that cover at most this angle.
+# The sides of mouldings that follow the arc consist of flat pieces, each of which covers at most
+# this angle.
 _PIECE_RAD: Final = math.radians(3.0)
 # Width of the strips between the groins of a cross vault.
 _STRIP_M: Final = 0.03
@@ -51,10 +53,10 @@ class TrueCylinder:
     """A cylinder that a detector should find.
 
     Attributes:
-        shape: the cylinder, whose point is at the middle of the surface.
+        shape: the cylinder; its point is at the middle of the surface's length.
         zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
-        arc_rad: range of the angles.
-        along_m: range along the axis.
+        arc_rad: smallest and largest angle.
+        along_m: smallest and largest position along the axis.
     """
 
     shape: Cylinder
@@ -71,9 +73,11 @@ class Building:
         scene: its surfaces.
         planes: its large planes; `scene.plane_index` is an index into them.
         cylinders: its curved surfaces.
-        on_cylinder: (r,) index of the cylinder of each rectangle of the scene; -1 for none.
+        on_cylinder: (r,) index of the cylinder that contains each rectangle of the scene; -1 for
+            none.
         stations: (s, 3) positions from which it is scanned.
-        photographed: targets of photos: points, normals and distances of the camera.
+        photographed: targets of photos: for each, a point, the normal at this point, and the
+            distance of the camera.
     """
 
     scene: Scene
@@ -88,14 +92,14 @@ class Building:
 class _Bend:
     """A cylindrical wall under construction.
 
-    Places on it are (a, b): length of arc from angle 0, and distance along the axis. Depths are
-    positive towards the viewer.
+    Positions on the wall are (a, b): arc length from angle 0, and distance along the axis. Depths
+    are positive towards the viewer.
 
     Attributes:
         draft: the draft to which rectangles are added.
         shape: the cylinder.
         zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
-        extents: extents of all parts of the wall itself.
+        extents: extents of all parts of the wall, without mouldings and recesses.
         rows: indices of these parts in the draft.
     """
 
@@ -113,7 +117,7 @@ class _Bend:
         role: SurfaceRole,
         holes: Sequence[Extent] = (),
     ) -> None:
-        """Add a bent rectangle, whose extent is given on the wall itself."""
+        """Add a bent rectangle; its extent is given at depth 0."""
         sign = -1.0 if self.shape.is_concave else 1.0
         radius_m = self.shape.radius_m + sign * depth_m
         scale = radius_m / self.shape.radius_m
@@ -134,7 +138,7 @@ class _Bend:
             self.rows.append(len(self.draft.surfaces) - 1)
 
     def box(self, extent: Extent, depths_m: tuple[float, float], paint: Paint) -> None:
-        """Add a moulding or a recess between the depth of the wall and another one."""
+        """Add a moulding or a recess, given the depths of its base and its face."""
         role = SurfaceRole.RELIEF if depths_m[1] > 0.0 else SurfaceRole.RECESS
         self.place(extent, depths_m[1], paint, role)
         a0, a1, b0, b1 = extent
@@ -155,7 +159,7 @@ class _Bend:
     def at(
         self, a: float, b: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the point at (a, b), the direction in which a increases, and the normal."""
+        """Return the point at (a, b), the direction of increasing a, and the normal."""
         angle, aside = a / self.shape.radius_m, np.cross(self.shape.axis_world, self.zero)
         outwards = math.cos(angle) * self.zero + math.sin(angle) * aside
         along = math.cos(angle) * aside - math.sin(angle) * self.zero
@@ -175,13 +179,13 @@ class _Bend:
 
 
 def _scaled(extent: Extent, scale: float) -> Extent:
-    """Return an extent whose a is multiplied by a scale, which may be negative."""
+    """Multiply a_min and a_max of an extent by a scale, which may be negative."""
     a0, a1, b0, b1 = extent
     return min(scale * a0, scale * a1), max(scale * a0, scale * a1), b0, b1
 
 
 def build(subject: Subject, rng: np.random.Generator, *, relief: float, gap: float) -> Building:
-    """Build a drawn building.
+    """Build a building with random dimensions.
 
     Args:
         subject: kind of building.
@@ -228,7 +232,7 @@ def _turned(true: TrueCylinder, turn: NDArray[np.float64]) -> TrueCylinder:
 
 
 def _targets(bend: _Bend) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
-    """Yield targets over the wall: three around the axis times two or more along it."""
+    """Yield targets on the wall: at least three around the axis, times at least two along it."""
     true, radius_m = bend.true_cylinder(), bend.shape.radius_m
     distance_m = min(0.9 * radius_m, 3.0) if bend.shape.is_concave else 3.0
     n_along = max(2, math.ceil((true.along_m[1] - true.along_m[0]) / 1.5))
@@ -248,7 +252,7 @@ def _wall(
     paint: Paint,
     holes: Sequence[Extent] = (),
 ) -> Side:
-    """Add a vertical wall whose outward direction has an azimuth."""
+    """Add a vertical wall, given the azimuth of its outward normal."""
     wall = wall_side(draft, omega_deg=omega_deg, phi_deg=0.0, distance_m=distance_m)
     plane = wall.true_plane(name, extent)
     wall.place(extent, 0.0, paint, SurfaceRole.WALL, plane=plane, holes=holes)
@@ -256,7 +260,7 @@ def _wall(
 
 
 def _level(draft: SceneDraft, name: str, height_m: float, reach: tuple[float, float]) -> None:
-    """Add a floor or, above the origin, a ceiling."""
+    """Add a floor, or a ceiling if the height is positive."""
     sign = 1.0 if height_m < 0.0 else -1.0
     level = flat_side(draft, normal=(0.0, 0.0, sign), height_m=height_m)
     extent = (-reach[0], reach[0], -reach[1], reach[1])
@@ -279,7 +283,7 @@ def _vaulted_hall(
     half_long_m: float,
     top_m: float,
 ) -> None:
-    """Add floor, furniture and four walls; those at the ends reach up to `top_m`."""
+    """Add a floor, furniture and four walls; the walls at the ends extend up to `top_m`."""
     spring_m = 1.0
     door: Extent = (-0.5, 0.6, FLOOR_M - 0.1, 0.6)
     for name, omega_deg in (("right wall", 0.0), ("left wall", 180.0)):
@@ -399,7 +403,7 @@ def _tower(
     if relief > 0.0:
         tower.box((-turn_m, turn_m, 3.0, 3.2), (0.0, 0.06 * relief), _STUCCO)
     _level(draft, "floor", FLOOR_M, (16.0, 16.0))
-    # A house that touches the tower hides about 60 degrees of it.
+    # Add a house that touches the tower and hides about 60 degrees of it.
     add_block(
         draft,
         base=np.array([-radius_m - 2.2, 0.0, FLOOR_M]),
@@ -434,7 +438,7 @@ def _column(
         _wall(draft, name, omega_deg, 3.2, (-3.2, 3.2, FLOOR_M, top_m), _STUCCO)
     for name, height_m in (("floor", FLOOR_M), ("ceiling", top_m)):
         _level(draft, name, height_m, (3.2, 3.2))
-    # A screen beside the column hides a part of it from the second station.
+    # Add a screen beside the column, which hides a part of it from the second station.
     base = np.array([place[0] + radius_m + 0.3, place[1] - 0.9, FLOOR_M])
     add_block(draft, base=base, yaw_deg=0.0, size_m=(0.5, 0.1, 2.4), paint=_OAK)
     _furniture(draft, rng, (-2.0, -2.0, 2.2, 1.5))

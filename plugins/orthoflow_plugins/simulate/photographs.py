@@ -155,7 +155,7 @@ def planned_shots(
 def draw_lens(
     rng: np.random.Generator, footprint_m: tuple[float, float], distance_m: float, gsd_m: float
 ) -> Intrinsics:
-    """Draw a lens with Brown distortion that shows an area at a distance with this pixel size."""
+    """Return a random lens that shows an area, at a given distance, with a given pixel size."""
     width, height = (max(16, round(side / gsd_m)) for side in footprint_m)
     off_centre = rng.uniform(-0.006, 0.006, 2) * width
     scatter = np.append(rng.uniform(-1.0, 1.0, 4), 0.0)
@@ -181,9 +181,9 @@ def shot_at(
     aim: tuple[NDArray[np.float64], NDArray[np.float64]],
     roll_deg: float,
 ) -> Shot:
-    """Return a photo that is taken from a centre, aimed at a point with a normal, and rotated.
+    """Return a photo that is taken from a centre, aimed at a point on a wall, and rotated.
 
-    The upper side of a camera that looks straight up or down is along x.
+    If the camera looks straight up or down, the upper side of the photo is in the direction of x.
     """
     target, normal = aim
     cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
