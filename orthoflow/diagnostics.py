@@ -183,7 +183,7 @@ def grouped(reported: Iterable[tuple[str, Diagnostic]]) -> tuple[DiagnosticGroup
 
 
 def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
-    """Return the distinct texts of warnings and errors, with their remedies."""
+    """Return the text of each distinct warning and error, with its remedy."""
     return tuple(
         dict.fromkeys(
             f"{one.text}: {one.remedy}" if one.remedy else one.text

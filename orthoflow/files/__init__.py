@@ -1,1 +1,1 @@
-"""Readers of files from other programs (images, GeoTIFF, point clouds), and writers of results."""
+"""Readers of images, GeoTIFFs and point clouds from other programs, and writers of results."""

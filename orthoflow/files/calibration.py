@@ -267,7 +267,7 @@ def _problem(lens: Intrinsics | FisheyeLens) -> str:
 
 
 def _folds(camera: Intrinsics) -> bool:
-    """Return whether the lens model is not invertible somewhere in the image."""
+    """Return whether the lens model cannot be inverted in a part of the image."""
     sides = (np.linspace(0.0, side, 9) for side in (camera.width, camera.height))
     pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     try:

@@ -184,7 +184,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     with tempfile.TemporaryDirectory() as folder:
         for path in parts:
             (Path(folder) / f"{path.stem.lower()}{suffix}").symlink_to(path.absolute())
-        # Replace the points by an empty file, because they are many and not needed.
+        # Replace the file of points with an empty one, because it is large and not needed.
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
-# Exactly the text that GDAL returns from a GeoTIFF, so that comparisons succeed.
+# This is exactly the text that GDAL returns from a GeoTIFF, so that comparisons succeed.
 _LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["{},'
     ' metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
@@ -218,7 +218,7 @@ def write_raster(
         path: output file in an existing folder.
         values: (rows, cols) float32 values, int16 or int32 labels, or uint8 classes.
         place: position of the raster.
-        tags: texts stored in the file.
+        tags: strings stored in the file, by name.
 
     Raises:
         StoreError: the file cannot be written.
@@ -259,7 +259,7 @@ def write_orthoimage(
         rgb: (rows, cols, 3) colours of 8 or 16 bits; the file has the same depth.
         shown: (rows, cols) True where the image has content (coloured from photos or filled).
         place: position of the raster.
-        tags: texts stored in the file.
+        tags: strings stored in the file, by name.
         icc_profile: colour profile; None if it is sRGB or unknown.
 
     Raises:
@@ -619,7 +619,7 @@ class RasterPlace:
         epsg: EPSG code of the coordinate system, or None.
         wkt: coordinate system, as returned by GDAL.
         wkt2: coordinate system as WKT 2.
-        bounds: lowest X and Y, highest X and Y, in the coordinate system.
+        bounds: lowest X, lowest Y, highest X and highest Y in the coordinate system.
         outline_lonlat: closed ring of the corners, counter-clockwise, longitude and latitude in
             degrees; empty if the coordinate system has no position on Earth.
         bands: data type of each band.

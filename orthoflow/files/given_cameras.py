@@ -93,8 +93,8 @@ class GivenCamera:
     """The orientation of one photo, as given in a file.
 
     Attributes:
-        name: photo name, including folders in the file, separated by slashes; some programs omit
-            the suffix.
+        name: photo name as in the file, with folders separated by slashes; some programs omit the
+            suffix.
         lens: interior orientation, or None if the file does not contain it.
         rotation: (3, 3) camera_from_world; None if the photo has no orientation.
         translation: (3,) camera_from_world, in the unit of the file.
@@ -232,7 +232,7 @@ def _fisheye(
 def nearest_lens(
     start: Intrinsics, rays: NDArray[np.float64], pixels: NDArray[np.float64]
 ) -> tuple[Intrinsics | FisheyeLens, float]:
-    """Return the lens in our models that is closest to another program's, and its deviation.
+    """Return the lens of our models that is closest to another program's lens, and its deviation.
 
     Args:
         start: focal length, principal point and size of the other lens.

@@ -181,7 +181,7 @@ def _is_photo(page: ImageFileDirectory_v2) -> bool:
 
 
 def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
-    """Return the page of a TIFF file that has the photo: the largest that is not a preview."""
+    """Return the photo's page in a TIFF file: the largest page that is not a preview."""
     pages = tiff_pages(encoded)
     return max(
         [item for item in pages if _is_photo(item[1])] or pages,
@@ -433,7 +433,7 @@ def damage(encoded: bytes) -> tuple[str, bool]:
 
 
 def _is_padded(encoded: bytes, text: str) -> bool:
-    """Return whether libjpeg only skipped bytes after the scan, as some cameras write them.
+    """Return whether libjpeg only skipped bytes after the scan, which some cameras write.
 
     Some cameras write a few arbitrary bytes, or a long padding. If libjpeg decoded a part of the
     padding as pixels, however, a part of the scan is missing.

@@ -382,7 +382,7 @@ def _publish_raster(
 
 
 def _cells_of(image: Orthoimage, shown: NDArray[np.bool_]) -> Cells:
-    """Return the source of a preview's cells; images with 16 bits are converted part by part."""
+    """Return a function for the cells of a preview; 16-bit images are converted in parts."""
     return lambda part: (eight_bits(image.rgb[part]), shown[part])
 
 
@@ -465,7 +465,7 @@ _DIGITS: Final = 4
 
 
 def publish_openings(product: Openings, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_openings.geojson` per wall with openings, `openings.geojson`, `openings.csv`.
+    """Write `openings.geojson`, `openings.csv` and, per wall, `wall_<k>_openings.geojson`.
 
     The files of a wall are in the coordinates of its GeoTIFF; `openings.geojson` is in scan
     coordinates, with x, y, z on the planes of the walls.

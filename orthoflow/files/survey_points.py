@@ -344,7 +344,7 @@ class _Table:
 
 def _as_number(cell: str) -> float | None:
     try:
-        # Python accepts digits grouped by underscores, but they are not numbers here.
+        # Python accepts digits grouped by underscores, which are not numbers here.
         return None if "_" in cell else float(cell)
     except ValueError:
         return None

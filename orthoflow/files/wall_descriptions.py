@@ -34,11 +34,11 @@ class WallDescription(BaseModel):
         painted_share: share of cells with a colour in the image.
         height_of_top_m: height of the upper edge in scan coordinates, in metres; None for
             horizontal surfaces.
-        expected_mm_median: median over the image of the expected error (one standard deviation) of
-            a point measured in it; None if the image was not checked.
+        expected_mm_median: median of the expected error (one standard deviation) of points measured
+            in the image; None if the image was not checked.
         expected_mm_p95: 95th percentile of the expected error over the image.
         n_withheld_ties: number of withheld tie points on this wall; 0 if there is no image.
-        errors: errors in the run because of which the orthoimage should not be delivered.
+        errors: errors of the run that are reasons not to deliver the orthoimage.
         near: centre of the image in scan coordinates, in metres, which selects the wall if it is
             added to the parameter `near` of the wall step.
         orthoimage: path of the GeoTIFF, relative to the file with this description.

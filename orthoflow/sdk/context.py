@@ -236,7 +236,7 @@ class StepContext:
 
     @property
     def warnings(self) -> list[str]:
-        """Texts of the diagnostics that are warnings or errors."""
+        """The text of each diagnostic that is a warning or an error."""
         return list(warning_texts(self.diagnostics))
 
     def cancelled(self) -> bool:

@@ -258,7 +258,11 @@ class AttributedCloud:
         scan: NDArray[np.uint16] | None,
         plane: NDArray[np.int16] | None,
     ) -> NDArray[np.float32]:
-        """Return signs (n,) that turn normals to the scanner, to the plane's normal, or upwards."""
+        """Return signs (n,) that orient normals towards the scanner.
+
+        If its position is unknown, normals point to the same side as the plane's normal, or upwards
+        if there is no plane.
+        """
         stations = self.cloud.stations
         towards = np.broadcast_to(self.cloud.up, world.shape)
         if self.station(0) is not None and stations is not None:

@@ -155,8 +155,8 @@ def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path)
         return None
     records = np.memmap(folder / "records", dtype=kind, mode="r")
     n_points = len(records)
-    # With a margin of one step and an odd number of steps, no point is on the border between nodes
-    # that readers compute from rounded metres.
+    # A margin of one step and an odd number of steps keep all points off the borders between nodes,
+    # which readers compute from rounded metres.
     low = np.min(lowest, axis=0) - 1
     span = int((np.max(highest, axis=0) - low).max())
     waiting = _Waiting(

@@ -1,4 +1,4 @@
-"""Colours of points from the photo that shows each of them best."""
+"""Colours of points, each from the photo that shows the point best."""
 
 from __future__ import annotations
 

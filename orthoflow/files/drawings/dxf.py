@@ -401,7 +401,7 @@ def _sides(
 def _arches(
     samples: NDArray[np.float64], left: float, bottom: float, right: float
 ) -> list[NDArray[np.float64]]:
-    """Return candidate arches up to the outline's apex, keyed by springing height."""
+    """Return candidate arches with the outline's apex, in descending order of springing height."""
     apex = float(samples[:, 1].max())
     half = 0.5 * (right - left)
     rises = np.linspace(0.0, min(half, apex - bottom), _SPRINGINGS + 1)[1:]

@@ -194,12 +194,12 @@ class RoomLines:
 
     @cached_property
     def edges(self) -> tuple[Edge, ...]:
-        """Return the edges of the room, in each of which two planes intersect."""
+        """Return the edges of the room, where two planes intersect."""
         return edges_between(self.surfaces)
 
     @cached_property
     def corners(self) -> tuple[Corner, ...]:
-        """Return the corners of the room, in each of which three planes intersect."""
+        """Return the corners of the room, where three planes intersect."""
         return corners_between(self.surfaces, self.edges)
 
     @cached_property

@@ -116,7 +116,7 @@ class Section:
     Attributes:
         cut: the cutting plane.
         lines: the cut lines.
-        gaps_m: (g, 2, 2) stretches of cut planes without points: doors, windows, occlusions.
+        gaps_m: (g, 2, 2) stretches of cut planes without points: doors, windows and occlusions.
         beyond_m: (b, 2, 2) edges and outlines of openings beyond the cut.
         points_m: (p, 2) thinned points of the slab that are not near any line.
         slab_m: thickness of the slab from which points were used; 0 if there is no cloud.
@@ -227,7 +227,7 @@ def _areas_m2(planes: Planes) -> NDArray[np.float64]:
 def _slab(
     cut: Cut, cloud: PointCloud | None, labels: PointLabels | None
 ) -> tuple[float, NDArray[np.float64], NDArray[np.int64]]:
-    """Return the slab's thickness, its points' X and Y, and the plane of each point, or -1."""
+    """Return the slab's thickness, X and Y of its points, and the plane of each point, or -1."""
     if cloud is None or len(cloud) == 0:
         return 0.0, np.empty((0, 2)), np.empty(0, dtype=np.int64)
     slab_m = 0.02

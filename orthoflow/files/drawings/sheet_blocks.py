@@ -1,4 +1,4 @@
-"""The blocks beside the pictures of a sheet: scale bar, notes, legend, key plan, title block.
+"""The blocks beside the pictures of a sheet: scale bar, notes, legend, key plan and title block.
 
 reportlab's flowables measure and wrap text; this module creates the blocks, and packs them into a
 column on the right of the sheet or a strip along its lower edge.
@@ -442,7 +442,7 @@ def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any]
 def _rows(
     cells: Sequence[tuple[list[Any], bool]], n_columns: int, wide_mm: float
 ) -> Iterator[list[Any]]:
-    """Arrange cells in rows: wide cells take two columns, the last one the rest of its row."""
+    """Arrange cells in rows; wide cells take two columns, and the last cell the rest of its row."""
     rows: list[list[tuple[list[Any], int]]] = [[]]
     for content, is_wide in cells:
         span = 2 if is_wide else 1

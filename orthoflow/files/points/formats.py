@@ -37,7 +37,7 @@ class Format(NamedTuple):
 
 
 _PLY_START: Final = re.compile(rb"ply[\n\r ]", re.IGNORECASE)
-# The first line of some programs differs from the standard's, or there is no comment line.
+# Some programs write a different first line than the standard's, or no comment line.
 _PCD_START: Final = re.compile(
     rb"# \.PCD|(?:.*\n)*?[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]", re.IGNORECASE
 )

@@ -88,7 +88,7 @@ class PointBlock:
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest coordinates (2, 3), NaN included; infinities without points."""
+        """Lowest and highest coordinates (2, 3); NaN if any is NaN, infinite without points."""
         if not len(self.points):
             return np.array([[np.inf] * 3, [-np.inf] * 3])
         return np.stack([self.points.min(axis=0), self.points.max(axis=0)])

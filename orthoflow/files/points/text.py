@@ -272,7 +272,7 @@ def _count_ends(block: bytes) -> int:
 
 # Any: arrays of any type.
 def values_of(table: Table, columns: Columns, packed: Any = np.int64) -> Values:
-    """Return the columns of a text table by meaning; packed colours are cast to type `packed`."""
+    """Return the columns of a text table by meaning; `packed` is the type of packed colours."""
     values: Values = dict(zip(columns.places, table, strict=True))
     if "rgb" in values:
         values["rgb"] = np.nan_to_num(values["rgb"], posinf=0.0, neginf=0.0).astype(packed)
