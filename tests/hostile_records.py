@@ -87,7 +87,7 @@ def rewrite(file: h5py.File, text: str) -> None:
         for name in list(file.attrs):
             del file.attrs[name]
         for name, node in nodes.items():
-            module._write_node(file, name, node)
+            module.write_node(file, name, node)
     except (RecordFormatError, ValueError, KeyError, TypeError, RecursionError):
         # A document that no writer would write: nothing can repeat it.
         for name in {"document", "seal"} & set(file):
@@ -104,7 +104,7 @@ def seal(file: h5py.File) -> None:
     offset = write_array(file, "seal", fixed_text("0" * 64)).id.get_offset()
     path = Path(file.filename)
     file.close()
-    module._seal_file(path, offset)
+    module.seal_file(path, offset)
 
 
 def publish_again(run: Path) -> None:

@@ -94,7 +94,7 @@ def doctor(store: Path, *, as_json: bool) -> int:
     """
     # Each library is imported in a process of its own, because it may crash.
     with ThreadPoolExecutor(max_workers=max(2, os.cpu_count() or 1)) as pool:
-        libraries = list(pool.map(_library, _libraries()))
+        libraries = list(pool.map(_library, required_libraries()))
     findings = [*_machine(), *_store(store), *libraries, *_plugins()]
     is_broken = any(item.core and item.verdict == "missing" for item in findings)
     if as_json:
@@ -116,7 +116,7 @@ def _print(findings: list[Finding], *, is_broken: bool) -> None:
     echo("", "a required part is missing" if is_broken else restricted)
 
 
-def _libraries() -> list[str]:
+def required_libraries() -> list[str]:
     """Return the names of the libraries that orthoflow requires."""
     # On Linux, open3d is provided by open3d-cpu.
     return sorted((direct_requirements(DISTRIBUTION) or frozenset()) - {"open3d"})

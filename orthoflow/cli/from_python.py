@@ -58,7 +58,7 @@ def run(
         ArgumentError: the folder contains a finished run, or an option is invalid.
     """
     several = {
-        "sets": [f"{name}={_json(f'set.{name}', value)}" for name, value in (set or {}).items()],
+        "sets": [f"{name}={json_of(f'set.{name}', value)}" for name, value in (set or {}).items()],
         "inputs": [
             f"{name}={path}" for name, paths in (inputs or {}).items() for path in _listed(paths)
         ],
@@ -83,7 +83,7 @@ def run(
         raise ArgumentError(f"orthoflow.run: {error.format_message()}") from error
     chosen = dict(context.params)
     if isinstance(datasets, Mapping):
-        chosen["datasets"] = json.loads(_json("datasets", datasets))
+        chosen["datasets"] = json.loads(json_of("datasets", datasets))
     changes = Changes(**{item.name: chosen.pop(item.name) for item in fields(Changes)})
     # If the run is interrupted, its report shows the command in this context.
     with context:
@@ -99,7 +99,12 @@ def _listed(value: Any) -> list[Any]:
     return list(value) if is_many else [value]
 
 
-def _json(where: str, value: Any) -> str:
+def json_of(where: str, value: Any) -> str:
+    """Return a value as JSON, with arrays, NumPy numbers and paths as a workflow has them.
+
+    Raises:
+        ArgumentError: the value at `where` has another type.
+    """
     try:
         return json.dumps(value, default=_plain)
     except (TypeError, ValueError) as error:

@@ -340,7 +340,7 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
     from orthoflow.testing import conformance_cases
 
     results: list[dict[str, str]] = []
-    with _sharing_kernels(method_id):
+    with sharing_kernels(method_id):
         for case in conformance_cases(method_id, golden=golden):
             is_left_out = quick and not case.check.is_quick
             problem = "" if is_left_out else case.problem()
@@ -371,7 +371,7 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
 
 
 @contextmanager
-def _sharing_kernels(method_id: str) -> Iterator[None]:
+def sharing_kernels(method_id: str) -> Iterator[None]:
     """While the block runs, use and extend this user's cache of compiled kernels."""
     from orthoflow.engine.kernels import VARIABLE, kernel_folder, kernels_in
     from orthoflow.engine.keys import method_facts

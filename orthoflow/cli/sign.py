@@ -36,12 +36,17 @@ def sign(run: Path, key: Path) -> int:
     if verification.findings:
         raise RecordError(f"{verification.wrong}, so it is not signed: {verification.findings[0]}")
     path = verification.path
-    made = sign_record(path, key, lambda: _password(key))
+    made = sign_record(path, key, lambda: ask_passphrase(key))
     echo(f"signed: {path}{SIGNATURE_SUFFIX}, with the key {made.fingerprint}")
     return EXIT_GOOD
 
 
-def _password(key: Path) -> str:
+def ask_passphrase(key: Path) -> str:
+    """Prompt for the passphrase of a private key on the terminal.
+
+    Raises:
+        ArgumentError: there is no terminal.
+    """
     if not sys.stdin.isatty():
         raise ArgumentError(
             f"the key {key} has a passphrase, but there is no terminal to prompt for it: "

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # runs short.
 _COARSE: Final = ("room.scan_step_m=0.05", "wall.gsd_m=0.05")
 _WITH_PHOTOS: Final = ("room.scan_step_m=0.004", "room.photo_gsd_m=0.003")
-_RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
+RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
     "direct": _COARSE,
     "quickstart": _WITH_PHOTOS,
     "plane-methods": ("room.scan_step_m=0.02",),
@@ -79,7 +79,7 @@ def _results(catalog: Catalog, wanted: Collection[str]) -> dict[str, str]:
     seen: set[object] = set()
     with tempfile.TemporaryDirectory(prefix="orthoflow-warm-") as scratch:
         store = Store(Path(scratch) / "store")
-        for number, (recipe, sets) in enumerate(_RECIPES.items()):
+        for number, (recipe, sets) in enumerate(RECIPES.items()):
             loaded = load_workflow(recipe, catalog, sets=sets)
             cells = {cell.address: cell for cell in expand_cells(loaded, catalog)}
             chosen: set[str] = set()

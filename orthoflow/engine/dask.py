@@ -129,10 +129,10 @@ def _refused(task: Task, error: StepFailedError | PluginError) -> str:
 # Name of the Dask resource by which workers report their number of cores.
 CORES: Final = "cores"
 _PROOF_FILE: Final = "workers-see-this"
-_CONNECT_S: Final = 15.0
+CONNECT_S: Final = 15.0
 # How long to wait for the first worker, for a lost scheduler, and for a new worker after all
 # workers are lost.
-_PATIENCE_S: Final = 60.0
+PATIENCE_S: Final = 60.0
 _WATCH_S: Final = 2.0
 _CLOSE_S: Final = 5.0
 # Reduce polling: by default, each worker profiles its thread 100 times a second and checks its
@@ -263,7 +263,7 @@ class DaskExecutor:
                 return failed_result(task, interrupted)
             raise self._lost()
         try:
-            return result_from_json(future.result(timeout=_PATIENCE_S), f"result of {task.address}")
+            return result_from_json(future.result(timeout=PATIENCE_S), f"result of {task.address}")
         except KilledWorker:
             return failed_result(task, StepFailedError(describe_loss(task.who, self._retries + 1)))
         except OrthoflowError as error:
@@ -294,7 +294,7 @@ class DaskExecutor:
             # The executor's own workers share the cores of this machine, so its capacity does not
             # depend on their number.
             self._capacity = _capacity(workers) if self._address else self._capacity
-        elif self._running and now - self._with_workers > _PATIENCE_S:
+        elif self._running and now - self._with_workers > PATIENCE_S:
             raise self._lost()
 
     def _lost(self) -> ClusterError:
@@ -314,7 +314,7 @@ class DaskExecutor:
 
     def _wait_for_workers(self) -> None:
         while not (workers := self._workers()):
-            if time.monotonic() - self._with_workers > _PATIENCE_S:
+            if time.monotonic() - self._with_workers > PATIENCE_S:
                 raise ArgumentError(
                     f"--scheduler {self._address}: no worker there reports its number of cores; "
                     f"start workers with `dask worker {self._address} --resources {CORES}=N`"
@@ -352,7 +352,7 @@ def _client(address: str, capacity: Capacity) -> Client:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address:
         try:
-            return Client(address, timeout=_CONNECT_S, set_as_default=False)
+            return Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ArgumentError(
                 f"--scheduler {address}: no Dask scheduler responds there "

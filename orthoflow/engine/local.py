@@ -71,7 +71,7 @@ _starting: Final = threading.Lock()
 
 StepListener = Callable[[str, StepEvent], None]
 EVENTS: Final = TypeAdapter(StepEvent)
-_GRACE_S: Final = 5.0
+GRACE_S: Final = 5.0
 # Maximum number of messages read per poll, so that a step that keeps sending messages cannot delay
 # its own timeout.
 _MOST_MESSAGES: Final = 256
@@ -341,12 +341,12 @@ class _Step:
         """Ask the process to stop, and start the grace period; later calls have no effect."""
         if self.reason is None:
             self.reason = reason
-            self.kill_at = time.monotonic() + _GRACE_S
+            self.kill_at = time.monotonic() + GRACE_S
             with suppress(OSError):
                 self.process.terminate()
 
     def kill(self) -> None:
-        self.kill_at = time.monotonic() + _GRACE_S
+        self.kill_at = time.monotonic() + GRACE_S
         _kill(_with_descendants(self.pid))
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
@@ -436,7 +436,7 @@ class LocalExecutor:
         """Kill all processes still running."""
         for step in list(self._running.values()):
             step.kill()
-            step.process.join(_GRACE_S)
+            step.process.join(GRACE_S)
             self._forget(step)
 
     def _read(self, step: _Step) -> None:

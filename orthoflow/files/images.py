@@ -42,10 +42,10 @@ RAW_SUFFIXES: Final = frozenset(
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
 PREVIEW_SIDE_PX: Final = 1600
-# Images with more pixels are averaged before they are reduced, in bands of `_BAND_PX` rows of the
+# Images with more pixels are averaged before they are reduced, in bands of `BAND_PX` rows of the
 # result.
-_IN_MEMORY_PX: Final = 1 << 26
-_BAND_PX: Final = 64
+IN_MEMORY_PX: Final = 1 << 26
+BAND_PX: Final = 64
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
 
 Shrunk = TypeVar("Shrunk", np.float32, np.uint8)
@@ -174,7 +174,7 @@ def grey_cells(values: NDArray[np.floating]) -> Cells:
 
 def sampled_rows(values: NDArray[Sampled]) -> NDArray[Sampled]:
     """Return evenly spaced rows of a raster, with at most 64 million cells in total."""
-    return values[:: max(1, -(-values.size // _IN_MEMORY_PX))]
+    return values[:: max(1, -(-values.size // IN_MEMORY_PX))]
 
 
 def _stretch_of(values: NDArray[np.floating]) -> tuple[float, float] | None:
@@ -256,7 +256,7 @@ def _weighted(
     rows, columns = (side // factor for side in shape)
     summed = np.empty((rows, columns, 3), dtype=np.float32)
     weight = np.empty((rows, columns), dtype=np.float32)
-    step = rows if factor == 1 else _BAND_PX
+    step = rows if factor == 1 else BAND_PX
     for first in range(0, rows, step):
         last = min(rows, first + step)
         part = (slice(first * factor, last * factor), slice(0, columns * factor))
@@ -274,7 +274,7 @@ def _weighted(
 
 def _averaged_px(shape: tuple[int, ...], longest_side_px: int) -> int:
     """Return the side of the squares that are averaged before a picture is reduced."""
-    return max(shape) // (2 * longest_side_px) if math.prod(shape) > _IN_MEMORY_PX else 1
+    return max(shape) // (2 * longest_side_px) if math.prod(shape) > IN_MEMORY_PX else 1
 
 
 def _shrunk_shape(shape: tuple[int, ...], longest_side_px: int) -> tuple[int, int]:

@@ -16,7 +16,7 @@ Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 # Rasters with more cells are stored in files, because there may be many walls.
 IN_MEMORY_CELLS: Final = 1 << 22
 # A temporary array for a band of this size needs about 16 MB for each byte per cell.
-_BAND_CELLS: Final = 1 << 24
+BAND_CELLS: Final = 1 << 24
 
 
 def in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
@@ -35,7 +35,7 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
     Yields:
         The rows of each band, from top to bottom.
     """
-    height = max(1, _BAND_CELLS // max(1, shape[1]) // multiple) * multiple
+    height = max(1, BAND_CELLS // max(1, shape[1]) // multiple) * multiple
     for first in range(0, shape[0], height):
         yield slice(first, min(shape[0], first + height))
 

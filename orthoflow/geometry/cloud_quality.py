@@ -59,9 +59,9 @@ _POINTS_MOST: Final = 4000
 _AT_ONCE: Final = 1 << 16
 _HASH_BITS: Final = 20
 _CUBE_BITS: Final = 21
-_GATHERED_MOST: Final = 1_500_000
+MAX_GATHERED: Final = 1_500_000
 # Maximum number of points assigned to cubes. For larger clouds, only some layers of cubes are used.
-_LOOKED_AT_MOST: Final = 4_000_000
+MAX_LOOKED_AT: Final = 4_000_000
 # Odd factors with well distributed bits, so that the upper bits of a product depend on all bits of
 # the other factor.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
@@ -194,7 +194,7 @@ def _indices_of_pieces(
 ) -> Iterator[NDArray[np.intp]]:
     n_points = len(offsets[0])
     lows = tuple(axis.min() for axis in offsets)
-    one_of = -(-n_points // _LOOKED_AT_MOST)
+    one_of = -(-n_points // MAX_LOOKED_AT)
     seeds = np.unique(np.linspace(0, n_points - 1, one_of * 2 * _PIECES_MOST).astype(np.intp))
     cubes = _cubes(offsets, lows, seeds, side_m)
     along = max(range(3), key=lambda axis: len(np.unique(cubes[axis])))
@@ -215,7 +215,7 @@ def _indices_of_pieces(
     groups = x + (y << _CUBE_BITS) + (z << 2 * _CUBE_BITS)
     known = np.unique(groups)
     # In a dense cloud, fewer pieces suffice.
-    known = known[:: max(1, len(indices) // _GATHERED_MOST)]
+    known = known[:: max(1, len(indices) // MAX_GATHERED)]
     is_known = np.isin(groups, known)
     indices, groups = indices[is_known], groups[is_known]
     order = np.argsort(groups, kind="stable")

@@ -23,7 +23,7 @@ Unit = Literal["m", "px", "grey", "deg", "1"]
 
 _ARRAY: Final = "$array"
 # Larger arrays of all product types are memory-mapped.
-_LARGE_BYTES: Final = 1 << 30
+LARGE_BYTES: Final = 1 << 30
 # Errors that the checks of a product may raise for inconsistent values.
 _NO_SENSE: Final = (
     *(AttributeError, IndexError, KeyError),
@@ -94,7 +94,7 @@ class Product:
             encoding_version=self.encoding_version,
             metadata=metadata,
             arrays=arrays,
-            mapped=self.mapped or sum(array.nbytes for array in arrays.values()) > _LARGE_BYTES,
+            mapped=self.mapped or sum(array.nbytes for array in arrays.values()) > LARGE_BYTES,
         )
 
     def check_against(self, others: Mapping[str, Product]) -> None:

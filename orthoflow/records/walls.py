@@ -279,8 +279,8 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         ArgumentError: there is no such cell, or there are no rasters.
         RecordError: a published file differs from the record, or an orthoimage is missing.
     """
-    address = _pictured(run, cell)
-    _require_orthoimages(run, address, wall)
+    address = pictured_cell(run, cell)
+    require_orthoimages(run, address, wall)
     upstream = tuple(cell.address for cell in run.upstream(address))
     files: dict[int, dict[str, Path]] = {}
     pictured = [
@@ -310,11 +310,11 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         for name, inspection in _inspections(run, address)
     }
     kept = Planes.from_payload(run.payload(*planes)) if planes else None
-    colours = _colours(run, address)
+    colours = colours_phrase(run, address)
     return RoomResults(
         address=address,
         walls=tuple(
-            _with_inspections(run, result, tuple(_accuracy(inspections, number)))
+            _with_inspections(run, result, tuple(accuracy_phrases(inspections, number)))
             for number in ([wall] if wall in files else sorted(files))
             for result in [_wall_result(run, number, files[number], kept, colours)]
         ),
@@ -335,7 +335,7 @@ def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
     }
 
 
-def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
+def require_orthoimages(run: Run, address: str, wall: int | None) -> None:
     """Raise an error if a published orthoimage is missing.
 
     Otherwise, a raster of an upstream cell would be used instead.
@@ -365,7 +365,12 @@ def _openings(run: Run, upstream: tuple[str, ...]) -> tuple[Opening, ...]:
     return tuple(sorted(found, key=lambda opening: opening.wall))
 
 
-def _pictured(run: Run, cell: str | None) -> str:
+def pictured_cell(run: Run, cell: str | None) -> str:
+    """Return the address of the cell whose orthoimages, or else walls, are shown.
+
+    Raises:
+        ArgumentError: the run has none, or the named cell has none.
+    """
     found = {
         name: [
             address
@@ -480,7 +485,8 @@ def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) 
     return replace(wall, accuracy=(*wall.accuracy, *measured))
 
 
-def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[Phrase]:
+def accuracy_phrases(inspections: dict[str, Inspection], wall: int) -> Iterator[Phrase]:
+    """Yield the measured accuracy of a wall, one phrase for each kind of inspection."""
     for inspection in inspections.values():
         own = {item.name: item.value for item in inspection.findings if item.wall == wall}
         for first, second, key, counts in _ACCURACY:
@@ -499,7 +505,7 @@ def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> Iterat
             return
 
 
-def _colours(run: Run, address: str) -> Phrase:
+def colours_phrase(run: Run, address: str) -> Phrase:
     """Describe how the colours of photos or points were changed, according to the record."""
     cell = run.cells[address]
     whence = tuple(run.upstream(address))

@@ -146,11 +146,11 @@ def _state(cells: Sequence[RecordedCell]) -> str:
     return "cached" if all(cell.cached_from for cell in cells if cell.status == "ok") else "ok"
 
 
-_BYTES_MOST: Final = 3_900_000  # of all figures on a page; base64 adds a third
+MAX_FIGURE_BYTES: Final = 3_900_000  # of all figures on a page; base64 adds a third
 _LEAST_SIDE_PX: Final = 240
 _MAX_SIDE_PX: Final = 700
 _DPI: Final = 300
-_SMALL_BYTES: Final = 20_000  # smaller files are not scaled down
+SMALL_BYTES: Final = 20_000  # smaller files are not scaled down
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +184,9 @@ def figure_groups(
             if figure.data not in seen:
                 seen.add(figure.data)
                 chosen[address, figure.name] = figure
-    fitted = dict(zip(chosen, _fitted(tuple(chosen.values()), share * _BYTES_MOST), strict=True))
+    fitted = dict(
+        zip(chosen, _fitted(tuple(chosen.values()), share * MAX_FIGURE_BYTES), strict=True)
+    )
     groups = []
     for address, cell in run.cells.items():
         pictures = tuple(
@@ -266,7 +268,7 @@ def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[
 
 
 def _smaller(figure: RecordedFigure, side_px: int) -> RecordedFigure:
-    if figure.media_type == "image/svg+xml" or len(figure.data) <= _SMALL_BYTES:
+    if figure.media_type == "image/svg+xml" or len(figure.data) <= SMALL_BYTES:
         return figure
     try:
         data = shrunk_webp(figure.data, figure.name, longest_side_px=side_px)

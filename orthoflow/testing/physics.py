@@ -64,10 +64,11 @@ def planes_follow_a_rigid_motion(subject: Subject) -> None:
         run = subject.run_on(cloud=cloud)
         planes = output_of(run, "planes", Planes)
         require(len(planes) > 0, "no plane was found")
-        _match_planes(planes, truth)
+        match_planes(planes, truth)
 
 
-def _match_planes(found: Planes, truth: Planes) -> None:
+def match_planes(found: Planes, truth: Planes) -> None:
+    """Require that each plane found matches a true plane."""
     for index in range(len(found)):
         cosines = truth.normal @ found.normal[index]
         centres = truth.corners.mean(axis=1)
@@ -159,7 +160,7 @@ def cells_show_their_own_place(subject: Subject) -> None:
         layers = output_of(run, "layers", Layers).layers
         require(layers, "no layer was made")
         for layer in layers:
-            _check_cells(scene, layer, layer.source, layer.mask == LayerMask.PAINTED)
+            check_cells(scene, layer, layer.source, layer.mask == LayerMask.PAINTED)
 
 
 def mosaics_show_cells_in_place(subject: Subject) -> None:
@@ -171,7 +172,7 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
         require(images, "no orthoimage was made")
         for image in images:
             painted = is_painted(image.mask)
-            _check_cells(scene, image, image.name, painted)
+            check_cells(scene, image, image.name, painted)
             require(
                 painted.mean() > _JOINED_SHARE,
                 f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are covered, "
@@ -179,9 +180,10 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
             )
 
 
-def _check_cells(
+def check_cells(
     scene: TexturedWall, image: Layer | Orthoimage, name: str, painted: NDArray[np.bool_]
 ) -> None:
+    """Require that an image covers the wall and shows its texture where it is."""
     truth_grey = 255.0 * scene.grey(*places_of_cells(image.frame))
     where = f"{name} at {image.frame.gsd_m} m"
     share = float(painted.mean())

@@ -165,7 +165,7 @@ def write_record(
         before = stack.enter_context(safe_open(earlier, RUN_FORMAT)) if earlier else None
         file = stack.enter_context(create_file(part))
         for name, node in expected_nodes(written, text).items():
-            _write_node(file, name, node)
+            write_node(file, name, node)
         products = create_group(file, PRODUCTS)
         for digest in _embedded(written):
             _embed_product(products, digest, product_file, before)
@@ -179,7 +179,7 @@ def write_record(
                 if given.sha256 not in files:
                     _embed_file(files, entry.name, given, input_file and input_file(given.sha256))
         offset = write_array(file, SEAL, fixed_text(_UNSEALED)).id.get_offset()
-    _seal_file(part, offset)
+    seal_file(part, offset)
     part.replace(path)
     _sync_folder(path.parent)
     return sha256_text(text)
@@ -439,7 +439,8 @@ def _table(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> NDArray
     return table
 
 
-def _write_node(file: h5py.File, path: str, node: Node) -> None:
+def write_node(file: h5py.File, path: str, node: Node) -> None:
+    """Write one group, array or set of attributes of a record."""
     parent, _, name = path.rpartition("/")
     if path == "/":
         item = file
@@ -506,7 +507,8 @@ def _embed_file(files: h5py.Group, input_name: str, file: RecordedFile, path: Pa
         raise another
 
 
-def _seal_file(path: Path, offset: int) -> None:
+def seal_file(path: Path, offset: int) -> None:
+    """Write the SHA-256 of the bytes before `offset` into the seal, which begins there."""
     seal = file_sha256(path, offset)
     with path.open("r+b") as stream:
         stream.seek(offset)

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from orthoflow.cli import program
-from orthoflow.cli.doctor import _libraries
+from orthoflow.cli.doctor import required_libraries
 
 GIB = 1 << 30
 
@@ -22,7 +22,7 @@ GIB = 1 << 30
 def libraries(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The libraries that are looked at: one that is here."""
     looked_at = ["click"]
-    monkeypatch.setattr("orthoflow.cli.doctor._libraries", lambda: looked_at)
+    monkeypatch.setattr("orthoflow.cli.doctor.required_libraries", lambda: looked_at)
     return looked_at
 
 
@@ -104,7 +104,7 @@ def test_a_library_that_does_not_import_is_named_with_the_way_out(
 
 
 def test_what_an_installation_brings_is_looked_at() -> None:
-    assert {"numpy", "open3d-cpu", "pye57", "ruamel-yaml"} <= {*_libraries()}
+    assert {"numpy", "open3d-cpu", "pye57", "ruamel-yaml"} <= {*required_libraries()}
 
 
 @pytest.mark.usefixtures("libraries")

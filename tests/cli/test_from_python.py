@@ -22,7 +22,7 @@ def studio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Studio:
 
 def test_arrays_and_paths_are_what_a_workflow_would_say() -> None:
     swept = {"sweep": np.array([0.25, 0.5]), "ranks": [np.int64(3)], "file": Path("a/b")}
-    found = json.loads(module._json("set", swept))
+    found = json.loads(module.json_of("set", swept))
     assert found == {"sweep": [0.25, 0.5], "ranks": [3], "file": "a/b"}
 
 

@@ -31,8 +31,8 @@ def test_what_was_compiled_beforehand_is_not_compiled_by_a_run(
     tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     studio = write_studio(tmp_path, "paint.kernel")
-    assert all(shipped_workflow(name).is_file() and sets for name, sets in warm._RECIPES.items())
-    monkeypatch.setattr(warm, "_RECIPES", {str(studio): ("survey.offset_m=2",)})
+    assert all(shipped_workflow(name).is_file() and sets for name, sets in warm.RECIPES.items())
+    monkeypatch.setattr(warm, "RECIPES", {str(studio): ("survey.offset_m=2",)})
     called = CliRunner().invoke(program, ["warm", "--json"])
     assert called.exit_code == 0, called.output
     warmed = json.loads(called.stdout)
@@ -53,7 +53,7 @@ def test_the_conformance_suite_shares_the_kernels_of_runs(
     monkeypatch.syspath_prepend(str(WORKSHOP))
     monkeypatch.delenv(VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    with plugins._sharing_kernels("paint.kernel"):
+    with plugins.sharing_kernels("paint.kernel"):
         folder = Path(os.environ[VARIABLE])
     assert folder.is_relative_to(tmp_path / "orthoflow" / "numba")
     assert VARIABLE not in os.environ

@@ -171,7 +171,7 @@ def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
 def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_dask, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(engine_dask, "PATIENCE_S", 1.0)
     world, folder = office.world, office.world.folder / "alone"
     with cluster(1, processes=False, **{CORES: 1}) as lost:
         plan = world.plan(
@@ -213,7 +213,7 @@ def test_workers_that_do_not_see_the_store_are_refused(
 def test_an_address_without_scheduler_is_refused(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_dask, "_CONNECT_S", 1.0)
+    monkeypatch.setattr(engine_dask, "CONNECT_S", 1.0)
     for address in ("tcp://127.0.0.1:9", "nonsense"):
         plan = office.world.plan(STEPS, executor="dask", scheduler=address)
         with pytest.raises(ArgumentError, match=f"--scheduler {address}: no Dask scheduler"):
@@ -223,7 +223,7 @@ def test_an_address_without_scheduler_is_refused(
 def test_workers_that_do_not_say_their_cores_get_no_work(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_dask, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(engine_dask, "PATIENCE_S", 1.0)
     with cluster(1, processes=False) as silent:
         plan = office.world.plan(STEPS, executor="dask", scheduler=silent.scheduler_address)
         with pytest.raises(ArgumentError, match="no worker there reports its number of cores"):

@@ -174,7 +174,7 @@ def test_what_a_method_does_to_its_process_harms_nothing_else(
 ) -> None:
     # As in a program that had started the server of steps for purposes of its own.
     start_fork_server()
-    monkeypatch.setattr("orthoflow.engine.local._GRACE_S", 0.5)
+    monkeypatch.setattr("orthoflow.engine.local.GRACE_S", 0.5)
     late = ("hangs", "ignores", "stops", "logs")
     results = results_of(world, PROCESSES, dict.fromkeys(late, "1.5s"), jobs=2)
     messages = {name: result.error_message for name, result in results.items()}

@@ -68,8 +68,8 @@ def test_the_first_percentile_is_black_and_the_last_one_white() -> None:
 def test_a_very_large_one_is_averaged_band_by_band(
     monkeypatch: pytest.MonkeyPatch, band_px: int
 ) -> None:
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
-    monkeypatch.setattr(images, "_BAND_PX", band_px)
+    monkeypatch.setattr(images, "IN_MEMORY_PX", 1000)
+    monkeypatch.setattr(images, "BAND_PX", band_px)
     # Squares of 4 pixels, the left half of each of them shown, what is not is black.
     shown = np.broadcast_to(np.arange(48) % 4 < 2, (64, 48))
     image = np.where(shown[..., None], picture(96, 128)[::2, ::2], 0).astype(np.uint8)
@@ -80,7 +80,9 @@ def test_a_very_large_one_is_averaged_band_by_band(
         return image[part], shown[part]
 
     # Squares of 64 / (2 * 16) pixels first: two, of which 32 rows are made.
-    preview = images._preview(shown.shape, cells, 16)
+    monkeypatch.setattr(images, "PREVIEW_SIDE_PX", 16)
+    with Image.open(io.BytesIO(images.cells_png(shown.shape, cells))) as png:
+        preview = np.asarray(png)
     assert preview.shape == (16, 12, 4)
     # The black that is not shown does not darken what is.
     np.testing.assert_array_equal(preview[..., :3], image[::4, ::4])

@@ -57,7 +57,7 @@ def test_previews_open_where_their_rasters_lie(
 ) -> None:
     import rasterio
 
-    monkeypatch.setattr(images, "_IN_MEMORY_PX", 1000)
+    monkeypatch.setattr(images, "IN_MEMORY_PX", 1000)
     wide = replace(frame, width=3407, height=1203)
     half = np.zeros((*wide.shape, 3), dtype=np.uint8)
     half[:, 3000:] = 200

@@ -208,7 +208,7 @@ FIGURE = Target(seeds=_figure_files, read=_read_figure)
 # Orthoimages of other programs --------------------------------------------------------------------
 
 
-def _frame() -> WallFrame:
+def wall_frame() -> WallFrame:
     return samples.facing_south(0.01, 64, 48, (1.0, 2.0, 3.0))
 
 
@@ -220,7 +220,7 @@ def _write_image(path: Path) -> None:
 
 
 def _write_sidecar(path: Path) -> None:
-    write_json(path, {"wall": 3, **frame_json(_frame())})
+    write_json(path, {"wall": 3, **frame_json(wall_frame())})
 
 
 def _read_ortho(path: Path) -> object:

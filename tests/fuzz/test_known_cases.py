@@ -48,7 +48,7 @@ def _variants(n_steps: int, n_variants: int) -> str:
 
 
 def _sidecar(**changed: object) -> bytes:
-    return json.dumps({**frame_json(readers._frame()), **changed}).encode()
+    return json.dumps({**frame_json(readers.wall_frame()), **changed}).encode()
 
 
 def _sound_e57(folder: Path) -> bytes:

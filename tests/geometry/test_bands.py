@@ -43,7 +43,7 @@ def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPa
     rng = np.random.default_rng(1)
     mask = rng.integers(0, 4, (103, 37), dtype=np.uint8)
     depths = np.where(mask == 2, np.nan, 1.0)
-    monkeypatch.setattr(module, "_BAND_CELLS", 37 * 10)
+    monkeypatch.setattr(module, "BAND_CELLS", 37 * 10)
     parts = list(row_bands(mask.shape, multiple=4))
     assert [part.stop - part.start for part in parts] == [8] * 12 + [7]
     assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]

@@ -177,8 +177,8 @@ def test_scans_disagree_beyond_a_millimetre_their_scatter_and_chance(
 
 def test_of_a_large_cloud_a_part_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     # Of more points some slabs, and of dense pieces some.
-    monkeypatch.setattr(cloud_quality, "_LOOKED_AT_MOST", 400_000)
-    monkeypatch.setattr(cloud_quality, "_GATHERED_MOST", 150_000)
+    monkeypatch.setattr(cloud_quality, "MAX_LOOKED_AT", 400_000)
+    monkeypatch.setattr(cloud_quality, "MAX_GATHERED", 150_000)
     quality = judged(wall(step_m=0.0035, noise_m=0.001))
     assert quality.n_pieces >= 20
     assert quality.sigma_m == pytest.approx(0.001, rel=0.15)

@@ -55,6 +55,6 @@ def test_large_products_are_mapped_whatever_their_type(monkeypatch: pytest.Monke
     )
     n_bytes = sum(array.nbytes for array in points.to_payload().arrays.values())
     for limit, is_mapped in ((n_bytes, False), (n_bytes - 1, True)):
-        monkeypatch.setattr(product, "_LARGE_BYTES", limit)
+        monkeypatch.setattr(product, "LARGE_BYTES", limit)
         assert points.to_payload().mapped == is_mapped
         assert labels.to_payload().mapped

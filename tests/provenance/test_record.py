@@ -221,7 +221,7 @@ def test_a_broken_seal_and_bytes_behind_the_end_are_found(tmp_path: Path) -> Non
     assert [found.code for found in verify_record(path)] == ["seal"]
     path.write_bytes(content + b"more")
     assert [found.code for found in verify_record(path)] == ["appended", "seal"]
-    module._seal_file(path, offset)
+    module.seal_file(path, offset)
     assert [found.code for found in verify_record(path)] == ["appended"]
     assert read_record(path) == record
     path.write_bytes(content)

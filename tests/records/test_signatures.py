@@ -103,7 +103,7 @@ def test_the_password_of_a_key_is_asked_for(
     finished: Studio, run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     key = "jane-protected"
-    monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: "wrong")
+    monkeypatch.setattr("orthoflow.cli.sign.ask_passphrase", lambda _: "wrong")
     assert "or the password is wrong" in said("sign", run, "--key", key, code=2)
     monkeypatch.undo()
     monkeypatch.chdir(finished.folder)
@@ -111,9 +111,9 @@ def test_the_password_of_a_key_is_asked_for(
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     asked: list[dict[str, bool]] = []
     monkeypatch.setattr("click.prompt", lambda _, **how: (asked.append(how), PASSWORD)[1])
-    assert sign._password(Path(key)) == PASSWORD
+    assert sign.ask_passphrase(Path(key)) == PASSWORD
     assert asked == [{"hide_input": True, "err": True}]
-    monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: PASSWORD)
+    monkeypatch.setattr("orthoflow.cli.sign.ask_passphrase", lambda _: PASSWORD)
     assert finished("sign", run, "--key", key).exit_code == 0
     verified(finished, run, 0)
 

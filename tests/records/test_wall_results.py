@@ -43,12 +43,12 @@ def test_an_inspection_says_how_exact_a_wall_is_by_findings_on_it() -> None:
     first = inspection(("rmse_u_mm", 4.0, 0), ("rmse_v_mm", 5.0, 0))
     half = inspection(("rmse_x_mm", 1.0, 3), ("n_points", 5.0, 3))
     found = {"check": own, "truth": every, "half": half, "first": first}
-    assert [said.text() for said in module._accuracy(found, 3)] == [
+    assert [said.text() for said in module.accuracy_phrases(found, 3)] == [
         "measured: RMSE horizontal 1.2 mm, vertical 2.0 mm (check points: 6)",
         "measured in 3D: RMS 3.0 mm, largest 9.0 mm",
     ]
     # What was found of all walls together says nothing of one.
-    (first_said,) = module._accuracy(found, 0)
+    (first_said,) = module.accuracy_phrases(found, 0)
     assert first_said.text("de") == "gemessen: RMSE horizontal 4,0 mm, vertikal 5,0 mm"
 
 
@@ -115,11 +115,11 @@ def test_what_was_done_to_colours_is_said(
     behind = {"layers": given("ortho.layers", "l", "layers")}
     mosaic = cell("mosaic", method="mosaic.seams", inputs=behind, params=params, metrics=metrics)
     ortho = cell("ortho", inputs={"photos": given("shots.photos", "p", "photos")})
-    assert module._colours(held(ortho, mosaic), "mosaic").text() == said
+    assert module.colours_phrase(held(ortho, mosaic), "mosaic").text() == said
     for least, more in ((0, ""), (10, ", without points darker than 10 of 255")):
         cloud = {"cloud": given("cloud.cloud", "c", "cloud")}
         ortho = cell("ortho", inputs=cloud, params={"skip_below_grey": least})
-        found = module._colours(held(ortho, mosaic), "mosaic")
+        found = module.colours_phrase(held(ortho, mosaic), "mosaic")
         assert found.text() == f"colours as scanned{more}"
 
 
@@ -130,15 +130,15 @@ def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
     a, d, e = giving("a", "walls"), giving("d", "walls"), giving("e", "cloud")
     plane = cell("plane", status="failed", error_message="no plane")
     run = held(a, giving("b", "orthoimages"), giving("c", "orthoimages"), d, e)
-    assert module._pictured(run, None) == "c"
-    assert module._pictured(run, "a") == "a"
-    assert module._pictured(held(a, d), None) == "d"
+    assert module.pictured_cell(run, None) == "c"
+    assert module.pictured_cell(run, "a") == "a"
+    assert module.pictured_cell(held(a, d), None) == "d"
     with pytest.raises(ArgumentError, match=r"r1 has no orthoimages and no walls.*plane.*no plane"):
-        module._pictured(held(e, plane), None)
+        module.pictured_cell(held(e, plane), None)
     with pytest.raises(ArgumentError, match=r"e has no orthoimages or walls; .*: none"):
-        module._pictured(held(e), "e")
+        module.pictured_cell(held(e), "e")
     with pytest.raises(ArgumentError, match="steps of this run that have them: b, c, a, d"):
-        module._pictured(run, "e")
+        module.pictured_cell(run, "e")
 
 
 PUBLISHED = (
@@ -155,10 +155,10 @@ PUBLISHED = (
 def test_an_orthoimage_that_is_gone_is_asked_for(tmp_path: Path) -> None:
     files = tuple(PublishedFile(path=path, size_bytes=0, sha256="") for path in PUBLISHED)
     run = HeldRun(path=tmp_path / "run.h5", record=record([cell("mosaic")], published=files))
-    module._require_orthoimages(run, "mosaic", 10)
+    module.require_orthoimages(run, "mosaic", 10)
     for wall in (None, 2):
         with pytest.raises(RecordError, match=r"wall_2_ortho.tif is missing in .* copy it back"):
-            module._require_orthoimages(run, "mosaic", wall)
+            module.require_orthoimages(run, "mosaic", wall)
     (tmp_path / "products/mosaic").mkdir(parents=True)
     (tmp_path / PUBLISHED[0]).touch()
-    module._require_orthoimages(run, "mosaic", None)
+    module.require_orthoimages(run, "mosaic", None)

@@ -110,8 +110,8 @@ def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
     monkeypatch.setitem(compared.cells, cell.address, replace(cell, figures=spoilt))  # type: ignore[arg-type]
     assert write_figures(compared, tmp_path, [cell.address]) == 1
     assert not list((tmp_path / cell.address).glob("error_map*"))
-    monkeypatch.setattr("orthoflow.report.figures._BYTES_MOST", 100)
-    monkeypatch.setattr("orthoflow.report.figures._SMALL_BYTES", 0)
+    monkeypatch.setattr("orthoflow.report.figures.MAX_FIGURE_BYTES", 100)
+    monkeypatch.setattr("orthoflow.report.figures.SMALL_BYTES", 0)
     (group,) = [group for group in figure_groups(compared) if group.cell == cell.address]
     assert [picture.caption for picture in group.pictures] == [
         "how far (the picture is damaged)",

@@ -37,12 +37,12 @@ def test_planes_may_be_a_fiftieth_of_a_degree_off(
         offset=np.append(offset, truth.offset[1:]),
     )
     if fits:
-        physics._match_planes(found, truth)
+        physics.match_planes(found, truth)
         return
     with pytest.raises(
         AssertionError, match=r"plane 0 of a rotated and shifted room is 0\.030 deg and 0\.00 mm"
     ):
-        physics._match_planes(found, truth)
+        physics.match_planes(found, truth)
 
 
 def oriented(shift_m: float) -> Any:
@@ -113,7 +113,7 @@ def test_cells_that_show_another_place_are_reported(image: dict[str, Any], messa
     shown = layer(**image)
     scene = photographed.textured_wall(gsd_m=0.01)
     with pytest.raises(AssertionError, match=message):
-        physics._check_cells(scene, shown, "a.png", shown.mask == LayerMask.PAINTED)
+        physics.check_cells(scene, shown, "a.png", shown.mask == LayerMask.PAINTED)
 
 
 @pytest.mark.parametrize(("hidden", "passes"), [(0.02, True), (0.05, False)])

@@ -36,7 +36,7 @@ from orthoflow.products import Cameras, Photo, Photos, Planes, PointCloud, Point
 from orthoflow.records.runs import Run
 
 
-def _export(
+def export_cloud(
     name: str,
     write: Callable[[Path, AttributedCloud], int],
     run: Run,
@@ -74,7 +74,7 @@ def _export(
     # Read the photos only if their colours may be used. The error message lists the colouring
     # `photos` in any case.
     is_wanted = chosen.colour in {None, "photos"}
-    oriented = _oriented(run, cells, chosen) if is_wanted else ()
+    oriented = oriented_photos(run, cells, chosen) if is_wanted else ()
     has: dict[Colouring, bool] = {
         "photos": bool(oriented) if is_wanted else bool(_makers_of_cameras(cells)),
         "rgb": cloud.rgb is not None,
@@ -104,7 +104,7 @@ def _export(
         wall_plane=wall_plane,
         box_world=_box(chosen.box),
         is_cleaned=chosen.clean,
-        crs_wkt=_crs_wkt(walls),
+        crs_wkt=common_crs_wkt(walls),
         name=digest,
     )
     if attributed.is_empty:
@@ -124,10 +124,10 @@ def _export(
     )
 
 
-export_laz = partial(_export, "cloud.laz", write_laz)
-export_copc = partial(_export, "cloud.copc.laz", write_copc)
-export_ply = partial(_export, "cloud.ply", write_ply)
-export_e57 = partial(_export, "cloud.e57", write_e57)
+export_laz = partial(export_cloud, "cloud.laz", write_laz)
+export_copc = partial(export_cloud, "cloud.copc.laz", write_copc)
+export_ply = partial(export_cloud, "cloud.ply", write_ply)
+export_e57 = partial(export_cloud, "cloud.e57", write_e57)
 
 
 def _makers_of_cameras(cells: Any) -> dict[str, Any]:
@@ -138,7 +138,9 @@ def _makers_of_cameras(cells: Any) -> dict[str, Any]:
     }
 
 
-def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
+def oriented_photos(
+    run: Run, cells: Any, chosen: Choices
+) -> tuple[tuple[Photo, ViewingCamera], ...]:
     """Return the oriented photos with their cameras, according to the last orientation."""
     makers = _makers_of_cameras(cells)
     if not makers:
@@ -189,7 +191,7 @@ def _box(text: str | None) -> NDArray[np.float64] | None:
     return np.sort(np.array(values).reshape(2, 3), axis=0)
 
 
-def _crs_wkt(walls: Walls | None) -> str:
+def common_crs_wkt(walls: Walls | None) -> str:
     """Return the coordinate system of the cloud, which the parameter `crs` of `raster.grid` sets.
 
     The result is WKT; empty if the system is unknown.

@@ -28,8 +28,8 @@ from orthoflow.files.points.scan_file import load_library
 _PLACE_BITS: Final = 21
 _GRID_BITS: Final = 7
 _DEEPEST: Final = _PLACE_BITS - _GRID_BITS
-_KEPT_WHOLE: Final = 1 << 15
-_IN_MEMORY_POINTS: Final = 1 << 22
+KEPT_WHOLE: Final = 1 << 15
+IN_MEMORY_POINTS: Final = 1 << 22
 _KEY_BITS: Final = 3 * _DEEPEST
 _SPREADS: Final = (
     (32, 0x1F00000000FFFF),
@@ -66,7 +66,7 @@ class _Waiting:
 
     @property
     def groups(self) -> NDArray[np.int64]:
-        return (np.cumsum(self.counts) - self.counts) // _IN_MEMORY_POINTS
+        return (np.cumsum(self.counts) - self.counts) // IN_MEMORY_POINTS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +252,7 @@ def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> N
             total = np.searchsorted(every, node, "right") - np.searchsorted(every, node, "left")
         cell = _ancestors(codes[left], level + _GRID_BITS)
         begins = np.flatnonzero(np.append(True, cell[1:] != cell[:-1]))
-        kept = total <= _KEPT_WHOLE
+        kept = total <= KEPT_WHOLE
         kept[(begins + np.append(begins[1:], len(cell))) // 2] = True
         levels[left[kept]] = level
         left = left[~kept]

@@ -73,7 +73,7 @@ def colour_points(
 
     occluders = occluders_in(
         cloud,
-        _box_of(cloud, [camera for _, camera in oriented]),
+        box_around(cloud, [camera for _, camera in oriented]),
         cloud.stations,
         threads=threads,
     )
@@ -151,7 +151,7 @@ def _extent(
     return low, high, side_m, side_m * float(np.sqrt(len(cubes) / max(1, len(cloud))))
 
 
-def _box_of(cloud: PointCloud, cameras: Sequence[ViewingCamera]) -> Box:
+def box_around(cloud: PointCloud, cameras: Sequence[ViewingCamera]) -> Box:
     """Return the box around the cameras and the cloud without outliers, and the point spacing."""
     from orthoflow.geometry.occluders import Box
 

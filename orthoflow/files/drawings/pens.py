@@ -275,7 +275,7 @@ def fallback_font(letter: str) -> str:
     from reportlab.pdfbase.ttfonts import TTFont
 
     code = ord(letter)
-    path = next((path for path, codes in _installed_letters().items() if code in codes), None)
+    path = next((path for path, codes in installed_letters().items() if code in codes), None)
     if path is None:
         raise InputError(
             f"no installed font contains the character {letter} (U+{code:04X}), which is used on "
@@ -305,7 +305,7 @@ def fallback_font(letter: str) -> str:
 
 
 @lru_cache(maxsize=1)
-def _installed_letters() -> dict[str, frozenset[int]]:
+def installed_letters() -> dict[str, frozenset[int]]:
     """Return the code points of each system font file; of a collection, only the first font's."""
     from fontTools.ttLib import TTFont, TTLibError
     from matplotlib.font_manager import findSystemFonts

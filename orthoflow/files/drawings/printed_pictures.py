@@ -50,7 +50,7 @@ _MM_PER_INCH: Final = 25.4
 # Number of cells that are read at a time.
 _BAND_CELLS: Final = 1 << 23
 # Pictures up to this size are lossless; larger ones would make the files too large to send.
-_LOSSLESS_PX: Final = 8_000_000
+LOSSLESS_PX: Final = 8_000_000
 _JPEG_QUALITY: Final = 95
 _CONTOUR_PITCH_MM: Final = 0.5
 _SHORTEST_CONTOUR_MM: Final = 6.0
@@ -120,7 +120,7 @@ def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = Fals
             colours = _grey(values, stretch) if stretch else eight_bits(cast("Colours", values))
             picture[rows][shown] = colours[shown][:, ::-1]
     picture = np.ascontiguousarray(picture[::-1]) if is_flipped else picture
-    if shape[0] * shape[1] <= _LOSSLESS_PX:
+    if shape[0] * shape[1] <= LOSSLESS_PX:
         return cv2.imencode(".png", picture)[1].tobytes()
     sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, *sampling]

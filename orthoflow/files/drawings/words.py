@@ -19,7 +19,8 @@ _SEPARATORS: Final = {"de": str.maketrans(".,", ",."), "fr": _SPACED, "pl": _SPA
 
 
 @lru_cache(maxsize=1)
-def _labels() -> dict[str, tuple[str, ...]]:
+def all_labels() -> dict[str, tuple[str, ...]]:
+    """Return the text of each label in every language, in the order of `LANGUAGES`."""
     lines = _TEXTS.read_text(encoding="utf-8").splitlines()
     rows = (line.split(" | ") for line in lines if line and not line.startswith("#"))
     return {key: tuple(texts) for key, *texts in rows}
@@ -31,7 +32,7 @@ def label(key: str, language: Language = "en", **values: object) -> str:
     >>> label("section", "de"), label("n_pairs", "de", count="1,234")
     ('Schnitt', 'Paare: 1.234')
     """
-    text = _labels()[key][LANGUAGES.index(language)]
+    text = all_labels()[key][LANGUAGES.index(language)]
     filled = {name: numerals(str(value), language) for name, value in values.items()}
     return text.format(**filled) if values else text
 

@@ -41,7 +41,7 @@ MOST_LINE_BYTES: Final = 10_000
 _HEADER_LINES: Final = 200
 _SAMPLE_LINES: Final = 1000
 # A block has about 300,000 points.
-_BLOCK_BYTES: Final = 1 << 24
+BLOCK_BYTES: Final = 1 << 24
 # Maximum number of digits of a point count; a longer number is not a count.
 _MOST_DIGITS: Final = 20
 _NUMBER: Final = re.compile(
@@ -258,7 +258,7 @@ def line_at(path: Path, place: int | None = None) -> int:
     """Return the number (1 for the first) of the line at an offset; None is the file's end."""
     n_lines, n_left, is_within = 1, path.stat().st_size if place is None else place, False
     with path.open("rb") as file:
-        while block := file.read(min(_BLOCK_BYTES, n_left)):
+        while block := file.read(min(BLOCK_BYTES, n_left)):
             n_left -= len(block)
             n_lines += _count_ends(block)
             is_within = not block.endswith(b"\n")
@@ -410,7 +410,7 @@ def read_tables(
 
 def _take_block(file: BinaryIO, n_lines: int | None, end: int | None) -> bytes:
     """Read the next complete lines, up to a given number of lines and a given offset."""
-    size = _BLOCK_BYTES if end is None else min(_BLOCK_BYTES, end - file.tell())
+    size = BLOCK_BYTES if end is None else min(BLOCK_BYTES, end - file.tell())
     block = file.read(size)
     if block and not block.endswith(b"\n"):
         rest = file.readline(MOST_LINE_BYTES)

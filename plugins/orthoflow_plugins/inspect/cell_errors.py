@@ -41,12 +41,12 @@ _STEP_BAND_CELLS: Final = 2
 # are lost at the border.
 BLOCK_CELLS: Final = 96
 # Maximum number of cells, on all walls together, for which colours are compared.
-_COLOUR_CELLS: Final = 250_000
+COLOUR_CELLS: Final = 250_000
 # Maximum number of cells, on all walls together, for which visibility is tested.
 _SEEN_CELLS: Final = 600_000
 # Maximum number of errors (32 bytes each) that are kept for all walls together. The standard error
 # of the median of so many values is 1/2000 of their standard deviation.
-_KEPT_ERRORS: Final = 1 << 23
+MAX_KEPT_ERRORS: Final = 1 << 23
 # Multiples of these numbers, modulo 1, are evenly distributed (R2 sequence, Roberts 2018).
 _SPREAD: Final = (0.7548776662466927, 0.5698402909980532)
 _NAMES_BESIDE_TRACED: Final = {
@@ -90,9 +90,9 @@ class SamplingRule:
         n_shown = sum(n_shown_of(image) for image in images)
         n_cells = sum(image.mask.size for image in images)
         return cls(
-            colour_share=min(1.0, _COLOUR_CELLS / max(1, n_shown)),
+            colour_share=min(1.0, COLOUR_CELLS / max(1, n_shown)),
             lattice_step=max(1, math.ceil(math.sqrt(n_cells / _SEEN_CELLS))),
-            error_step=max(1, n_cells // _KEPT_ERRORS),
+            error_step=max(1, n_cells // MAX_KEPT_ERRORS),
         )
 
 

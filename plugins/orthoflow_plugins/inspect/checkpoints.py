@@ -193,7 +193,7 @@ class InspectCheckpoints(Method):
         classes = [inputs.checkpoints.classes[k] for k in found]
         findings = _findings(shift_m, classes, max(gsd_m.values()))
         findings += length_findings(surveyed_m, shift_m, walls)
-        findings += _findings_in_space(shown, inputs.checkpoints, found)
+        findings += findings_in_space(shown, inputs.checkpoints, found)
         if inputs.orthoimages is not None:
             findings += _findings_of_images(pictures, inputs.cameras)
         ctx.metric("n_points", len(points), "1")
@@ -284,9 +284,10 @@ def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float
     return findings
 
 
-def _findings_in_space(
+def findings_in_space(
     points: Sequence[ShownPoint], surveyed: CheckPoints, found: Sequence[int]
 ) -> list[Finding]:
+    """Return the errors in space of the check points that were shown as targets."""
     apart = np.array(
         [
             np.linalg.norm(point.point_world - surveyed.points_world[k])

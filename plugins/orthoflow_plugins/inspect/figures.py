@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 DEPTH_SPAN_MM: Final = 10.0
 COLOUR_SPAN_GREY: Final = 60.0
 DISPLACEMENT_SPAN_CELLS: Final = 1.0
-_LONGEST_PX: Final = 1000
+LONGEST_PX: Final = 1000
 # In larger images, squares of cells are averaged before drawing.
-_WHOLE_CELLS: Final = 1 << 24
+WHOLE_CELLS: Final = 1 << 24
 # Length at which the 95th percentile of displacements is drawn, relative to the longer image side.
 _ARROW_SHARE: Final = 0.06
 _NAMES_MOST: Final = 60
@@ -77,7 +77,7 @@ def vector_map(
     """
     import cv2
 
-    scale = min(1.0, _LONGEST_PX / max(image.frame.shape))
+    scale = min(1.0, LONGEST_PX / max(image.frame.shape))
     rows, columns = image.frame.shape
     size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
     small = cv2.resize(_grey_means(image), size, interpolation=cv2.INTER_AREA)
@@ -125,8 +125,8 @@ def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
     Incomplete squares at the right and bottom borders are omitted.
     """
     factor = 1
-    if image.mask.size > _WHOLE_CELLS:
-        factor = max(1, max(image.frame.shape) // (2 * _LONGEST_PX))
+    if image.mask.size > WHOLE_CELLS:
+        factor = max(1, max(image.frame.shape) // (2 * LONGEST_PX))
     if factor == 1:
         return np.asarray(eight_bits(image.rgb).mean(axis=2, dtype=np.float32))
     rows, columns = (size // factor for size in image.frame.shape)

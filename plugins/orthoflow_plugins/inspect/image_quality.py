@@ -42,12 +42,12 @@ _SMEARED_CELLS: Final = 5.0
 _ASKED_MOST: Final = 200_000
 _REACH_CELLS: Final = 8
 _STEP_CELLS: Final = 0.25
-_ALONG: Final = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
+PROFILE_PLACES: Final = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
 _PEAKS_MOST: Final = 4000
 _EDGES_MOST: Final = 400
 # If the interpolated validity is at least this, all cells used in the interpolation are valid.
 _WHOLE: Final = 0.999
-_TILE_CELLS: Final = 2048
+TILE_CELLS: Final = 2048
 _EDGES_LEAST: Final = 20
 _CONTRAST_GREY: Final = 30.0
 # Maximum variation of grey levels on either side of an edge, relative to the contrast of the edge.
@@ -117,7 +117,7 @@ def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
         image: grey levels with a mask of valid cells.
         wall: index of the wall in the findings.
     """
-    profiles = _edge_profiles(image)
+    profiles = edge_profiles(image)
     if len(profiles) < _EDGES_LEAST:
         return []
     spread = np.median(profiles, axis=0)
@@ -215,15 +215,15 @@ def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
     return np.concatenate(chosen)
 
 
-def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
+def edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
     """Return profiles (n, steps) across edges, from 0 on the dark side to 1 on the bright side."""
     from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
     # A tile of a few million cells contains enough edges.
-    image = cells.fullest_part(_TILE_CELLS)
+    image = cells.fullest_part(TILE_CELLS)
     # The gradient of a single row or column is undefined.
     if not image.valid.any() or min(image.valid.shape) < 2:
-        return np.zeros((0, _ALONG.size))
+        return np.zeros((0, PROFILE_PLACES.size))
     # Fill voids with the nearest value, so that they neither create edges nor distort profiles.
     grey = _closed(image)
     smooth = gaussian_filter(grey, 1.0)
@@ -235,8 +235,8 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
     rows, columns = rows[order], columns[order]
     length = steep[rows, columns][:, None]
     at = [
-        rows[:, None] + _ALONG * down[rows, columns][:, None] / length,
-        columns[:, None] + _ALONG * right[rows, columns][:, None] / length,
+        rows[:, None] + PROFILE_PLACES * down[rows, columns][:, None] / length,
+        columns[:, None] + PROFILE_PLACES * right[rows, columns][:, None] / length,
     ]
     whole = map_coordinates(image.valid.astype(np.float64), at, order=1, cval=0.0) > _WHOLE
     kept = np.flatnonzero(whole.all(axis=1))[:_EDGES_MOST]
@@ -248,7 +248,7 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
     even = np.maximum(np.ptp(dark, axis=1), np.ptp(bright, axis=1)) <= _EVEN_SHARE * contrast
     kept = even & (contrast >= _CONTRAST_GREY)
     scaled = (values[kept] - low[kept, None]) / contrast[kept, None]
-    return _centred(scaled, _ALONG)
+    return _centred(scaled, PROFILE_PLACES)
 
 
 def _closed(image: GreyImage) -> NDArray[np.float64]:

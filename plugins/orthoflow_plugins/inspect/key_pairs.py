@@ -43,13 +43,13 @@ _AGREE_CELLS: Final = 1.0
 _SURF_THRESHOLD: Final = 0.1
 # Larger images are processed in tiles with a margin for the support of the largest key points; a
 # tile needs about 2 GB of memory.
-_WHOLE_CELLS: Final = 1 << 24
-_TILE_CELLS: Final = 3072
-_RIM_CELLS: Final = 512
+WHOLE_CELLS: Final = 1 << 24
+TILE_CELLS: Final = 3072
+RIM_CELLS: Final = 512
 
 
 @dataclass(frozen=True, kw_only=True)
-class _KeyPoints:
+class SurfPoints:
     """SURF key points: positions (n, 2), scales (n,), signs of the Laplacian (n,), descriptors."""
 
     places: NDArray[np.float64]
@@ -79,14 +79,14 @@ def find_key_pairs(
         The pairs as patches of the shown image, with their displacements from the reference.
     """
     shape = shown.shape
-    is_whole = math.prod(shape) <= _WHOLE_CELLS
+    is_whole = math.prod(shape) <= WHOLE_CELLS
     found = PatchShifts.joined(
         [
             _pairs_of_tile(shown, reference, tile, radius_cells, threads=threads, is_whole=is_whole)
-            for tile in tiles(shape, max(shape) if is_whole else _TILE_CELLS)
+            for tile in tiles(shape, max(shape) if is_whole else TILE_CELLS)
         ]
     )
-    return found.take(_agreed(found.centre, found.shift))
+    return found.take(agreeing_pairs(found.centre, found.shift))
 
 
 def _pairs_of_tile(
@@ -100,7 +100,7 @@ def _pairs_of_tile(
 ) -> PatchShifts:
     """Find the pairs whose first point is in a tile; key points in the margin are also matched."""
     rows, columns = (
-        slice(max(0, part.start - _RIM_CELLS), min(size, part.stop + _RIM_CELLS))
+        slice(max(0, part.start - RIM_CELLS), min(size, part.stop + RIM_CELLS))
         for part, size in zip(tile, shown.shape, strict=True)
     )
     corner = np.array([columns.start, rows.start])
@@ -110,7 +110,7 @@ def _pairs_of_tile(
     # Process only one tile at a time, since two would need too much memory.
     key_points = partial(_key_points, n_most=round(share * _n_most(shown.shape)))
     one, other = in_order(key_points, (first, second), threads=threads if is_whole else 1)
-    matches = _matches(one, other, radius_cells)
+    matches = matched_pairs(one, other, radius_cells)
     places = one.places[matches[:, 0]]
     low, end = ([getattr(part, name) for part in tile[::-1]] for name in ("start", "stop"))
     own = np.all((places + corner >= low) & (places + corner < end), axis=1)
@@ -130,7 +130,7 @@ def _n_most(shape: tuple[int, int]) -> int:
     return int(np.clip(math.prod(shape) // _CELLS_PER_POINT, _POINTS_LEAST, _POINTS_MOST))
 
 
-def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.bool_]:
+def agreeing_pairs(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask of the pairs that agree with enough neighbours, unlike chance matches."""
     from scipy.spatial import cKDTree
 
@@ -179,7 +179,7 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(twice, dtype=np.float32)
 
 
-def _key_points(image: GreyImage, *, n_most: int) -> _KeyPoints:
+def _key_points(image: GreyImage, *, n_most: int) -> SurfPoints:
     """Return the strongest key points with a patch that is in the image and mostly valid."""
     from mahotas.features import surf
 
@@ -194,7 +194,7 @@ def _key_points(image: GreyImage, *, n_most: int) -> _KeyPoints:
     )
     share = _patch_means(image.valid.astype(np.float32), places[inside])
     kept = inside[share >= _LEAST_VALID_SHARE]
-    return _KeyPoints(
+    return SurfPoints(
         places=places[kept],
         scale=found[kept, 2],
         sign=found[kept, 4],
@@ -210,7 +210,7 @@ def _patch_means(values: NDArray[np.float32], places: NDArray[np.float64]) -> ND
     return np.asarray(np.asarray(means)[cells[:, 1], cells[:, 0]], dtype=np.float32)
 
 
-def _matches(first: _KeyPoints, second: _KeyPoints, radius: float) -> NDArray[np.int64]:
+def matched_pairs(first: SurfPoints, second: SurfPoints, radius: float) -> NDArray[np.int64]:
     """Return index pairs (m, 2) of mutually best descriptors that also pass the ratio test."""
     from scipy.spatial import cKDTree
 

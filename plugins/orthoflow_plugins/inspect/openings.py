@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
 # Larger walls are sampled more coarsely, except along the borders of openings.
-_MAX_SAMPLES: Final = 1 << 24
+MAX_SAMPLES: Final = 1 << 24
 # Maximum depth of a recess in the scene, in metres.
 _BEHIND_MOST_M: Final = 2.0
 # The first value is the width, in cells, of the rim around a recess. The recess belongs to the wall
@@ -198,7 +198,7 @@ def _true_wall(
     from orthoflow.geometry.scene_views import render
 
     scene, slab = inputs.truth.scene, inputs.walls.slab(place)
-    step = max(1, math.ceil(math.sqrt(slab.n_cells / _MAX_SAMPLES)))
+    step = max(1, math.ceil(math.sqrt(slab.n_cells / MAX_SAMPLES)))
     rows, columns = (-(-count // step) for count in slab.frame.shape)
     sampled = replace(slab.frame, gsd_m=step * slab.frame.gsd_m, width=columns, height=rows)
     nowhere = np.zeros(sampled.shape, dtype=np.bool_)

@@ -235,7 +235,7 @@ def _pose_error(
         status=camera.status,
         centre_m=float(np.linalg.norm(found.centre_world - true.centre_world)),
         rotation_deg=_angle_deg(found.rotation @ true.rotation.T),
-        wall_m=_error_on_walls(found, true, walls, scene, views),
+        wall_m=error_on_walls(found, true, walls, scene, views),
         sigma_wall_m=camera.sigma_wall_m,
     )
 
@@ -252,7 +252,7 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
     return math.degrees(math.atan2(float(np.linalg.norm(axis)), float(np.trace(rotation)) - 1.0))
 
 
-def _error_on_walls(
+def error_on_walls(
     found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
     """Compare where the two cameras project a grid of pixels onto the true surfaces.

@@ -57,14 +57,14 @@ def report_doubts(
     if n_own := int(np.count_nonzero(is_own(surveyed))):
         ctx.report(OWN_POINTS, n=n_own, n_points=len(points))
     by_wall = {picture.wall: picture for picture in pictures}
-    beyond_m = np.array([_beyond_m(point, by_wall.get(point.wall)) for point in points])
+    beyond_m = np.array([beyond_wall_m(point, by_wall.get(point.wall)) for point in points])
     if n_far := np.count_nonzero(beyond_m > 0.0):
         farthest_m = float(beyond_m.max())
         how_far = f", up to {farthest_m:.4g} m" if np.isfinite(farthest_m) else ""
         ctx.report(FAR_POINTS, n=n_far, n_points=len(points), how_far=how_far)
 
 
-def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
+def beyond_wall_m(point: ShownPoint, picture: Picture | None) -> float:
     """Return the distance in metres from a wall's raster; 0 if below the length of the wall."""
     if picture is None:
         return 0.0

@@ -89,9 +89,9 @@ if TYPE_CHECKING:
 
 _TRACED_POINTS: Final = 4000
 # The true colour of a cell is the mean over n x n rays.
-_SUPERSAMPLE: Final = 3
+SUPERSAMPLE: Final = 3
 # Larger walls are compared in bands of this many cells; a band needs about 1 GB of memory.
-_BAND_CELLS: Final = 1 << 23
+BAND_CELLS: Final = 1 << 23
 # Figures of large walls show every nth row and column, such that about this many remain along the
 # longer side.
 _DRAWN_CELLS: Final = 1800
@@ -485,7 +485,7 @@ class _Judge:
             front_m=slab.front_m,
             behind_m=slab.behind_m,
             viewers=viewers,
-            supersample=_SUPERSAMPLE,
+            supersample=SUPERSAMPLE,
             coloured=chosen.coloured,
             judged=chosen.lattice,
             cores=self.ctx.cores,
@@ -549,7 +549,7 @@ def _draw_step(image: Orthoimage) -> int:
 
 
 def _is_large(image: Orthoimage) -> bool:
-    return image.mask.size > _BAND_CELLS
+    return image.mask.size > BAND_CELLS
 
 
 def _bands(image: Orthoimage) -> Iterator[Band]:
@@ -557,7 +557,7 @@ def _bands(image: Orthoimage) -> Iterator[Band]:
     height, width = image.frame.shape
     rows = height
     if _is_large(image):
-        rows = BLOCK_CELLS * max(1, _BAND_CELLS // (width * BLOCK_CELLS) - 2)
+        rows = BLOCK_CELLS * max(1, BAND_CELLS // (width * BLOCK_CELLS) - 2)
     for first in range(0, height, rows):
         end = min(height, first + rows)
         around = slice(max(0, first - BLOCK_CELLS), min(height, end + BLOCK_CELLS))

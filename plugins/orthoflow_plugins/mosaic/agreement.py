@@ -24,7 +24,7 @@ _PATCHES_MOST: Final = 200
 _CONTRAST_LEAST_GREY: Final = 3.0
 # Correlation peaks lower than this may be due to chance.
 _RESPONSE_LEAST: Final = 0.15
-_ROWS_AT_ONCE: Final = 1024
+ROWS_AT_ONCE: Final = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overl
     """
     import cv2
 
-    pairs = _pairs(layers, of_all_pairs=of_all_pairs)
+    pairs = patch_pairs(layers, of_all_pairs=of_all_pairs)
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), _PATCHES_MOST)).round().astype(int)
     window = cv2.createHanningWindow((PATCH_CELLS, PATCH_CELLS), cv2.CV_32F)
     shifts, centres, photos = [], [], []
@@ -77,7 +77,7 @@ def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overl
     )
 
 
-def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, int, int, int]]:
+def patch_pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, int, int, int]]:
     """Return (row, column, layer, layer) for each pair of layers that show a whole patch."""
     n_rows, n_columns = (side // PATCH_CELLS for side in layers[0].frame.shape)
     if len(layers) < 2 or not n_rows or not n_columns:
@@ -135,7 +135,7 @@ def seam_steps(
     nothing = np.zeros((0, 3), dtype=np.uint8)
     firsts, seconds = [nothing], [nothing]
     for axis in (0, 1):
-        rows, columns = _before_seams(source, axis)
+        rows, columns = cells_before_seams(source, axis)
         mine = source[rows, columns]
         other = source[rows + (axis == 0), columns + (axis == 1)]
         for index, layer in enumerate(layers):
@@ -151,13 +151,13 @@ def seam_steps(
     return grey, np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
 
 
-def _before_seams(
+def cells_before_seams(
     source: NDArray[np.int16], axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the rows and columns of the cells above (axis 0) or to the left of (axis 1) seams."""
     found: list[NDArray[np.int64]] = []
-    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
-        strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
+    for first in range(0, source.shape[0], ROWS_AT_ONCE):
+        strip = source[first : first + ROWS_AT_ONCE + (axis == 0)]
         here = strip[:-1] if axis == 0 else strip[:, :-1]
         there = strip[1:] if axis == 0 else strip[:, 1:]
         rows, columns = np.nonzero((here != there) & (here >= 0) & (there >= 0))
@@ -169,13 +169,13 @@ def _before_seams(
 def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
     """Count all seam cells, and those on depth edges."""
     n_seam = n_edge_seam = 0
-    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
+    for first in range(0, source.shape[0], ROWS_AT_ONCE):
         # The row below the last row determines whether the last row contains seam cells.
-        rows = slice(first, first + _ROWS_AT_ONCE + 1)
-        seam = is_seam(source[rows])[:_ROWS_AT_ONCE]
+        rows = slice(first, first + ROWS_AT_ONCE + 1)
+        seam = is_seam(source[rows])[:ROWS_AT_ONCE]
         n_seam += int(np.count_nonzero(seam))
         if depth_m is not None:
-            n_edge_seam += int(np.count_nonzero(seam & depth_edges(depth_m[rows])[:_ROWS_AT_ONCE]))
+            n_edge_seam += int(np.count_nonzero(seam & depth_edges(depth_m[rows])[:ROWS_AT_ONCE]))
     return n_seam, n_edge_seam
 
 

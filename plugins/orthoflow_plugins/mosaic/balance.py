@@ -72,7 +72,7 @@ _NODES: Final = 4
 _SWEEPS: Final = 6
 _OUTLIER: Final = 2.0
 # Distance from a seam within which colours are blended.
-_FEATHER_CELLS: Final = 64
+FEATHER_CELLS: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +147,7 @@ def balance_of(
     shape = layers[0].frame.shape
     blocks = Blocks.over(shape, _block_cells(shape))
     lights = [block_light(layer, blocks) for layer in layers]
-    radii = _radii(layers[0].frame, wall, cameras, blocks, lights)
+    radii = radii_of_blocks(layers[0].frame, wall, cameras, blocks, lights)
     exposures = estimate(lights, radii)
     logs = [
         exposures.logs(index, light, seen).astype(np.float32)
@@ -162,13 +162,14 @@ def _block_cells(shape: tuple[int, int]) -> int:
     return int(np.clip(np.sqrt(shape[0] * shape[1] / _BLOCKS_LEAST), 2, _BLOCK_CELLS_MOST))
 
 
-def _radii(
+def radii_of_blocks(
     frame: WallFrame,
     wall: Wall | None,
     cameras: Sequence[Camera | None],
     blocks: Blocks,
     lights: Sequence[BlockLight],
 ) -> list[Radii | None]:
+    """Return, for each layer, the distances of its blocks from the centre of its photo."""
     lenses: dict[tuple[int, int, int], int] = {}
     found: list[Radii | None] = []
     down, right = blocks.centres()
@@ -215,7 +216,7 @@ def with_seams(balance: Balance, source: NDArray[np.int16], wall: Wall | None) -
     """
     blocks = balance.blocks
     side = float(np.diff(blocks.rows).max())
-    spread = max(0.5, 0.5 * _FEATHER_CELLS / side)
+    spread = max(0.5, 0.5 * FEATHER_CELLS / side)
     shares = _Shares.of(balance, source, spread)
     says = np.ones(blocks.shape, dtype=np.float32)
     if wall is not None:
@@ -372,7 +373,7 @@ class Exposures:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Overlap:
+class Overlap:
     """Blocks that two layers have in common.
 
     Attributes:
@@ -400,7 +401,7 @@ def estimate(lights: Sequence[BlockLight], radii: Sequence[Radii | None]) -> Exp
     """
     count = len(lights)
     n_lenses = 1 + max((item.lens for item in radii if item is not None), default=-1)
-    overlaps = _overlaps(lights)
+    overlaps = overlaps_of(lights)
     if not overlaps:
         return Exposures(
             exposures=np.zeros((count, 3)),
@@ -430,7 +431,8 @@ def estimate(lights: Sequence[BlockLight], radii: Sequence[Radii | None]) -> Exp
     )
 
 
-def _overlaps(lights: Sequence[BlockLight]) -> list[_Overlap]:
+def overlaps_of(lights: Sequence[BlockLight]) -> list[Overlap]:
+    """Return the differences of light, block by block, of each pair of layers that overlap."""
     found = []
     for i, j, shared in pairs(lights):
         parts = [inside(shared, lights[k].box) for k in (i, j)]
@@ -442,7 +444,7 @@ def _overlaps(lights: Sequence[BlockLight]) -> list[_Overlap]:
         places = places[np.linspace(0, len(places) - 1, n_taken).round().astype(np.int64)]
         one, other = (places + _corner(part) for part in parts)
         apart = lights[j].log_light[tuple(other.T)] - lights[i].log_light[tuple(one.T)]
-        found.append(_Overlap(layers=(i, j), places=(one, other), apart=apart.astype(np.float64)))
+        found.append(Overlap(layers=(i, j), places=(one, other), apart=apart.astype(np.float64)))
     return found
 
 
@@ -450,7 +452,7 @@ def _corner(part: Box) -> NDArray[np.int64]:
     return np.array([part[0].start, part[1].start], dtype=np.int64)
 
 
-def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
+def _exposure_columns(overlaps: Sequence[Overlap], count: int) -> csr_array:
     """Return the exposure columns of the design matrix: 1 for first, -1 for second layers."""
     from scipy.sparse import csr_array
 
@@ -464,7 +466,7 @@ def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
 
 
 def _lens_columns(
-    overlaps: Sequence[_Overlap], radii: Sequence[Radii | None], n_lenses: int
+    overlaps: Sequence[Overlap], radii: Sequence[Radii | None], n_lenses: int
 ) -> csr_array:
     """Return the lens columns of the design matrix, two per lens."""
     from scipy.sparse import csr_array
@@ -482,7 +484,7 @@ def _lens_columns(
     return csr_array(columns)
 
 
-def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -> csr_array:
+def _field_columns(overlaps: Sequence[Overlap], lights: Sequence[BlockLight]) -> csr_array:
     """Return the field columns of the design matrix, one per node and layer."""
     from scipy.sparse import csr_array
 
@@ -517,7 +519,7 @@ def _solved(
     columns: Sequence[csr_array],
     apart: NDArray[np.float64],
     priors: NDArray[np.float64],
-    overlaps: Sequence[_Overlap],
+    overlaps: Sequence[Overlap],
 ) -> NDArray[np.float64]:
     """Solve for unknowns (unknowns, channels) by robust least squares with zero-mean priors.
 

@@ -27,12 +27,12 @@ _DEPTH_EDGE_COST: Final = 1.0
 _LENGTH_COST: Final = 0.01
 _VIEW_WEIGHT: Final = 0.1
 # Cost of assigning a cell to a layer that does not show it.
-_FORBIDDEN: Final = 1e3
+FORBIDDEN: Final = 1e3
 _UNITS: Final = 1000.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Scene:
+class CutScene:
     """Layers at reduced scale: colours (k, rows, cols, 3) in 0..1, views (k, rows, cols), edges.
 
     `views` is the cost of a layer in each cell; `edges` (rows, cols) is the additional cost of a
@@ -82,21 +82,22 @@ def cut_labels(
     shape = layers[0].frame.shape
     factor = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS_MOST)))
     blocks = Blocks.over((shape[0], shape[1]), factor)
-    scene = _reduced(layers, wall, blocks, balance)
+    scene = reduced_scene(layers, wall, blocks, balance)
     labels = np.argmin(scene.views, axis=0)
     for _ in range(_SWEEPS_MOST):
         before = labels
         for alpha in range(len(layers)):
-            labels = _expanded(scene, labels, alpha)
+            labels = expanded(scene, labels, alpha)
         if np.array_equal(labels, before):
             break
-    labels = np.where(scene.views.min(axis=0) < _FORBIDDEN, labels, -1)
+    labels = np.where(scene.views.min(axis=0) < FORBIDDEN, labels, -1)
     return CutLabels(small=labels.astype(np.int16), blocks=blocks)
 
 
-def _reduced(
+def reduced_scene(
     layers: Sequence[Layer], wall: Wall | None, blocks: Blocks, balance: Balance | None
-) -> _Scene:
+) -> CutScene:
+    """Return the layers reduced to the mean of each block, with the costs of views and edges."""
     painted = np.stack([block_means(partial(_painted_in, layer.mask), blocks) for layer in layers])
     colours = np.stack(
         [
@@ -114,19 +115,19 @@ def _reduced(
             colours[index] = lit_shares(shares.reshape(-1, 3), gains).reshape(shares.shape)
     quality = np.stack([raster_means(layer.quality, blocks) for layer in layers])
     best = np.maximum(quality.max(axis=0), 1e-12)
-    views = np.where(painted > 0.5, _VIEW_WEIGHT * (1.0 - quality / best), _FORBIDDEN)
+    views = np.where(painted > 0.5, _VIEW_WEIGHT * (1.0 - quality / best), FORBIDDEN)
     edges = np.zeros(views.shape[1:])
     if wall is not None:
         steps = block_means(partial(depth_edges_in, wall.depth_m), blocks)
         edges = np.where(steps > 0.0, _DEPTH_EDGE_COST, 0.0)
-    return _Scene(colours=colours.astype(np.float32), views=views, edges=edges)
+    return CutScene(colours=colours.astype(np.float32), views=views, edges=edges)
 
 
 def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
     return np.asarray(mask[rows] == LayerMask.PAINTED, dtype=np.bool_)
 
 
-def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
+def expanded(scene: CutScene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
     """Return the labels after the optimal expansion of one layer, found by a minimum cut."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -144,11 +145,11 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     grid = cells.reshape(labels.shape)
     for one, other in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
         p, q = one.ravel(), other.ravel()
-        right = _seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
-        left = _seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
+        right = seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
+        left = seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
         # Enforce the triangle inequality: a seam costs at most as much as both seams with alpha
         # together.
-        kept = np.minimum(_seam_cost(scene, p, q, flat[p], flat[q]), right + left)
+        kept = np.minimum(seam_cost(scene, p, q, flat[p], flat[q]), right + left)
         # Kolmogorov and Zabih 2004: A + (C - A) p - C q + (B + C - A) (1 - p) q.
         np.add.at(take, p, left - kept)
         np.add.at(take, q, -left)
@@ -161,7 +162,7 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     # A cell on the sink side of the cut changes to alpha, which cuts the edge from the source.
     between += [take - low, keep - low]
     # An edge from p to q is cut where p keeps its label (source side) and q changes.
-    capacity = np.minimum(np.concatenate(between), 4.0 * _FORBIDDEN * _UNITS)
+    capacity = np.minimum(np.concatenate(between), 4.0 * FORBIDDEN * _UNITS)
     graph = coo_array(
         (
             np.rint(capacity).astype(np.int32),
@@ -180,8 +181,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     return moved.reshape(labels.shape)
 
 
-def _seam_cost(
-    scene: _Scene,
+def seam_cost(
+    scene: CutScene,
     p: NDArray[np.int64],
     q: NDArray[np.int64],
     label_p: NDArray[np.int64],
@@ -195,6 +196,6 @@ def _seam_cost(
     for cell in (p, q):
         apart = np.abs(colours[label_p, cell] - colours[label_q, cell]).mean(axis=1)
         # If only one layer shows a cell, the colours cannot be compared and no step is visible.
-        both = (views[label_p, cell] < _FORBIDDEN) & (views[label_q, cell] < _FORBIDDEN)
+        both = (views[label_p, cell] < FORBIDDEN) & (views[label_q, cell] < FORBIDDEN)
         cost = cost + np.where(both, apart, 0.0)
     return np.where(label_p == label_q, 0.0, np.rint(_UNITS * cost))

@@ -28,7 +28,7 @@ Preference = Callable[[slice], NDArray[np.float32]]
 
 NOBODY: Final = -1
 # Walls with more cells than this are processed in bands of about this size.
-_BAND_CELLS: Final = 1 << 25
+BAND_CELLS: Final = 1 << 25
 # Balancing colours temporarily takes more than a hundred bytes per cell.
 _BALANCED_AT_ONCE: Final = 1 << 20
 # States in ascending order; a cell takes the highest state that it has in any layer. It is occluded
@@ -96,7 +96,7 @@ def _depth_inside(layer: Layer) -> Preference:
     import cv2
 
     shape = layer.mask.shape
-    step = math.ceil(math.sqrt(layer.mask.size / _BAND_CELLS))
+    step = math.ceil(math.sqrt(layer.mask.size / BAND_CELLS))
     painted = np.pad((layer.mask[step // 2 :: step, step // 2 :: step] == LayerMask.PAINTED), 1)
     distance = cv2.distanceTransform(painted.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     inside = np.float32(step) * np.asarray(distance, dtype=np.float32)
@@ -181,7 +181,7 @@ def joined(
     # A cell can influence another one only if they are at most this many rows apart.
     cells_min = params.island_cells_min
     reach = cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
-    for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
+    for band in bands_with_reach(shape, cells_most=BAND_CELLS, reach_rows=reach):
         rows = band.around
         parts = [raster_rows(layer, rows) for layer in painters]
         values = [preference(rows) for preference in preferred]
@@ -220,7 +220,7 @@ def coloured(
     is_deep = any(layer.rgb.dtype == np.uint16 for layer in painters)
     level: Level = np.uint16 if is_deep else np.uint8
     rgb: Colours = np.asarray(allocate("rgb", (*source.shape, 3), level), level)
-    cells_most = _BAND_CELLS if balance is None else _BALANCED_AT_ONCE
+    cells_most = BAND_CELLS if balance is None else _BALANCED_AT_ONCE
     for band in bands_with_reach(source.shape, cells_most=cells_most, reach_rows=0):
         rows = band.rows
         for index, layer in enumerate(painters):

@@ -57,7 +57,7 @@ from orthoflow_plugins.mosaic.joining import (
 from orthoflow_plugins.mosaic.parameters import SeamsParams
 
 # Length of the longer side of the figure of the sources, in pixels.
-_LONGEST_PX: Final = 900
+LONGEST_PX: Final = 900
 # Maximum number of sources in the legend.
 _NAMED_MOST: Final = 24
 # The legend has two columns instead of three if a name has at least this many characters.
@@ -386,7 +386,7 @@ def _source_map(image: Orthoimage) -> bytes:
     """
     from matplotlib.patches import Patch
 
-    step = max(1, -(-max(image.source.shape) // _LONGEST_PX))
+    step = max(1, -(-max(image.source.shape) // LONGEST_PX))
     source = image.source[::step, ::step]
     colours = [plane_ink(k) for k in range(len(image.sources))]
     tint = 255.0 * np.array([*colours, (0.0, 0.0, 0.0)])[source]

@@ -110,7 +110,7 @@ def tie_photos(
         )
         near = matched.take(off <= _MAX_OFF_LINE_PX)
         links.append(np.column_stack([near.first + starts[first], near.second + starts[second]]))
-    tracks = _tracks(np.vstack(links), starts)
+    tracks = tracks_of(np.vstack(links), starts)
     return _located(cameras, features, rays, tracks[:n_most])
 
 
@@ -127,7 +127,7 @@ def _off_line_px(
     return np.where(np.isfinite(off), off * second[0].fx, np.inf)
 
 
-def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def tracks_of(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Return tracks of linked key points, longest first, with at most one key point per photo."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # Limit in standard deviations. It is exceeded by 4.55 % of a normal distribution, and by at most a
 # quarter of any distribution (Chebyshev).
 _BEYOND: Final = 2.0
-_SIDE_PX: Final = 900
+SIDE_PX: Final = 900
 # Colours as in Figure 17 of markiewicz2015: control green, rejected red, check yellow.
 _ROLE_RGB: Final = {
     TieRole.REJECTED: (220, 40, 40),
@@ -318,7 +318,7 @@ def draw_ties(
     if any(figure.name == name for figure in ctx.figures):
         name = f"{name}-{len(ctx.figures)}"
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
-    scale = min(1.0, _SIDE_PX / max(photo.width, photo.height))
+    scale = min(1.0, SIDE_PX / max(photo.width, photo.height))
     size = (max(1, round(photo.width * scale)), max(1, round(photo.height * scale)))
     small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     # Dim the photo so that the marks are visible.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.surfaces import Surface
 
 # Larger layers are coloured in bands of this many cells; a band needs about 600 MB.
-_BAND_CELLS: Final = 1 << 23
+BAND_CELLS: Final = 1 << 23
 
 
 class DsmForward(Method):
@@ -138,7 +138,7 @@ def _layer(
     free = surface.relief._replace(bottoms=np.full_like(surface.relief.bottoms, np.inf))
     # The width of a gap depends on cells within two disc radii, and its colour on one more cell.
     reach_rows = 2 * params.fill_gap_cells + 2
-    for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
+    for band in bands_with_reach(shape, cells_most=BAND_CELLS, reach_rows=reach_rows):
         inner, width = band.inner, surface.frame.width
         pixel, depth_m = catch.pixel[band.around], surface.relief.depth[band.around]
         visible = cells_seen(from_anywhere, free, empty, band.rows, slice(0, width))

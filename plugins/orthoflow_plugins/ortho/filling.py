@@ -20,7 +20,7 @@ _WINDOWS: Final = (3, 5, 7)
 _BESIDE_CELLS: Final = 2
 # OpenCV fills gaps from cells that it has already filled, so the influence of a cell is unlimited.
 # Beyond this distance, it is less than one 8-bit level.
-_FRONT_CELLS: Final = 64
+FRONT_CELLS: Final = 64
 
 
 def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
@@ -28,7 +28,7 @@ def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
     if inpainting == "none":
         return 0
     reach = max(_WINDOWS) // 2 + math.ceil(radius_px) + 1 + _BESIDE_CELLS
-    return reach if inpainting == "between" else reach + _FRONT_CELLS
+    return reach if inpainting == "between" else reach + FRONT_CELLS
 
 
 def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> NDArray[np.bool_]:

@@ -87,7 +87,7 @@ def throw_pixels(
             nearest = buffer.nearest[int((j + 0.5) * per_pixel), int((i + 0.5) * per_pixel)]
             if nearest < passes:
                 continue
-            t = _first_meeting(view, relief, dc, dr, dn, lowest)
+            t = first_hit(view, relief, dc, dr, dn, lowest)
             if t < 0.0:
                 continue
             u, v = view.column + 0.5 + t * dc, view.row + 0.5 + t * dr
@@ -106,7 +106,7 @@ def throw_pixels(
 
 
 @compiled
-def _first_meeting(
+def first_hit(
     view: WallView, relief: Relief, dc: float, dr: float, dn: float, lowest: float
 ) -> float:
     """Return the distance in metres along the optical axis at which a ray hits the surface, or -1.

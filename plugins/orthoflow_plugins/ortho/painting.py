@@ -40,7 +40,7 @@ _REACH_PX: Final = 5
 _SIGMA_LEAST_PX: Final = 0.2
 _BASE_CELLS: Final = 4.0
 # Cells this close to a hidden area are not coloured, because edges are blurred in photos.
-_EROSION_CELLS: Final = 1
+EROSION_CELLS: Final = 1
 # Twenty bits are enough to rank photos by quality, and halve the compressed size.
 _QUALITY_BITS: Final = np.uint32(0xFFFFF000)
 
@@ -110,7 +110,7 @@ def paint(
     painting = Painting(mask=np.asarray(allocate("mask", shape, np.uint8), np.uint8))
     # With the additional cell, hidden patches of 2 x 2 cells across the border of the tile are
     # found.
-    margin = _EROSION_CELLS + 1 if params.visibility == "full" else 0
+    margin = EROSION_CELLS + 1 if params.visibility == "full" else 0
 
     def paint_tile(tile: Tile) -> None:
         visible, inner = _visible(view, surface, buffer, tile, margin)
@@ -135,7 +135,7 @@ def paint(
                 painting.rgb = np.asarray(allocate("rgb", (*shape, 3), level), level)
                 painting.quality = np.asarray(allocate("quality", shape, np.float32), np.float32)
         if params.visibility == "full":
-            is_near = near_patches(visible.mask == OCCLUDED, _EROSION_CELLS)
+            is_near = near_patches(visible.mask == OCCLUDED, EROSION_CELLS)
             np.copyto(visible.mask, np.uint8(OCCLUDED), where=is_painted & is_near)
             np.copyto(visible.quality, np.float32(0.0), where=is_near)
         painting.mask[tile] = visible.mask[inner]

@@ -39,7 +39,7 @@ _NO_COLOUR: Final = 999
 # Maximum number of points in a cell from which the median is computed.
 _TOP_MOST: Final = 5
 # Maximum number of points sorted at once for the median.
-_POINTS_AT_ONCE: Final = 1 << 24
+POINTS_AT_ONCE: Final = 1 << 24
 # Side of the squares in which the colours of scans are compared.
 _PLACE_M: Final = 0.05
 # Minimum number of points that each scan must have in a square.
@@ -125,7 +125,7 @@ def colours_of(
         # Limit the number of points processed at once, but process at least one cell.
         totals, first, n_before = np.cumsum(winners["n_points"], dtype=np.int64), 0, 0
         while first < totals.size:
-            end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
+            end = int(np.searchsorted(totals, n_before + POINTS_AT_ONCE, side="right"))
             cells = slice(first, max(first + 1, end))
             tops = list(_on_top(painters, slab, floors_m, threads=threads, cells=cells))
             _set_medians(rgb, tops, painters.values)

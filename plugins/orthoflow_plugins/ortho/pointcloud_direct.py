@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.point_colours import CellColours, Painters
 
 # Larger walls are processed in bands of this many cells; a band needs about 600 MB.
-_BAND_CELLS: Final = 1 << 22
+BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
 # Pure black points are reported if their share is larger, since real surfaces have hardly any.
 _BLACK_WORTH_WORDS: Final = 0.001
@@ -143,7 +143,7 @@ class PointcloudDirect(Method):
                 quality=np.asarray(new("quality", shape, np.float32), np.float32),
                 filled=filled,
             )
-            for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
+            for band in bands_with_reach(shape, cells_most=BAND_CELLS, reach_rows=reach):
                 started = ctx.clock_s()
                 found = colours_of(painters, slabs[k].over(band.around), params, threads=ctx.cores)
                 projected = ctx.clock_s()

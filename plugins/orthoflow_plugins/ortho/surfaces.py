@@ -34,7 +34,7 @@ _TOLERANCE_CELLS: Final = 0.5
 # side.
 _BORDER_SHARE: Final = 0.05
 # The occluding surface is computed in bands of this many cells.
-_BAND_CELLS: Final = 1 << 17
+BAND_CELLS: Final = 1 << 17
 # A cell influences the occluding surface within this distance, in rows.
 _REACH_ROWS: Final = 4
 # Between neighbouring cells, a height difference of more than this many cells (79 degrees) is an
@@ -138,7 +138,7 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
     if hides:
         occluding = np.asarray(allocate("occluding", depth.shape, np.float32), np.float32)
         edge_m = _EDGE_CELLS * wall.frame.gsd_m
-        for band in bands_with_reach(depth.shape, cells_most=_BAND_CELLS, reach_rows=_REACH_ROWS):
+        for band in bands_with_reach(depth.shape, cells_most=BAND_CELLS, reach_rows=_REACH_ROWS):
             occluding[band.rows] = _hiding(depth[band.around], edge_m)[band.inner]
         tops = _of_blocks(occluding, np.maximum, side)
     occluding = occluding.view(np.ndarray)

@@ -93,7 +93,7 @@ _FIT_POINTS: Final = 20_000
 _SPREAD_POINTS: Final = 5_000
 # With this number of points, the uncertainty of planes is smaller than the deviations of surfaces
 # from a plane, so only part of a larger cloud is used.
-_FITTED_MOST: Final = 12_000_000
+MAX_FITTED: Final = 12_000_000
 # For small scenes, the minimum area is reduced to this share of the largest face of the box.
 _SIDE_SHARE: Final = 0.02
 # Maximum number of rectangles per plane (a frame has four sides), and of slabs, whose indices are
@@ -517,7 +517,7 @@ def _judged(
 def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
     """Fit planes of the sample to all points; omit planes that these points do not confirm."""
     cloud = search.cloud
-    every = max(1, len(cloud.claims) // _FITTED_MOST)
+    every = max(1, len(cloud.claims) // MAX_FITTED)
     # Draw blocks at random, because a fixed step could coincide with the columns of a scan and omit
     # stripes.
     drawn = np.random.default_rng(0).permutation(len(cloud.points.boxes)) % every == 0

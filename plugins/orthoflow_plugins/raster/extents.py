@@ -268,7 +268,7 @@ def extent_of(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Bound:
+class Bound:
     """An adjoining plane, given as a linear function of position: the distance from the plane.
 
     Attributes:
@@ -312,7 +312,7 @@ class _Search:
     width_m: float
     height_m: float
     seed_m: float
-    bounds: tuple[_Bound, ...]
+    bounds: tuple[Bound, ...]
 
     @classmethod
     def of(cls, points: SampledPoints, planes: Planes, index: int, reach: Reach) -> _Search:
@@ -331,7 +331,7 @@ class _Search:
             math.sqrt(searched_m2 * n_steps / _VOXELS_MOST),
         )
         size_m = width_m, height_m
-        around = _Around.of(points, rectangle, size_m)
+        around = PointsAround.of(points, rectangle, size_m)
         # Grow by whole cells, so that the rectangle's corner is also a corner of a cell.
         growth_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
         frame = frame_of(planes, index, gsd_m=side_m, margin_m=growth_m)
@@ -340,7 +340,7 @@ class _Search:
             width_m=width_m,
             height_m=height_m,
             seed_m=planes.tolerance_m,
-            bounds=tuple(_bounds(planes, index, rectangle, size_m, around)),
+            bounds=tuple(adjoining_bounds(planes, index, rectangle, size_m, around)),
         )
 
     def places_m(self, points: PointsInside) -> NDArray[np.float64]:
@@ -588,22 +588,26 @@ def _parts(planes: Planes, index: int) -> NDArray[np.float64]:
     return own if len(own) else planes.corners[[index]]
 
 
-def _bounds(
-    planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float], around: _Around
-) -> Iterator[_Bound]:
+def adjoining_bounds(
+    planes: Planes,
+    index: int,
+    rectangle: WallFrame,
+    size_m: tuple[float, float],
+    around: PointsAround,
+) -> Iterator[Bound]:
     """Yield the adjoining plane of each side of a wall: the innermost one, if there are several.
 
     If the wall has points beyond the innermost plane, the plane does not bound the wall, and the
     next one is used. An example is the side of a chimney breast on the adjoining wall.
     """
-    found: dict[Side, list[_Bound]] = {}
+    found: dict[Side, list[Bound]] = {}
     for other in range(len(planes)):
         if other == index or abs(float(planes.normal[other] @ rectangle.normal_world)) > (
             _ADJOINING_COSINE
         ):
             continue
-        bound = _bound(planes, other, rectangle, size_m)
-        if bound is None or not _stands(bound, size_m, around):
+        bound = adjoining_bound(planes, other, rectangle, size_m)
+        if bound is None or not stands_beside(bound, size_m, around):
             continue
         found.setdefault(bound.side, []).append(bound)
     for bounds in found.values():
@@ -613,9 +617,10 @@ def _bounds(
         yield bounds[0]
 
 
-def _bound(
+def adjoining_bound(
     planes: Planes, other: int, rectangle: WallFrame, size_m: tuple[float, float]
-) -> _Bound | None:
+) -> Bound | None:
+    """Return where another plane bounds a wall; None if it is not beside, above or below it."""
     normal = planes.normal[other]
     axes = np.array([rectangle.u_world, rectangle.v_world, rectangle.normal_world])
     slopes = axes @ normal
@@ -639,7 +644,7 @@ def _bound(
     if not -_WITHIN_M <= beyond_m <= _GROWTH_MOST_M:
         return None
     noise_m = min(_NOISE_SIGMAS * _sigma_m(planes, other), _NOISE_MOST_M)
-    return _Bound(
+    return Bound(
         side=sides[0] if is_first else sides[1],
         slopes=slopes,
         offset_m=offset_m,
@@ -650,7 +655,7 @@ def _bound(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Around:
+class PointsAround:
     """Points in and around a wall, in metres relative to its rectangle.
 
     Attributes:
@@ -665,7 +670,8 @@ class _Around:
     @classmethod
     def of(
         cls, points: SampledPoints, rectangle: WallFrame, size_m: tuple[float, float]
-    ) -> _Around:
+    ) -> PointsAround:
+        """Select the points that are near enough to a rectangle of this size to bound its wall."""
         growth_m = _GROWTH_MOST_M
         corner = rectangle.world_from_wall(np.array([[-growth_m, -growth_m]]) / rectangle.gsd_m)[0]
         width_m, height_m = (length_m + 2.0 * growth_m for length_m in size_m)
@@ -689,7 +695,7 @@ class _Around:
         )
 
 
-def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
+def stands_beside(bound: Bound, size_m: tuple[float, float], around: PointsAround) -> bool:
     """Return whether a plane has points along a wall's side, in front of or behind the wall."""
     places_m = around.places_m
     is_near = np.abs(bound.offset_m + bound.slopes @ places_m) <= bound.noise_m
@@ -699,7 +705,7 @@ def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool
     )
 
 
-def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
+def _goes_on(inner: Bound, outer: Bound, size_m: tuple[float, float], around: PointsAround) -> bool:
     """Return whether a wall has points between two planes that adjoin the same side."""
     places_m = around.own_m
     is_between = inner.offset_m + inner.slopes @ places_m < -inner.noise_m
@@ -707,7 +713,7 @@ def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: 
     return _runs_along(inner, places_m[:, is_between], size_m)
 
 
-def _runs_along(bound: _Bound, places_m: NDArray[np.float64], size_m: tuple[float, float]) -> bool:
+def _runs_along(bound: Bound, places_m: NDArray[np.float64], size_m: tuple[float, float]) -> bool:
     """Return whether positions (3, n) cover a sufficient share of the side that a plane bounds."""
     along = 1 if bound.side in {"left", "right"} else 0
     length_m = size_m[along]

@@ -253,7 +253,7 @@ def _frames(
         reach_m = max(max(buffer_m(index)) for index in frames)
         frames = mapped(frames, planes, params.crs, reach_m=reach_m, ctx=ctx)
     frames = {index: extent_of(index).widened(frame) for index, frame in frames.items()}
-    _report_doubts(list(frames), planes, params, extent_of, ctx)
+    report_doubts(list(frames), planes, params, extent_of, ctx)
     if params.crop is None:
         return frames, covered
     parts = {index: cropped(frame, params.crop) for index, frame in frames.items()}
@@ -270,9 +270,10 @@ def _frames(
     return crops, covered
 
 
-def _report_doubts(
+def report_doubts(
     chosen: list[int], planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> None:
+    """Report walls cut by oblique neighbours, and points of `near` far from all walls."""
     for index in chosen:
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - params.margin_m

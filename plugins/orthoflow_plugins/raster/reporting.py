@@ -18,7 +18,7 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Cause, Emptiness
 
 # For walls with more cells, medians are estimated from only some of the rows.
-_CELLS_ASKED: Final = 1 << 26
+CELLS_ASKED: Final = 1 << 26
 # Maximum spacing of the points of a scan, in cells.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0
 # Minimum share of empty or interpolated cells for a warning.
@@ -116,7 +116,7 @@ CLOSE_CELLS: Final = DiagnosticSpec(
     remedy="{remedy}",
     rank_by="interpolated",
 )
-_CAUSES: Final[dict[Cause, DiagnosticSpec]] = {
+CAUSES: Final[dict[Cause, DiagnosticSpec]] = {
     "behind": BEHIND_BUFFER,
     "before": FRONT_LEFT_OUT,
     "hidden": HIDDEN,
@@ -245,13 +245,13 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
     """Report the causes of empty cells as metrics, and as diagnostics if many cells are empty."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
-    for cause in _CAUSES:
+    for cause in CAUSES:
         shares = [of_wall.shares[cause] for of_wall in empty]
         ctx.metric(f"empty_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
     for wall, of_wall in zip(walls, empty, strict=True):
         if not wall.count.any() or of_wall.share < _SHARE_LEAST:
             continue
-        shares_of = {cause: of_wall.shares[cause] for cause in _CAUSES}
+        shares_of = {cause: of_wall.shares[cause] for cause in CAUSES}
         ctx.log(
             f"{wall.name}: {of_wall.share:.1%} of its cells are empty: "
             + ", ".join(f"{share:.1%} {cause}" for cause, share in shares_of.items())
@@ -264,7 +264,7 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
         for cause, share in shares_of.items():
             if share >= least:
                 is_floor = wall.frame.raster_axes in {"level", "map"}
-                spec = STOOD_ON if cause == "before" and is_floor else _CAUSES[cause]
+                spec = STOOD_ON if cause == "before" and is_floor else CAUSES[cause]
                 ctx.report(
                     spec,
                     subject=wall.name,
@@ -286,4 +286,4 @@ def _rounded_up(depth_m: float) -> float | None:
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
-    return values[:: max(1, values.size // _CELLS_ASKED)]
+    return values[:: max(1, values.size // CELLS_ASKED)]

@@ -48,7 +48,7 @@ SPAN_GAPS: Final = 4
 # scans are not used.
 _GRID_CELLS_MOST: Final = 1 << 28
 # Number of depths sorted at once (256 MB).
-_POINTS_AT_ONCE: Final = 1 << 26
+POINTS_AT_ONCE: Final = 1 << 26
 
 # Radius of the neighbourhood for outliers, in rows and columns.
 _NEAR_CELLS: Final = 2
@@ -293,7 +293,7 @@ def _grouped(
     first = n_before = 0
     while first < count.size:
         # Use at least one cell, even if it has more points.
-        end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
+        end = int(np.searchsorted(totals, n_before + POINTS_AT_ONCE, side="right"))
         end = max(first + 1, end)
         ends = totals[first:end] - n_before
         cursors = ends - count[first:end]

@@ -25,7 +25,7 @@ _BYTES_WORKING: Final = 90
 _BYTES_VERTEX: Final = 700
 _MEMORY_SHARE: Final = 0.75
 # Number of cells in a band, which needs 1.5 GB of memory; larger walls are processed in bands.
-_BAND_CELLS: Final = 1 << 24
+BAND_CELLS: Final = 1 << 24
 # Margin of a band in rows, for the detection of outliers, which uses cells up to 20 rows away.
 _REACH_OF_OUTLIERS: Final = 32
 
@@ -38,7 +38,7 @@ def bytes_needed(shapes: Sequence[tuple[int, int]], *, is_tin: bool = False) -> 
     kept = _BYTES_KEPT * sum(size for size in sizes if size <= IN_MEMORY_CELLS)
     if is_tin:
         return kept + (_BYTES_WORKING + _BYTES_VERTEX) * max(sizes)
-    return kept + _BYTES_WORKING * min(max(sizes), _BAND_CELLS)
+    return kept + _BYTES_WORKING * min(max(sizes), BAND_CELLS)
 
 
 def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None:
@@ -84,7 +84,7 @@ def rastered_wall(
     from orthoflow_plugins.raster.surfaces import DENOISE_CELLS, SPAN_GAPS
 
     frame, width = slab.frame, slab.frame.width
-    cells_most = _BAND_CELLS + (slab.n_cells if params.surface == "tin" else 0)
+    cells_most = BAND_CELLS + (slab.n_cells if params.surface == "tin" else 0)
     # The noise filter is applied twice. The interpolation of gaps needs the distance between
     # neighbours across a gap, the radius of a disc on each side, and a margin.
     reach_rows = _REACH_OF_OUTLIERS + 2 * DENOISE_CELLS

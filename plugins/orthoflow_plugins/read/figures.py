@@ -22,8 +22,8 @@ _POLAR_SAMPLE: Final = 2_000_000
 # Maximum number of rows, and of columns, of a scan that are drawn as lines on a wall.
 _LINES: Final = 24
 # Colours in which rows and columns are drawn.
-_ROW_RGB: Final = (235, 165, 20)
-_COLUMN_RGB: Final = (20, 150, 215)
+ROW_RGB: Final = (235, 165, 20)
+COLUMN_RGB: Final = (20, 150, 215)
 _WALL_STEP_DEG: Final = 2.0
 _WALL_FARTHEST_M: Final = 1000.0
 _WALL_CELL_M: Final = 0.05
@@ -150,7 +150,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     grey = np.rint(40.0 + 120.0 * np.broadcast_to(shade, len(pixels))).astype(np.uint8)
     picture[pixels[is_inside, 1], pixels[is_inside, 0]] = grey[is_inside, None]
     rows, columns = (array[index][on_wall].astype(np.int64) for array in (cloud.row, cloud.column))
-    for lines, order, colour in ((rows, columns, _ROW_RGB), (columns, rows, _COLUMN_RGB)):
+    for lines, order, colour in ((rows, columns, ROW_RGB), (columns, rows, COLUMN_RGB)):
         pieces = [piece for line in _some_lines(lines, order) for piece in _unbroken(pixels[line])]
         cv2.polylines(picture, pieces, isClosed=False, color=colour)
     return encode_png(picture)

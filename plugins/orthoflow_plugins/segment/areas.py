@@ -25,13 +25,13 @@ _EMPTY_LEAST: Final = 0.5
 # If more than this share of the measured cells is behind the plane, the plane is not the wall's
 # face.
 _FACE_LEAST: Final = 0.5
-_CELLS_TOLD: Final = 1 << 25
+MAX_MEASURED_CELLS: Final = 1 << 25
 # Approximate side length of the tiles in which rays are counted; a tile contains many rays.
 _TILE_M: Final = 0.05
 # Larger clouds are reduced by Fibonacci hashing to a sample of about this number of points.
 _POINTS_MOST: Final = 1 << 22
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
-_BLOCK: Final = 1 << 18
+BLOCK: Final = 1 << 18
 # If stations are unknown, only points within these distances behind and in front of the plane are
 # used.
 _BEHIND_MOST_M: Final = 4.0
@@ -125,8 +125,8 @@ def _rays(
     stations = cloud.stations if cloud.stations_source == "file" else None
     scan = cloud.scan
     every = -(-len(cloud) // _POINTS_MOST)
-    for first in range(0, len(cloud), _BLOCK * every):
-        index = np.arange(first, min(first + _BLOCK * every, len(cloud)), every)
+    for first in range(0, len(cloud), BLOCK * every):
+        index = np.arange(first, min(first + BLOCK * every, len(cloud)), every)
         if every > 1:
             chance = (index.astype(np.uint64) * _TURN) >> np.uint64(32)
             index = np.minimum(index + (chance % np.uint64(every)).astype(np.int64), len(cloud) - 1)
@@ -193,7 +193,7 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
     import cv2
 
     step = 1
-    while wall.mask.size // step**2 > _CELLS_TOLD:
+    while wall.mask.size // step**2 > MAX_MEASURED_CELLS:
         step += 1
     depth_m = np.ascontiguousarray(wall.depth_m[::step, ::step])
     is_empty = np.ascontiguousarray(wall.mask[::step, ::step] == SurfaceMask.VOID)

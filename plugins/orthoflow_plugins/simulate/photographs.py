@@ -277,7 +277,7 @@ def take_photos(
         photos.append(
             Photo(
                 name=shot.taken.photo,
-                encoded=encode_jpeg(_developed(image, film, rng), quality=_JPEG_QUALITY),
+                encoded=encode_jpeg(developed_photo(image, film, rng), quality=_JPEG_QUALITY),
                 width=shot.camera.width,
                 height=shot.camera.height,
                 exif_focal_px=exif_focal,
@@ -323,9 +323,10 @@ def place_to_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
     return axes.T @ place
 
 
-def _developed(
+def developed_photo(
     image: NDArray[np.float32], film: Film, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
+    """Apply vignetting, add noise, and round to grey levels."""
     height, width = image.shape[:2]
     rows = (np.arange(height, dtype=np.float32) + 0.5) / height - 0.5
     columns = (np.arange(width, dtype=np.float32) + 0.5) / width - 0.5

@@ -359,7 +359,7 @@ class SimulateRoom(Method):
         delivery = Delivery(
             room=room,
             scan=scan_scene(room.scene, sweeps, errors, ctx),
-            world_from_room=basis_from_up(up_vector(params.up)).T @ _turn_about_up(turn_deg),
+            world_from_room=basis_from_up(up_vector(params.up)).T @ turn_about_up(turn_deg),
             shift_world_m=np.array(params.shift_world_m),
         )
         shots = planned_shots(
@@ -401,7 +401,7 @@ class SimulateRoom(Method):
         )
 
 
-def _turn_about_up(turn_deg: float) -> NDArray[np.float64]:
+def turn_about_up(turn_deg: float) -> NDArray[np.float64]:
     """Return the rotation (3, 3) about the room's z axis; for 0 degrees, exactly the identity."""
     if turn_deg == 0.0:
         return np.eye(3)

@@ -100,7 +100,7 @@ def exported(folder: Path, run: Any, **choices: Any) -> tuple[str, AttributedClo
         path.touch()
         return sum(len(block) for block in attributed.blocks())
 
-    said = module._export("cloud.toy", write, run, folder, Choices(**choices))
+    said = module.export_cloud("cloud.toy", write, run, folder, Choices(**choices))
     (attributed,) = kept
     return said, attributed
 
@@ -183,10 +183,10 @@ def test_the_coordinate_system_is_written_where_all_walls_agree() -> None:
             walls=[SimpleNamespace(frame=SimpleNamespace(map_crs=name)) for name in names]
         )
 
-    assert module._crs_wkt(None) == ""
-    assert module._crs_wkt(walls(None, "site")) == ""
-    assert CRS.from_wkt(module._crs_wkt(walls("EPSG:25832", None))).to_epsg() == 25832
-    assert module._crs_wkt(walls("EPSG:25832", "EPSG:25833")) == ""
+    assert module.common_crs_wkt(None) == ""
+    assert module.common_crs_wkt(walls(None, "site")) == ""
+    assert CRS.from_wkt(module.common_crs_wkt(walls("EPSG:25832", None))).to_epsg() == 25832
+    assert module.common_crs_wkt(walls("EPSG:25832", "EPSG:25833")) == ""
 
 
 @pytest.mark.parametrize("colour", [None, "intensity"])
@@ -199,7 +199,7 @@ def test_photos_colour_what_they_see_and_the_rest_stays_grey(
 
     monkeypatch.setattr("orthoflow.cli.exports.clouds.colour_points", colour_points)
     oriented = ((SimpleNamespace(name="a.jpg"), "its camera"),)
-    monkeypatch.setattr(module, "_oriented", lambda *_args: oriented)
+    monkeypatch.setattr(module, "oriented_photos", lambda *_args: oriented)
     said, attributed = exported(tmp_path, labelled(), colour=colour)
     if colour == "intensity":
         assert (attributed.photo_colours, attributed.photo_names) == (None, ())
@@ -237,13 +237,13 @@ def photographed(*names: str, takes: bool = True) -> Any:
 def test_photos_are_those_that_the_last_cell_oriented(tmp_path: Path) -> None:
     chosen = Choices(store=tmp_path)
     run = photographed("a.jpg", "b.jpg", "c.jpg", "d.jpg")
-    found = module._oriented(run, run.cells, chosen)
+    found = module.oriented_photos(run, run.cells, chosen)
     assert [photo.name for photo, _ in found] == ["a.jpg", "b.jpg"]
     np.testing.assert_allclose(
         found[0][1].centre_world, cameras_product().cameras[0].viewing().centre_world
     )
     first = {name: cell for name, cell in run.cells.items() if name != "bundle"}
-    assert [photo.name for photo, _ in module._oriented(run, first, chosen)] == ["a.jpg"]
-    assert module._oriented(run, {"shots": run.cells["shots"]}, chosen) == ()
+    assert [photo.name for photo, _ in module.oriented_photos(run, first, chosen)] == ["a.jpg"]
+    assert module.oriented_photos(run, {"shots": run.cells["shots"]}, chosen) == ()
     alone = photographed("a.jpg", takes=False)
-    assert module._oriented(alone, alone.cells, chosen) == ()
+    assert module.oriented_photos(alone, alone.cells, chosen) == ()

@@ -148,7 +148,7 @@ def test_another_program_reads_every_point_as_it_is(
 def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(copc, "_KEPT_WHOLE", 300)
+    monkeypatch.setattr(copc, "KEPT_WHOLE", 300)
     # The nearer to a corner the denser, as about a scanner.
     x, y, z = (2.0 * np.random.default_rng(2).random((3, 8000)) ** 4).astype(np.float32)
     cloud = PointCloud(
@@ -159,7 +159,7 @@ def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
     assert write_copc(path, attributed) == len(cloud)
     assert list(tmp_path.iterdir()) == [path]
     # In groups and blocks it gives the same bytes.
-    monkeypatch.setattr(copc, "_IN_MEMORY_POINTS", 500)
+    monkeypatch.setattr(copc, "IN_MEMORY_POINTS", 500)
     monkeypatch.setattr(copc, "BLOCK", 1000)
     monkeypatch.setattr(attributes, "BLOCK", 1000)
     write_copc(tmp_path / "b.copc.laz", attributed)

@@ -65,7 +65,7 @@ def test_large_pictures_are_jpeg_with_the_colours_they_had(
     )
     part = Part(left_m=0.0, top_m=0.0, right_m=40.0, bottom_m=30.0)
     for lossless_px, magic in ((120_000, b"\x89PNG"), (119_999, b"\xff\xd8")):
-        monkeypatch.setattr(printed_pictures, "_LOSSLESS_PX", lossless_px)
+        monkeypatch.setattr(printed_pictures, "LOSSLESS_PX", lossless_px)
         encoded = encode_part(tmp_path / "a.tif", part, scale=50)
         assert encoded.startswith(magic)
     picture = decode_image(encoded).astype(int)

@@ -38,7 +38,7 @@ from orthoflow.files.drawings.sheet_contents import (
     usual_papers,
 )
 from orthoflow.files.drawings.sheets import fitting_scale, lay_out
-from orthoflow.files.drawings.words import LANGUAGES, _labels, label
+from orthoflow.files.drawings.words import LANGUAGES, all_labels, label
 from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.products import OrthoMask
@@ -259,7 +259,7 @@ def test_feet_are_written_and_measured(run: Path, tmp_path: Path) -> None:
 
 
 def test_each_text_is_there_in_each_language_with_the_same_values() -> None:
-    for key, texts in _labels().items():
+    for key, texts in all_labels().items():
         assert len(texts) == len(LANGUAGES), key
         fields = {tuple(sorted(set(re.findall(r"\{(\w+)\}", text)))) for text in texts}
         assert len(fields) == 1, key
@@ -269,11 +269,11 @@ def test_letters_of_no_font_are_refused_and_nothing_is_written(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("matplotlib.font_manager.findSystemFonts", list)
-    pens._installed_letters.cache_clear()
+    pens.installed_letters.cache_clear()
     block = tmp_path / "block.yaml"
     block.write_text("project: 松本城\n", encoding="utf-8")
     done = export(run, tmp_path / "out", "--title-block", block)
-    pens._installed_letters.cache_clear()
+    pens.installed_letters.cache_clear()
     assert done.exit_code == 2
     assert "no installed font contains the character 松 (U+677E), which is used" in done.output
     assert "Noto Sans CJK" in done.output
@@ -286,12 +286,12 @@ def test_letters_are_taken_from_an_installed_font(
     font = tmp_path / "postscript.otf"
     write_cff_font(font, "城")
     monkeypatch.setattr("matplotlib.font_manager.findSystemFonts", lambda: [str(font)])
-    pens._installed_letters.cache_clear()
+    pens.installed_letters.cache_clear()
     pens.fallback_font.cache_clear()
     block = tmp_path / "block.yaml"
     block.write_text("project: A 城\n", encoding="utf-8")
     done = export(run, tmp_path / "out", "--title-block", block)
-    pens._installed_letters.cache_clear()
+    pens.installed_letters.cache_clear()
     assert done.exit_code == 0, done.output
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
         letters = [one for one in page.chars if one["text"] == "城"]

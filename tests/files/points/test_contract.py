@@ -212,7 +212,7 @@ def test_blocks_join_without_a_seam(
 ) -> None:
     for module in (e57, las, records):
         monkeypatch.setattr(module, "BLOCK_POINTS", 150)
-    monkeypatch.setattr(text, "_BLOCK_BYTES", 5000)
+    monkeypatch.setattr(text, "BLOCK_BYTES", 5000)
     path, right = written(name, tmp_path, scene())
     assert len(list(open_scan(path).read())) > 2
     check(read(path), right, atol=tolerance(name, is_survey=False))

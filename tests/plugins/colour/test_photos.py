@@ -95,7 +95,7 @@ def test_the_box_holds_the_cameras_and_the_cloud_but_for_outliers() -> None:
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     stray = np.tile([[500.0, 500.0, 500.0]], (5, 1))
     cloud = scenes.cloud_of(np.concatenate([floor, stray]))
-    box = module._box_of(cloud, [viewer])
+    box = module.box_around(cloud, [viewer])
     centre, offsets = viewer.centre_world - cloud.origin, cloud.points_world()[:-5] - cloud.origin
     low, high = np.minimum(offsets.min(axis=0), centre), np.maximum(offsets.max(axis=0), centre)
     # The box has a margin of one cube on each side.

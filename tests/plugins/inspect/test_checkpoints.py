@@ -197,11 +197,11 @@ def test_points_are_measured_without_memory_per_cell(
     where = inspect_scenes.frame(shape=(1600, 2000))
     n_cells = where.width * where.height
     for name, limit in (
-        ("orthoflow.geometry.bands._BAND_CELLS", 1 << 17),
-        ("orthoflow_plugins.inspect.figures._WHOLE_CELLS", 1 << 17),
+        ("orthoflow.geometry.bands.BAND_CELLS", 1 << 17),
+        ("orthoflow_plugins.inspect.figures.WHOLE_CELLS", 1 << 17),
         ("orthoflow_plugins.inspect.checkpoints.IN_MEMORY_CELLS", 1 << 17),
-        ("orthoflow_plugins.inspect.figures._LONGEST_PX", 200),
-        ("orthoflow_plugins.inspect.image_quality._TILE_CELLS", 256),
+        ("orthoflow_plugins.inspect.figures.LONGEST_PX", 200),
+        ("orthoflow_plugins.inspect.image_quality.TILE_CELLS", 256),
     ):
         monkeypatch.setattr(name, limit)
     grey = np.random.default_rng(1).random(where.shape, dtype=np.float32)
@@ -223,13 +223,13 @@ def test_points_that_are_carried_back_into_space_are_off_by_their_distance() -> 
     places = ([1.0, 2.0, 3.0], [np.nan] * 3, [5.003, 6.0, 7.004])
     points = [ShownPoint(how="target", point_world=np.array(place)) for place in places]
     checks = points_at(np.array([[9.0, 9, 9], [1, 2, 3], [1, 1, 1], [5, 6, 7]]))
-    found = checkpoints._findings_in_space(points, checks, [1, 2, 3])
+    found = checkpoints.findings_in_space(points, checks, [1, 2, 3])
     assert {item.name: (item.value, item.unit) for item in found} == {
         "n_3d": (2.0, "1"),
         "rms_3d_mm": (pytest.approx(np.sqrt(12.5)), "mm"),
         "max_3d_mm": (pytest.approx(5.0), "mm"),
     }
-    assert checkpoints._findings_in_space(points[1:2], checks, [2]) == []
+    assert checkpoints.findings_in_space(points[1:2], checks, [2]) == []
 
 
 def test_points_without_a_class_are_check_points(tmp_path: Path) -> None:
@@ -281,8 +281,8 @@ def test_points_are_far_beyond_the_length_of_their_wall(side: tuple[float, float
         ]
         point: Any = SimpleNamespace(expected=np.array(place))
         expected = GSD_M * off if is_far else 0.0
-        assert point_doubts._beyond_m(point, picture) == pytest.approx(expected)
-    assert point_doubts._beyond_m(point, None) == 0.0
+        assert point_doubts.beyond_wall_m(point, picture) == pytest.approx(expected)
+    assert point_doubts.beyond_wall_m(point, None) == 0.0
 
 
 def test_four_unused_points_are_named_and_the_others_counted() -> None:

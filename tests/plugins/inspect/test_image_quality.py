@@ -120,9 +120,9 @@ def test_only_cells_that_a_photo_painted_are_asked() -> None:
 def test_a_spread_that_begins_or_ends_grey_tells_nothing(
     first: float, last: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ramp = np.linspace(0.0, 1.0, image_quality._ALONG.size)
+    ramp = np.linspace(0.0, 1.0, image_quality.PROFILE_PLACES.size)
     ramp[0], ramp[-1] = first, last
-    monkeypatch.setattr(image_quality, "_edge_profiles", lambda _: np.tile(ramp, (20, 1)))
+    monkeypatch.setattr(image_quality, "edge_profiles", lambda _: np.tile(ramp, (20, 1)))
     assert bool(numbers(edge())) == is_told
 
 

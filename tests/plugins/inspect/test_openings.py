@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_large_walls_are_judged_in_coarser_cells_but_sides_as_exactly(
     walls = scene()[1]
     found = opening(walls, outwards_m=0.03), opening(walls, right_m=0.9)
     whole, inspection = judged(tmp_path, *found)
-    monkeypatch.setattr(inspected, "_MAX_SAMPLES", n_samples)
+    monkeypatch.setattr(inspected, "MAX_SAMPLES", n_samples)
     coarse, again = judged(tmp_path, *found)
     np.testing.assert_array_equal(again.displacement_m, inspection.displacement_m)
     np.testing.assert_array_equal(again.points_world, inspection.points_world)
@@ -91,6 +91,13 @@ def test_an_outline_is_of_what_it_shares_half_of_its_area_with(
     assert (numbers["n_found_openings"], numbers["n_false_openings"]) == (is_found, not is_found)
 
 
-def test_a_side_without_length_has_no_error() -> None:
-    wall: Any = None
-    assert inspected._side_error(wall, np.ones(2), np.ones(2), 0.01) is None
+def test_a_side_without_length_has_no_error(tmp_path: Path) -> None:
+    plain = opening(scene()[1])
+    last = {
+        name: np.append(corners := getattr(plain, name), corners[-1:], axis=0)
+        for name in ("outline_m", "outline_world", "side_sigma_m", "side_source")
+    }
+    numbers, inspection = judged(tmp_path, replace(plain, **last))
+    assert len(inspection.points_world) == 4
+    # It is not the side of any true border.
+    assert numbers == judged(tmp_path, plain)[0] | {"n_stray_sides": 1}

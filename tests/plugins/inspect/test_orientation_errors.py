@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect.orientation_errors import (
     PoseError,
-    _error_on_walls,
+    error_on_walls,
     most_shown,
     pose_findings,
     tie_errors_cells,
@@ -124,7 +124,7 @@ def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool
     if turned:
         # The camera looks away from the wall.
         found = camera_at(scene.origin, FACING * [[1.0], [-1.0], [-1.0]])
-    error = _error_on_walls(found, true, walls, scene, views)
+    error = error_on_walls(found, true, walls, scene, views)
     # Root mean square per coordinate.
     assert error == (math.inf if turned else pytest.approx(0.005 / math.sqrt(2.0), rel=1e-9))
     # Pixels are in the centres of 24 x 18 equal parts of the photo.
@@ -133,9 +133,9 @@ def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool
     np.testing.assert_allclose(np.unique(pixels[:, 0]), 1000.0 * (np.arange(24) + 0.5) / 24.0)
     np.testing.assert_allclose(np.unique(pixels[:, 1]), 800.0 * (np.arange(18) + 0.5) / 18.0)
     unknown: Any = SimpleNamespace(shifted=lambda _: SimpleNamespace(rays_world=no_rays))
-    assert _error_on_walls(unknown, true, walls, scene, views) == math.inf
+    assert error_on_walls(unknown, true, walls, scene, views) == math.inf
     nothing = one_wall(frame, front_m=0.1, behind_m=-1.0)
-    assert _error_on_walls(found, true, nothing, scene, views) is None
+    assert error_on_walls(found, true, nothing, scene, views) is None
 
 
 def test_a_photo_shows_most_of_the_nearest_wall_that_faces_it() -> None:

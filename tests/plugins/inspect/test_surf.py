@@ -117,9 +117,9 @@ def test_ten_pairs_say_something(
         assert len(found.displacement_m) == 10
 
 
-def key_points(count: int) -> key_pairs._KeyPoints:
+def key_points(count: int) -> key_pairs.SurfPoints:
     ones = np.ones(count)
-    return key_pairs._KeyPoints(
+    return key_pairs.SurfPoints(
         places=np.full((count, 2), 10.0), scale=ones, sign=ones, descriptors=np.eye(8)[:count]
     )
 
@@ -127,15 +127,15 @@ def key_points(count: int) -> key_pairs._KeyPoints:
 def test_without_candidates_there_are_no_pairs() -> None:
     some, none = key_points(1), key_points(0)
     for first, second in ((none, some), (some, none), (some, replace(some, sign=-some.sign))):
-        assert key_pairs._matches(first, second, 5.0).shape == (0, 2)
+        assert key_pairs.matched_pairs(first, second, 5.0).shape == (0, 2)
 
 
 def test_of_few_pairs_two_others_must_agree() -> None:
     places, shift = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]]), np.zeros((3, 2))
-    assert key_pairs._agreed(places, shift).all()
-    assert not key_pairs._agreed(places[:2], shift[:2]).any()
+    assert key_pairs.agreeing_pairs(places, shift).all()
+    assert not key_pairs.agreeing_pairs(places[:2], shift[:2]).any()
     shift[2] = 5.0
-    assert not key_pairs._agreed(places, shift).any()
+    assert not key_pairs.agreeing_pairs(places, shift).any()
 
 
 def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
@@ -143,11 +143,11 @@ def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
 ) -> None:
     shown, true = (OrthoimageGrey(displaced(*by)) for by in ((1.4, -0.6), (0.0, 0.0)))
     whole = find_key_pairs(shown, true, radius_cells=40.0)
-    monkeypatch.setattr(key_pairs, "_WHOLE_CELLS", 1000)
-    monkeypatch.setattr(key_pairs, "_TILE_CELLS", 150)
+    monkeypatch.setattr(key_pairs, "WHOLE_CELLS", 1000)
+    monkeypatch.setattr(key_pairs, "TILE_CELLS", 150)
     # The margin contains the support of the widest descriptors, so all points are found as in the
     # whole image.
-    monkeypatch.setattr(key_pairs, "_RIM_CELLS", 400)
+    monkeypatch.setattr(key_pairs, "RIM_CELLS", 400)
     tiled = find_key_pairs(shown, true, radius_cells=40.0)
     assert len(tiled) == len(whole) >= 50
     one, other = (

@@ -220,7 +220,7 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
         )
         for x in (0.6, 0.603)
     )
-    monkeypatch.setattr("orthoflow_plugins.inspect.truth._SUPERSAMPLE", 1)
+    monkeypatch.setattr("orthoflow_plugins.inspect.truth.SUPERSAMPLE", 1)
     given = finer(2)
     inputs = given | {"truth": replace(given["truth"], cameras=true), "cameras": found}
 
@@ -241,7 +241,7 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
     assert n_hidden > 450
     assert whole["n_ghost_cells"] == pytest.approx(n_hidden, rel=0.02)
     assert 0.5 < whole["completeness_seen_by_both"] < 1.0
-    monkeypatch.setattr("orthoflow_plugins.inspect.truth._BAND_CELLS", 1000)
+    monkeypatch.setattr("orthoflow_plugins.inspect.truth.BAND_CELLS", 1000)
     parts, in_bands = outcome()
     assert parts == {name: pytest.approx(value) for name, value in whole.items()}
     assert at_once.kinds == ("patch", "painted cell")
@@ -254,7 +254,7 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
     patches = [product.points_world[product.kind == 0] for product in (at_once, in_bands)]
     np.testing.assert_allclose(*patches)
     # If not all errors are kept, every nth gives the same result.
-    monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors._KEPT_ERRORS", 4000)
+    monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors.MAX_KEPT_ERRORS", 4000)
     some, _ = outcome()
     assert some["n_traced"] == whole["n_traced"]
     for name in ("rmse_u_mm", "nmad_v_mm", "depth_median_mm", "depth_rmse_mm"):
@@ -267,11 +267,11 @@ def test_a_large_wall_takes_the_memory_of_a_band(
     inputs = finer(6)
     n_cells = inputs["orthoimages"].images[0].mask.size
     for name, value in (
-        ("truth._SUPERSAMPLE", 1),
-        ("truth._BAND_CELLS", 1000),
-        ("cell_errors._COLOUR_CELLS", 20_000),
-        ("cell_errors._KEPT_ERRORS", 5000),
-        ("image_quality._TILE_CELLS", 128),
+        ("truth.SUPERSAMPLE", 1),
+        ("truth.BAND_CELLS", 1000),
+        ("cell_errors.COLOUR_CELLS", 20_000),
+        ("cell_errors.MAX_KEPT_ERRORS", 5000),
+        ("image_quality.TILE_CELLS", 128),
     ):
         monkeypatch.setattr(f"orthoflow_plugins.inspect.{name}", value)
     tracemalloc.start()

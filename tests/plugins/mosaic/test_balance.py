@@ -249,7 +249,7 @@ def test_near_a_seam_layers_go_over_to_each_other_unless_depths_leap_everywhere(
 def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
     apart: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(balancing, "_FEATHER_CELLS", 40)
+    monkeypatch.setattr(balancing, "FEATHER_CELLS", 40)
     # Two layers cover a wall of 16 x 24 blocks, with the seam in the middle; the second is unknown
     # beyond the fourth block after the seam.
     shape = (16, 24)
@@ -303,7 +303,7 @@ def test_photos_of_one_lens_lose_light_alike_however_it_was_adjusted() -> None:
     cameras = [photographed(fx) for fx in (1000.0, 1010.0, 1200.0)]
     cameras += [photographed(1000.0, width=800), None, cameras[0]]
     frame = inspect_scenes.frame(shape=SHAPE)
-    found = balancing._radii(frame, None, cameras, Blocks.over(SHAPE, 8), lights)
+    found = balancing.radii_of_blocks(frame, None, cameras, Blocks.over(SHAPE, 8), lights)
     lenses = [None if one is None else one.lens for one in found]
     # A focal length larger by 1 % is the same lens, by 20 % a zoomed one; other sizes are another
     # camera.
@@ -319,7 +319,9 @@ def test_radii_are_told_from_the_middle_of_the_photo(*, has_depths: bool) -> Non
     depth_m = np.full(SHAPE, 0.4, dtype=np.float32)
     depth_m[:40] = np.nan
     wall = samples.wall(frame, depth_m=depth_m)
-    (found,) = balancing._radii(frame, wall if has_depths else None, [camera], blocks, [light])
+    (found,) = balancing.radii_of_blocks(
+        frame, wall if has_depths else None, [camera], blocks, [light]
+    )
     assert found is not None
     down, right = blocks.centres()
     for row, column in ((0, 0), (7, 3), (14, 19)):
@@ -372,7 +374,7 @@ def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(lens: int | None)
 def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_taken: int) -> None:
     one = light(slice(0, 1), slice(0, n_shared), 1)
     other = light(slice(0, 1), slice(0, n_shared + 5), 2)
-    overlaps = balancing._overlaps([one, other])
+    overlaps = balancing.overlaps_of([one, other])
     assert sum(len(item.apart) for item in overlaps) == n_taken
     if n_taken:
         columns = overlaps[0].places[0][:, 1]

@@ -145,7 +145,7 @@ def test_bands_decide_islands_as_the_whole_does(
     options = PLAIN.model_copy(update={"island_cells_min": cells_min})
     given = {"drawn": None, "wall": None, "balance": None, "allocate": in_memory}
     whole = joining.joined(layers, [], options, **given)  # type: ignore[arg-type]
-    monkeypatch.setattr(joining, "_BAND_CELLS", SHAPE[1])
+    monkeypatch.setattr(joining, "BAND_CELLS", SHAPE[1])
     banded = joining.joined(layers, [], options, **given)  # type: ignore[arg-type]
     np.testing.assert_array_equal(banded, whole)
 
@@ -158,7 +158,7 @@ def test_bands_decide_islands_as_the_whole_does(
 def test_each_cell_has_the_colour_of_its_layer(
     monkeypatch: pytest.MonkeyPatch, band_cells: int, *, is_deep: bool
 ) -> None:
-    monkeypatch.setattr(joining, "_BAND_CELLS", band_cells)
+    monkeypatch.setattr(joining, "BAND_CELLS", band_cells)
     rng = np.random.default_rng(6)
     layers = [
         replace(one, rgb=rng.integers(0, 256, (*SHAPE, 3)).astype(np.uint8)) for one in LAYERS[:2]
@@ -200,7 +200,7 @@ def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
     large = samples.layer(mask)
     options = PLAIN.model_copy(update={"seams": "voronoi"})
     (whole,) = joining.preferences([large], options)
-    monkeypatch.setattr(joining, "_BAND_CELLS", shape[0] * shape[1] // 8)
+    monkeypatch.setattr(joining, "BAND_CELLS", shape[0] * shape[1] // 8)
     (reduced,) = joining.preferences([large], options)
     rows = slice(0, shape[0])
     # With every third cell, the border of the painted area may be off by two cells.
@@ -230,19 +230,19 @@ def test_a_depth_edge_is_a_step_of_more_than_three_centimetres_right_or_down() -
     np.testing.assert_array_equal(depth_edges(depth_m), expected)
 
 
-def scene(edges: tuple[float, float] = (0.0, 0.0)) -> graph_cut._Scene:
+def scene(edges: tuple[float, float] = (0.0, 0.0)) -> graph_cut.CutScene:
     """Return two layers of two cells: grey 0.2 and 0.5 in the first, 0.2 and 0.9 in the second."""
     colours = np.array([[[0.2, 0.2]], [[0.5, 0.9]]], dtype=np.float32)
-    return graph_cut._Scene(
+    return graph_cut.CutScene(
         colours=np.repeat(colours[..., None], 3, axis=3),
         views=np.zeros((2, 1, 2)),
         edges=np.array([edges]),
     )
 
 
-def cost(of: graph_cut._Scene, one: int, other: int) -> float:
+def cost(of: graph_cut.CutScene, one: int, other: int) -> float:
     p, q = np.array([0]), np.array([1])
-    (found,) = graph_cut._seam_cost(of, p, q, np.array([one]), np.array([other]))
+    (found,) = graph_cut.seam_cost(of, p, q, np.array([one]), np.array([other]))
     return float(found)
 
 
@@ -255,7 +255,7 @@ def test_a_seam_costs_differences_on_both_sides_its_length_and_depth_edges() -> 
         assert cost(scene(edges=edges), 0, 1) == plain + 1000 * sum(edges)
     # Where only one layer is painted, there is no visible difference.
     half = scene()
-    half.views[1, 0, 0] = graph_cut._FORBIDDEN
+    half.views[1, 0, 0] = graph_cut.FORBIDDEN
     assert cost(half, 0, 1) == pytest.approx(1000 * (0.7 + 0.01))
 
 
@@ -265,14 +265,14 @@ def test_a_layer_takes_over_what_it_shows_better_for_less_than_the_seam() -> Non
     colours = np.full((2, 1, 10, 3), 0.5, dtype=np.float32)
     views = np.zeros((2, 1, 10))
     views[0, 0, 5:], views[1, 0, :5] = 0.1, 0.1
-    flat = graph_cut._Scene(colours=colours, views=views, edges=np.zeros((1, 10)))
-    labels = graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1)
+    flat = graph_cut.CutScene(colours=colours, views=views, edges=np.zeros((1, 10)))
+    labels = graph_cut.expanded(flat, np.zeros((1, 10), dtype=np.int64), 1)
     assert labels.tolist() == [[0] * 5 + [1] * 5]
     # If a single cell is better by less than the cost of its two seams, nothing changes.
     views[0] = 0.0
     views[0, 0, 4], views[1] = 0.015, 0.1
     views[1, 0, 4] = 0.0
-    assert not graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1).any()
+    assert not graph_cut.expanded(flat, np.zeros((1, 10), dtype=np.int64), 1).any()
 
 
 # --- reduced scale ---
@@ -307,7 +307,7 @@ def test_blocks_have_the_mean_colour_of_what_is_painted_as_it_is_balanced(
         )
     )
     plain, balanced = (
-        graph_cut._reduced(layers, None, Blocks.over((4, 6), 2), each).colours
+        graph_cut.reduced_scene(layers, None, Blocks.over((4, 6), 2), each).colours
         for each in (None, balance)
     )
     for k, row, column in np.ndindex(2, 2, 3):
@@ -326,7 +326,7 @@ def test_blocks_have_the_mean_colour_of_what_is_painted_as_it_is_balanced(
 def test_cuts_are_made_on_some_ten_thousand_cells_that_a_layer_paints(
     monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], small: tuple[int, int]
 ) -> None:
-    monkeypatch.setattr(graph_cut, "_expanded", lambda _scene, labels, _alpha: labels)
+    monkeypatch.setattr(graph_cut, "expanded", lambda _scene, labels, _alpha: labels)
     layers = two_layers(shape)
     for each in layers:
         each.mask[:, -2:] = LayerMask.OUTSIDE
@@ -378,11 +378,11 @@ def test_the_two_best_layers_of_a_patch_are_those_that_paint_all_of_it() -> None
             if len(best) >= 2:
                 wanted.append((row, column, best[0], best[1]))
     assert 2 < len(wanted) <= 6
-    assert agreement._pairs(layers, of_all_pairs=False) == wanted
-    assert agreement._pairs(layers[:1], of_all_pairs=False) == []
-    assert agreement._pairs([plain_layer(mask=(63, 300))] * 2, of_all_pairs=False) == []
+    assert agreement.patch_pairs(layers, of_all_pairs=False) == wanted
+    assert agreement.patch_pairs(layers[:1], of_all_pairs=False) == []
+    assert agreement.patch_pairs([plain_layer(mask=(63, 300))] * 2, of_all_pairs=False) == []
     for of_all_pairs, n_pairs in ((False, 1), (True, 3)):
-        assert len(agreement._pairs([plain_layer()] * 3, of_all_pairs=of_all_pairs)) == n_pairs
+        assert len(agreement.patch_pairs([plain_layer()] * 3, of_all_pairs=of_all_pairs)) == n_pairs
 
 
 def texture(spread_grey: float) -> NDArray[np.float64]:
@@ -433,7 +433,7 @@ def test_two_hundred_patches_are_enough() -> None:
 def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
     monkeypatch: pytest.MonkeyPatch, seed: int, at_once: int
 ) -> None:
-    monkeypatch.setattr(agreement, "_ROWS_AT_ONCE", at_once)
+    monkeypatch.setattr(agreement, "ROWS_AT_ONCE", at_once)
     rng = np.random.default_rng(seed)
     source = rng.integers(-1, 3, (11, 9)).astype(np.int16)
     seam = np.zeros(source.shape, dtype=np.bool_)
@@ -441,7 +441,7 @@ def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
         later = np.full_like(source, -1)
         later[np.s_[:-1] if axis == 0 else np.s_[:, :-1]] = np.delete(source, 0, axis=axis)
         before = (source != later) & (source != -1) & (later != -1)
-        found = np.array(agreement._before_seams(source, axis)).T
+        found = np.array(agreement.cells_before_seams(source, axis)).T
         np.testing.assert_array_equal(found[np.lexsort(found.T[::-1])], np.argwhere(before))
         seam |= before
     np.testing.assert_array_equal(agreement.is_seam(source), seam)

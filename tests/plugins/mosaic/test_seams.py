@@ -426,7 +426,7 @@ def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
     own = np.choose(after.source[..., None].clip(0), [layer.rgb for layer in DISCS])
     np.testing.assert_array_equal(after.rgb[shown], own[shown])
     # Bands do not affect the result.
-    monkeypatch.setattr(joining, "_BAND_CELLS", 1)
+    monkeypatch.setattr(joining, "BAND_CELLS", 1)
     np.testing.assert_array_equal(along(path, folder=tmp_path).source, after.source)
     # Polygons of another wall have no effect.
     other = drawn(tmp_path, "photo 1", [[0.0, 0.0], [1.0, 0.0], [1.0, -1.0]], wall=3)

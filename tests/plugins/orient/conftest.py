@@ -15,7 +15,7 @@ def _small_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     Other tests check pictures at full size.
     """
     if request.path.stem != "test_figures":
-        monkeypatch.setattr(report, "_SIDE_PX", 90)
+        monkeypatch.setattr(report, "SIDE_PX", 90)
 
 
 @pytest.fixture(autouse=True)

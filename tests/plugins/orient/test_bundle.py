@@ -381,6 +381,6 @@ def test_points_behind_a_camera_are_none() -> None:
 def test_a_track_with_two_points_of_one_photo_is_none() -> None:
     starts = np.array([0, 10, 20, 30])
     links = np.array([[0, 10], [10, 20], [1, 11], [11, 21], [21, 2], [3, 22]])
-    found = [track.tolist() for track in photo_ties._tracks(links, starts)]
+    found = [track.tolist() for track in photo_ties.tracks_of(links, starts)]
     assert found == [[0, 10, 20], [3, 22]]
-    assert photo_ties._tracks(np.empty((0, 2), dtype=np.intp), starts) == []
+    assert photo_ties.tracks_of(np.empty((0, 2), dtype=np.intp), starts) == []

@@ -146,7 +146,7 @@ def test_erosion_takes_the_cells_beside_hidden_patches(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     eroded = layer_of(tmp_path)
-    monkeypatch.setattr(painting, "_EROSION_CELLS", 0)
+    monkeypatch.setattr(painting, "EROSION_CELLS", 0)
     plain = layer_of(tmp_path)
     hidden = (plain.mask == HIDDEN).astype(np.uint8)
     # Each patch here is wide; a single cell would be ignored.

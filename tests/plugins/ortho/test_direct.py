@@ -315,9 +315,9 @@ def test_bands_do_not_show_in_colours(
 ) -> None:
     whole, _ = painted_by_rule(tmp_path, colouring, inpaint=inpaint)
     # Fronts on this wall are short.
-    monkeypatch.setattr("orthoflow_plugins.ortho.filling._FRONT_CELLS", 2)
-    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", 30 * 24)
-    monkeypatch.setattr("orthoflow_plugins.ortho.point_colours._POINTS_AT_ONCE", 100)
+    monkeypatch.setattr("orthoflow_plugins.ortho.filling.FRONT_CELLS", 2)
+    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct.BAND_CELLS", 30 * 24)
+    monkeypatch.setattr("orthoflow_plugins.ortho.point_colours.POINTS_AT_ONCE", 100)
     banded, _ = painted_by_rule(tmp_path, colouring, inpaint=inpaint)
     for name in ("rgb", "mask", "filled"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name), err_msg=name)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.ortho import dsm_forward
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.dsm_forward import DsmForward
-from orthoflow_plugins.ortho.forward_kernels import _first_meeting
+from orthoflow_plugins.ortho.forward_kernels import first_hit
 from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
@@ -99,7 +99,7 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
 def test_bands_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     coarse = given(aside_m=0.0, width=300, cloud=None)
     whole, _ = thrown(coarse, tmp_path, fill_gap_cells=3)
-    monkeypatch.setattr(dsm_forward, "_BAND_CELLS", 25 * scenes.SHAPE[1])
+    monkeypatch.setattr(dsm_forward, "BAND_CELLS", 25 * scenes.SHAPE[1])
     banded, _ = thrown(coarse, tmp_path, fill_gap_cells=3)
     for name in ("rgb", "mask", "quality", "filled"):
         np.testing.assert_array_equal(getattr(banded, name), getattr(whole, name), err_msg=name)
@@ -172,7 +172,7 @@ def test_rays_meet_the_first_patch_on_their_way_and_no_sides(seed: int) -> None:
         way = np.append(goal, lowest) - [view.column + 0.5, view.row + 0.5, view.height_m]
         ray = way / rng.uniform(1.0, 3.0)
         expected, what = met(view, relief, ray, lowest)
-        found = _first_meeting(view, relief, *(float(value) for value in ray), lowest)
+        found = first_hit(view, relief, *(float(value) for value in ray), lowest)
         assert found == pytest.approx(expected, abs=1e-9), what
         seen.add((what, ray[0] > 0.0, ray[1] > 0.0))
     for what in ("patch", "slope", "side", "nothing"):

@@ -270,7 +270,7 @@ def test_bounds_of_blocks_are_those_of_their_cells(
     assert clear.occluding.size == 0
     assert clear.highest_m == clear.tops.max() == -np.inf
     # Bands of a large wall do not affect the result.
-    monkeypatch.setattr(surfaces, "_BAND_CELLS", 20 * shape[1])
+    monkeypatch.setattr(surfaces, "BAND_CELLS", 20 * shape[1])
     np.testing.assert_array_equal(surfaces.relief_of(wall_of(depths)).occluding, relief.occluding)
 
 

@@ -252,7 +252,7 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
 
     whole = found(1)
     # Of 88,000 points in blocks of 256, one of three blocks is fitted.
-    monkeypatch.setattr(search, "_FITTED_MOST", 25_000)
+    monkeypatch.setattr(search, "MAX_FITTED", 25_000)
     one = found(3)
     np.testing.assert_array_equal(one.offset, found(1).offset)
     assert not np.array_equal(one.offset, whole.offset)

@@ -298,7 +298,7 @@ def rectangle_of(planes: Planes) -> Any:
 
 def bound_by(adjoining: tuple[NDArray, NDArray], **changes: Any) -> Any:
     planes = replace(planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), adjoining), **changes)
-    return extents._bound(planes, 1, rectangle_of(planes), (WIDTH_M, HEIGHT_M))
+    return extents.adjoining_bound(planes, 1, rectangle_of(planes), (WIDTH_M, HEIGHT_M))
 
 
 def beside(side: str, beyond_m: float, towards: float) -> tuple[NDArray, NDArray]:
@@ -369,7 +369,7 @@ def test_a_plane_that_runs_askew_is_farther_at_one_end(turn_deg: float) -> None:
 def test_a_plane_ends_no_wall_that_goes_on_behind_it_to_the_next(
     monkeypatch: pytest.MonkeyPatch, share: float, off_m: float, depth_m: float, left_m: float
 ) -> None:
-    monkeypatch.setattr(extents, "_stands", lambda *_: True)
+    monkeypatch.setattr(extents, "stands_beside", lambda *_: True)
     planes = planes_of(
         (0.0, WIDTH_M),
         (0.0, HEIGHT_M),
@@ -378,8 +378,8 @@ def test_a_plane_ends_no_wall_that_goes_on_behind_it_to_the_next(
     up = np.arange(0.05, HEIGHT_M * share, 0.1)
     points = np.column_stack([np.full(len(up), -off_m), np.full(len(up), -depth_m), up])
     rectangle, size_m = rectangle_of(planes), (WIDTH_M, HEIGHT_M)
-    around = extents._Around.of(sampled(scenes.cloud_of(points)), rectangle, size_m)
-    (found,) = extents._bounds(planes, 0, rectangle, size_m, around)
+    around = extents.PointsAround.of(sampled(scenes.cloud_of(points)), rectangle, size_m)
+    (found,) = extents.adjoining_bounds(planes, 0, rectangle, size_m, around)
     assert found.beyond_m == pytest.approx(left_m)
 
 

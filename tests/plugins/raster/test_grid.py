@@ -216,7 +216,7 @@ def test_what_an_adjoining_plane_cuts_off_is_warned_of_from_5_cm(
     extent = Extent(front_m=0.1, behind_m=0.1, cut_m={"left": askew_m})
     # A margin takes 2 cm of this.
     params = RasterGrid.Params(margin_m=0.02)
-    grid._report_doubts([0], known.planes(), params, lambda _: extent, ctx)
+    grid.report_doubts([0], known.planes(), params, lambda _: extent, ctx)
     assert [one.values["cut_m"] for one in ctx.diagnostics] == [pytest.approx(0.051)] * n_warnings
 
 

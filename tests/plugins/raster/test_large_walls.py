@@ -34,15 +34,15 @@ BAND_CELLS = 1 << 17
 @pytest.fixture
 def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     """Treat walls of a million cells as large."""
-    monkeypatch.setattr(bands, "_BAND_CELLS", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.ortho.surfaces._BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr(bands, "BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.ortho.surfaces.BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.ortho.painting.TILE_CELLS", 128)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 64)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.seams._LONGEST_PX", 100)
-    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 2 * BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.raster.reporting._CELLS_ASKED", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.agreement.ROWS_AT_ONCE", 64)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.joining.BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.seams.LONGEST_PX", 100)
+    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct.BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.raster.walls.BAND_CELLS", 2 * BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.raster.reporting.CELLS_ASKED", BAND_CELLS)
 
 
 @contextmanager

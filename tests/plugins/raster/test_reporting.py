@@ -99,7 +99,7 @@ def emptiness(**shares: float) -> Emptiness:
     return Emptiness(
         behind_m=0.4321 if "behind" in shares else math.nan,
         before_m=2.7654 if "before" in shares else math.nan,
-        shares={cause: shares.get(cause, 0.0) for cause in reporting._CAUSES},
+        shares={cause: shares.get(cause, 0.0) for cause in reporting.CAUSES},
     )
 
 

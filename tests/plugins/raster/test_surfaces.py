@@ -157,7 +157,7 @@ def test_depths_sorted_a_few_at_a_time_give_the_same_medians_and_percentiles(
     cloud, *_ = scattered(known, per_cell=5.0, noise_m=NOISE_M)
     found = []
     for n_points, n_cells in ((1 << 26, 1 << 20), (700, 50)):
-        monkeypatch.setattr("orthoflow_plugins.raster.surfaces._POINTS_AT_ONCE", n_points)
+        monkeypatch.setattr("orthoflow_plugins.raster.surfaces.POINTS_AT_ONCE", n_points)
         monkeypatch.setattr("orthoflow_plugins.raster.surfaces.CELLS_AT_ONCE", n_cells)
         found.append(rastered(cloud, known, tmp_path, percentiles=[5, 50]).walls[0])
     for name in ("depth_m", "percentiles_m", "count", "intensity"):
@@ -217,7 +217,7 @@ def test_a_wall_rastered_in_bands_is_the_same(
     cloud, *_ = scattered(known, per_cell=1.2, noise_m=NOISE_M)
     params = {"surface": surface, "percentiles": (10.0,)}
     whole = rastered(cloud, known, tmp_path, **params).walls[0]
-    monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 60 * 180)
+    monkeypatch.setattr("orthoflow_plugins.raster.walls.BAND_CELLS", 60 * 180)
     banded = rastered(cloud, known, tmp_path, **params).walls[0]
     for name in ("count", "mask", "rgb", "percentiles_m", "intensity", "depth_m", "sigma_m"):
         one, other = getattr(whole, name), getattr(banded, name)

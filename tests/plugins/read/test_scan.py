@@ -683,8 +683,8 @@ def test_rows_and_columns_are_lines_over_the_fullest_wall() -> None:
     # 3.975 m are 1200 pixels, and points within 15 cm of the wall are drawn.
     assert shown.shape[1] == 1200
     assert shown.shape[0] == pytest.approx(1200 * 1.975 / 3.975, abs=8)
-    is_row = (shown == figures._ROW_RGB).all(axis=2)
-    is_column = (shown == figures._COLUMN_RGB).all(axis=2)
+    is_row = (shown == figures.ROW_RGB).all(axis=2)
+    is_column = (shown == figures.COLUMN_RGB).all(axis=2)
     # Every third of 80 rows and every seventh of 167 columns are straight from edge to edge; the
     # last columns are on the other wall, behind each other and outside the picture.
     full_rows = (is_row | is_column).mean(axis=1) > 0.98

@@ -126,11 +126,11 @@ def test_of_a_large_wall_every_nth_cell_is_taken(monkeypatch: pytest.MonkeyPatch
     depth = flat()
     depth[9:30, 21:51] = -0.25
     # A quarter of 60 x 80 cells exceeds the limit by one; a ninth does not.
-    monkeypatch.setattr(areas, "_CELLS_TOLD", 1199)
+    monkeypatch.setattr(areas, "MAX_MEASURED_CELLS", 1199)
     found = relief_of(wall(depth), None, BEHIND_M)
     assert (found.step, found.gsd_m) == (3, pytest.approx(3 * GSD_M))
     np.testing.assert_array_equal(found.depth_m, depth[::3, ::3])
-    monkeypatch.setattr(areas, "_CELLS_TOLD", 1200)
+    monkeypatch.setattr(areas, "MAX_MEASURED_CELLS", 1200)
     assert relief_of(wall(depth), None, BEHIND_M).step == 2
 
 
@@ -308,7 +308,7 @@ def test_large_clouds_are_followed_part_by_part(monkeypatch: pytest.MonkeyPatch)
     scan = np.random.default_rng(5).integers(0, 4, len(ends))
     given = cloud(ends, STATIONS, scan)
     whole = sight_lines(given, slab())
-    monkeypatch.setattr(module, "_BLOCK", 64)
+    monkeypatch.setattr(module, "BLOCK", 64)
     parts = sight_lines(given, slab())
     np.testing.assert_array_equal(parts.crossed, whole.crossed)
     np.testing.assert_array_equal(parts.stopped, whole.stopped)

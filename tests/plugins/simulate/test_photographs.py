@@ -265,7 +265,7 @@ def rng(seed: int) -> np.random.Generator:
 
 def developed(image: NDArray[np.floating], **film: float) -> NDArray[np.uint8]:
     given: dict[str, Any] = {**vars(PLAIN), **film}
-    return photographs._developed(image.astype(np.float32), Film(**given), rng(1))
+    return photographs.developed_photo(image.astype(np.float32), Film(**given), rng(1))
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
