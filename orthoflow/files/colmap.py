@@ -286,7 +286,10 @@ def _given(
 def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | WideLens | str, str]:
     """Return a camera's lens and a note on omitted terms, or the reason why it is unusable."""
     if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
-        raise damaged(path, f"a camera has {camera.width} x {camera.height} pixels")
+        raise damaged(
+            path,
+            f"a camera has {camera.width} x {camera.height} pixels; expected 1 to {MOST_PIXELS}",
+        )
     if camera.is_spherical():
         return PanoramaLens(width=int(camera.width), height=int(camera.height)), ""
     words = [word.strip() for word in camera.params_info.split(",")]

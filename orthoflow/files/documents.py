@@ -84,7 +84,7 @@ _FORMS: Final[Mapping[str, str]] = {
     "list_type": "a list",
     "literal_error": "{expected}",
     "model_type": "a mapping",
-    "string_type": "a text",
+    "string_type": "text",
     "tuple_type": "a list",
 }
 _OF_NUMBERS: Final = frozenset(

@@ -507,7 +507,7 @@ def _gsd_m(path: Path, transform: Affine) -> float:
         )
     low, high = _SIDES_M
     if not low <= side <= high:
-        raise InputError(f"{path.name} has cells of {side:g} m, expected {low:g} to {high:g} m")
+        raise InputError(f"{path.name} has cells of {side:g} m; expected {low:g} to {high:g} m")
     return side
 
 

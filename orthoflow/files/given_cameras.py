@@ -334,11 +334,13 @@ def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
     values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew or 0.0, *lens.distortion)
     if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):
         raise damaged(
-            path, f"the lens of {whose} is invalid: focal length {lens.fx:g}, {lens.fy:g}"
+            path,
+            f"the lens of {whose} must have finite parameters and positive focal lengths, got fx = "
+            f"{lens.fx:g} and fy = {lens.fy:g}",
         )
     if min(lens.width, lens.height) < 1 or lens.width * lens.height > MOST_PIXELS:
         size = f"{_cut(lens.width)} x {_cut(lens.height)}"
-        raise damaged(path, f"the photo {whose} has {size} pixels, expected 1 to {MOST_PIXELS}")
+        raise damaged(path, f"the photo {whose} has {size} pixels; expected 1 to {MOST_PIXELS}")
     return lens
 
 

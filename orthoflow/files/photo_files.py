@@ -711,8 +711,8 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
         return FocalLength(value_px=by_equivalent, reason="35 mm equivalent over the diagonal")
     return FocalLength(
         value_px=None,
-        reason=f"EXIF contains {exif.focal_mm:g} mm, but neither the pixel pitch nor the 35 mm "
-        "equivalent",
+        reason=f"EXIF contains a focal length of {exif.focal_mm:g} mm, but neither the pixel pitch "
+        "nor the 35 mm equivalent",
     )
 
 

@@ -438,8 +438,8 @@ class OrthoFile:
         with RasterParts(self.path) as raster:
             if raster.bands < _COLOURS or raster.dtype not in ("uint8", "uint16"):
                 raise InputError(
-                    f"{self.path} has {raster.bands} bands of {raster.dtype}, expected "
-                    f"{_COLOURS} with 8 or 16 bits"
+                    f"{self.path} has {raster.bands} bands of {raster.dtype}; expected "
+                    f"{_COLOURS} bands with 8 or 16 bits"
                 )
             bands, shown = raster.read((left, top, right, bottom), shape)
         return eight_bits(np.ascontiguousarray(bands[:, :, :_COLOURS])), shown

@@ -70,6 +70,6 @@ def test_depths_are_no_colours(tmp_path: Path) -> None:
         one.path, np.zeros((ROWS, COLUMNS), np.float32), place=GridPlace(gsd_m=0.5), tags={}
     )
     with pytest.raises(
-        InputError, match=r"ortho\.tif has 1 bands of float32, expected 3 with 8 or"
+        InputError, match=r"ortho\.tif has 1 bands of float32; expected 3 bands with 8 or"
     ):
         one.shrunk(9)

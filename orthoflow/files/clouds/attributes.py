@@ -403,8 +403,7 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
         "points": n_points,
         "points_of_the_cloud": len(cloud),
         "product_digest": attributed.name,
-        "coordinates": "metres, in the coordinates of the scan; `up` is the direction that "
-        "points up",
+        "coordinates": "metres, in the coordinates of the scan; `up` points upwards",
         "up": numbers(cloud.up),
         "origin_world": numbers(cloud.origin),
         "coordinate_system_wkt": attributed.crs_wkt or None,

@@ -348,7 +348,7 @@ def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
         n_bytes = at - start - _OFFSET_BYTES
         n_chunks = _offset_at(path, file, at) >> 32 & 0xFFFFFFFF
         if n_chunks > min(n_stated, n_bytes):
-            raise _damaged(path, f"its chunk table declares {n_chunks} chunks")
+            raise _damaged(path, f"its chunk table declares {n_chunks} chunks, which is impossible")
         file.seek(start)
         table = lazrs.read_chunk_table(file, compression)
     _check_chunks(path, header, compression, table, n_bytes)
@@ -375,7 +375,8 @@ def _check_chunks(
     is_variable = compression.uses_variable_size_chunks()
     if not is_variable and compression.chunk_size() > max(MOST_FIXED_CHUNK, 2 * n_stated):
         raise _damaged(
-            path, f"its header declares chunks of {compression.chunk_size()} points each"
+            path,
+            f"its header declares chunks of {compression.chunk_size()} points, which is too many",
         )
     if n_points < n_stated or (is_variable and n_points != n_stated):
         raise _damaged(

@@ -20,7 +20,7 @@ def read(folder: Path, text: str) -> TitleBlock:
     ("text", "said"),
     [
         ("projct: a\n", "block.yaml:1:1: projct: unknown key projct (did you mean project?)"),
-        ("title: [1]\n", "block.yaml:1:8: title: input should be a text, got a list"),
+        ("title: [1]\n", "block.yaml:1:8: title: input should be text, got a list"),
         (f"note: {'a' * 301}\n", "note: has 301 characters; at most 300 fit on a sheet"),
         ("layout: middle\n", "block.yaml:1:9: layout: input should be 'column' or 'strip', got"),
         (
