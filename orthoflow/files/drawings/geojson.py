@@ -33,6 +33,7 @@ _ROUNDED: Final = (
     *("depth_m", "width_m", "height_m", "sill_m", "area_m2", "edge_sigma_m", "seen_share"),
 )
 # Of an image with more cells, the seams are outlined in every nth row and column.
+#: cells of an orthoimage whose seams are outlined at full resolution
 MAX_SEAM_CELLS: Final = 16_000_000
 
 
