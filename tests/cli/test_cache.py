@@ -56,7 +56,7 @@ def test_a_run_says_what_it_found_damaged(say: Said, tmp_path: Path) -> None:
         flip(published)
     code, text = say(*RUN, "again")
     assert code == 0
-    assert "range: warning: stored-result-damaged" in text
+    assert "range: warning: the stored result was damaged (" in text
     assert "1 warning with a code shown above" in next(
         line for line in text.splitlines() if line.startswith("dots: ok")
     )
