@@ -33,8 +33,7 @@ _ROUNDED: Final = (
     *("depth_m", "width_m", "height_m", "sill_m", "area_m2", "edge_sigma_m", "seen_share"),
 )
 # Of an image with more cells, the seams are outlined in every nth row and column.
-#: cells of an orthoimage whose seams are outlined at full resolution
-MAX_SEAM_CELLS: Final = 16_000_000
+SEAM_CELLS: Final = 16_000_000
 
 
 def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
@@ -64,7 +63,7 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
     the automatic seams.
     """
     # On very large walls, the corners of areas are accurate only to a few cells.
-    step = max(1, math.ceil(math.sqrt(image.source.size / MAX_SEAM_CELLS)))
+    step = max(1, math.ceil(math.sqrt(image.source.size / SEAM_CELLS)))
     source = np.ascontiguousarray(image.source[::step, ::step])
     features: list[Feature] = []
     for index, rings in outlines(source):

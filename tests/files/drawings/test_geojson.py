@@ -22,7 +22,7 @@ def features(path: Path) -> list[Any]:
 def test_seams_lie_in_the_metres_of_the_wall_however_coarse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_cells: int
 ) -> None:
-    monkeypatch.setattr(geojson, "MAX_SEAM_CELLS", most_cells)
+    monkeypatch.setattr(geojson, "SEAM_CELLS", most_cells)
     frame = samples.facing_south(0.5, 6, 4, (100.0, 200.0, 3.0))
     source = np.zeros(frame.shape, dtype=np.int16)
     source[:, 4:] = 1
