@@ -1,8 +1,11 @@
-"""What commands share: the words that repeat one."""
+"""What commands share: the words that repeat one, columns and quantities, closed streams."""
 
 from __future__ import annotations
 
+import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import click
@@ -10,6 +13,7 @@ import h5py
 import pytest
 from click.testing import CliRunner
 
+from orthoflow.cli import tables
 from orthoflow.cli.commands import (
     RecordCommand,
     command_again,
@@ -72,3 +76,43 @@ def test_a_failure_on_a_changed_record_is_that_records(tmp_path: Path) -> None:
         raised = failing(kind("no plane"), intact)
         assert isinstance(raised, RecordError)
         assert str(raised) == "a product of this run is invalid: no plane"
+
+
+def test_what_a_terminal_would_obey_is_written_out(capsys: pytest.CaptureFixture[str]) -> None:
+    tables.echo("\x1b[31mred", "plain")
+    tables.echo("told", err=True)
+    tables.echo()
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("\\x1b[31mred\nplain\n\n", "told\n")
+    tables.echo_json({"name": "w\N{LATIN SMALL LETTER A WITH DIAERESIS}nde\x9b", "n": 1})
+    printed = capsys.readouterr().out
+    assert json.loads(printed) == {
+        "name": "w\N{LATIN SMALL LETTER A WITH DIAERESIS}nde\x9b",
+        "n": 1,
+    }
+    assert "\N{LATIN SMALL LETTER A WITH DIAERESIS}" in printed
+    assert "\x9b" not in printed
+
+
+@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])
+def test_a_command_works_with_closed_streams(closed: str, tmp_path: Path) -> None:
+    # What is opened later must not get the number of a closed stream, and its output.
+    target = tmp_path / "found.txt"
+    program = (
+        "import sys\n"
+        "from orthoflow.cli.program import take_up_streams\n"
+        "take_up_streams()\n"
+        f"file = open({str(target)!r}, 'w')\n"
+        "print('out'); print('err', file=sys.stderr)\n"
+        "sys.stdout.flush(); sys.stderr.flush()\n"
+        "file.write(str(file.fileno() > 2))\n"
+    )
+    command = f'"{sys.executable}" -c "$0" {closed}'
+    done = subprocess.run(["bash", "-c", command, program], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert target.read_text() == "True"
+
+
+def test_the_program_ends_well_with_closed_streams() -> None:
+    command = f'"{sys.executable}" -m orthoflow --version >&- 2>&-'
+    assert subprocess.run(["bash", "-c", command], check=False).returncode == 0

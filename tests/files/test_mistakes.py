@@ -22,7 +22,7 @@ from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from tests.files import test_metashape as agisoft
 from tests.files.test_calibration import GOOD
 from tests.files.test_given_cameras import HEAD, TURN, json_with
-from tests.files.test_polygons import SQUARE, feature, features
+from tests.files.test_vector_files import SQUARE, feature, features
 
 ALL = "name,x,y,z,wall,u_px,v_px\n"
 BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]><x>&b;</x>'

@@ -63,7 +63,7 @@ from tests.files.test_e57_images import pinhole, spherical, written
 from tests.files.test_exif import INNER, MAIN
 from tests.files.test_given_cameras import HEAD as REALITYCAPTURE
 from tests.files.test_given_cameras import oriented
-from tests.files.test_polygons import HOLE, SQUARE, feature, features
+from tests.files.test_vector_files import HOLE, SQUARE, feature, features
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import (
     mutate_bytes,

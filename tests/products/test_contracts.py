@@ -1,18 +1,20 @@
-"""What is stored of each product type, how, and how far two of them may differ and be the same.
-
-Reviewed in a snapshot: a wider tolerance would let every golden result, replay and comparison pass
-that it should stop, and numbers that stand for names are in files.
-"""
+"""What is stored of each product type, how far two products may differ, and what inputs allow."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
 from orthoflow import products
+from orthoflow.errors import ProductError
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
-from orthoflow.products import Product, product
+from orthoflow.products import Camera, Cameras, PointLabels, Product, product
+from tests import samples
+from tests.raster_scenes import cloud_of
 
 TYPES = {
     item.type_name: item
@@ -58,3 +60,102 @@ def test_large_products_are_mapped_whatever_their_type(monkeypatch: pytest.Monke
         monkeypatch.setattr(product, "LARGE_BYTES", limit)
         assert points.to_payload().mapped == is_mapped
         assert labels.to_payload().mapped
+
+
+CLOUD = cloud_of(np.zeros((4, 3)))
+PLANES = samples.planes(
+    normal=np.array([[0.0, 0.0, 1.0]]),
+    offset=np.zeros(1),
+    corners=np.zeros((1, 4, 3)),
+    covariance=np.eye(4)[None],
+    n_points=np.array([4]),
+    names=("floor 0",),
+)
+POSE: dict[str, Any] = {
+    "rotation_camera_from_world": np.eye(3),
+    "translation_camera_from_world": np.zeros(3),
+}
+CAMERA = Camera(photo="a.jpg", status="ok", covariance=np.eye(6), **POSE)
+OTHERS: dict[str, Product] = {"cloud": CLOUD, "planes": PLANES}
+
+
+def labels(*values: int) -> PointLabels:
+    return PointLabels(plane_index=np.array(values, np.int16))
+
+
+@pytest.mark.parametrize(
+    ("values", "named"), [((0, 0, 0, 5), "5"), ((0, -2, 0, 0), "-2"), ((0, 0, 0), "3"), ((), "0")]
+)
+def test_labels_that_contradict_cloud_or_planes_are_refused(
+    values: tuple[int, ...], named: str
+) -> None:
+    labels(-1, 0, 0, -1).check_against(OTHERS)
+    with pytest.raises(ProductError, match=rf"labels\.plane_index.*got {named}"):
+        labels(*values).check_against(OTHERS)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"covariance": -np.eye(4)[None]},
+        {"covariance": np.full((1, 4, 4), np.nan)},
+        {"rms_m": np.array([np.nan])},
+        {"rms_m": np.array([-0.1])},
+        {"n_points": np.array([5])},
+        {"n_points": np.array([-1])},
+    ],
+)
+def test_impossible_planes_are_refused(changed: dict[str, Any]) -> None:
+    PLANES.check_against(OTHERS)
+    (name,) = changed
+    with pytest.raises(ProductError, match=rf"planes\.{name}"):
+        replace(PLANES, **changed).check_against(OTHERS)
+
+
+@pytest.mark.parametrize(
+    ("rule", "changed"),
+    [
+        ("covariance", {"covariance": -np.eye(7)}),
+        ("zero_world", {"zero_world": np.array([0.0, 0.6, 0.8])}),
+        ("along_m", {"along_m": (2.0, 1.0)}),
+        ("arc_rad", {"arc_rad": (-1.0, 6.0)}),
+        ("rms_m", {"rms_m": -0.1}),
+        ("n_points", {"n_points": 5}),
+    ],
+)
+def test_impossible_surfaces_are_refused(rule: str, changed: dict[str, Any]) -> None:
+    surfaces = samples.surfaces()
+    surfaces.check_against(OTHERS)
+    labels(-1, 0, 1, -1).check_against({"surfaces": surfaces})
+    with pytest.raises(ProductError, match=r"labels\.plane_index.*2 surfaces.*got 2"):
+        labels(-1, 0, 2, -1).check_against({"surfaces": surfaces})
+    wrong = replace(surfaces.surfaces[0], **changed)
+    with pytest.raises(ProductError, match=rf"surfaces\[0\]\.{rule}"):
+        replace(surfaces, surfaces=(wrong, *surfaces.surfaces[1:])).check_against(OTHERS)
+
+
+def test_a_cloud_without_a_place_is_refused() -> None:
+    CLOUD.check_against({})
+    for name in ("x", "y", "z", "origin"):
+        value = np.array(getattr(CLOUD, name))
+        value[1] = np.inf
+        with pytest.raises(ProductError, match=rf"cloud\.{name} must be finite"):
+            replace(CLOUD, **{name: value}).check_against({})
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"rotation_camera_from_world": -np.eye(3)},
+        {"rotation_camera_from_world": 2.0 * np.eye(3)},
+        {"rotation_camera_from_world": None},
+        {"translation_camera_from_world": np.full(3, np.nan)},
+        {"covariance": -np.eye(6)},
+    ],
+)
+def test_an_impossible_orientation_is_refused(changed: dict[str, Any]) -> None:
+    Cameras(cameras=(CAMERA,)).check_against({})
+    with pytest.raises(ProductError, match=r"camera a\.jpg"):
+        Cameras(cameras=(replace(CAMERA, **changed),)).check_against({})
+    refused = replace(CAMERA, status="too few ties", **changed)
+    Cameras(cameras=(refused,)).check_against({})

@@ -1,8 +1,9 @@
-"""A replay takes seeds, repeats and parameters as recorded, whatever today's code would derive."""
+"""A replay takes seeds, repeats and parameters as recorded; a lone record has its rasters again."""
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
@@ -10,14 +11,19 @@ from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import RecordError
+from orthoflow.files.geotiff import RasterParts
+from orthoflow.products import Orthoimages
+from orthoflow.records.open import open_run
 from orthoflow.records.replay import plan_replay
-from orthoflow.records.runs import Run
-from orthoflow.records.write import write_run
+from orthoflow.records.runs import Run, published_state
+from orthoflow.records.write import with_files, write_run
 from orthoflow.workflow import expand as cells
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from orthoflow.workflow.model import Workflow
+from tests.drawing_runs import WALL, write_drawing_run
 from tests.engine_world import World
+from tests.report_runs import without_products
 
 WORKFLOW = """
 orthoflow: 1
@@ -99,3 +105,40 @@ def test_a_record_whose_workflow_asks_for_the_impossible_is_refused(
     said = r"the resolved workflow cannot be read: steps\.last\.variants\.0\.cores: .*or equal to 1"
     with pytest.raises(RecordError, match=said):
         plan_replay(run, world.catalog(), Store(world.folder / "fresh"), INLINE)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drawing_run(tmp_path_factory.mktemp("whole") / "run")
+
+
+@pytest.fixture
+def alone(run: Path, tmp_path: Path) -> Run:
+    (tmp_path / "court.h5").write_bytes((run / "run.h5").read_bytes())
+    return open_run(tmp_path / "court.h5")
+
+
+def test_rasters_are_made_of_the_products_and_go_away_again(alone: Run) -> None:
+    said: list[str] = []
+    with with_files(alone, said.append) as found:
+        assert found.path == alone.path
+        assert found.folder != alone.folder
+        (ortho,) = found.orthoimages
+        assert ortho.name == f"wall_{WALL}_ortho.tif"
+        product = alone.product("mosaic", "orthoimages")
+        assert isinstance(product, Orthoimages)
+        with RasterParts(ortho) as raster:
+            assert raster.shape == product.images[0].frame.shape
+        # What was made is what the run now calls its own.
+        states = {published_state(found.folder, file) for file in found.record.published}
+        assert states == {"same"}
+    left_out = "and other published files are omitted"
+    made_anew = "its rasters are recreated from its products"
+    assert said == [f"{alone.path} has no files next to it: {made_anew}, {left_out}"]
+    assert not ortho.exists()
+
+
+def test_products_that_are_not_in_the_record_make_no_files(alone: Run) -> None:
+    bare = without_products(alone)
+    with with_files(bare) as found:
+        assert found is bare

@@ -1,17 +1,24 @@
-"""Figures on a page: which are shown, how they share its bytes, and their files beside it."""
+"""Figures on a page: which are shown, how they share its bytes, and the plan of photos."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
+from orthoflow_plugins.orient.report import residual_rows
 from orthoflow_provenance.document import RecordedCell, RecordedFigure
 
 from orthoflow.files.images import decode_image, encode_png, encode_webp
+from orthoflow.products import Camera, Cameras
 from orthoflow.report.figures import figure_groups, write_figures
-from tests.report_runs import HeldRun, cell, compared_resolved, record
+from orthoflow.report.photo_plans import photo_plan
+from orthoflow.report.pictures import wall_pictures
+from tests.report_runs import HeldRun, cell, compared_resolved, compared_run, record
 
 PNG, SVG, WEBP = "image/png", "image/svg+xml", "image/webp"
 
@@ -88,3 +95,76 @@ def test_figures_are_written_as_programs_take_them(tmp_path: Path) -> None:
     assert write_figures(of, tmp_path / "page", ["other"], inside="figures") == 1
     assert (tmp_path / "page/figures/other/not_asked.png").is_file()
     assert (tmp_path / "page/figures/graph.svg").is_file()
+
+
+def oriented(run: HeldRun, **changes: Any) -> HeldRun:
+    """The run with other orientations."""
+    products = {
+        place: replace(product, **changes) if isinstance(product, Cameras) else product
+        for place, product in run.products.items()
+    }
+    return replace(run, products=products)
+
+
+def run_with(folder: Path, *cameras: Camera) -> HeldRun:
+    return oriented(compared_run(folder), cameras=cameras)
+
+
+def ours(run: HeldRun) -> Camera:
+    return next(
+        product.cameras[0] for product in run.products.values() if isinstance(product, Cameras)
+    )
+
+
+def test_a_photo_stands_before_its_wall_and_looks_at_it(tmp_path: Path) -> None:
+    run = compared_run(tmp_path)
+    plan = photo_plan(run, list(wall_pictures(run)))
+    assert plan is not None
+    # Of two variants the baseline's.
+    assert plan.cell == "orient@plane=fine"
+    [photo], [wall] = plan.photos, plan.walls
+    _, foot_m, look = photo
+    _, _, corners = wall
+    # 2 m to the south of a wall of 1.2 m from west to east.
+    assert np.ptp(corners[:, 0]) == pytest.approx(1.2)
+    assert corners[:, 0].min() < foot_m[0] < corners[:, 0].max()
+    assert corners[:, 1].min() - foot_m[1] == pytest.approx(2.0, rel=0.02)
+    np.testing.assert_allclose(look, [0.0, 1.0], atol=0.05)
+
+
+def test_refused_photos_are_named_and_names_are_escaped(tmp_path: Path) -> None:
+    one = ours(compared_run(tmp_path))
+    odd = replace(one, photo="<b>.jpg")
+    refused = Camera(photo="gone.jpg", status="too few ties")
+    run = run_with(tmp_path, odd, refused)
+    plan = photo_plan(run, list(wall_pictures(run)))
+    assert plan is not None
+    assert "1 of 2 photos" in plan.caption
+    assert "Not oriented and therefore not shown: gone.jpg." in plan.caption
+    # Names are outlines, and only the caption and the table have them as text.
+    assert b"<b>" not in plan.file("svg")
+
+
+def test_without_an_oriented_photo_there_is_no_plan(tmp_path: Path) -> None:
+    run = run_with(tmp_path, Camera(photo="gone.jpg", status="too few ties"))
+    assert photo_plan(run, list(wall_pictures(run))) is None
+
+
+def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None:
+    one = replace(ours(compared_run(tmp_path)), sigma_wall_m=0.0012)
+    refused = Camera(photo="gone.jpg", status="too few <ties>")
+    run = run_with(tmp_path, one, refused, replace(one, photo="untied.jpg", sigma_wall_m=None))
+    check_px, control_px = np.array([[3.0, -4.0]]), np.array([[50.0, 60.0]])
+    units = {"px": 1.0, "mm": 2.0}
+    check = residual_rows("a.jpg", "check", check_px, units)
+    control = residual_rows("a.jpg", "control", control_px, units)
+    run = oriented(run, residual_table=(*check, *control))
+    plan = photo_plan(run, list(wall_pictures(run)))
+    assert plan is not None
+    assert plan.table.rows == (
+        # The mean of both axes, of check ties alone, in millimetres alone. Of 30 ties a third each
+        # is control, check and rejected.
+        ("a.jpg", pytest.approx(1.2), pytest.approx(2.0 * 12.5**0.5), 10, 10, "ok"),
+        ("gone.jpg", None, None, None, None, "too few <ties>"),
+        ("untied.jpg", None, None, 0, 0, "ok"),
+    )

@@ -1,12 +1,15 @@
-"""The SDK: ports from annotations, what the context collects and refuses."""
+"""The SDK: ports from annotations, what the context collects and refuses, untrusted names."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from orthoflow.errors import PluginError
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import Method, Metric, MetricSpec, Ports, port_specs
+from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.sdk.methods import labelled
 
 
@@ -66,3 +69,16 @@ def test_the_unit_of_a_metric_is_declared_or_the_end_of_its_name() -> None:
     ):
         with pytest.raises(PluginError, match=named):
             MetricSpec(**declared)
+
+
+def test_what_cannot_say_anything_is_told_by_its_kind() -> None:
+    class MuteError(Exception):
+        def __str__(self) -> str:
+            raise RuntimeError
+
+    assert one_line(MuteError()) == "a MuteError without a message"
+
+
+def test_a_path_is_kept_where_others_can_read_it() -> None:
+    assert text_of_path(Path("a/ä.laz")) == str(Path("a/ä.laz"))
+    assert text_of_path(Path("a/\udcff.laz")) is None
