@@ -164,7 +164,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
 
 
 _Direction = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Derivatives (2 n,) of observations by errors in this direction, and their pulls (n, p)."""
+"""Derivatives (2 n,) of observations with respect to an error, and the pulls (n, p)."""
 
 
 def _kinds(

@@ -198,8 +198,8 @@ class Bend:
     def __post_init__(self) -> None:
         if self.along not in ("u", "v") or not 0.0 < abs(self.radius_m) < math.inf:
             raise GeometryError(
-                "a curved raster needs an arc along u or v and a radius, got "
-                f"{self.along!r} and {self.radius_m} m"
+                "a curved raster needs an arc along u or v and a finite radius "
+                f"other than 0, got {self.along!r} and {self.radius_m} m"
             )
 
 
@@ -253,7 +253,9 @@ class WallFrame:
             )
         vectors = (self.origin_world, self.u_world, self.v_world, self.normal_world)
         if any(np.shape(vector) != (3,) for vector in vectors):
-            raise GeometryError("a wall frame needs an origin and axes of three numbers each")
+            raise GeometryError(
+                "a wall frame needs an origin and three axes, each with 3 coordinates"
+            )
         if not np.allclose(np.cross(self.u_world, self.v_world), -self.normal_world, atol=1e-9):
             raise GeometryError("a wall frame needs u x v = -n, but these axes mirror the image")
         if self.bend is not None:

@@ -361,7 +361,7 @@ def _problem(
     # The prior determines the lens parameters, so the points only need to determine the pose.
     if 2 * len(seen) < POSE_PARAMETERS + 2:
         raise GeometryError(
-            f"a resection with {POSE_PARAMETERS} unknowns got only {len(seen)} points"
+            f"a resection needs at least {POSE_PARAMETERS // 2 + 1} points, got {len(seen)}"
         )
     middle = seen.points_world.mean(axis=0)
     local = replace(seen, points_world=seen.points_world - middle)

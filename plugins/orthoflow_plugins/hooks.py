@@ -25,8 +25,8 @@ _METHODS: Final = {
     "points, with sigma0 and residuals",
     "plane.hough2d:Hough2d": "Hough transform of the plan, with cells weighted by number of points",
     "plane.hough3d:Hough3d": "Hough transform of voxels, for planes in any direction",
-    "plane.ransac:Ransac": "random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or "
-    "the plan",
+    "plane.ransac:Ransac": "random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D "
+    "or in plan",
     "plane.region:Region": (
         "region growing over neighbouring points with similar normals in one plane"
     ),
@@ -37,7 +37,8 @@ _METHODS: Final = {
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
     "match.sift:MatchSift": "match RootSIFT key points of photos and walls, if mutually best and "
     "distinct by the ratio test",
-    "match.sides:FaceByPhotos": "determine from photos the fronts of planes that were only assumed",
+    "match.sides:FaceByPhotos": "determine the fronts of planes from photos, where they were "
+    "only guessed",
     "match.guided:MatchGuided": "match photos with the walls again, starting from a first pose",
     "orient.pnp:OrientPnp": "orient each photo separately from its ties, with its accuracy or "
     "the reason for its rejection",

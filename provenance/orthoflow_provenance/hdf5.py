@@ -62,7 +62,7 @@ _LARGEST_RATIO: Final = 1100
 _LARGEST_CHUNK_BYTES: Final = 64 << 20
 _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
 _LONGEST_NAME: Final = 256
-# Maximum size of compressed texts, tables and figures; larger ones could expand to excessive sizes.
+# Maximum size of compressed strings, tables and figures; larger ones could expand too much.
 _PACKED_BYTES_MOST: Final = 4 << 20
 # A cell with its products has about 50. Section 2 of `provenance/SPEC.md` lists other limits.
 #: groups, datasets and attributes of a record
@@ -156,7 +156,7 @@ def read_text(group: h5py.Group, name: str) -> str:
     dataset = dataset_of(group, name)
     value = read_whole(dataset)
     if not isinstance(value, bytes):
-        raise RecordFormatError(f"{dataset.name} must be a single text, got {dataset.dtype}")
+        raise RecordFormatError(f"{dataset.name} must be a single string, got {dataset.dtype}")
     return _decoded(bytes(value), dataset.name)
 
 
@@ -196,8 +196,9 @@ def read_whole(dataset: h5py.Dataset) -> object:
     with reading(dataset.name):
         if dataset.nbytes > max(_PACKED_BYTES_MOST, dataset.id.get_storage_size()):
             raise RecordFormatError(
-                f"{dataset.name} has {dataset.nbytes} bytes when decompressed: texts, tables and "
-                f"figures of more than {_PACKED_BYTES_MOST} bytes must not be compressed"
+                f"{dataset.name} has {dataset.nbytes} bytes when decompressed: "
+                f"strings, tables and figures of more than {_PACKED_BYTES_MOST} bytes must "
+                "not be compressed"
             )
         value: object = dataset[()]
     return value
@@ -433,7 +434,7 @@ class _Inspection:
             # Reject names such as `..`, which other programs would interpret as the parent group.
             check_name(name.decode("utf-8"), "the object")
         except RecordFormatError as error:
-            raise self._refusal(place, f"is not a path in a record: {error}") from error
+            raise self._refusal(place, f"is not a valid path in a record: {error}") from error
         link = group.links.get_info(name).type
         self._refuse(place, link == h5py.h5l.TYPE_EXTERNAL, "is a link into another file")
         is_soft = link != h5py.h5l.TYPE_HARD
@@ -456,7 +457,7 @@ class _Inspection:
 
     def _count(self, n_objects: int, place: str) -> None:
         self._n_objects += n_objects
-        reason = f"is preceded by more than {MAX_OBJECTS} groups and attributes"
+        reason = f"exceeds the limit of {MAX_OBJECTS} groups, datasets and attributes in a file"
         self._refuse(place, self._n_objects > MAX_OBJECTS, reason)
 
     def _check_dataset(self, dataset: h5py.h5d.DatasetID, place: str) -> None:
@@ -467,7 +468,9 @@ class _Inspection:
         is_filtered = not set(used) <= set(_FILTERS) or len(set(used)) != len(used)
         chunk = math.prod(properties.get_chunk()) * itemsize if is_chunked else 0
         in_file = is_chunked or layout in {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS}
-        filters = f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
+        filters = (
+            f"must use no filters other than {', '.join(_FILTERS.values())}, and each at most once"
+        )
         self._refuse(place, properties.get_external_count(), "stores its data in another file")
         self._refuse(place, not in_file, "is a virtual dataset")
         self._refuse(place, is_filtered, filters)

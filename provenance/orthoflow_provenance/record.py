@@ -533,8 +533,8 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
         # Check before writing, because the untrusted record determines how much disk space is used.
         if dataset.dtype != np.uint8 or dataset.shape != (file.size_bytes,):
             raise RecordFormatError(
-                f"{dataset.name} must be the {file.size_bytes} bytes of {file.name!r}, got "
-                f"{dataset.dtype} {dataset.shape}"
+                f"{dataset.name} must contain the {file.size_bytes} bytes of "
+                f"{file.name!r}, got the type {dataset.dtype} and the shape {dataset.shape}"
             )
         inside = f"{entry.name}/{index:04}/{file.name}"
         with create_below(folder, inside) as stream:

@@ -179,7 +179,7 @@ def _object_problem(
     """Return how an object differs from a node; without a node, check only attribute names."""
     with reading(item.name):
         if isinstance(item, h5py.Group) and item.id.get_create_plist().get_link_creation_order():
-            return "tracks the creation order of its links, which records do not"
+            return "tracks the creation order of its links, which is not allowed in a record"
         odd = set(item.attrs) ^ set(node.attributes if node else attributes)
         odd |= {
             name
@@ -244,7 +244,7 @@ def _content_findings(
 ) -> Iterator[Finding]:
     """Check the contents of `/files`; without `with_arrays`, only the sizes of input files."""
     for sha256, size_bytes in contents.items():
-        problem = "does not contain the bytes that the document states"
+        problem = "does not have the size and the SHA-256 that the document states"
         try:
             dataset = dataset_of(open_group(file, FILES), sha256)
             is_sized = size_bytes in (None, dataset.size)

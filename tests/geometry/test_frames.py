@@ -202,7 +202,7 @@ def test_frames_have_the_same_cells_to_a_thousandth_of_one() -> None:
         ({"width": 0}, "at least one cell, got 0.1 m and 0 x 3"),
         ({"height": 0}, "at least one cell, got 0.1 m and 5 x 0"),
         ({"gsd_m": math.nan}, "needs a positive cell size"),
-        ({"u_world": np.zeros(2)}, "an origin and axes of three numbers each"),
+        ({"u_world": np.zeros(2)}, "an origin and three axes, each with 3 coordinates"),
         ({"v_world": -FRAME.v_world}, "these axes mirror the image"),
         ({"bend": Bend(along="u", radius_m=0.05)}, "must not exceed one turn, got 5 cells"),
         ({"bend": Bend(along="u", radius_m=1.0), "map_crs": "site"}, "cannot be a map"),

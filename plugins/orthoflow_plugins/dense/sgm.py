@@ -67,14 +67,14 @@ class DenseSgm(Method):
     class Params(MethodParams):
         """Range of distances to the surface, and density of its points."""
 
-        nearest_m: float = Field(1.0, gt=0.0, description="Distance of the nearest surface.")
+        nearest_m: float = Field(1.0, gt=0.0, description="Distance to the nearest surface.")
         farthest_m: float = Field(
-            10.0, gt=0.0, description="Distance of the farthest surface; larger ranges take longer."
+            10.0, gt=0.0, description="Distance to the farthest surface; larger ranges take longer."
         )
         spacing_m: float = Field(
             0.0,
             ge=0.0,
-            description="Side of the cubes of which each pair of photos keeps one point; with 0, "
+            description="Each pair of photos keeps one point per cube of this side; with 0, "
             "it keeps one per pixel.",
         )
         up: UpDirection = Field("z", description="World direction that is up.")

@@ -60,12 +60,12 @@ DETECTOR_METRICS: Final = (
     MetricSpec("raw_r_m", label="distance of the first plane (r); before the fit"),
     MetricSpec(
         "raw_angle_deg",
-        label="direction against the fitted plane; before the fit",
+        label="angle to the fitted plane; before the fit",
         better="lower",
     ),
     MetricSpec(
         "raw_offset_mm",
-        label="position against the fitted plane; before the fit",
+        label="distance from the fitted plane; before the fit",
         better="lower",
     ),
     MetricSpec("thickest_mm", label="largest thickness of the cloud"),

@@ -94,11 +94,12 @@ def draw_deviations(
     ctx.figure(
         "deviations",
         figure,
-        "Distances of the points to their plane, positive towards the viewer; the curve is the "
-        f"normal distribution of those within {1000.0 * deviations.fit_tolerance_m:.0f} mm. "
-        "Right: their quantiles against those of a normal distribution, for which all points would "
-        "be on the line. A second peak, or ends that leave the line early, indicate relief or "
-        "another surface near the plane.",
+        "Left: distances of the points from their plane, positive towards the "
+        "viewer; the curve is the normal distribution with the mean and standard deviation "
+        f"of the distances within {1000.0 * deviations.fit_tolerance_m:.0f} mm. Right: "
+        "quantiles of the distances over those of a normal distribution; if the distances "
+        "were normally distributed, all points would be on the line. A second peak, or ends "
+        "that leave the line early, indicate relief or another surface near the plane.",
     )
 
 
@@ -160,10 +161,10 @@ def draw_planes(
     ctx.figure(
         "planes",
         figure,
-        "Above: a sample of the points, coloured by plane, without planes seen from behind; "
-        f"{np.mean(on_none):.1%} are on no plane (grey). Below: the rectangles of the planes' "
-        "connected parts. Each wall should have one colour: a wall with two colours was divided, "
-        "and a grey wall was missed.",
+        "Above: a sample of the points, coloured by plane, without planes seen from "
+        f"behind; {np.mean(on_none):.1%} of the points are on no plane (grey). Below: the "
+        "rectangles of the planes' connected parts. Each wall should have one colour: a "
+        "wall with two colours was divided, and a grey wall was missed.",
     )
 
 
@@ -198,7 +199,7 @@ def draw_thickness(
     sigmas = [(planes.names[k], 1000.0 * item.sigma_m, plane_ink(k)) for k, item in known]
     axes = _draw_bars(figure.add_subplot(next(places)), sigmas, "thickness [mm]")
     steps_mm = [1000.0 * item.scan_step_m for _, item in known]
-    axes.plot(steps_mm, range(len(known)), "|", color="black", label="scan step")
+    axes.plot(steps_mm, range(len(known)), "|", color="black", label="point spacing")
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
     for label, name in classes:
         axes = figure.add_subplot(next(places))
@@ -218,10 +219,10 @@ def draw_thickness(
     ctx.figure(
         "thickness",
         figure,
-        "Thickness of the cloud, one standard deviation in millimetres: on each plane, with the "
-        f"scan step{''.join(f', by {name}' for name in drawn)}."
-        f"{'' if row is None else ' Below: one row of the scan on the first plane.'} "
-        "If the thickness exceeds the scan step, the cloud is noisy or its scans are misaligned.",
+        "Thickness of the cloud (one standard deviation, in millimetres) on each plane, compared "
+        f"with the point spacing{''.join(f', by {name}' for name in drawn)}."
+        f"{'' if row is None else ' Below: a row of the scan on the first plane.'} If the "
+        "thickness exceeds the point spacing, the cloud is noisy or its scans are misaligned.",
     )
 
 
@@ -348,10 +349,11 @@ def draw_accumulator(
     ctx.figure(
         "accumulator",
         figure,
-        "Above: points of the sample per plan cell with the walls found. Below: votes in the "
-        "parameter space; circles mark the walls, the cross and the dotted line the "
-        "bin with the most votes. A wall is a sharp bright spot; a bright spot without a circle is "
-        "a missed wall, and a circle on grey background may be accidental.",
+        "Above: number of sample points in each cell of the plan, and the walls "
+        "that were found. Below: votes in the parameter space; circles mark the walls, and "
+        "the cross and the dotted line mark the bin with the most votes. A wall is a sharp "
+        "bright spot. A bright spot without a circle is a missed wall, and a circle on a "
+        "grey background may be due to chance.",
     )
 
 
@@ -391,9 +393,10 @@ def draw_space(
     ctx.figure(
         "accumulator",
         figure,
-        "The best score of any distance over the direction of the normal; circles mark the planes. "
-        "Directions are distributed evenly over the hemisphere, so near the poles one direction "
-        "covers several pixels. A bright spot without a circle is the direction of a missed plane.",
+        "Best score over all distances for each direction of the normal; circles "
+        "mark the planes. Directions are distributed evenly over the hemisphere, so near "
+        "the poles, one direction covers several pixels. A bright spot without a circle is "
+        "the direction of a missed plane.",
     )
     figure = column_figure(5.0)
     panels = figure.subplots(3, 2, sharex="col", sharey=True)
@@ -412,9 +415,10 @@ def draw_space(
     ctx.figure(
         "accumulator-sections",
         figure,
-        "Votes over direction and distance from the middle before any plane was taken, in sections "
-        "of constant phi (left) and omega (right); brightness is the square root of the votes. "
-        "Planes are sharp spots where bands cross; without such spots there are no planes.",
+        "Votes for each direction and distance from the centre, before any plane "
+        "was removed, in sections at constant phi (left) and constant omega (right); "
+        "brightness is the square root of the votes. Planes are sharp spots where bands "
+        "cross; without such spots, there are no planes.",
     )
 
 
@@ -563,11 +567,13 @@ def _draw_normals(
     ctx.figure(
         "normals",
         figure,
-        "Left: angles between the normals of neighbourhoods and of the first plane, weighted by "
-        "points. Right: their inclination to the second horizontal axis (markiewicz2015, Figure "
-        f"8). Below: map of the first angle, up to {1000.0 * _MAP_DEPTH_M:.0f} mm in front of and "
-        "behind the plane; surfaces with the wall's colour differ from it only in depth. Normals "
-        "of a good wall are close to 0 degrees; a wide peak indicates noise or relief.",
+        "Left: angles between the normals of neighbourhoods and the normal of the "
+        "first plane, weighted by numbers of points. Right: inclinations of the normals of "
+        "neighbourhoods towards the second horizontal axis (Ny; Figure 8 of "
+        "markiewicz2015). Below: map of the angles on the left, up to "
+        f"{1000.0 * _MAP_DEPTH_M:.0f} mm in front of and behind the plane; surfaces with the "
+        "colour of the wall differ from it only in depth. On a good wall, angles are close "
+        "to 0 degrees; a wide peak indicates noise or relief.",
     )
 
 

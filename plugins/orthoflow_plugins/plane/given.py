@@ -52,7 +52,7 @@ STRAY_PARTS: Final = DiagnosticSpec(
     severity="warning",
     text="{n} points ({share:.2%}) are outside the rectangle of the plane, in parts that cover "
     "less than {part_share:.0%} of the total area",
-    remedy="{step}.part_min_share=0 keeps them",
+    remedy="set {step}.part_min_share=0 to keep them",
     rank_by="share",
 )
 
@@ -67,7 +67,7 @@ class StatedPlane(MethodParams):
         None, description="Distance of the plane from the world origin along the unit normal."
     )
     points: tuple[Vector, Vector, Vector] | None = Field(
-        None, description="Three points on the plane, world metres."
+        None, description="Three points on the plane in world coordinates, metres."
     )
     horizontal: bool = Field(
         default=False,
@@ -75,7 +75,7 @@ class StatedPlane(MethodParams):
     )
     height_m: float | None = Field(
         None,
-        description="Height of the horizontal plane along `up`, world metres; by default the "
+        description="Height of the horizontal plane along `up`, in metres; by default, the "
         "first percentile of the heights of the points.",
     )
 
@@ -93,8 +93,8 @@ class StatedPlane(MethodParams):
     def _one_way_only(self) -> Self:
         if len(self.ways) > 1:
             raise ValueError(
-                f"plane.given takes one of normal with offset_m, points, or horizontal, got "
-                f"{' and '.join(self.ways)}"
+                "plane.given needs exactly one of normal (with offset_m), points "
+                f"and horizontal, got {' and '.join(self.ways)}"
             )
         if (self.normal is None) != (self.offset_m is None):
             raise ValueError("plane.given needs normal and offset_m together, got only one")
@@ -142,8 +142,9 @@ class GivenPlane(Method):
         buffer_m: float | None = Field(
             None,
             gt=0.0,
-            description="Maximum distance of points enclosed by the rectangle of the plane; by "
-            "default three times tolerance_m, and unlimited for the horizontal plane.",
+            description="Maximum distance from the plane of the points that its rectangle "
+            "encloses; by default, three times tolerance_m, or unlimited for the horizontal "
+            "plane.",
         )
         part_min_share: float = Field(
             0.03,
@@ -158,8 +159,8 @@ class GivenPlane(Method):
         def _one_or_several(self) -> Self:
             if self.planes and self.ways:
                 raise ValueError(
-                    f"plane.given takes one plane, or several in planes, got {self.ways[0]} and "
-                    "planes: move it into the list"
+                    "plane.given needs either one plane or the list planes, got "
+                    f"{self.ways[0]} and planes: move the single plane into the list"
                 )
             return self
 

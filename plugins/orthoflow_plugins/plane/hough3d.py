@@ -57,9 +57,9 @@ class Hough3d(Detector):
         )
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
-            description="Score of a plane. contrast: its votes minus those on its emptier side, "
-            "refined with finer angles and bins; votes: only the votes of its bin, as in "
-            "markiewicz2015.",
+            description="Score of a plane. contrast: its votes minus those of the adjacent "
+            "bins with fewer votes, refined with finer angles and bins; votes: the votes of "
+            "its bin, as in markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
             "cells",

@@ -63,8 +63,9 @@ class DetectorParams(MethodParams):
     min_area_m2: float = Field(
         1.0,
         ge=0.0,
-        description="Minimum area of a plane, square metres; the search ends when all candidates "
-        "are smaller. It is reduced for a cloud without a face of at least 50 times this area.",
+        description="Minimum area of a plane, square metres; the search ends when all "
+        "candidates are smaller. In small clouds, it is reduced to 2 % of the largest face "
+        "of the bounding box.",
     )
     min_share: float = Field(
         0.001, gt=0.0, lt=1.0, description="Minimum share of all points that a plane must contain."
@@ -110,8 +111,9 @@ class DetectorParams(MethodParams):
                 )
             if low < before:
                 raise ValueError(
-                    f"intensities of {name} begin at {low:g}, below {before:g} where those of "
-                    f"{before_name} end"
+                    f"intensities of {name} begin at {low:g}, but those of "
+                    f"{before_name} end at {before:g}: the ranges of materials must not "
+                    "overlap"
                 )
             before_name, before = name, high
         return materials

@@ -127,9 +127,9 @@ class Ransac(Detector):
         )
         scoring: Scoring = Field(
             "msac",
-            description="Score of a hypothesis. count: its number of points; msac: this number "
-            "weighted by distance; a-contrario: how unlikely so many points are by chance, "
-            "at an estimated tolerance.",
+            description="Score of a hypothesis. count: its number of points; msac: this "
+            "number weighted by distance; a-contrario: how unlikely it is that so many "
+            "points are near the plane by chance, at an estimated tolerance.",
         )
 
         @model_validator(mode="after")

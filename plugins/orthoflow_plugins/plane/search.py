@@ -121,8 +121,9 @@ _CRITERIA: Final[Mapping[Criterion, str]] = {
     "{area:.2g} m2",
     "scattered": "no points concentrate on any candidate",
     "strip": "the candidates are strips too narrow for a plane",
-    "smear": "most points near the largest candidate, which has {share:.2%} of all, only pass "
-    "through it, as on a rounded body or in a cloud noisier than the tolerance",
+    "smear": "most points near the largest candidate, which has {share:.2%} of all points, "
+    "are not on a plane but on a surface that crosses it, such as a rounded body, or the "
+    "cloud is noisier than the tolerance",
     "bent": "the largest candidate, which has {share:.2%} of the points, is a curved surface",
     "tilt": "the candidates are tilted by more than max_tilt_deg",
 }

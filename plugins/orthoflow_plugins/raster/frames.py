@@ -36,7 +36,7 @@ NO_MAP: Final = DiagnosticSpec(
     code="map-without-a-level-plane",
     severity="warning",
     text="crs {crs} applies to no raster: none of the planes is horizontal and seen from above",
-    remedy="omit {step}.crs, or raster a floor",
+    remedy="omit {step}.crs, or select a floor",
 )
 
 

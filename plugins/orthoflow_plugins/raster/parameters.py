@@ -30,16 +30,21 @@ class RasterParams(MethodParams):
         "times the tolerance of the planes (markiewicz2015: 3 x 5 cm).",
     )
     buffer_front_m: float | None = Field(
-        default=None, ge=0, description="Depth towards the viewer instead of buffer_m."
+        default=None,
+        ge=0,
+        description="Maximum distance of points in front of the plane, "
+        "towards the viewer, instead of buffer_m.",
     )
     buffer_behind_m: float | None = Field(
-        default=None, ge=0, description="Depth behind the plane instead of buffer_m."
+        default=None,
+        ge=0,
+        description="Maximum distance of points behind the plane instead of buffer_m.",
     )
     rectangle: Literal["points", "room"] = Field(
         default="room",
-        description="room: the whole surface of the wall with cornices and pilasters, up to the "
-        "nearest points of adjoining walls, floor and ceiling; points: the rectangle of the "
-        "points on its plane.",
+        description="Extent of a raster. room: the whole surface of the wall with cornices "
+        "and pilasters, up to the nearest points of adjoining walls, floor and ceiling; "
+        "points: the rectangle of the points on the plane.",
     )
     surface: Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"] = Field(
         default="median",
@@ -73,11 +78,12 @@ class RasterParams(MethodParams):
         ge=0,
         le=10,
         description="If the rows and columns of the scan are known, void cells are first "
-        "interpolated linearly between points of one layer that are up to this number of rows or "
-        "columns, and at most four times recover_gap_cells, apart.",
+        "interpolated linearly between points of the same layer. The distance between these "
+        "points is at most this number of rows or columns in the scan, and at most four "
+        "times recover_gap_cells on the wall.",
     )
     constraint: Constraint = Field(
-        default="any", description="Orientation of the planes to raster."
+        default="any", description="Orientation of the planes to rasterise."
     )
     min_area_m2: float = Field(
         default=1.0,
@@ -93,22 +99,22 @@ class RasterParams(MethodParams):
     )
     ranks: tuple[Annotated[int, Field(ge=0)], ...] = Field(
         default=(),
-        description="Raster exactly these planes, by index in planes.json, where 0 has the most "
-        "points. Indices change with the scan, the detector and its tolerances; near selects "
-        "planes by position. If empty, planes are selected by constraint, min_area_m2, "
-        "n_walls_max and skip_covered.",
+        description="Rasterise exactly these planes, by index in planes.json, where 0 has the "
+        "most points. Indices change with the scan, the detector and its tolerances; near "
+        "selects planes by position. If empty, planes are selected by constraint, "
+        "min_area_m2, n_walls_max and skip_covered.",
     )
     near: tuple[Place, ...] = Field(
         default=(),
-        description="Raster only the walls nearest to these points, [[x, y, z], ...] in world "
-        "metres, among planes of the required orientation (constraint).",
+        description="Rasterise only the walls nearest to these points, [[x, y, z], ...] in "
+        "world metres, among planes of the required orientation (constraint).",
     )
     crop: Rectangle | Polygon | None = Field(
         default=None,
-        description="Part of the wall to raster, in metres right of and below the top-left "
+        description="Part of the wall to rasterise, in metres right of and below the top-left "
         "corner of its whole raster: a rectangle [left, top, right, bottom], or a polygon "
-        "[[right, down], ...] outside which cells are void. Photos are matched only to this part, "
-        "so orient them with the whole wall first, and use the resulting cameras.",
+        "[[right, down], ...] outside which cells are void. Photos are matched only to this "
+        "part, so orient them with the whole wall first, and use the resulting cameras.",
     )
     skip_covered: bool = Field(
         default=True,

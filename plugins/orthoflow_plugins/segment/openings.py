@@ -137,7 +137,9 @@ class SegmentOpenings(Method):
         area_least_m2: float = Field(
             default=0.1, gt=0.0, le=10_000.0, description="Smallest area of an opening."
         )
-        level: bool = Field(default=False, description="Also search floors, ceilings and slopes.")
+        level: bool = Field(
+            default=False, description="Also search for openings in floors, ceilings and slopes."
+        )
 
     class In(Ports):
         """Walls; optionally, a cloud to detect hidden areas, and orthoimages to refine sides."""

@@ -158,8 +158,9 @@ class SimulateRoom(Method):
         design_seed: int | None = Field(
             default=None,
             ge=0,
-            description="Seed of a drawn room, which gives each dataset its own room; by default "
-            "the seed of the workflow. Scanning errors do not depend on it.",
+            description="Seed of a drawn room, with which each dataset can have a different "
+            "room; by default, the seed of the workflow. Scanning errors do not depend on "
+            "this seed.",
         )
         obstacle: bool = Field(
             default=True, description="Place an object 0.6 m in front of the main wall."
@@ -189,9 +190,9 @@ class SimulateRoom(Method):
             0,
             ge=0,
             le=40,
-            description="Number of plaques, 12 to 45 cm wide and 2 to 15 cm thick, on a drawn "
-            "main wall, which provide corners for check points at edges; fewer if there is "
-            "no room for them.",
+            description="Number of plaques on a drawn main wall, 12 to 45 cm wide and 2 to 15 "
+            "cm thick. Their corners serve as check points at edges. If there is not enough "
+            "space, fewer are added.",
         )
         photo_layout: PhotoLayout = Field(
             "none",

@@ -371,7 +371,7 @@ def test_materials_have_a_thickness_each_on_the_plane_and_along_a_row(tmp_path: 
 def test_materials_that_overlap_or_fall_are_refused() -> None:
     with pytest.raises(ValidationError, match=r"a must ascend between 0 and 1, got 0\.2 and 0\.2"):
         Ransac.Params(materials={"a": (0.2, 0.2)})
-    with pytest.raises(ValidationError, match=r"b begin at 0\.2, below 0\.3 where"):
+    with pytest.raises(ValidationError, match=r"b begin at 0\.2, but those of a end at 0\.3"):
         Ransac.Params(materials={"b": (0.2, 0.5), "a": (0.0, 0.3)})
 
 
@@ -441,7 +441,7 @@ def test_a_horizontal_plane_lies_below_the_scene_or_at_the_height_given(tmp_path
         ({"normal": (0, 0, 1.0), "offset_m": 0.0, "horizontal": True}, "got normal and horizontal"),
         ({**TRIPLE, "height_m": 2.0}, "points and horizontal"),
         ({"normal": (0, 0, 0.0), "offset_m": 1.0}, "normal must not be"),
-        ({"planes": TWO, "height_m": 2.0}, "got horizontal and planes: move it into"),
+        ({"planes": TWO, "height_m": 2.0}, "got horizontal and planes: move the single"),
         ({"planes": ({"normal": (0, 0, 1.0)},)}, "normal and offset_m together, got only one"),
     ],
 )
