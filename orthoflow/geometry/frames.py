@@ -173,8 +173,8 @@ def signed_area(ring: NDArray[np.float64]) -> float:
 # this. With a nearly vertical normal, the direction to the right of the viewer would depend on
 # noise.
 LEVEL_LIMIT_DEG: Final = 10.0
-# Maximum distance of points from the origin in metres. Coordinates in survey frames on Earth are
-# smaller, so points farther away are corrupt; they are ignored with a warning.
+# Coordinates in survey frames on Earth are smaller than this; larger ones are corrupt.
+#: maximum distance from the origin in metres; points farther away are ignored with a warning
 FARTHEST_M: Final = 1e9
 _LEAST_COSINE: Final = math.cos(math.radians(LEVEL_LIMIT_DEG))
 

@@ -249,7 +249,8 @@ def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders
         wxx, wxy, wyy = wxx + weight * x * x, wxy + weight * x * y, wyy + weight * y * y
     ridge = _RIDGE * sigma * sigma * w
     wxx, wyy = wxx + ridge, wyy + ridge
-    # Rows of the inverse of ((w, wx, wy), (wx, wxx, wxy), (wy, wxy, wyy)), without its determinant.
+    # First row of the inverse of ((w, wx, wy), (wx, wxx, wxy), (wy, wxy, wyy)), times the
+    # determinant.
     level, across, down = wxx * wyy - wxy * wxy, wxy * wy - wx * wyy, wx * wxy - wxx * wy
     determinant = w * level + wx * across + wy * down
     if not math.isnan(places[cell, 0]):

@@ -390,7 +390,8 @@ _STEPS_MOST: Final = 20
 # A fit has converged if it moves a point of the plane ten metres away by less than this share of
 # the tolerance.
 _SETTLED_SHARE: Final = 5e-4
-# Points whose RMS distance from a line is smaller do not determine a rotation about the line.
+# Points whose RMS distance from a line is smaller than this do not determine a rotation about the
+# line.
 _LINE_WIDTH_M: Final = 1e-4
 
 

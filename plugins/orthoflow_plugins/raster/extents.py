@@ -620,7 +620,7 @@ def adjoining_bounds(
 def adjoining_bound(
     planes: Planes, other: int, rectangle: WallFrame, size_m: tuple[float, float]
 ) -> Bound | None:
-    """Return where another plane bounds a wall; None if it is not beside, above or below it."""
+    """Return how another plane bounds a wall; None if it is not beside, above or below the wall."""
     normal = planes.normal[other]
     axes = np.array([rectangle.u_world, rectangle.v_world, rectangle.normal_world])
     slopes = axes @ normal

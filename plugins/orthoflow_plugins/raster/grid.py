@@ -273,7 +273,7 @@ def _frames(
 def report_doubts(
     chosen: list[int], planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> None:
-    """Report walls cut by oblique neighbours, and points of `near` far from all walls."""
+    """Report walls that oblique planes cut off, and points of `near` far from all walls."""
     for index in chosen:
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - params.margin_m
