@@ -317,7 +317,7 @@ execution_options = _together(
         default=2,
         show_default=True,
         metavar="N",
-        help="With dask: how often a step is repeated after losing its worker.",
+        help="With dask: how often a step is repeated, at most, if its worker is lost.",
     ),
 )
 

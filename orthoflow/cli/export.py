@@ -197,9 +197,9 @@ _HELP: Final = "\n\n".join(
     _CLOUDS,
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
-    help="colour of the points, from the oriented photos (grey if no photo shows the point), the "
-    "colours of the scan, its intensity, the plane (a colour for each), or the deviation from the "
-    "plane (blue behind, red in front of it); by default the first of these that is available.",
+    help="source of the points' colours: the oriented photos (grey if no photo shows the point), "
+    "the colours of the scan, its intensity, the plane (one colour each), or the deviation from "
+    "the plane (blue behind, red in front of it); by default the first of these that is available.",
 )
 @_for(
     f"{_CLOUDS} dxf geojson gltf tiles relief iiif sheet",

@@ -272,7 +272,7 @@ def plugins_new(
 
     `orthoflow plugins list` shows the kinds and product types. The method is a simple example,
     to be replaced by your own. With `--new-kind`, the plugin also defines a kind, and a product
-    type if `--gives` is a new one.
+    type if `--gives` names a new one.
     """
     from orthoflow.scaffold import Project, write_project
 

@@ -73,17 +73,17 @@ def replay(
     """Repeat RUN, a run folder or its run.h5, from its record and its input files.
 
     Workflow, parameters and seeds are taken from the record. Inputs that are not in the record are
-    located by their content: under any name at the paths given with --input, or else where the
-    store in .orthoflow last found them, and under their own name at the paths in the workflow, in
-    the working directory and next to the run. Missing and changed files are reported before
-    anything runs.
+    located by their content. Files at the paths given with --input may have any name. Without
+    --input, the files are looked for where the store in .orthoflow last found them, and at the
+    paths in the workflow, relative to the working directory and to the run. Missing and changed
+    files are reported before anything runs.
 
-    The result lists for every product whether it is identical, equal within the tolerance of its
-    type, or different, and which metrics differ, apart from times and memory. The exit code is 3 if
-    a product differs, or if a metric differs (a count by any amount, other numbers by more than a
-    millionth) in a step whose products are identical or whose method's code has changed. It is also
-    3 if the run cannot be repeated because an input or the record was changed, or a method has
-    another version; it is 2 if an input is not found, and 4 if methods are missing.
+    The output states for every product whether it is identical, equal within the tolerance of its
+    type, or different. It also lists the metrics that differ, apart from times and memory. The exit
+    code is 3 if a product differs, or if a metric differs (a count by any amount, other numbers by
+    more than a millionth) in a step whose products are identical or whose method's code has
+    changed. It is also 3 if the run cannot be repeated because an input or the record was changed,
+    or a method has another version; it is 2 if an input is not found, and 4 if methods are missing.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.journal import new_run_folder, new_run_id

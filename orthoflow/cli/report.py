@@ -24,11 +24,11 @@ from orthoflow.errors import ArgumentError
 def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     """Write the HTML report of one or more runs, each a run folder or its run.h5.
 
-    Without -o, it is written to the run folder, with figures/ next to it, which contains the
-    figures as PNG or SVG files; if there are variants, only those of the baseline (`orthoflow
-    export RUN --to figures` writes all). For two runs, it also compares products; those that the
-    records reference but do not contain are loaded from the store. If the seal of a record is
-    broken, the page shows a warning, and the exit code is 3.
+    Without -o, the report is written to the run folder, and the figures are written to figures/
+    next to it, as PNG or SVG files; if there are variants, only the figures of the baseline are
+    written (`orthoflow export RUN --to figures` writes all). For two runs, the report also compares
+    products; products that the records reference but do not contain are loaded from the store. If
+    the seal of a record is broken, the page shows a warning, and the exit code is 3.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.open import open_run

@@ -78,7 +78,7 @@ def runs(
     their folder is given. For runs without a record, and for unreadable records, the reason is
     shown. --table FILE merges the given runs, or those in the given folders, into one table with a
     row per cell and metric; cells with the same methods, parameters, seeds and data in several runs
-    are merged, and `environments` is the number of machines.
+    are merged, and `environments` is the number of environments in which they were computed.
     """
     if table is not None:
         return _write_table(folders, table)

@@ -45,8 +45,8 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
 
     If there are many metrics, only those that measure quality are printed; --all prints all of
     them. With variants, there is a row per combination; with several datasets, its values are
-    medians over them. For a folder that contains runs, their table is printed, as `orthoflow runs`
-    does. The exit code is 3 if the seal of the record is broken; `orthoflow verify` also checks
+    medians over the datasets. For a folder that contains runs, the table of `orthoflow runs` is
+    printed. The exit code is 3 if the seal of the record is broken; `orthoflow verify` also checks
     large arrays, which are not read here.
     """
     from orthoflow.engine.journal import RECORD_FILE

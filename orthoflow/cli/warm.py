@@ -32,9 +32,10 @@ RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
 @click.argument("workflow", metavar="[WORKFLOW]", required=False)
 @json_option
 def warm(workflow: str | None, *, as_json: bool) -> int:
-    """Compile the kernels of all built-in methods, or of those in WORKFLOW, on simulated rooms.
+    """Compile the kernels of all built-in methods, or of the methods in WORKFLOW.
 
-    Later runs by the same user then do not have to compile them. Compiled kernels are kept in the
+    For this purpose, the methods are run on simulated rooms. Later runs by the same user then do
+    not have to compile the kernels. Compiled kernels are kept in the
     user's cache (~/.cache/orthoflow), or in the folder given by the variable NUMBA_CACHE_DIR if
     only this user may write there; never in a store.
     """

@@ -74,7 +74,7 @@ class RunOptions(Selection):
         if self.executor not in ("local", "inline", "dask"):
             raise ArgumentError(f"--executor must be local, inline or dask, got {self.executor}")
         if self.scheduler and self.executor != "dask":
-            raise ArgumentError("--scheduler is for --executor dask")
+            raise ArgumentError("--scheduler requires --executor dask")
         if self.retries < 0:
             raise ArgumentError(f"--retries must be 0 or more, got {self.retries}")
 

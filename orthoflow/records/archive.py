@@ -463,9 +463,8 @@ def _add_cell(
         owner, _, name = product.source.rpartition(".")
         if owner != "inputs" and product.source not in given:
             raise RecordError(
-                f"according to the record, {product.source} was used, but no executed step made "
-                f"it: "
-                "`orthoflow verify` reports other contradictions"
+                f"according to the record, {product.source} was used, but no executed step "
+                "produced it: `orthoflow verify` reports other contradictions"
             )
         source = f"{WORKFLOW_FILE}#inputs/{name}" if owner == "inputs" else given[product.source]
         target = f"{tool}/{port}"

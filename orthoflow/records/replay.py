@@ -171,7 +171,7 @@ def _inconsistencies(run: Run) -> Iterator[str]:
         }
         for name, value in stated.items():
             if preimage.get(name) != value:
-                yield f"{cell.address}: {name} does not match its key"
+                yield f"{cell.address}: {name} does not match the cache key"
 
 
 def _loose_ends(run: Run) -> Iterator[str]:
@@ -183,7 +183,8 @@ def _loose_ends(run: Run) -> Iterator[str]:
             # The missing output of an upstream cell may be the reason why this cell was skipped.
             is_lacking = cell.status == "skipped" and owner != "inputs" and owner in given
             if not is_lacking and name not in given.get(owner, ()):
-                yield f"{cell.address}: no earlier step outputs {product.source!r}, its {port}"
+                text = f"no earlier step outputs {product.source!r}, its input {port}"
+                yield f"{cell.address}: {text}"
         given.setdefault(cell.address, set(cell.outputs))
 
 

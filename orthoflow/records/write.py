@@ -494,7 +494,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         run: the run.
         path: path of the new record, in an existing folder.
         store: store that contains the products that the run's record references only by digest.
-        inputs: inputs as `NAME=PATH`, as for `--input`; other input files are searched by their
+        inputs: inputs as `NAME=PATH`, as for `--input`; other input files are located by their
             content.
 
     Returns:

@@ -428,8 +428,9 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     needed = f"at least {enough} datasets are needed for all comparisons ({len(rows)})"
     if not tested:
         return (
-            f"{n_datasets} datasets are not enough for a claim: {needed}, with results that "
-            f"differ, all computed in one environment; {_MIN_SHOWN} for a single comparison"
+            f"{n_datasets} datasets are not enough to draw a conclusion: the results must differ "
+            f"in at least {enough} datasets for all comparisons ({len(rows)}), or in at least "
+            f"{_MIN_SHOWN} for a single comparison, and must be computed in one environment"
         )
     leads, level = [], []
     for name in dict.fromkeys(one.name for _, one in rows):
@@ -462,8 +463,8 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         n, n_tests = max(pair.wins + pair.losses for pair in tested), len(tested)
         if (least := n_tests * 2.0 ** (1 - n)) >= _SHOWN_P:
             sentences.append(
-                f"None could be: with {n} datasets and {n_tests} testable comparisons, the "
-                f"smallest possible p is {min(1.0, least):.2g}; {needed}, or fewer metrics "
+                f"None could be significant: with {n} datasets and {n_tests} testable comparisons, "
+                f"the smallest possible p is {min(1.0, least):.2g}; {needed}, or fewer metrics "
                 "(compare.metrics)"
             )
     ranked = [
@@ -473,8 +474,8 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     ]
     if ranked:
         sentences.append(
-            "By Friedman's and Nemenyi's tests of each metric alone, there are differences; the "
-            f"best, and those not significantly different from it: {'; '.join(ranked)}"
+            "Friedman's and Nemenyi's tests of each metric by itself show differences; the best "
+            f"method, and the methods not significantly different from it: {'; '.join(ranked)}"
         )
     return ". ".join(sentences)
 

@@ -94,7 +94,7 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         raise WorkflowError(f"{name_or_path} is empty; expected a workflow")
     for key, needed in (
         ("orthoflow", "a workflow begins with orthoflow: 1"),
-        (_STEPS, "a workflow needs the key steps"),
+        (_STEPS, "a workflow needs the key `steps`"),
     ):
         if not log.has((key,)):
             log.report((key,), needed)
@@ -309,7 +309,7 @@ class _Reader:
 
     def _call(self, name: str, call: CallSection, location: Location) -> DraftCall:
         if self.log.get((*location, "use")) is None:
-            message = "the key use is missing; it selects a method, such as plane.hough2d"
+            message = "the key `use` is missing; it selects a method, such as plane.hough2d"
             self.log.report(location, message, at_key=True)
         kind = self.catalog.kinds.get((call.use or "").partition(".")[0])
         return DraftCall(

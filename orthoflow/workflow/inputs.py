@@ -603,7 +603,7 @@ def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
         else ""
     )
     listed = first_few([name for name in names if name]) or "none"
-    message = f"a table of datasets needs the column name; its columns are {listed}{way_out}"
+    message = f"a table of datasets needs a column called `name`; its columns are {listed}{way_out}"
     log.add(header[0].position, "", message)
     return []
 
@@ -618,7 +618,9 @@ def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog)
             return None
     found = [field for key, field in zip(names, row, strict=False) if key == "name" and field.text]
     if not found and any(field.text for field in row):
-        log.add(row[0].position, "name", "the dataset needs a name in the column name")
+        log.add(
+            row[0].position, "name", "the column `name` is empty, but each dataset needs a name"
+        )
     return found[-1] if found else None
 
 

@@ -266,8 +266,8 @@ class CallSection(FileSection):
         1,
         description="Number of runs with different seeds. For a method without randomness, "
         "repeats only measure times. Steps listed in `compare.metrics` (by default all "
-        "inspections) and the steps in between run once per repeat; all other steps use the first "
-        "repeat.",
+        "inspections), and the steps between this step and these, run once per repeat; all other "
+        "steps use the first repeat.",
         examples=[10],
     )
     resources: ResourcesSection = Field(
@@ -354,8 +354,8 @@ class Comparison(FileSection):
     )
     baseline: _Assignment = Field(
         {},
-        description="The variant of each step that the report shows and with which it compares "
-        "the others; by default the first.",
+        description="For each step, the variant that the report shows and with which it compares "
+        "the other variants; by default the first one.",
         examples=[{"plane": "hough2d", "orient": "bundle"}],
     )
     exclude: tuple[Annotated[_Assignment, Field(min_length=1)], ...] = Field(

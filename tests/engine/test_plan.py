@@ -67,7 +67,7 @@ INPUTS = {"left": LEFT, "right": RIGHT}
 
 def test_an_executor_is_the_one_that_is_asked_for() -> None:
     assert RunOptions(executor="dask", scheduler="tcp://x:1").scheduler == "tcp://x:1"
-    with pytest.raises(ArgumentError, match="--scheduler is for --executor dask"):
+    with pytest.raises(ArgumentError, match="--scheduler requires --executor dask"):
         RunOptions(scheduler="tcp://x:1")
     with pytest.raises(ArgumentError, match="--executor must be local, inline or dask, got slow"):
         RunOptions(executor="slow")  # type: ignore[arg-type]

@@ -173,7 +173,9 @@ def test_products_that_the_record_holds_are_part_of_it(studio: Studio) -> None:
         graph: dict[str, Any] = crate_metadata(replace(run, cells=cells), [], license_text="CC0")
         [found] = [one for one in graph["@graph"] if one.get("identifier") == planes.digest]
         assert found.get("isPartOf") == part
-    with pytest.raises(RecordError, match=r"survey\.planes was used, but no executed step made"):
+    with pytest.raises(
+        RecordError, match=r"survey\.planes was used, but no executed step produced"
+    ):
         crate_metadata(replace(run, cells=run.cells[1:]), [], license_text="none")
 
 

@@ -270,16 +270,16 @@ REFUSES = "step paint: the installed paint.plain does not accept the recorded pa
 IMPOSSIBLE: tuple[tuple[Callable[[hostile.Record], None], str], ...] = (
     (with_preimage(""), "key_preimage must not be empty"),
     *(
-        (with_preimage(text), "inputs does not match its key")
+        (with_preimage(text), "inputs does not match the cache key")
         for text in ("[" * 50_000, f'{{"seed": {"9" * 5000}}}', '{"inputs": [1]}')
     ),
     (with_parameters(grey=128, gsd_m=0.5, x=1), f"{REFUSES} x: Extra inputs are not permitted"),
     (with_parameters(grey=[[]], gsd_m={}), f"{REFUSES} gsd_m: Input should be a valid number"),
     *(
-        (with_source(source), f"paint: no earlier step outputs {source!a}, its planes")
+        (with_source(source), f"paint: no earlier step outputs {source!a}, its input planes")
         for source in ("survey.nothing", "inputs.nothing", "a\x1b[2J.planes")
     ),
-    (close_a_circle, "paint: no earlier step outputs 'paint.planes', its planes"),
+    (close_a_circle, "paint: no earlier step outputs 'paint.planes', its input planes"),
 )
 
 

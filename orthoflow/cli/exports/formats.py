@@ -90,15 +90,16 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "copc": Format(
         "clouds:export_copc",
-        "the same as COPC (LAZ with an octree), from which viewers load only the visible part",
+        "the registered cloud as COPC (LAZ with an octree), from which viewers load only the "
+        "visible part",
     ),
     "ply": Format(
         "clouds:export_ply",
-        "the same as binary PLY with double-precision coordinates",
+        "the registered cloud as binary PLY with double-precision coordinates",
     ),
     "e57": Format(
         "clouds:export_e57",
-        "the same as E57, with a pose for each scan",
+        "the registered cloud as E57, with a pose for each scan",
     ),
     "gltf": Format(
         "viewers:export_gltf",
