@@ -225,7 +225,6 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
 
 
 def _parameters(cells: Iterable[RecordedCell]) -> dict[str, tuple[JsonValue, ...]]:
-    """Return `step.parameter` -> values that occur in the cells."""
     found: dict[str, dict[str, JsonValue]] = {}
     for cell in cells:
         if cell.repeat == 0 and cell.status != "skipped":
@@ -236,7 +235,6 @@ def _parameters(cells: Iterable[RecordedCell]) -> dict[str, tuple[JsonValue, ...
 
 
 def _unfinished(folder: Path) -> RunSummary:
-    """Summarise a run without a record, from the first line of its journal."""
     try:
         with open_file(folder / JOURNAL) as journal:
             first = parse_json(journal.readline(_FIRST_LINE_BYTES).decode("utf-8"))

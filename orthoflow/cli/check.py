@@ -37,7 +37,6 @@ def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
 
 
 def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
-    """Return a summary of a valid workflow, and warnings about implausible settings."""
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.checks import lint_workflow
     from orthoflow.workflow.expand import expand_cells, is_plain, variants_text

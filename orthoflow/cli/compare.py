@@ -57,7 +57,6 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
 
 
 def _as_json(comparison: RunComparison) -> dict[str, object]:
-    """Return a comparison as JSON; each row states whether both values are the same."""
     return {
         "runs": [
             {name: getattr(record, name) for name in _OF_RUNS}

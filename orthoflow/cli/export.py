@@ -312,7 +312,6 @@ def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _folder_inside(run: Run, *names: str) -> Path:
-    """Return the path of a subfolder of the run folder; reject links."""
     folder = run.home_folder
     for name in names:
         folder /= name

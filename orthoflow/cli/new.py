@@ -69,7 +69,6 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
 
 
 def _write(output: Path, text: str) -> None:
-    """Write the file; raise an error if it has been created in the meantime."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         with output.open("x", encoding="utf-8") as stream:

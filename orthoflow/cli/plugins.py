@@ -136,11 +136,6 @@ def plugins_show(method_id: str, *, as_json: bool) -> int:
 
 
 def _described(entry: MethodEntry) -> dict[str, Any]:
-    """Return the complete declaration of a method as JSON.
-
-    Raises:
-        PluginError: the method's class cannot be loaded.
-    """
     from orthoflow.files.documents import type_text
     from orthoflow.sdk import port_specs
     from orthoflow.sdk.units import unit_of

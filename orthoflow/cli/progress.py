@@ -180,7 +180,6 @@ class Progress:
             echo_error(f"{line} ({self.n_ended} of {self._n_cells})" if is_end else line)
 
     def _applied(self, event: RunEvent) -> str:
-        """Update the cells with an event; return a log line, which may be empty."""
         with self._lock:
             match event:
                 case RunStarted():
@@ -215,7 +214,6 @@ class Progress:
         return ""
 
     def _reported_line(self, address: str, one: Diagnostic) -> str:
-        """Format a diagnostic as a line; empty for notes and for codes reported before."""
         if one.is_summary:
             return f"{address}: {one.text}"
         if one.severity == "note" or not self._methods.isdisjoint(one.settled_by):
@@ -343,7 +341,6 @@ def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[Callable[[st
 
 
 def _live(console: Console, drawn: Callable[[], RenderableType]) -> Live:
-    """Return a display that refreshes itself, and is removed from the terminal at the end."""
     from rich.live import Live
 
     return Live(

@@ -158,7 +158,6 @@ def replay(
 
 @contextmanager
 def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
-    """Yield the given store, or a new store next to the run folder, which is removed at the end."""
     if given is not None:
         yield given
         return

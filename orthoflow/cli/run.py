@@ -268,13 +268,6 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
 
 
 def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
-    """Print the table of cells, the warnings, and the paths of the results.
-
-    Args:
-        run: the finished run.
-        kept: addresses of the cells that were computed before an interruption.
-        took_s: duration of the whole run in seconds.
-    """
     cells = run.record.cells
     echo()
     echo_table(
@@ -309,7 +302,6 @@ def _print_summary(run: Run, kept: Collection[str], took_s: float) -> None:
 
 
 def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
-    """Describe how many cells were cached, or computed before an interruption."""
     counted_cells = [cell for cell in cells if cell.status != "skipped"]
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)

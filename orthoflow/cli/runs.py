@@ -165,7 +165,6 @@ def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
 
 
 def _condition(text: str) -> tuple[str, Callable[[float], bool]]:
-    """Parse the value of `--where` into a name and a condition."""
     match = _CONDITION.fullmatch(text)
     if match is None:
         raise click.UsageError(
@@ -219,7 +218,6 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
 
 
 def _facts_text(facts: Mapping[str, object]) -> str:
-    """Describe the first few differences of a run from other runs in one line."""
     parts = []
     for name, value in facts.items():
         text = json.dumps(value, ensure_ascii=False)

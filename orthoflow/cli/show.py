@@ -119,7 +119,6 @@ def _print_cells(run: Run, *, is_whole: bool) -> None:
 
 
 def _print_comparison(run: Run, most: int | None) -> bool:
-    """Print one row per combination; return whether there are several combinations."""
     if all(set(cell.assignment) <= {DATA} for cell in run.record.cells):
         return False
     from orthoflow.records.runs import parts_of

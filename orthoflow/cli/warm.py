@@ -65,10 +65,6 @@ def warm(workflow: str | None, *, as_json: bool) -> int:
 
 
 def _results(catalog: Catalog, wanted: Collection[str]) -> dict[str, str]:
-    """Run the recipes in a temporary store, and return method -> error message.
-
-    The message is empty if the method succeeded.
-    """
     from orthoflow.cli.progress import Progress
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.scheduler import execute

@@ -305,7 +305,6 @@ class DaskExecutor:
         )
 
     def _workers(self) -> Mapping[str, Any]:
-        """Return address -> properties, for workers that report their number of cores."""
         try:
             known = self._client.scheduler_info(n_workers=-1)["workers"]
         except Exception:  # noqa: BLE001 - any error means no answer

@@ -184,11 +184,6 @@ def _require_distinct(
     inputs: Mapping[str, PlannedInput | None],
     methods: Mapping[str, MethodFacts],
 ) -> None:
-    """Reject an input that contains copies of a file, or several links to it.
-
-    Raises:
-        InputError: two files have the same content.
-    """
     for cell in cells:
         for port, source in cell.inputs.items():
             given = inputs[source.name] if isinstance(source, WorkflowInput) else None

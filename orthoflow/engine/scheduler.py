@@ -254,7 +254,6 @@ class _Run:
                 self._start(planned.cell, key, refs, executor)
 
     def _prepare(self, cell: Cell) -> None:
-        """If the inputs of a cell are known, use its stored result or mark the cell as ready."""
         needed = cell.sources
         if not all(address in self._results for address in needed):
             return

@@ -470,7 +470,6 @@ class Store:
         return ""
 
     def _remove_damaged(self, path: Path, damaged: Callable[[], str]) -> None:
-        """Remove a file or folder if it exists and is still damaged."""
         # Another process may have replaced the damaged object in the meantime.
         if not os.path.lexists(path) or not damaged():
             return
@@ -508,7 +507,6 @@ def _describe(folder: Path, name: str, type_name: str) -> Mapping[str, tuple[int
 
 
 def _read_description(folder: Path) -> StoredProduct | None:
-    """Read `object.json`; return None if it is missing or damaged, or describes another object."""
     try:
         text = (folder / DESCRIPTION).read_text(encoding="utf-8")
         found = _codec().validate_json(text, strict=True)

@@ -297,7 +297,6 @@ def _status(*, is_ok: bool) -> str:
 
 
 def _value_type(value: JsonValue) -> str:
-    """Return the Schema.org type of a parameter; non-scalar values are written as JSON text."""
     return {bool: "Boolean", int: "Integer", float: "Float"}.get(type(value), "Text")
 
 
@@ -573,7 +572,6 @@ def _add_action(crate: _Crate, cell: RecordedCell) -> str:
 
 
 def _add_final(crate: _Crate, source: str, of_tool: str, product: RecordedProduct) -> None:
-    """Add an output of the workflow, which is an output that no other cell uses."""
     output = crate.formal(f"{WORKFLOW_FILE}#out/{source}", source, "CreativeWork")
     crate.link(WORKFLOW_FILE, "output", output)
     crate.connect(WORKFLOW_FILE, f"#to-{output}", of_tool, output)
@@ -651,7 +649,6 @@ def _add_workflow(document: ProvDocument, record: RunRecord) -> None:
 
 
 def _add_inputs(document: ProvDocument, record: RunRecord) -> None:
-    """Add inputs and their files without duplicates; omit optional inputs that were not given."""
     known: set[str] = set()
     for entry in record.inputs:
         if not entry.files:

@@ -208,7 +208,6 @@ def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
 
 
 def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
-    """Return the largest difference of each unit."""
     units: dict[str, list[ArrayDifference]] = {}
     for difference in differences:
         units.setdefault(difference.unit, []).append(difference)

@@ -150,7 +150,6 @@ def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Wo
 
 
 def _inconsistencies(run: Run) -> Iterator[str]:
-    """Yield a sentence for each contradiction between a cell and its inputs or cache key."""
     files = {f"inputs.{entry.name}": input_digest(entry.files) for entry in run.record.inputs}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
@@ -175,7 +174,6 @@ def _inconsistencies(run: Run) -> Iterator[str]:
 
 
 def _loose_ends(run: Run) -> Iterator[str]:
-    """Yield a sentence for each cell input that is no input of the run and no earlier output."""
     given = {"inputs": {entry.name for entry in run.record.inputs}}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
@@ -189,7 +187,6 @@ def _loose_ends(run: Run) -> Iterator[str]:
 
 
 def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return missing methods, and differences between installed and recorded methods."""
     missing: list[str] = []
     others: list[str] = []
     for cell in run.record.cells:

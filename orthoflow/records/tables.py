@@ -475,7 +475,6 @@ def _choice(cell: RecordedCell) -> Choice:
 
 
 def _distinction(choice: Choice, others: Sequence[Choice]) -> str:
-    """Return how a choice differs from others with the same name, for use as a suffix."""
     if len(set(others)) < 2:
         return ""
     params = json.loads(choice[1])

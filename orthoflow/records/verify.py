@@ -361,10 +361,6 @@ def verify_run(
 
 
 def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
-    """Yield a sentence for each metric of an inspection that contradicts a finding in its product.
-
-    The name of such a metric is the name of the finding, or the same with the wall as prefix.
-    """
     places = [
         port
         for port, output in cell.outputs.items()
@@ -437,7 +433,6 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
 
 
 def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str], list[Note]]:
-    """Return the fingerprint of a valid signature, findings, and notes."""
     try:
         if signer is not None:
             return check_signature(record, signer).fingerprint, [], []
@@ -527,13 +522,6 @@ def _check_others(
 
 
 def _left_over(folder: Path, checked: Set[str], free: str) -> Iterator[str]:
-    """Yield the unchecked files of a folder; for a subfolder with several, their number.
-
-    Args:
-        folder: the folder.
-        checked: paths of the checked files.
-        free: description of the part of a crate's metadata that was not checked.
-    """
     tops: dict[str, list[str]] = {}
     for place, _, below in os.walk(folder):
         for name in below:

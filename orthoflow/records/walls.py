@@ -125,7 +125,6 @@ def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
 def _with_sidecars(
     products: Path, cell: RecordedCell, pattern: re.Pattern[str]
 ) -> Iterator[tuple[int, Path, Mapping[str, object]]]:
-    """Yield wall number, path and sidecar for the rasters of a cell that match a pattern."""
     for path in sorted((products / cell_file_name(cell.address)).glob("*.json")):
         raster = path.with_suffix(".tif")
         if found := pattern.fullmatch(raster.name):
@@ -475,7 +474,6 @@ def _check_kind(kind: str, path: Path) -> None:
 
 
 def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) -> WallResult:
-    """Add results of inspections, or a phrase that the orthoimage's accuracy is unknown."""
     if not measured and "ortho" in wall.rasters:
         uncounted = uncounted_points(run)
         if uncounted is not None:

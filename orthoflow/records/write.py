@@ -172,7 +172,6 @@ def _publish_cell(
     files_of: Mapping[str, Mapping[Path, str]],
     run_id: str,
 ) -> None:
-    """Copy the files of a cell and insert the run id into them."""
     folder.mkdir()
     taken = [METRICS_FILE]
     for port, files in files_of.items():
@@ -333,7 +332,6 @@ def _publish(
     *,
     embed: bool,
 ) -> Path:
-    """Write `products/`, and write the record under its temporary name."""
     record = build_record(outcome, plan, workflow, store, embed=embed)
     given = {
         file.sha256: place
@@ -536,7 +534,6 @@ def _write_again(
     *,
     embed: bool = True,
 ) -> None:
-    """Write a modified record of a run, with products from its own record or from a store."""
     try:
         with writing_to(path.parent):
             write_record(
@@ -657,7 +654,6 @@ def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iter
 
 
 def _made_again(run: Run, folder: Path) -> dict[str, dict[str, dict[Path, str]]]:
-    """Publish the files of the products in a record; return address -> port -> file -> SHA-256."""
     from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     catalog = discover_catalog()

@@ -423,7 +423,6 @@ def distinct_words(
 
 
 def _other_packages(own: Mapping[str, str], others: Mapping[str, str]) -> str:
-    """Describe the packages in which an environment differs from the first; empty if none do."""
     texts = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
     texts += [f"no {name}" for name in others if name not in own]
     return f"; differs from the first in {first_few(texts)}" if texts else ""

@@ -231,7 +231,6 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, 
 
 
 def _differs(key: tuple[str, str], combinations: Sequence[Combination]) -> bool:
-    """Return whether combinations differ in a metric by more than rounding."""
     values = [value.value for one in combinations if (value := one.measured(*key))]
     return any(not is_rounding(values[0], value) for value in values[1:])
 
@@ -249,10 +248,6 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
 
 
 def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
-    """Return processor time and memory of the cells that depend on variants.
-
-    Both are empty if a cell failed or had not run.
-    """
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
     if one.failure or one.missing or not varied:
         return Value(), Value()
@@ -266,7 +261,6 @@ def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
 
 
 def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
-    """Return a label for each run, with workflow, differing options, folder and id."""
     shared = frozenset.intersection(*(frozenset(run.record.overrides) for run in runs))
     labels = {}
     for run in runs:
@@ -366,7 +360,6 @@ def _place(one: Combination) -> _Place:
 
 
 def _data_of(record: RunRecord, data: str) -> tuple[str, ...]:
-    """Return the digests of a dataset's input files and simulated data."""
     digests = [
         file.sha256
         for given in record.inputs
@@ -478,7 +471,6 @@ _Measured = Mapping[tuple[str, str], MetricRow]
 
 
 def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
-    """Return (step, metric) -> row for the baseline's metrics on a dataset."""
     return {
         (row.step, row.metric): row
         for cell in baseline_cells(part)
@@ -498,7 +490,6 @@ def _dataset_value(measured: MetricRow | None) -> Value:
 
 
 def _limit(part: Run, own: AbstractSet[str]) -> str:
-    """Return the limitations of the baseline on a dataset, without failures."""
     baseline = {cell.address for cell in baseline_cells(part)} & own
     texts = [
         limit.text

@@ -257,7 +257,6 @@ def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: boo
 
 
 def _points_text(lines: Mapping[str, _Line], column: MetricRow, n_datasets: int) -> str:
-    """Describe the points and error bars, and state the number of datasets that were used."""
     found = [values for line in lines.values() for values in line.values()]
     if n_datasets < 2:
         if any(math.isfinite(one.spread) for values in found for one in values):

@@ -242,7 +242,6 @@ def write_figures(
 
 
 def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
-    """Return the content of a figure's file; None if the figure is damaged or an SVG file."""
     if figure.media_type == "image/svg+xml":
         return None
     try:
@@ -257,7 +256,6 @@ def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
 
 
 def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:
-    """Scale figures down if their total size exceeds a limit."""
     n_bytes = sum(len(figure.data) for figure in figures)
     if n_bytes <= bytes_most:
         return figures

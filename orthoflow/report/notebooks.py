@@ -216,7 +216,6 @@ class OpenedRun(Run):
         return ShownComparison(**vars(compare_runs(self, opened, stores=stores_at(store))))
 
     def _way_to_logs(self) -> str:
-        """Return a hint on how to read the log of the first failed step; empty if none failed."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed or not failed[0].log:
             return ""

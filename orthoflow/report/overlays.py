@@ -82,7 +82,6 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
 def _walls_before(
     run: Run, address: str, known: Mapping[str, Mapping[int, Picture]]
 ) -> Mapping[int, Picture]:
-    """Return wall -> picture, from the nearest upstream step of a cell."""
     for cell in run.upstream(address):
         for given in cell.inputs.values():
             if given.digest in known:

@@ -74,7 +74,6 @@ _NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
 def _part(every: Mapping[str, Sequence[Any]], addresses: Collection[str]) -> SimpleNamespace:
-    """Return the items, such as pictures and tables, that belong to the given cells."""
     return SimpleNamespace(
         **{
             kind: [one for one in ones if (getattr(one, "cell", "") or one.address) in addresses]
@@ -296,7 +295,6 @@ def _section(
 
 
 def _files(run: Run, from_page: Path) -> Mapping[str, Mapping[str, str]]:
-    """Return cell address -> file name -> path relative to the page, for published files."""
     published = {file.path for file in run.record.published}
     found: dict[str, dict[str, str]] = defaultdict(dict)
     for address, paths in run.files.items():

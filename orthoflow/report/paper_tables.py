@@ -48,7 +48,6 @@ def paper_files(run: Run) -> dict[str, str]:
 
 
 def _values(run: Run) -> Table:
-    """Return a table with one row for each combination and metric."""
     columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     names = (
@@ -75,10 +74,6 @@ def _values(run: Run) -> Table:
 
 
 def _results(run: Run) -> Table:
-    """Return a table of metrics and combinations.
-
-    If there are few combinations, the metrics are rows; otherwise, they are columns.
-    """
     columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     texts = [
@@ -126,7 +121,6 @@ def _results(run: Run) -> Table:
 
 
 def _factors(combinations: Iterable[Combination]) -> tuple[str, ...]:
-    """Return the names of the factors, beginning with the dataset."""
     found = dict.fromkeys(step for one in combinations for step in one.assignment)
     return tuple(sorted(found, key=lambda factor: factor != DATA))
 

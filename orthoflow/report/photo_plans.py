@@ -122,7 +122,6 @@ def _table(orientation: Cameras) -> Table:
 
 
 def _counts(ties: Ties | None, role: TieRole) -> dict[str, int]:
-    """Return photo -> number of ties with the given role."""
     if ties is None:
         return {}
     counts = np.bincount(ties.photo[ties.role == role], minlength=len(ties.photo_names))
@@ -152,7 +151,6 @@ def _drawn(
     oriented: Sequence[Camera],
     walls: Mapping[int, tuple[str, WallFrame]],
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
-    """Return walls and photos in plan view."""
     axes = basis_from_up(up)[:2].T
     viewing = {camera.photo: camera.viewing() for camera in oriented}
     return (

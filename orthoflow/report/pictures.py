@@ -278,7 +278,6 @@ def _intensity(
 
 
 def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Picture:
-    """Return a picture of `depth` or `intensity` without image data, caption and reading."""
     return Picture(
         uri="",
         title=_title(f"{wall.name}, {what}", address),

@@ -165,7 +165,6 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
 
 
 def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
-    """Return whether a value cannot be distinguished from a better value."""
     if is_rounding(badness(one.sort, better), badness(other.sort, better)):
         return True
     known = [

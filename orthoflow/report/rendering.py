@@ -75,7 +75,6 @@ def _shown(value: object) -> object:
 
 
 def _hash_source(text: str) -> str:
-    """Return the hash of a style or script for the page's content security policy."""
     digest = hashlib.sha256(text.encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 

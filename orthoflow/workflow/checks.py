@@ -79,7 +79,6 @@ def _types(
     input_names: Collection[str],
     log: ProblemLog,
 ) -> Callable[[Location, Reference], str | None]:
-    """Return a function that finds the product type of a reference."""
     given = {step.name: _ports(step, are_given=True) for step in steps}
 
     def type_of(location: Location, reference: Reference) -> str | None:
@@ -129,7 +128,6 @@ def _check_required(step: DraftStep, log: ProblemLog) -> None:
 
 
 def _placed(step: DraftStep) -> Iterator[tuple[str, Location, Reference]]:
-    """Yield port, location and reference for all references of a step."""
     for port, references in step.inputs.items():
         for index, reference in enumerate(references):
             yield port, (*step.location, "in", port, index), reference
@@ -320,7 +318,6 @@ def _known(
 
 
 def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequence[str]) -> str:
-    """Return why a metric pattern matches no metric; empty if it may match one."""
     step, _, metric = pattern.partition(".")
     if not _has_wildcard(step) and step not in step_names:
         return (
@@ -443,10 +440,6 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
 
 
 def _calls(workflow: Workflow, parameter: str) -> Iterator[tuple[str, str, StepVariant]]:
-    """Yield origin, step and call for all calls.
-
-    These include the calls of datasets that set `parameter`.
-    """
     for step in workflow.steps.values():
         for variant in step.variants:
             yield "", step.name, variant

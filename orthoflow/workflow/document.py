@@ -121,7 +121,6 @@ def _is_mapping(log: ProblemLog, text: str) -> bool:
 
 
 def _sections(log: ProblemLog) -> WorkflowFile:
-    """Validate all sections except `datasets`, which an option may replace."""
     data = log.get(())
     assert isinstance(data, dict)  # noqa: S101 - checked before
     sections = {key: value for key, value in data.items() if key != "datasets"}

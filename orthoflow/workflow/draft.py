@@ -258,7 +258,6 @@ def _seen_in(
 
 
 def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
-    """Return advice to check the unit if the extent of a scan is implausible."""
     if extent_m > _MAX_EXTENT_M:
         size, hint = (
             f"{extent_m:,.0f} m",
@@ -283,7 +282,6 @@ _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
 
 def _table(path: Path) -> Recognised:
-    """Recognise a text file: a table of points or ties, cameras, or a scan."""
     with path.open("rb") as file:
         head = file.read(_FIRST_LINE_BYTES).decode("utf-8", "replace")
     if matrix := _matrix_in(head):
@@ -343,7 +341,6 @@ def _is_cloud(rows: Sequence[object]) -> bool:
 
 
 def _yaml(path: Path) -> Recognised:
-    """Recognise a calibration; a workflow is reported as such."""
     found = _read(
         "calibration",
         path,
@@ -471,7 +468,6 @@ _ByKind: TypeAlias = Mapping[FileKind, Sequence[Recognised]]
 
 
 def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
-    """Insert inputs and a heading into the text of a recipe."""
     shipped = shipped_workflow(recipe).read_text(encoding="utf-8")
     _, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
     taken, left_out = _assigned(by_kind, inputs, recipe)
@@ -529,7 +525,6 @@ def _advice(by_kind: _ByKind) -> list[str]:
 def _assigned(
     by_kind: _ByKind, inputs: str, recipe: Recipe
 ) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
-    """Return input -> files, and a sentence for each file or group of files that is not used."""
     names = [match[1] for line in inputs.splitlines() if (match := _INPUT.fullmatch(line))]
     taken: dict[str, Sequence[Recognised]] = {}
     left_out = []
@@ -595,7 +590,6 @@ def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
 
 
 def _described(items: Sequence[Recognised]) -> str:
-    """Describe files in one line."""
     if len(items) == 1 or (len(items) <= _FEW_SCANS and all(item.n_points for item in items)):
         return "; ".join(f"{_word(item.path.name)}, {item.summary}" for item in items)
     n_photos = sum(item.n_photos for item in items)
@@ -628,7 +622,6 @@ def _seen(text: str) -> str:
 
 
 def _without_stand_ins(steps: str) -> str:
-    """Remove the simulated room, and the inspection that needs it, from the steps."""
     blocks = re.split(r"^(?=  \w+:)", steps, flags=re.MULTILINE)
     has_room = any(block.startswith("  room:") for block in blocks)
     kept = [

@@ -278,7 +278,6 @@ def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignmen
 
 
 def _require_few(workflow: Workflow, count: int) -> None:
-    """Raise an error if a workflow has too many cells."""
     if count < MOST_CELLS:
         return
     raise WorkflowError(
@@ -394,7 +393,6 @@ class _Expansion:
         return step.variant(cell.assignment.get(step.name, "")).repeat
 
     def _outer(self, steps: Iterable[str]) -> list[Assignment]:
-        """Return the assignments of dataset and seed that can affect one of the steps."""
         workflow = self.workflow
         variants = [variant for name in steps for variant in workflow.steps[name].variants]
         is_random = workflow.has_seeds and any(map(self._uses_seed, variants))
@@ -543,7 +541,6 @@ class _Expansion:
         return None, dependence, tuple(causes)
 
     def _input_name(self, name: str, full: Mapping[str, str]) -> str:
-        """Return the name of an input, followed by the dataset if it has its own files."""
         dataset = self.workflow.datasets.get(full.get(DATA, ""))
         return dataset.inputs[name].name if dataset and name in dataset.inputs else name
 

@@ -266,7 +266,6 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
 
 
 def _meant(path: Path) -> str:
-    """Return a suggestion with a similar file name in the same folder; empty if there is none."""
     with suppress(OSError):
         beside = [item.name for item in islice(path.parent.iterdir(), _MOST_BESIDE)]
         return did_you_mean(path.name, beside)
@@ -382,7 +381,6 @@ class DatasetReader:
         return self._named(_Origin(log=log, folder=path.resolve().parent, table=name))
 
     def _named(self, origin: _Origin) -> dict[str, Dataset]:
-        """Read the mapping `datasets` in the log of an origin."""
         log = origin.log
         check_no_step(self.steps, DATA, log, (_DATASETS,))
         written = log.get((_DATASETS,))
@@ -563,7 +561,6 @@ class _Field(NamedTuple):
 
 
 def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
-    """Yield the fields of each line that is neither empty nor a comment."""
     separator = ""
     for number, line in enumerate(log.lines, start=1):
         if not line.strip() or line.lstrip()[0] == "#":
@@ -609,7 +606,6 @@ def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
 
 
 def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog) -> _Field | None:
-    """Return the dataset name in a row; if there is none, add a problem and return None."""
     names = [column.text for column in columns]
     for index, field in enumerate(row):
         if field.text and not "".join(names[index : index + 1]):

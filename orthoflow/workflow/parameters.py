@@ -382,7 +382,6 @@ def expand_sweeps(
 def _sweeps_of(
     draft: DraftCall, overrides: Sequence[Override], log: ProblemLog
 ) -> tuple[_Sweeps, tuple[Override, ...]]:
-    """Return the sweeps of a call, and the overrides that do not contain sweeps."""
     found: _Sweeps = {}
     for name, value in draft.call.params.items():
         if _is_sweep(value):
@@ -419,7 +418,6 @@ def _is_sweep(value: JsonValue) -> bool:
 
 
 def _once(values: list[tuple[JsonValue, Report]]) -> list[tuple[JsonValue, Report]]:
-    """Remove duplicate values, and report them at their positions."""
     kept: dict[str, tuple[JsonValue, Report]] = {}
     for value, report in values:
         text = _canonical(value)

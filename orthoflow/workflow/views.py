@@ -120,7 +120,6 @@ def _renamed(schema: Any, info: type[Method]) -> Any:
 
 
 def _or_sweep(schema: Schema) -> Schema:
-    """Return a schema that also allows a sweep."""
     shown: Schema = {key: schema[key] for key in _SHOWN if key in schema}
     own = {key: value for key, value in schema.items() if key not in (*_SHOWN, "title")}
     choices = own.pop("anyOf") if set(own) == {"anyOf"} else [own]
@@ -166,7 +165,6 @@ def _call_label(variant: StepVariant) -> str:
 
 
 def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[str, str, str]]:
-    """Yield source, arrow and label of each connection to a step."""
     taken = {
         port
         for variant in step.variants

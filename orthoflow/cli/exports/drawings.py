@@ -133,7 +133,6 @@ def export_qgis(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _images(run: Run, address: str) -> Sequence[Orthoimage]:
-    """Return the orthoimages of a cell; empty if its rasters are of another type."""
     for port, output in run.cell(address).outputs.items():
         if output.type_name == Orthoimages.type_name and output.embedded:
             return Orthoimages.from_payload(run.payload(address, port)).images

@@ -197,7 +197,6 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _warn(walls: Sequence[WallResult]) -> None:
-    """Warn about walls that are drawn although their orthoimages should not be delivered."""
     few = [
         f"{wall.name} ({wall.about.reason})"
         for wall in walls
@@ -239,7 +238,6 @@ def _ppi(wall: WallResult, scale: int) -> float:
 
 
 def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Choices) -> Drawing:
-    """Return the drawing of a wall, whose scale is still to be set."""
     language, unit = chosen.language or "en", chosen.units or "m"
     frame = wall.frame
     areas = [_area(wall, opening, chosen) for opening in results.openings_of(wall)]
@@ -286,7 +284,6 @@ def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Ch
 
 
 def _scaled(drawing: Drawing, wall: WallResult, chosen: Choices, scale: int) -> Drawing:
-    """Set the scale of a drawing, and the grid and note that depend on the scale."""
     ppi = _ppi(wall, scale)
     values = {"mm": f"{1e3 * wall.frame.gsd_m:g}", "ppi": f"{ppi:.0f}"}
     coarse = (Phrase(key="coarse", values={"least": f"{_LEAST_PPI:.0f}"}),)
@@ -309,12 +306,10 @@ def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
 
 
 def _first_kind(wall: WallResult) -> str:
-    """Return `ortho` if the wall has an orthoimage, or else the kind of another raster."""
     return next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
 
 
 def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
-    """Return the kinds of rasters to draw for a wall."""
     for kind in chosen.beside:
         if kind not in wall.rasters:
             raise ArgumentError(

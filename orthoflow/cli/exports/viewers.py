@@ -54,7 +54,6 @@ def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
 def _depths(
     run: Run, address: str, orthos: Sequence[OrthoFile], wall: int | None
 ) -> dict[int, Path]:
-    """Return wall number -> published depth raster, for all walls with orthoimages."""
     walls = room_results(run, address, wall).walls
     found = {wall.number: wall.rasters["depth"] for wall in walls if "depth" in wall.rasters}
     for ortho in orthos:
@@ -91,7 +90,6 @@ def export_iiif(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _canvas(wall: WallResult, scratch: Path) -> Canvas:
-    """Return the rasters of a wall, including a shaded relief that is created in `scratch`."""
     rasters = dict(wall.rasters)
     if "depth" in rasters:
         rasters["relief"] = scratch / f"wall_{wall.number}_relief.tif"
