@@ -282,7 +282,8 @@ class WallFrame:
         the top edge. For floors and ceilings, X and Y are the horizontal world axes. Y of a ceiling
         increases with the row number, so that the ceiling can be superimposed on the floor. For
         sloping planes, and if up is unknown, X and Y are distances from the top-left corner.
-        Cylinders with a vertical axis are treated as walls, and others as sloping planes.
+        Cylinders with a vertical axis are treated as walls, with heights of the axis; others are
+        treated as sloping planes.
         """
         if self.map_crs is not None:
             return "map"
@@ -304,7 +305,11 @@ class WallFrame:
             return float(self.origin_world[0]), float(self.origin_world[1])
         if axes == "plane" or self.up is None:
             return 0.0, 0.0
-        first, second, height = (basis_from_up(np.array(self.up)) @ self.origin_world).tolist()
+        # If a tower leans, its edge rises and falls, but the axis has one height at each row.
+        beside = self.origin_world
+        if self.bend is not None:
+            beside = beside + self.bend.radius_m * self.normal_world
+        first, second, height = (basis_from_up(np.array(self.up)) @ beside).tolist()
         return (self.left_m, height) if axes == "wall" else (first, second)
 
     @property
@@ -447,6 +452,18 @@ class WallFrame:
         if self.bend is not None:
             sizes[:, 0 if self.bend.along == "u" else 1] *= 1.0 - depths_m / self.bend.radius_m
         return sizes
+
+    def require_plane(self, what: str) -> None:
+        """Refuse a curved raster where only planes can be processed.
+
+        Args:
+            what: what cannot process it, for the message.
+
+        Raises:
+            GeometryError: the raster is on a cylinder.
+        """
+        if self.bend is not None:
+            raise GeometryError(f"{what} does not take curved walls, but {self.name} is one")
 
     @property
     def _size(self) -> NDArray[np.float64]:

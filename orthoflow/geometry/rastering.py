@@ -173,6 +173,7 @@ def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[n
     The difference between the two origins is computed in float64, so that no precision is lost with
     survey coordinates of 10^6 m.
     """
+    frame.require_plane("a linear transform onto the raster")
     axes = np.vstack([frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world])
     # Adding 0.0 converts -0.0, which has different bits, to 0.0.
     return np.column_stack([axes, axes @ (origin - frame.origin_world) + 0.0])

@@ -104,7 +104,13 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
     from_corner = cloud.origin - frame.origin_world
     offsets = np.column_stack([cloud.x[points], cloud.y[points], cloud.z[points]])
     world = offsets.astype(np.float64) + from_corner
-    u, v, depth = world @ frame.u_world, world @ frame.v_world, world @ frame.normal_world
+    if frame.bend is None:
+        u, v, depth = world @ frame.u_world, world @ frame.v_world, world @ frame.normal_world
+        normals = frame.normal_world[None]
+    else:
+        on_wall = frame.wall_from_world(world + frame.origin_world)
+        u, v, depth = frame.gsd_m * on_wall[:, 0], frame.gsd_m * on_wall[:, 1], on_wall[:, 2]
+        normals = frame.axes_at(on_wall[:, :2])[:, 2]
     size = frame.gsd_m * np.array([frame.width, frame.height])
     inside = (u >= 0) & (u < size[0]) & (v >= 0) & (v < size[1])
     inside &= (depth >= -slab.behind_m) & (depth <= slab.front_m)
@@ -113,7 +119,11 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
     scan = cloud.scan[points[inside]].astype(np.int64)
     rays = (cloud.stations - frame.origin_world)[scan] - world[inside]
     range_m = np.maximum(np.linalg.norm(rays, axis=1), 1e-3)
-    cosine = np.clip(np.abs(rays @ frame.normal_world) / range_m, _COSINE_LEAST, 1.0)
+    if frame.bend is None:
+        lifts = rays @ frame.normal_world
+    else:
+        lifts = np.einsum("ij,ij->i", rays, normals[inside])
+    cosine = np.clip(np.abs(lifts) / range_m, _COSINE_LEAST, 1.0)
     per_row = int(np.ceil(size[0] / _PLACE_M)) + 1
     place = np.floor(v[inside] / _PLACE_M) * per_row + np.floor(u[inside] / _PLACE_M)
     return _Looks(points[inside], place.astype(np.int64), scan, range_m, cosine)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import SurfaceMask, Wall
+from orthoflow_plugins.raster.curved import limits_m
 from orthoflow_plugins.raster.extents import SampledPoints, points_in
 
 Cause = Literal["behind", "before", "hidden", "sparse", "unseen"]
@@ -99,8 +100,9 @@ def emptiness_of(
     points = sight.points
     tiles = _tiles(wall, points)
     n_void = tiles.n_void
-    before_m = min(_BEFORE_MOST_M, free_m)
-    reach = Slab(frame=tiles.frame, front_m=before_m, behind_m=_BEHIND_MOST_M)
+    behind_m, before_m = limits_m(wall.frame)
+    before_m = min(_BEFORE_MOST_M, free_m, before_m)
+    reach = Slab(frame=tiles.frame, front_m=before_m, behind_m=min(_BEHIND_MOST_M, behind_m))
     around = points_in(points, reach, threads=threads)
     is_behind, is_before = around.depth_m < -slab.behind_m, around.depth_m > slab.front_m
     n_behind, n_before = (
@@ -178,12 +180,12 @@ def _blocked(
     asked = tiles[::every]
     places = np.column_stack([asked % frame.width, asked // frame.width]).astype(np.float64) + 0.5
     starts = frame.world_from_wall(places) - sight.points.origin
-    room = sight.room
+    room, normals = sight.room, frame.axes_at(places)[:, 2]
     is_blocked = np.ones(len(asked), dtype=np.bool_)
     for station in np.unique(stations, axis=0):
         rays = station - sight.points.origin - starts
         lengths_m = np.linalg.norm(rays, axis=1)
-        is_met = rays @ frame.normal_world <= 0.0
+        is_met = np.einsum("ij,ij->i", rays, normals) <= 0.0
         rays /= np.maximum(lengths_m, 1e-9)[:, None]
         # Follow rays only inside the voxel grid, because a station may be far from all points or
         # (wrongly) at the origin of a survey grid.

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
+from orthoflow.geometry.unrolling import unrolled
 from orthoflow.products import Planes, PointCloud
 from orthoflow_plugins.raster.selection import area_m2, frame_of
 
@@ -149,6 +150,12 @@ def points_in(points: SampledPoints, slab: Slab, *, threads: int) -> PointsInsid
     """Find the points that are inside the raster and the buffer of a wall."""
     from orthoflow.geometry.rastering import entries_inside, wall_from_offset
 
+    if slab.frame.bend is not None:
+        near = unrolled(points, slab)
+        points = SampledPoints(
+            origin=near.origin, x=near.x, y=near.y, z=near.z, n_represented=points.n_represented
+        )
+        slab = replace(slab, frame=slab.frame.flat)
     found = [
         (entries.points, entries.cells) for entries in entries_inside(points, slab, threads=threads)
     ]
@@ -181,10 +188,8 @@ class Extent:
         """Extend a raster on each side by whole cells, so that other cells keep their positions."""
         # The tolerance is 1e-6 cells, as in `frame_over`.
         left, right, top, bottom = (int(grown / frame.gsd_m + 1e-6) for grown in self.growth_m)
-        corner = np.array([[-left, -top]], dtype=np.float64)
-        return replace(
-            frame,
-            origin_world=frame.world_from_wall(corner)[0],
+        return frame.part(
+            np.array([-left, -top], dtype=np.float64),
             width=frame.width + left + right,
             height=frame.height + top + bottom,
         )

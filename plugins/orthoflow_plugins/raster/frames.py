@@ -69,13 +69,8 @@ def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> WallFrame | None:
     width, height = np.minimum(last, [frame.width, frame.height]) - first
     if width <= 0 or height <= 0:
         return None
-    return replace(
-        frame,
-        origin_world=frame.world_from_wall(first[None].astype(np.float64))[0],
-        width=int(width),
-        height=int(height),
-        left_m=frame.left_m + float(first[0]) * frame.gsd_m,
-    )
+    part = frame.part(first.astype(np.float64), width=int(width), height=int(height))
+    return replace(part, left_m=frame.left_m + float(first[0]) * frame.gsd_m)
 
 
 def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:

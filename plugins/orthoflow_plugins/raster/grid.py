@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from typing import ClassVar, Final
@@ -13,10 +14,11 @@ from numpy.typing import DTypeLike, NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import IntensitySource, Planes, PointCloud, Wall, Walls
+from orthoflow.products import IntensitySource, Planes, PointCloud, Surfaces, Wall, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
+from orthoflow_plugins.raster.curved import CurvedWalls, flattened
 from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
 from orthoflow_plugins.raster.extents import (
     Extent,
@@ -40,11 +42,10 @@ from orthoflow_plugins.raster.reporting import (
     warn_of_covered,
 )
 from orthoflow_plugins.raster.selection import (
-    chosen_planes,
+    chosen_walls,
     covered_planes,
-    distance_m,
     frame_of,
-    nearest_plane,
+    nearest_wall,
 )
 from orthoflow_plugins.raster.walls import rastered_wall, require_memory
 
@@ -85,6 +86,9 @@ class RasterGrid(Method):
     at the positions of their points. Wider gaps, such as windows, remain void. In cells with up to
     16 points, mean intensities and colours are extrapolated along their gradients from the mean
     position of the points to the centre of the cell.
+
+    Cylinders are unrolled: one axis of their rasters is the length of the arc, and depths are
+    distances from the cylinder.
     """
 
     id: ClassVar[str] = "raster.grid"
@@ -122,10 +126,11 @@ class RasterGrid(Method):
     Params = RasterParams
 
     class In(Ports):
-        """The cloud and its planes."""
+        """The cloud, its planes, and its curved surfaces."""
 
         cloud: PointCloud
         planes: Planes
+        surfaces: Surfaces | None = None
 
     class Out(Ports):
         """One raster per wall."""
@@ -139,8 +144,9 @@ class RasterGrid(Method):
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
         points = sampled(cloud)
-        extent_of = _extents(points, planes, cloud.stations, params, ctx)
-        frames, covered = _frames(planes, params, extent_of, ctx)
+        curved = CurvedWalls(inputs.surfaces, planes, params, ctx)
+        extent_of = _extents(points, planes, curved, cloud.stations, params, ctx)
+        frames, covered = _frames(planes, curved, params, extent_of, ctx)
         slabs = {
             index: Slab(
                 frame=frame,
@@ -159,17 +165,18 @@ class RasterGrid(Method):
         if params.balance_intensity:
             cloud = balanced(cloud, list(slabs.values()), ctx)
         for k, (index, slab) in enumerate(slabs.items()):
-            ctx.progress(k / len(slabs), planes.names[index])
+            name, is_curved = slab.frame.name, slab.frame.bend is not None
+            ctx.progress(k / len(slabs), name)
             wall = rastered_wall(
-                cloud,
-                slab,
+                *flattened(cloud, slab),
                 params,
-                planes=planes,
                 index=index,
+                name=name,
                 allocate=partial(_allocated, ctx, k),
                 threads=ctx.cores,
             )
-            free_m = free_before_m(planes, index, cloud.stations)
+            wall = replace(wall, frame=slab.frame)
+            free_m = math.inf if is_curved else free_before_m(planes, index, cloud.stations)
             empty.append(emptiness_of(wall, slab, sight, free_m=free_m, threads=ctx.cores))
             if params.crop is not None and np.ndim(params.crop) == 2:
                 blank_outside(wall, params.crop)
@@ -207,6 +214,7 @@ class RasterGrid(Method):
 def _extents(
     points: SampledPoints,
     planes: Planes,
+    curved: CurvedWalls,
     stations: NDArray[np.float64] | None,
     params: RasterParams,
     ctx: StepContext,
@@ -217,11 +225,13 @@ def _extents(
         behind_m=params.buffer_m if params.buffer_behind_m is None else params.buffer_behind_m,
         least_m=3.0 * planes.tolerance_m,
     )
-    if params.rectangle == "points" and reach.is_set:
-        return lambda _: reach.as_set
 
     @cache
     def extent(index: int) -> Extent:
+        if index in curved.frames:
+            return curved.extent(index, points, reach, threads=ctx.cores)
+        if params.rectangle == "points" and reach.is_set:
+            return reach.as_set
         found = extent_of(points, planes, index, reach, stations=stations, threads=ctx.cores)
         return (
             found if params.rectangle == "room" else replace(found, growth_m=(0.0,) * 4, cut_m={})
@@ -231,9 +241,13 @@ def _extents(
 
 
 def _frames(
-    planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
+    planes: Planes,
+    curved: CurvedWalls,
+    params: RasterParams,
+    extent_of: ExtentOf,
+    ctx: StepContext,
 ) -> tuple[dict[int, WallFrame], dict[int, int]]:
-    """Return the frames of the selected planes by index, and the planes that these walls cover.
+    """Return the frames of selected planes and surfaces by index, and the planes that they cover.
 
     Raises:
         MethodError: a selected plane does not exist, or no wall contains the requested part.
@@ -242,18 +256,27 @@ def _frames(
     def buffer_m(index: int) -> tuple[float, float]:
         return extent_of(index).front_m, extent_of(index).behind_m
 
-    chosen = chosen_planes(planes, params, buffer_m)
+    every = chosen_walls(planes, params, buffer_m, curved.frames)
+    chosen = [index for index in every if index < len(planes)]
+    curved_frames = {index: curved.frames[index] for index in every if index >= len(planes)}
     covered = covered_planes(planes, params, buffer_m, chosen)
-    warn_of_covered(ctx, planes.names, covered)
+    if params.skip_covered and not (params.ranks or params.near):
+        for index in curved_frames:
+            within = [k for k in chosen if curved.covers(k, buffer_m(index), index)]
+            covered |= dict.fromkeys(within, index)
+            chosen = [k for k in chosen if k not in within]
+    names = dict(enumerate(planes.names)) | {k: one.name for k, one in curved_frames.items()}
+    warn_of_covered(ctx, names, covered)
     frames = {
         index: frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m)
         for index in chosen
     }
-    if params.crs is not None:
+    if params.crs is not None and frames:
         reach_m = max(max(buffer_m(index)) for index in frames)
         frames = mapped(frames, planes, params.crs, reach_m=reach_m, ctx=ctx)
     frames = {index: extent_of(index).widened(frame) for index, frame in frames.items()}
-    report_doubts(list(frames), planes, params, extent_of, ctx)
+    frames |= curved_frames
+    report_doubts(frames, planes, params, extent_of, ctx)
     if params.crop is None:
         return frames, covered
     parts = {index: cropped(frame, params.crop) for index, frame in frames.items()}
@@ -262,7 +285,7 @@ def _frames(
         frame = next(iter(frames.values()))
         raise MethodError(
             f"crop {list(params.crop)} is outside every wall: the raster of "
-            f"{planes.names[next(iter(frames))]} is {frame.width * frame.gsd_m:.3f} m wide and "
+            f"{frame.name} is {frame.width * frame.gsd_m:.3f} m wide and "
             f"{frame.height * frame.gsd_m:.3f} m high"
         )
     if len(frames) > 1:
@@ -271,19 +294,22 @@ def _frames(
 
 
 def report_doubts(
-    chosen: list[int], planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
+    frames: Mapping[int, WallFrame],
+    planes: Planes,
+    params: RasterParams,
+    extent_of: ExtentOf,
+    ctx: StepContext,
 ) -> None:
     """Report walls that oblique planes cut off, and points of `near` far from all walls."""
-    for index in chosen:
+    for index, frame in frames.items():
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - params.margin_m
             if cut_m >= _CUT_WORTH_WORDS_M:
-                ctx.report(OBLIQUE, subject=planes.names[index], side=side, cut_m=cut_m)
+                ctx.report(OBLIQUE, subject=frame.name, side=side, cut_m=cut_m)
     for place in params.near:
-        index = nearest_plane(planes, chosen, np.array(place))
-        apart_m = distance_m(planes, index, np.array(place))
+        index, apart_m = nearest_wall(planes, list(frames), frames, np.array(place))
         if apart_m > _FAR_M:
-            name = planes.names[index]
+            name = frames[index].name
             ctx.report(NEAR_FAR, subject=name, place=str(list(place)), apart_m=apart_m)
 
 

@@ -99,10 +99,10 @@ class RasterParams(MethodParams):
     )
     ranks: tuple[Annotated[int, Field(ge=0)], ...] = Field(
         default=(),
-        description="Rasterise exactly these planes, by index in planes.json, where 0 has the "
-        "most points. Indices change with the scan, the detector and its tolerances; near "
-        "selects planes by position. If empty, planes are selected by constraint, "
-        "min_area_m2, n_walls_max and skip_covered.",
+        description="Rasterise just these planes, by index in planes.json, where 0 has the most "
+        "points; curved surfaces follow the last plane. Indices change with the scan, the detector "
+        "and its tolerances; near selects walls by position. If empty, planes are selected by "
+        "constraint, min_area_m2, n_walls_max and skip_covered.",
     )
     near: tuple[Place, ...] = Field(
         default=(),

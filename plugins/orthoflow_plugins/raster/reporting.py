@@ -194,12 +194,12 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
             ctx.report(PLAIN, subject=wall.name, tone=found[0], share=found[1], **words)
 
 
-def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:
+def warn_of_covered(ctx: StepContext, names: Mapping[int, str], covered: Mapping[int, int]) -> None:
     """Report planes that are not rasterised because a larger wall contains them.
 
     Args:
         ctx: context of the step.
-        names: names of all planes.
+        names: names of all planes and walls.
         covered: index of each such plane, with the index of the wall that contains it.
     """
     for wall in sorted(set(covered.values())):
@@ -217,7 +217,7 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
         up: (3,) unit vector.
     """
     frame = walls[0].frame
-    omega_deg, phi_deg = omega_phi_deg(frame.normal_world, up)
+    omega_deg, phi_deg = omega_phi_deg(frame.facing_world, up)
     ctx.metric("omega_deg", omega_deg, "deg")
     ctx.metric("phi_deg", phi_deg, "deg")
     ctx.metric("area_m2", frame.height * frame.width * frame.gsd_m**2, "m2")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -25,19 +26,33 @@ _COVERED_SHARE: Final = 0.8
 
 # Function that returns the buffers in front of and behind a plane, given its index.
 BufferOf = Callable[[int], tuple[float, float]]
+NO_SURFACES: Final[Mapping[int, WallFrame]] = MappingProxyType({})
 
 
-def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> list[int]:
+def chosen_walls(
+    planes: Planes,
+    params: RasterParams,
+    buffer_m: BufferOf,
+    curved: Mapping[int, WallFrame] = NO_SURFACES,
+) -> list[int]:
     """Return the indices of the planes to rasterise, those with the most points first.
+
+    Args:
+        planes: all planes.
+        params: the criteria.
+        buffer_m: function that returns the buffers of walls.
+        curved: rasters of curved surfaces, by index after that of the last plane. They follow the
+            planes, all of them unless only those nearest to points are requested.
 
     Raises:
         MethodError: there are no planes, none has the requested orientation, or a requested rank
             does not exist.
     """
-    if len(planes) == 0:
+    if len(planes) == 0 and not curved:
         raise MethodError("no plane was found in the cloud, but at least one is needed for a wall")
     if params.ranks:
-        missing = sorted(rank for rank in params.ranks if rank >= len(planes))
+        indices = [*range(len(planes)), *curved]
+        missing = sorted(rank for rank in params.ranks if rank not in indices)
         if missing:
             raise MethodError(
                 f"ranks contains {missing[0]}, but only planes 0 to {len(planes) - 1} were "
@@ -45,28 +60,30 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
             )
         return sorted(set(params.ranks))
     fitting = [k for k in range(len(planes)) if _fits(planes, k, params.constraint)]
-    if not fitting:
+    if not fitting and not curved:
         raise MethodError(
             f"none of the {len(planes)} planes is {params.constraint} within {_LEAN_DEG:g} deg: "
             "set constraint to any, or detect other planes"
         )
     if params.near:
-        return sorted({nearest_plane(planes, fitting, np.array(place)) for place in params.near})
+        among = [*fitting, *curved]
+        places = [np.array(place) for place in params.near]
+        return sorted({nearest_wall(planes, among, curved, place)[0] for place in places})
     large = [k for k in fitting if area_m2(planes.corners[k]) >= params.min_area_m2]
     # The minimum area does not apply to the plane with the most points, so that a scan of a small
     # object has a wall.
     chosen: list[int] = []
-    for index in sorted({fitting[0], *large}):
+    for index in sorted({*fitting[:1], *large}):
         if len(chosen) == params.n_walls_max:
             break
         if params.skip_covered and any(_covers(planes, wall, index, buffer_m) for wall in chosen):
             continue
         chosen.append(index)
     if not params.skip_covered:
-        return chosen
+        return [*chosen, *curved]
     # A wall that was selected later, because it has fewer points, may be larger and cover an
     # earlier one.
-    return [
+    kept = [
         index
         for index in chosen
         if index == chosen[0]
@@ -75,6 +92,7 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
             for wall in chosen
         )
     ]
+    return [*kept, *curved]
 
 
 def covered_planes(
@@ -86,7 +104,7 @@ def covered_planes(
         planes: all planes, those with the most points first.
         params: criteria for the selection.
         buffer_m: function that returns the buffers of walls.
-        chosen: result of `chosen_planes`.
+        chosen: indices of the planes that become walls.
     """
     if not params.skip_covered or params.ranks or params.near:
         return {}
@@ -106,9 +124,28 @@ def covered_planes(
     return found
 
 
-def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
-    """Return the plane nearest to a point (3,), or of several, the one with most points."""
-    return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))
+def nearest_wall(
+    planes: Planes,
+    among: Sequence[int],
+    curved: Mapping[int, WallFrame],
+    place: NDArray[np.float64],
+) -> tuple[int, float]:
+    """Return the wall nearest to a point (3,) and its distance; if tied, the first.
+
+    Args:
+        planes: all planes.
+        among: indices of planes and of curved surfaces.
+        curved: rasters of curved surfaces, by index; others are ignored.
+        place: the point.
+    """
+    distances_m = {
+        index: distance_m(planes, index, place)
+        if index < len(planes)
+        else float(curved[index].distances_m(place[None])[0])
+        for index in among
+    }
+    nearest = min(among, key=lambda index: (round(distances_m[index], 6), index))
+    return nearest, distances_m[nearest]
 
 
 def distance_m(planes: Planes, index: int, place: NDArray[np.float64]) -> float:

@@ -14,7 +14,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
 from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
+from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.parameters import RasterParams
 
 # Bytes per cell of a finished wall.
@@ -65,8 +65,8 @@ def rastered_wall(
     slab: Slab,
     params: RasterParams,
     *,
-    planes: Planes,
     index: int,
+    name: str,
     allocate: Allocate,
     threads: int,
 ) -> Wall:
@@ -76,8 +76,8 @@ def rastered_wall(
         cloud: the points.
         slab: raster and buffer of the wall.
         params: parameters.
-        planes: all planes.
-        index: index of the wall's plane.
+        index: number of the wall.
+        name: name of the wall.
         allocate: function that creates the arrays of a large wall.
         threads: number of threads.
     """
@@ -92,17 +92,18 @@ def rastered_wall(
     whole: dict[str, NDArray[np.generic]] = {}
     for band in bands_with_reach(frame.shape, cells_most=cells_most, reach_rows=reach_rows):
         found = _rastered(cloud, slab.over(band.around), params, threads=threads)
-        for name, values in found.items():
+        for field, values in found.items():
             shape = (*frame.shape, *values.shape[1:])
             if slab.n_cells <= min(IN_MEMORY_CELLS, cells_most):
-                whole[name] = values.reshape(shape)
+                whole[field] = values.reshape(shape)
                 continue
-            if name not in whole:
-                whole[name] = allocate(name, shape, values.dtype)
+            if field not in whole:
+                whole[field] = allocate(field, shape, values.dtype)
             of_band = values.reshape(-1, width, *values.shape[1:])
-            whole[name][band.rows] = of_band[band.inner]
+            whole[field][band.rows] = of_band[band.inner]
+    # The arrays have the same types as those of the bands.
     arrays = cast("dict[str, Any]", whole)
-    return Wall(frame=frame, plane_index=index, name=planes.names[index], **arrays)
+    return Wall(frame=frame, plane_index=index, name=name, **arrays)
 
 
 def _rastered(

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.selection import (
-    chosen_planes,
+    chosen_walls,
     covered_planes,
 )
 
@@ -84,15 +84,15 @@ def test_a_plane_inside_a_walls_buffer_is_its_relief(
     other: tuple[float, float, float, float], is_covered: bool
 ) -> None:
     both = planes(MAIN, other)
-    chosen = chosen_planes(both, CHOICE, lambda _: (0.1, 0.15))
+    chosen = chosen_walls(both, CHOICE, lambda _: (0.1, 0.15))
     assert chosen == ([0] if is_covered else [0, 1])
-    assert chosen_planes(both, but(CHOICE, skip_covered=False), buffer_m) == [0, 1]
+    assert chosen_walls(both, but(CHOICE, skip_covered=False), buffer_m) == [0, 1]
 
 
 def test_covered_planes_are_named_with_the_wall_that_shows_them() -> None:
     relief, other, small = (0.08, 1.0, 3.0, 0.0), (0.0, 6.0, 3.0, 0.0), (0.1, 2.0, 1.0, 0.0)
     four = planes(MAIN, relief, other, small)
-    chosen = chosen_planes(four, CHOICE, buffer_m)
+    chosen = chosen_walls(four, CHOICE, buffer_m)
     assert chosen == [0, 2]
     assert covered_planes(four, CHOICE, buffer_m, chosen) == {1: 0, 3: 0}
     # Planes that are too small for a wall, or not requested, are not reported.
@@ -103,18 +103,18 @@ def test_covered_planes_are_named_with_the_wall_that_shows_them() -> None:
 def test_a_plane_that_a_larger_one_of_less_support_shows_is_no_wall_of_its_own() -> None:
     # The second plane is at one end of the third, which is larger and has fewer points.
     three = planes((0.0, 0.0, 3.0, -90.0), (0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0))
-    chosen = chosen_planes(three, CHOICE, buffer_m)
+    chosen = chosen_walls(three, CHOICE, buffer_m)
     assert chosen == [0, 2]
     assert covered_planes(three, CHOICE, buffer_m, chosen) == {1: 2}
     # The plane with the most points is always a wall.
     best = planes((0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0))
-    assert chosen_planes(best, CHOICE, buffer_m) == [0, 1]
+    assert chosen_walls(best, CHOICE, buffer_m) == [0, 1]
 
 
 def test_a_plane_is_not_covered_by_one_that_was_left_out_itself() -> None:
     # The third is within the buffer of the second, but not within that of the first.
     three = planes(MAIN, (0.10, 0.0, 5.0, 0.0), (0.20, 0.0, 5.0, 0.0))
-    assert chosen_planes(three, CHOICE, buffer_m) == [0, 2]
+    assert chosen_walls(three, CHOICE, buffer_m) == [0, 2]
 
 
 def test_the_wall_nearest_to_a_point_is_chosen() -> None:
@@ -129,16 +129,16 @@ def test_the_wall_nearest_to_a_point_is_chosen() -> None:
         (5.6, 1.1, 1.0): 1,  # on the extension of 1's plane, and nearer than 2
     }
     for place, expected in cases.items():
-        assert chosen_planes(three, but(CHOICE, near=(place,)), buffer_m) == [expected], place
+        assert chosen_walls(three, but(CHOICE, near=(place,)), buffer_m) == [expected], place
     both = but(CHOICE, near=((6.5, 1.2, 1.0), (2.0, 2.9, 1.0), (1.0, 2.9, 1.0)))
-    assert chosen_planes(three, both, buffer_m) == [0, 1]
+    assert chosen_walls(three, both, buffer_m) == [0, 1]
 
 
 def test_a_covered_or_small_wall_is_chosen_when_a_point_is_near_it() -> None:
     both = planes(MAIN, (0.08, 1.0, 0.2, 0.0))
-    assert chosen_planes(both, CHOICE, buffer_m) == [0]
+    assert chosen_walls(both, CHOICE, buffer_m) == [0]
     choice = but(CHOICE, near=((1.1, 2.9, 1.0),))
-    assert chosen_planes(both, choice, buffer_m) == [1]
+    assert chosen_walls(both, choice, buffer_m) == [1]
 
 
 def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
@@ -151,15 +151,15 @@ def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
         part_plane=np.array([0, 0, 1], dtype=np.int32),
     )
     place = but(CHOICE, near=((2.5, 3.1, 1.0),))
-    assert chosen_planes(ends, place, buffer_m) == [0]
-    assert chosen_planes(known, place, buffer_m) == [1]
+    assert chosen_walls(ends, place, buffer_m) == [0]
+    assert chosen_walls(known, place, buffer_m) == [1]
 
 
 def test_a_rank_that_no_plane_has_is_refused() -> None:
     two = planes(MAIN, (0.5, 0.0, 5.0, 0.0))
-    assert chosen_planes(two, but(CHOICE, ranks=(1,)), buffer_m) == [1]
+    assert chosen_walls(two, but(CHOICE, ranks=(1,)), buffer_m) == [1]
     with pytest.raises(MethodError, match=r"ranks contains 2, but only planes 0 to 1 were found"):
-        chosen_planes(two, but(CHOICE, ranks=(1, 2)), buffer_m)
+        chosen_walls(two, but(CHOICE, ranks=(1, 2)), buffer_m)
 
 
 def leaning(degrees: float) -> Planes:
@@ -186,7 +186,7 @@ def test_walls_and_floors_lean_by_ten_degrees_at_most(
 ) -> None:
     choice = but(CHOICE, constraint=constraint)
     if fits:
-        assert chosen_planes(leaning(degrees), choice, buffer_m) == [0]
+        assert chosen_walls(leaning(degrees), choice, buffer_m) == [0]
     else:
         with pytest.raises(MethodError, match=f"none of the 1 planes is {constraint}"):
-            chosen_planes(leaning(degrees), choice, buffer_m)
+            chosen_walls(leaning(degrees), choice, buffer_m)

@@ -1,0 +1,178 @@
+"""Walls on cylinders: their grids, their extents and their points, unrolled onto a plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Bend, Cylinder, WallFrame
+from orthoflow.geometry.slabs import Slab
+from orthoflow.geometry.unrolling import unrolled
+from orthoflow.products import Planes, PointCloud, Surface, Surfaces
+from orthoflow.sdk import DiagnosticSpec, StepContext
+from orthoflow_plugins.raster.extents import Extent, Reach, SampledPoints, extent_of
+from orthoflow_plugins.raster.parameters import RasterParams
+
+# Axes closer than this to the vertical are upright.
+_UPRIGHT_COSINE: Final = math.sqrt(0.5)
+# Depths reach at most this share of the radius towards the axis, where cells shrink to nothing.
+_RADIUS_SHARE: Final = 0.8
+# A plane belongs to the relief of a cylinder if at least this share of it is in its buffer.
+_COVERED_SHARE: Final = 0.8
+_PLACES: Final = 9
+CONE: Final = DiagnosticSpec(
+    code="cone-not-unrolled",
+    severity="warning",
+    text="{subject} is a cone, which is not unrolled: it has no wall",
+)
+
+
+class CurvedWalls:
+    """The curved surfaces that become walls; they are numbered after all planes."""
+
+    def __init__(
+        self, surfaces: Surfaces | None, planes: Planes, params: RasterParams, ctx: StepContext
+    ) -> None:
+        self.surfaces: dict[int, Surface] = {}
+        self.frames: dict[int, WallFrame] = {}
+        self._planes, self._params = planes, params
+        for k, surface in enumerate(surfaces.surfaces if surfaces is not None else ()):
+            index = len(planes) + k
+            if not _is_chosen(surface, index, planes.up, params):
+                continue
+            if not isinstance(surface.shape, Cylinder):
+                ctx.report(CONE, subject=surface.name)
+            elif params.ranks or params.near or len(self.frames) < params.n_walls_max:
+                self.surfaces[index] = surface
+                self.frames[index] = _frame_of(surface, surface.shape, planes.up, index, params)
+
+    def extent(self, index: int, points: SampledPoints, reach: Reach, *, threads: int) -> Extent:
+        """Determine the buffer of a wall from its relief, unrolled onto a plane."""
+        frame, surface = self.frames[index], self.surfaces[index]
+        behind_m, front_m = limits_m(frame)
+        if not reach.is_set:
+            slab = Slab(frame=frame, front_m=min(front_m, 1.0), behind_m=min(behind_m, 1.5))
+            near = unrolled(points, slab)
+            sample = SampledPoints(
+                origin=near.origin,
+                x=near.x,
+                y=near.y,
+                z=near.z,
+                n_represented=points.n_represented,
+            )
+            flat = frame.flat
+            plane = replace(
+                self._planes,
+                normal=flat.normal_world[None],
+                offset=np.array([flat.plane.offset_m]),
+                corners=flat.corners_world()[None],
+                covariance=np.zeros((1, 4, 4)),
+                n_points=np.array([surface.n_points]),
+                rms_m=np.array([surface.rms_m]),
+                names=(frame.name,),
+                part_corners=None,
+                part_plane=None,
+                side_from=(),
+                thickness=(),
+            )
+            found = extent_of(sample, plane, 0, reach, threads=threads)
+        else:
+            found = reach.as_set
+        return Extent(front_m=min(found.front_m, front_m), behind_m=min(found.behind_m, behind_m))
+
+    def covers(self, plane: int, buffer_m: tuple[float, float], index: int) -> bool:
+        """Return whether a plane is inside the raster and the buffer of a curved wall."""
+        frame, corners = self.frames[index], self._planes.corners[plane]
+        shares = np.stack(np.meshgrid(*2 * [np.linspace(0.0, 1.0, _PLACES)]), axis=-1)
+        places = corners[0] + shares.reshape(-1, 2) @ (corners[[3, 1]] - corners[0])
+        on_wall = frame.wall_from_world(places)
+        inside = (on_wall[:, :2] >= 0.0).all(axis=1)
+        inside &= (on_wall[:, :2] <= [frame.width, frame.height]).all(axis=1)
+        inside &= (on_wall[:, 2] <= buffer_m[0]) & (on_wall[:, 2] >= -buffer_m[1])
+        facing = frame.axes_at(on_wall[:, :2])[:, 2] @ self._planes.normal[plane] > 0.0
+        return float((inside & facing).mean()) >= _COVERED_SHARE
+
+
+def limits_m(frame: WallFrame) -> tuple[float, float]:
+    """Return the largest depths behind and in front of a wall that stay away from the axis."""
+    if frame.bend is None:
+        return math.inf, math.inf
+    most_m = _RADIUS_SHARE * abs(frame.bend.radius_m)
+    return (math.inf, most_m) if frame.bend.radius_m > 0.0 else (most_m, math.inf)
+
+
+def flattened(cloud: PointCloud, slab: Slab) -> tuple[PointCloud, Slab]:
+    """Unroll the points in the slab of a curved wall, and the slab; others remain as they are."""
+    if slab.frame.bend is None:
+        return cloud, slab
+    near = unrolled(cloud, slab)
+    flat = replace(
+        cloud.selected(near.index), origin=near.origin, x=near.x, y=near.y, z=near.z, stations=None
+    )
+    return flat, replace(slab, frame=slab.frame.flat)
+
+
+def _is_chosen(surface: Surface, index: int, up: NDArray[np.float64], params: RasterParams) -> bool:
+    if params.ranks:
+        return index in params.ranks
+    is_upright = abs(float(surface.shape.axis_world @ up)) >= _UPRIGHT_COSINE
+    if params.constraint == "horizontal" or (params.constraint == "vertical" and not is_upright):
+        return False
+    if params.near or not isinstance(surface.shape, Cylinder):
+        return True
+    start_rad, end_rad = surface.arc_rad
+    length_m = surface.along_m[1] - surface.along_m[0]
+    return (end_rad - start_rad) * surface.shape.radius_m * length_m >= params.min_area_m2
+
+
+def _frame_of(
+    surface: Surface, shape: Cylinder, up: NDArray[np.float64], index: int, params: RasterParams
+) -> WallFrame:
+    """Return the grid over a cylinder's points, widened on all sides.
+
+    Where the axis is upright, it runs down the image, as a person in front of it sees it. A vault
+    is shown with its axis to the right, as if the walls below it continued upwards: its springing
+    lines are the upper and lower edges.
+    """
+    axis, radius_m, gsd_m = shape.axis_world, shape.radius_m, params.gsd_m
+    is_upright = abs(float(axis @ up)) >= _UPRIGHT_COSINE
+    is_upwards = float(axis @ up) > 0.0
+    start_rad, end_rad = surface.arc_rad
+    margin_rad = min(params.margin_m / radius_m, max(0.0, 0.5 * (math.tau - (end_rad - start_rad))))
+    start_rad, end_rad = start_rad - margin_rad, end_rad + margin_rad
+    low_m, high_m = surface.along_m[0] - params.margin_m, surface.along_m[1] + params.margin_m
+    # Down for towers, to the right for vaults.
+    straight = (-axis if is_upwards else axis) if is_upright else axis
+    first_m = high_m if float(straight @ axis) < 0.0 else low_m
+    # Angles about the axis decrease along the arc if a surface is seen from inside and the axis of
+    # an upright one points upwards. Seen from outside, or with the axis downwards, they increase.
+    is_from_end = shape.is_concave == (float(straight @ axis) < 0.0 or not is_upright)
+    angle = end_rad if is_from_end else start_rad
+    beside = np.cross(axis, surface.zero_world)
+    outwards = math.cos(angle) * surface.zero_world + math.sin(angle) * beside
+    normal = -outwards if shape.is_concave else outwards
+    u = np.cross(normal, straight) if is_upright else straight
+    arc_m, length_m = (end_rad - start_rad) * radius_m, high_m - low_m
+    # A whole turn ends with its last whole cell.
+    n_arc = min(math.ceil(arc_m / gsd_m - 1e-6), math.floor(math.tau * radius_m / gsd_m + 1e-6))
+    n_along = math.ceil(length_m / gsd_m - 1e-6)
+    east, north, top = up.tolist()
+    return WallFrame(
+        origin_world=shape.point_world + first_m * axis + radius_m * outwards,
+        u_world=u,
+        v_world=np.cross(u, normal),
+        normal_world=normal,
+        gsd_m=gsd_m,
+        width=max(1, n_arc if is_upright else n_along),
+        height=max(1, n_along if is_upright else n_arc),
+        up=(east, north, top),
+        name=f"{surface.name.rsplit(' ', 1)[0]} {index}",
+        bend=Bend(
+            along="u" if is_upright else "v",
+            radius_m=radius_m if shape.is_concave else -radius_m,
+        ),
+    )
