@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Cylinder
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.surfaces import angles_around, zero_direction
-from orthoflow.products import Planes, PointCloud, Surface, Surfaces, surface_kind
+from orthoflow.products import PointCloud, Surface, Surfaces, surface_kind
 from tests import samples
 from tests.raster_scenes import UP, cloud_of
 
@@ -96,7 +96,8 @@ class Drum:
             (shape.radius_m, False),
             (shape.radius_m + side * self.height_m, True),
         ):
-            root = np.sqrt(np.maximum(b * b - a * ((across**2).sum(axis=1) - radius_m**2), -1.0))
+            with np.errstate(invalid="ignore"):
+                root = np.sqrt(b * b - a * ((across**2).sum(axis=1) - radius_m**2))
             for sign in (-1.0, 1.0):
                 with np.errstate(invalid="ignore", divide="ignore"):
                     t = (-b + sign * root) / a
@@ -215,8 +216,3 @@ def camera(
         cy=0.37 * width,
         distortion=np.array([-0.08, 0.03, 5e-4, -4e-4, 0.0]),
     )
-
-
-def planes() -> Planes:
-    """No plane at all."""
-    return NO_PLANES

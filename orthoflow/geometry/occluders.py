@@ -20,6 +20,7 @@ from orthoflow.geometry.depth_buffer_kernels import (
 )
 from orthoflow.geometry.slabs import OffsetPoints, Offsets, Slab, read_only
 from orthoflow.geometry.threads import even_parts, in_threads
+from orthoflow.geometry.unrolling import box_around
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24
@@ -106,6 +107,9 @@ def occluders_before(
     """
     places = [camera.centre_world for camera in cameras]
     for slab in slabs:
+        if slab.frame.bend is not None:
+            places += [*box_around(slab)]
+            continue
         corners = slab.frame.corners_world()
         places += [*(corners + slab.front_m * slab.frame.normal_world), *corners]
     between = np.array(places) - cloud.origin

@@ -48,7 +48,7 @@ def unrolled(points: OffsetPoints, slab: Slab) -> UnrolledPoints:
         slab: slab around a cylinder, whose depths must not reach the axis.
     """
     frame, flat = slab.frame, slab.frame.flat
-    low, high = _box(slab)
+    low, high = box_around(slab)
     indices, offsets = [np.empty(0, dtype=np.int64)], [np.empty((0, 3), dtype=np.float32)]
     for first in range(0, points.x.size, _CHUNK):
         axes = [
@@ -75,7 +75,7 @@ def unrolled(points: OffsetPoints, slab: Slab) -> UnrolledPoints:
     )
 
 
-def _box(slab: Slab) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def box_around(slab: Slab) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lower and upper corners of a box around a curved slab."""
     frame = slab.frame
     columns, rows = (

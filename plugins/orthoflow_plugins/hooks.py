@@ -107,8 +107,8 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="raster",
-            summary="bin the cloud into a raster on each plane",
-            inputs=_ports("cloud planes"),
+            summary="bin the cloud into a raster on each plane and unrolled cylinder",
+            inputs=_ports("cloud planes surfaces"),
             outputs=_ports("walls"),
         ),
         KindSpec(

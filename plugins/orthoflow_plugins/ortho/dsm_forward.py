@@ -107,6 +107,7 @@ def _layer(
     from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch, throw_pixels
     from orthoflow_plugins.ortho.surfaces import cells_seen, is_before, view_of
 
+    surface.frame.require_plane("ortho.dsm-forward")
     view = view_of(photo.viewer, surface, params)
     if not is_before(view, surface):
         return None

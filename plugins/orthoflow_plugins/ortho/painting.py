@@ -237,22 +237,39 @@ def footprint_of(
     around = around[: len(painted), : painted.shape[1]]
     depth = cv2.sumElems(cv2.copyTo(around, painted))[0] / n_cells
     row, column = row + first_row, column + first_column
-    centre, beside, below = (
-        _project(view.camera, (column + a + 0.5) * view.gsd_m, (row + b + 0.5) * view.gsd_m, depth)
-        for a, b in ((0.0, 0.0), (_BASE_CELLS, 0.0), (0.0, _BASE_CELLS))
-    )
+    base = _BASE_CELLS
+    steps = ((0.0, 0.0), (base, 0.0), (0.0, base))
+    places = surface.local([(column + a + 0.5, row + b + 0.5) for a, b in steps], depth)
+    centre, beside, below = (_project(view.camera, *place) for place in places)
     across, down = (
         math.hypot(beside[k] - centre[k], below[k] - centre[k]) / _BASE_CELLS for k in range(2)
     )
-    aside = view.gsd_m * math.hypot(view.column - column, view.row - row)
+    aside, lift = (
+        view.gsd_m * math.hypot(view.column - column, view.row - row),
+        view.height_m - depth,
+    )
+    if surface.frame.bend is not None:
+        aside, lift = _aside_and_lift(view, surface, places, depth)
     return CellFootprint(
         # A neighbour of a coloured cell may be outside the lens model, so its position may be NaN.
         pixels_across=across if math.isfinite(across) else 1.0,
         pixels_down=down if math.isfinite(down) else 1.0,
         photo_gsd_m=centre[2] / math.sqrt(view.camera[12] * view.camera[13]),
-        obliquity_deg=math.degrees(math.atan2(aside, view.height_m - depth)),
+        obliquity_deg=math.degrees(math.atan2(aside, lift)),
         n_cells=n_cells,
     )
+
+
+def _aside_and_lift(
+    view: WallView, surface: Surface, places: list[tuple[float, ...]], depth: float
+) -> tuple[float, float]:
+    """Return distances of the camera along a cylinder and above it, from the first of places."""
+    here, across, down = np.array(places)
+    eye = (view.column + 0.5) * view.gsd_m, (view.row + 0.5) * view.gsd_m, view.height_m
+    normal = np.cross(across - here, down - here)
+    ray, normal = np.array(eye) - here, normal / np.linalg.norm(normal)
+    lift = float(ray @ normal)
+    return float(np.linalg.norm(ray - lift * normal)), lift
 
 
 def sample(

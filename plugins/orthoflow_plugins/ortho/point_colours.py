@@ -29,6 +29,7 @@ from orthoflow.geometry.rastering import (
 )
 from orthoflow.geometry.robust import least_absolute
 from orthoflow.geometry.slabs import Slab
+from orthoflow.geometry.unrolling import unrolled
 from orthoflow.products import PointCloud
 from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 
@@ -90,6 +91,19 @@ class CellColours:
     distance_cells: NDArray[np.float32]
     places: NDArray[np.float32]
     depth_m: NDArray[np.float32]
+
+
+def on_plane(painters: Painters, slab: Slab) -> tuple[Painters, Slab]:
+    """Unroll the points of a curved wall and its slab; a plane remains as it is."""
+    if slab.frame.bend is None:
+        return painters, slab
+    near = unrolled(painters.cloud, slab)
+    cloud = replace(
+        painters.cloud.selected(near.index), origin=near.origin, x=near.x, y=near.y, z=near.z
+    )
+    left_out = None if painters.is_left_out is None else painters.is_left_out[near.index]
+    flat = Painters(cloud=cloud, values=painters.values[near.index], is_left_out=left_out)
+    return flat, replace(slab, frame=slab.frame.flat)
 
 
 def colours_of(
@@ -164,7 +178,7 @@ def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> ND
     if scans is None or n_scans < 2:
         return np.zeros((n_scans, 3))
     pairs, apart = [np.empty((0, 2), dtype=np.int64)], [np.empty((0, 3))]
-    for slab in slabs:
+    for own, slab in (on_plane(painters, slab) for slab in slabs):
         frame, scale = slab.frame, max(1.0, _PLACE_M / slab.frame.gsd_m)
         width, height = (math.ceil(size / scale) for size in (frame.width, frame.height))
         places = replace(frame, gsd_m=scale * frame.gsd_m, width=width, height=height)
@@ -174,12 +188,13 @@ def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> ND
             behind_m=min(slab.behind_m, _PLACE_M),
         )
         sums = np.zeros((near.n_cells * n_scans, 5))
+        own_scans = scans if own is painters else np.asarray(own.cloud.scan)
         for entries in entries_inside(
-            painters.cloud, near, threads=threads, is_left_out=painters.is_left_out
+            own.cloud, near, threads=threads, is_left_out=own.is_left_out
         ):
-            values = painters.values[entries.points]
+            values = own.values[entries.points]
             is_useless = (values.min(axis=1) < _DARKEST) | (values.max(axis=1) > _BRIGHTEST)
-            key = entries.cells.astype(np.int64) * n_scans + scans[entries.points]
+            key = entries.cells.astype(np.int64) * n_scans + own_scans[entries.points]
             shades = np.column_stack([light[values], is_useless, np.ones(len(values))])
             for channel in range(5):
                 sums[:, channel] += np.bincount(key, shades[:, channel], len(sums))

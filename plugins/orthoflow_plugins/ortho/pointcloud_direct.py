@@ -118,7 +118,7 @@ class PointcloudDirect(Method):
 
     def run(self, inputs: In, params: DirectParams, ctx: StepContext) -> Out:
         """Project the cloud onto each wall, then fill its gaps."""
-        from orthoflow_plugins.ortho.point_colours import colours_of
+        from orthoflow_plugins.ortho.point_colours import colours_of, on_plane
 
         inputs.cloud.require_points(3)
         painters = _painters(inputs.cloud, params, ctx)
@@ -143,9 +143,12 @@ class PointcloudDirect(Method):
                 quality=np.asarray(new("quality", shape, np.float32), np.float32),
                 filled=filled,
             )
+            started = ctx.clock_s()
+            own, slab = on_plane(painters, slabs[k])
+            seconds[0] += ctx.clock_s() - started
             for band in bands_with_reach(shape, cells_most=BAND_CELLS, reach_rows=reach):
                 started = ctx.clock_s()
-                found = colours_of(painters, slabs[k].over(band.around), params, threads=ctx.cores)
+                found = colours_of(own, slab.over(band.around), params, threads=ctx.cores)
                 projected = ctx.clock_s()
                 _fill(found, layer, band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)

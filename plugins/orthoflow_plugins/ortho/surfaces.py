@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import Wall, Walls
 from orthoflow.sdk import StepContext
+from orthoflow_plugins.ortho.curved_kernels import look_at_curved_cells
 from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.visibility_kernels import (
     BLOCK_CELLS,
@@ -57,6 +59,18 @@ class Surface:
     relief: Relief
     front_m: float
     tolerance_m: float
+
+    def local(
+        self, places: Sequence[tuple[float, float]], depth_m: float
+    ) -> list[tuple[float, ...]]:
+        """Return positions (u, v, n) in the axes of a `WallView` of (column, row) at a depth."""
+        frame = self.frame
+        axes = np.array([frame.u_world, frame.v_world, frame.normal_world])
+        if frame.bend is None:
+            return [(u * frame.gsd_m, v * frame.gsd_m, depth_m) for u, v in places]
+        near = replace(frame, origin_world=np.zeros(3))
+        points = near.world_from_wall(np.array(places), depth_m) @ axes.T
+        return [tuple(point) for point in points.tolist()]
 
 
 def surfaces_of(walls: Walls, ctx: StepContext, *, hides: bool = True) -> list[Surface]:
@@ -103,6 +117,8 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
         tolerance_m=float(surface.tolerance_m),
         cosine_least=math.cos(math.radians(params.incidence_max_deg)),
         border_px=max(1.0, _BORDER_SHARE * min(camera.width, camera.height)),
+        radius_m=0.0 if frame.bend is None else frame.bend.radius_m,
+        is_along_u=frame.bend is not None and frame.bend.along == "u",
     )
 
 
@@ -113,13 +129,15 @@ def cells_seen(
     size = (rows.stop - rows.start, columns.stop - columns.start)
     u, v, quality = np.empty((3, *size), dtype=np.float32)
     visible = TileVisibility(u=u, v=v, mask=np.empty(size, dtype=np.uint8), quality=quality)
-    look_at_cells(view, relief, buffer, visible, rows.start, columns.start)
+    look = look_at_cells if view.radius_m == 0.0 else look_at_curved_cells
+    look(view, relief, buffer, visible, rows.start, columns.start)
     return visible
 
 
 def is_before(view: WallView, surface: Surface) -> bool:
     """Return whether a camera is in front of any part of a wall."""
-    return view.height_m > float(surface.relief.bottoms.min())
+    # The cells of a cylinder face different directions.
+    return view.radius_m != 0.0 or view.height_m > float(surface.relief.bottoms.min())
 
 
 def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory) -> Relief:

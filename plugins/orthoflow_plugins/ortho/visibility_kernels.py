@@ -42,6 +42,9 @@ class WallView(NamedTuple):
         tolerance_m: minimum height above a ray at which the surface blocks that ray.
         cosine_least: smallest cosine of the angle of incidence of visible cells.
         border_px: width of the strip along the image border in which quality decreases to 0.
+        radius_m: radius of a cylinder, as in `Bend`; 0 for a plane. The axes are then those at the
+            top-left corner of its raster.
+        is_along_u: whether rows of a cylinder's raster follow the arc.
     """
 
     camera: NDArray[np.float64]
@@ -53,6 +56,8 @@ class WallView(NamedTuple):
     tolerance_m: float
     cosine_least: float
     border_px: float
+    radius_m: float = 0.0
+    is_along_u: bool = False
 
 
 class Relief(NamedTuple):

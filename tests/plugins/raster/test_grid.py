@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthoflow_plugins.raster import grid
 from orthoflow_plugins.raster.extents import Extent
 from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.raster.selection import frame_of
 
 from orthoflow.errors import MethodError, OrthoflowError
 from orthoflow.products import PointCloud, SurfaceMask, Wall
@@ -216,7 +217,9 @@ def test_what_an_adjoining_plane_cuts_off_is_warned_of_from_5_cm(
     extent = Extent(front_m=0.1, behind_m=0.1, cut_m={"left": askew_m})
     # A margin takes 2 cm of this.
     params = RasterGrid.Params(margin_m=0.02)
-    grid.report_doubts([0], known.planes(), params, lambda _: extent, ctx)
+    planes = known.planes()
+    frames = {0: frame_of(planes, 0, gsd_m=0.01, margin_m=0.02)}
+    grid.report_doubts(frames, planes, params, lambda _: extent, ctx)
     assert [one.values["cut_m"] for one in ctx.diagnostics] == [pytest.approx(0.051)] * n_warnings
 
 

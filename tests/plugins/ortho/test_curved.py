@@ -1,0 +1,98 @@
+"""Photos and points projected onto unrolled cylinders: colours, visibility and quality."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.dsm_forward import DsmForward
+from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+from orthoflow_plugins.raster.grid import RasterGrid
+
+from orthoflow.errors import OrthoflowError
+from orthoflow.products import LayerMask
+from tests import curved_scenes, ortho_scenes
+from tests.curved_scenes import Drum
+from tests.method_runs import run
+from tests.raster_scenes import context, numbers
+
+GSD_M = 0.01
+BAND: dict[str, Any] = {"band_m": (0.2, 0.5), "height_m": 0.15}
+# The drum, and cameras: place along the arc in degrees, along the axis, and distance.
+SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
+    "vault": (curved_scenes.vault(length_m=2.0, **BAND), [(0.0, -0.6, 2.5), (30.0, 0.7, 2.4)]),
+    "tower": (curved_scenes.tower(**BAND), [(0.0, -0.6, 2.5), (60.0, 0.5, 1.6)]),
+    "apse": (curved_scenes.tower(is_concave=True, **BAND), [(100.0, 0.3, 1.5)]),
+}
+
+
+def projected(name: str, folder: Path, method: Any = DsmBackward) -> tuple[Any, ...]:
+    """Layers of the photos of a scene, the drum, its cameras, its wall, and the metrics."""
+    drum, poses = SCENES[name]
+    cloud = drum.cloud(0.6 * GSD_M)
+    found = {"cloud": cloud, "planes": curved_scenes.NO_PLANES, "surfaces": drum.surfaces()}
+    walls = run(RasterGrid, context(folder), found, gsd_m=GSD_M).walls
+    cameras = [curved_scenes.camera(drum, *pose, width=800) for pose in poses]
+    inputs = {"walls": walls, "cloud": cloud}
+    if method is not PointcloudDirect:
+        inputs["photos"] = ortho_scenes.photos(*map(drum.rendered, cameras))
+        inputs["cameras"] = ortho_scenes.cameras(*cameras)
+    ctx = context(folder)
+    layers = run(method, ctx, inputs).layers.layers
+    return layers, drum, cameras, walls.walls[0], numbers(ctx)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_photos_colour_what_they_see_of_a_cylinder(name: str, tmp_path: Path) -> None:
+    layers, drum, cameras, wall, metrics = projected(name, tmp_path)
+    frame = wall.frame
+    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
+    cells = np.column_stack([columns.ravel(), rows.ravel()])
+    places = drum.places(frame.world_from_wall(cells))
+    points, grey = drum.points(*places.T), curved_scenes.texture(places)
+    for camera, layer in zip(cameras, layers, strict=True):
+        rays = points - camera.centre_world
+        lengths_m = np.linalg.norm(rays, axis=1)
+        met = drum.met(np.broadcast_to(camera.centre_world, rays.shape), rays)
+        pixels = camera.project(points)[:, :2]
+        is_seen = (met > 1.0 - GSD_M / lengths_m) & camera.sees(pixels)
+        cosines = -np.einsum("ij,ij->i", rays, frame.axes_at(cells)[:, 2]) / lengths_m
+        mask = layer.mask.ravel()
+        is_painted = mask == LayerMask.PAINTED
+        assert (is_painted & ~is_seen).mean() < 5e-4
+        # Cells beside hidden ones are left out.
+        assert (is_seen & (cosines > 0.3) & ~is_painted).mean() < 0.035
+        assert (is_painted & is_seen).mean() > 0.9 * (is_seen & (cosines > 0.3)).mean() > 0.05
+        errors = layer.rgb.reshape(-1, 3)[:, 0] / 255.0 - grey
+        assert np.sqrt((errors[is_painted & is_seen] ** 2).mean()) < 0.13
+        # Quality: pixels per cell, by the distances of the cells' corners in the photo.
+        some = np.flatnonzero(is_painted)[::50]
+        depths = wall.depth_m.ravel()[some].astype(np.float64)
+        here, right, below = (
+            camera.project(frame.world_from_wall(cells[some] + np.array(step), depths))[:, :2]
+            for step in ((0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3))
+        )
+        (a, b), (c, d) = (right - here).T, (below - here).T
+        inside = np.minimum(here, [camera.width, camera.height] - here).min(axis=1)
+        rim = np.minimum(inside / (0.05 * camera.height), 1.0)
+        ratio = layer.quality.ravel()[some] / (np.abs(a * d - b * c) * 1e6 * rim)
+        assert 0.85 < np.percentile(ratio, 1) < np.percentile(ratio, 99) < 1.05
+    assert metrics["obliquity_deg"] < 60.0
+
+
+def test_points_colour_a_cylinder(tmp_path: Path) -> None:
+    (layer,), drum, _, wall, _ = projected("tower", tmp_path, PointcloudDirect)
+    frame = wall.frame
+    assert (layer.mask == LayerMask.PAINTED).mean() > 0.99
+    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
+    places = drum.places(frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()])))
+    errors = layer.rgb.reshape(-1, 3)[:, 0] / 255.0 - curved_scenes.texture(places)
+    assert np.sqrt((errors**2).mean()) < 0.13
+
+
+def test_pixels_are_not_thrown_onto_a_cylinder(tmp_path: Path) -> None:
+    with pytest.raises(OrthoflowError, match="dsm-forward does not take curved walls"):
+        projected("apse", tmp_path, DsmForward)
