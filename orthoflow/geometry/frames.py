@@ -443,6 +443,52 @@ class WallFrame:
         turned[:, 2] = cosines * axes[2] - sines * axes[bent]
         return turned
 
+    def outline_world(self, n_sides: int = 64) -> NDArray[np.float64]:
+        """Return the closed outline (n, 3) of the raster, with points along the arcs."""
+        corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]) * self._size
+        if self.bend is None:
+            return self.world_from_wall(corners[[0, 1, 2, 3, 0]])
+        shares = np.arange(n_sides)[:, None] / n_sides
+        sides = [
+            corner + shares * (corners[(k + 1) % 4] - corner) for k, corner in enumerate(corners)
+        ]
+        return self.world_from_wall(np.vstack([*sides, corners[:1]]))
+
+    def met_by(
+        self, start_world: NDArray[np.float64], rays: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the points (n, 3) where rays first meet the front of the raster; NaN where not.
+
+        Args:
+            start_world: (3,) start of all rays.
+            rays: (n, 3) directions.
+        """
+        points = np.full((len(rays), 3), np.nan)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            lengths = self._lengths_to_surface(start_world, rays)
+        ahead = np.flatnonzero(lengths > 0.0)
+        met = start_world + lengths[ahead, None] * rays[ahead]
+        on_wall = self.wall_from_world(met)[:, :2]
+        facing = np.einsum("ij,ij->i", rays[ahead], self.axes_at(on_wall)[:, 2]) < 0.0
+        inside = ((on_wall >= 0.0) & (on_wall <= self._size)).all(axis=1) & facing
+        points[ahead[inside]] = met[inside]
+        return points
+
+    def _lengths_to_surface(
+        self, start_world: NDArray[np.float64], rays: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return lengths (n,) of rays up to the surface that faces them, in lengths of the rays."""
+        to_origin = self.origin_world - start_world
+        if self.bend is None:
+            return np.asarray((to_origin @ self.normal_world) / (rays @ self.normal_world))
+        axis = self.v_world if self.bend.along == "u" else self.u_world
+        from_axis = -to_origin - self.bend.radius_m * self.normal_world
+        across, beside = from_axis - (from_axis @ axis) * axis, rays - np.outer(rays @ axis, axis)
+        a, b = (beside**2).sum(axis=1), beside @ across
+        root = np.sqrt(b * b - a * (across @ across - self.bend.radius_m**2))
+        # A cylinder faces rays from inside where they leave it, and others where they enter it.
+        return np.asarray((-b + math.copysign(1.0, self.bend.radius_m) * root) / a)
+
     def metres_per_cell(self, depths_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sizes (n, 2) of cells along u and v at depths (n,), in metres.
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.diagnostics import DiagnosticSpec
 from orthoflow.errors import ProductError
+from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, unmeasured
 from orthoflow.products.product import (
     JsonValue,
@@ -212,6 +213,7 @@ class TieWall:
         gsd_m: cell size of its raster in metres. None if the wall has no raster, in which case
             limits in cells do not apply.
         plane_index: index of its plane in `Planes`; None if unknown.
+        frame: raster of a curved wall, whose normal is that at its middle; None on a plane.
     """
 
     name: str = ""
@@ -219,6 +221,7 @@ class TieWall:
     normal_world: tuple[float, ...]
     gsd_m: float | None = None
     plane_index: int | None = None
+    frame: WallFrame | None = None
 
     def __post_init__(self) -> None:
         shapes = np.shape(self.corners_world), np.shape(self.normal_world)
@@ -235,9 +238,10 @@ class TieWall:
         return cls(
             name=wall.name,
             corners_world=tuple(tuple(corner) for corner in frame.corners_world().tolist()),
-            normal_world=tuple(frame.normal_world.tolist()),
+            normal_world=tuple(frame.facing_world.tolist()),
             gsd_m=frame.gsd_m,
             plane_index=wall.plane_index,
+            frame=None if frame.bend is None else frame,
         )
 
 

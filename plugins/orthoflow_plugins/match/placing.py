@@ -205,15 +205,17 @@ def _camera_at(
     rotated_px = np.abs(axes) @ stored_px
     pixels = ((place.parts_photo - 0.5) * rotated_px) @ axes.T + 0.5 * stored_px
     # The axes point right, down and into the wall.
-    rotation = np.array([*(axes @ [frame.u_world, frame.v_world]), -frame.normal_world])
+    at = place.centre_m[None] / frame.gsd_m
+    u, v, normal = frame.axes_at(at)[0]
+    rotation = np.array([*(axes @ [u, v]), -normal])
     px_per_m = rotated_px[0] / place.width_m
     # Use an origin near the wall, since large survey coordinates would reduce the precision.
     origin = frame.origin_world
-    middle = frame.world_from_wall(place.centre_m[None] / frame.gsd_m)[0] - origin
+    middle = frame.world_from_wall(at)[0] - origin
     start = replace(
         lens,
         rotation=rotation,
-        translation=-rotation @ (middle + lens.fx / px_per_m * frame.normal_world),
+        translation=-rotation @ (middle + lens.fx / px_per_m * normal),
     )
     cells = place.parts_m / frame.gsd_m
     lifted, _, known = points_on_wall(wall, cells, usual_m=structure.usual_spread_m)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import photo_grey, photo_rgb, reduced
+from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, to_opencv
 from orthoflow.products import Photo, Wall
 
@@ -179,12 +180,46 @@ def _hidden(
             # 1 at the cell.
             along = np.minimum(buffer.nearest[rows, columns] / projection.distance[seen], 1.0)
             frame = wall.frame
-            camera_m = float((camera.centre_world - frame.origin_world) @ frame.normal_world)
-            above_m = (1.0 - along) * camera_m + along * wall.depth_m[projection.part][seen]
+            depths_m = wall.depth_m[projection.part][seen]
+            if frame.bend is None:
+                camera_m = float((camera.centre_world - frame.origin_world) @ frame.normal_world)
+                above_m = (1.0 - along) * camera_m + along * depths_m
+            else:
+                rows, columns = np.nonzero(seen)
+                cells = (np.column_stack([columns, rows]) + projection.corner).astype(np.float64)
+                points = frame.world_from_wall(cells + 0.5, depths_m.astype(np.float64))
+                above_m = _highest_m(frame, points, camera.centre_world, 1.0 - along)
             mask[projection.part][seen] = above_m > front_m + frame.gsd_m
         dilated = cv2.dilate(mask, np.ones((side, side), dtype=np.uint8))
         hidden.append(np.asarray(dilated, dtype=np.bool_))
     return hidden
+
+
+def _highest_m(
+    frame: WallFrame,
+    points: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    shares: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Return the largest depths (n,) on the rays from points (n, 3) of a curved wall to a camera.
+
+    A ray from the inside of a cylinder rises up to its middle and then falls again.
+
+    Args:
+        frame: the raster of the wall.
+        points: the starts of the rays.
+        centre: (3,) the camera.
+        shares: (n,) parts of the rays, from the start.
+    """
+    rays = centre - points
+    if frame.bend is not None and frame.bend.radius_m > 0.0:
+        axis = frame.v_world if frame.bend.along == "u" else frame.u_world
+        from_axis = points - (frame.origin_world + frame.bend.radius_m * frame.normal_world)
+        across = from_axis - np.outer(from_axis @ axis, axis)
+        beside = rays - np.outer(rays @ axis, axis)
+        middle = -(across * beside).sum(axis=1) / np.maximum((beside**2).sum(axis=1), 1e-12)
+        shares = np.minimum(shares, np.maximum(middle, 0.0)).astype(np.float32)
+    return frame.wall_from_world(points + shares[:, None] * rays)[:, 2]
 
 
 def _bared(
@@ -257,7 +292,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
         camera.centre_world
         - frame.world_from_wall(np.array([[0.5 * frame.width, 0.5 * frame.height]]))[0]
     )
-    if float(towards @ frame.normal_world) <= 0.0:
+    if frame.bend is None and float(towards @ frame.normal_world) <= 0.0:
         return None
     # Use an origin on the wall, since large survey coordinates would reduce the precision.
     near = camera.shifted(frame.origin_world)
@@ -304,7 +339,11 @@ def _project_cells(
         points = frame.world_from_wall(grid, depth) - frame.origin_world
         seen = near.project(points)
         rays = near.centre_world - points
-        cosine = rays @ frame.normal_world / np.linalg.norm(rays, axis=1)
+        if frame.bend is None:
+            lifts = rays @ frame.normal_world
+        else:
+            lifts = np.einsum("ij,ij->i", rays, frame.axes_at(grid)[:, 2])
+        cosine = lifts / np.linalg.norm(rays, axis=1)
         seen[~near.sees(seen[:, :2]) | ~(cosine > _GRAZING_COSINE)] = np.nan
         for raster, values in zip((u, v, distance), seen.T, strict=True):
             raster[first : first + some.size] = values.reshape(some.size, columns.size)

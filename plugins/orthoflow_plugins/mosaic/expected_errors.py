@@ -122,7 +122,7 @@ def expected_errors_m(
         of_pose = _pose_variances(camera, frame, nodes, depths_m)
         if of_pose is None:
             continue
-        centre = frame.wall_from_world(camera.viewing().centre_world[None])[0]
+        centre_world = camera.viewing().centre_world
         for rows in row_bands(frame.shape):
             mine = source[rows] == index
             down, across = np.nonzero(mine)
@@ -130,7 +130,7 @@ def expected_errors_m(
                 continue
             down = down + rows.start
             variances = _between(of_pose, down, across, step)
-            variances += _depth_variances(wall, down, across, centre, (noise_m, patchy_m))
+            variances += _depth_variances(wall, down, across, centre_world, (noise_m, patchy_m))
             errors_m[down, across] = np.sqrt(variances + position_m**2)
     return errors_m
 
@@ -164,8 +164,10 @@ def _pose_variances(
         return None
     variances = np.full(len(points), np.nan)
     axes = np.array([frame.u_world, frame.v_world])
+    if frame.bend is not None:
+        axes = frame.axes_at(nodes.reshape(-1, 2)[shown])[:, :2]
     by_pose = linearised(near, points[shown], LensFreedom()).by_parameters
-    wall_by_pixel = np.linalg.pinv(pixels_by_point(near, points[shown]) @ axes.T)
+    wall_by_pixel = np.linalg.pinv(pixels_by_point(near, points[shown]) @ np.swapaxes(axes, -1, -2))
     by_pose = wall_by_pixel @ by_pose
     variances[shown] = 0.5 * np.einsum("nij,jk,nik->n", by_pose, covariance, by_pose)
     inside = near.sees(pixels) & shown
@@ -210,26 +212,42 @@ def _depth_variances(
     wall: Wall,
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
-    centre: NDArray[np.float64],
+    centre_world: NDArray[np.float64],
     noises_m: tuple[float, float],
 ) -> NDArray[np.float64]:
     """Return variances (n,), in m², of a wall coordinate due to depth errors.
 
-    The viewer is at `centre` (3,) in the axes of the wall. The first noise is that of single cells;
+    The viewer is at `centre_world` (3,). The first noise is that of single cells;
     the second is shared by neighbouring cells.
     """
     noise_m, patchy_m = noises_m
-    gsd_m = wall.frame.gsd_m
-    across = gsd_m * (columns + 0.5 - centre[0])
-    down = gsd_m * (rows + 0.5 - centre[1])
-    depth_m = np.nan_to_num(wall.depth_m[rows, columns].astype(np.float64))
-    before = np.maximum(centre[2] - depth_m, 1e-3)
-    squares = np.minimum((across**2 + down**2) / before**2, _MOST_TANGENT**2)
+    depths_m = np.nan_to_num(wall.depth_m[rows, columns].astype(np.float64))
+    places = np.column_stack([columns, rows]).astype(np.float64) + 0.5
+    beside_m, before_m = _seen_from(centre_world, wall.frame, places, depths_m)
+    squares = np.minimum((beside_m**2).sum(axis=1) / before_m**2, _MOST_TANGENT**2)
     n_points = np.maximum(1.0, wall.count[rows, columns].astype(np.float64))
     spread = np.nan_to_num(wall.sigma_m[rows, columns].astype(np.float64)) / np.sqrt(n_points)
     sigma_m = np.where(spread > _SPREAD_TIMES * noise_m, spread, noise_m)
     sigma_m[wall.mask[rows, columns] == SurfaceMask.RECOVERED] *= _RECOVERED_TIMES
     return np.asarray(0.5 * squares * (sigma_m**2 + patchy_m**2), dtype=np.float64)
+
+
+def _seen_from(
+    centre_world: NDArray[np.float64],
+    frame: WallFrame,
+    places: NDArray[np.float64],
+    depths_m: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances of places from a camera along u and v (n, 2), and in front of them (n,)."""
+    if frame.bend is None:
+        centre = frame.wall_from_world(centre_world[None])[0]
+        beside_m = frame.gsd_m * (places - centre[:2])
+        before_m = centre[2] - depths_m
+    else:
+        rays = frame.world_from_wall(places, depths_m) - centre_world
+        local = np.einsum("nij,nj->ni", frame.axes_at(places), rays)
+        beside_m, before_m = local[:, :2], -local[:, 2]
+    return beside_m, np.maximum(before_m, 1e-3)
 
 
 def _excess_of_overlaps(
@@ -297,9 +315,8 @@ def _views_of(
         wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)
     )
     variances = _pose_variances(camera, frame, centres[:, None], depths_m[:, None])
-    centre = frame.wall_from_world(camera.viewing().centre_world[None])[0]
-    before = np.maximum(centre[2] - depths_m, 1e-3)
-    tangents = (frame.gsd_m * centres - frame.gsd_m * centre[:2]) / before[:, None]
+    beside_m, before_m = _seen_from(camera.viewing().centre_world, frame, centres, depths_m)
+    tangents = beside_m / before_m[:, None]
     if variances is None:
         variances = np.full((len(centres), 1), np.nan)
     return variances[:, 0], tangents

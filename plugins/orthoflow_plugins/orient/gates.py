@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, to_opencv
 from orthoflow.geometry.resection import (
     Resection,
@@ -51,6 +52,7 @@ class KnownWall:
         normal: (3,) unit vector towards the viewer.
         gsd_m: cell size of its raster, or None if unknown.
         has_side: whether the normal is known to point to the viewer.
+        frame: raster of a curved wall; None on a plane.
     """
 
     index: int
@@ -60,6 +62,25 @@ class KnownWall:
     normal: NDArray[np.float64]
     gsd_m: float | None
     has_side: bool
+    frame: WallFrame | None = None
+
+    @property
+    def ring_world(self) -> NDArray[np.float64]:
+        """Closed outline (n, 3) of the wall."""
+        if self.frame is None:
+            return self.corners_world[[0, 1, 2, 3, 0]]
+        return self.frame.outline_world()
+
+    def axes_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the axes right, down and towards the viewer, as rows, at points (n, 3).
+
+        They are (3, 3) on a plane, and (n, 3, 3) on a cylinder.
+        """
+        if self.frame is not None:
+            return self.frame.axes_at(self.frame.wall_from_world(points)[:, :2])
+        top_left, bottom_left, _, top_right = self.corners_world
+        right, down = top_right - top_left, bottom_left - top_left
+        return np.vstack([right / np.linalg.norm(right), down / np.linalg.norm(down), self.normal])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +123,7 @@ def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
                 normal=np.array(wall.normal_world, dtype=np.float64),
                 gsd_m=wall.gsd_m,
                 has_side=has_side,
+                frame=wall.frame,
             )
         )
     return known
@@ -145,6 +167,11 @@ def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.
     )
     rays = camera_rays(camera, corners_px) @ camera.rotation
     for wall in walls:
+        if wall.frame is not None:
+            met = wall.frame.met_by(camera.centre_world, rays)
+            hit = np.flatnonzero(np.isfinite(met[:, 0]))
+            worst[hit] = np.fmax(worst[hit], _variances(resection, wall, met[hit])[0])
+            continue
         top_left, bottom_left, _, top_right = wall.corners_world
         sides = np.array([top_right - top_left, bottom_left - top_left])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -157,6 +184,14 @@ def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.
     return worst
 
 
+def _before_m(centre: NDArray[np.float64], wall: KnownWall) -> float:
+    """Return how far a camera is in front of a wall, or in front of any part of a curved one."""
+    if wall.frame is None:
+        return float((centre - wall.corners_world.mean(axis=0)) @ wall.normal)
+    points = _grid(wall, (_GRID_SIDE, _GRID_SIDE))
+    return float(np.einsum("ij,ij->i", centre - points, wall.axes_at(points)[:, 2]).max())
+
+
 def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return the cell centres (rows * cols, 3) of a grid over the rectangle of a wall."""
     top_left, bottom_left, _, top_right = wall.corners_world
@@ -164,6 +199,8 @@ def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
         axis.ravel()
         for axis in np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij")
     )
+    if (frame := wall.frame) is not None:
+        return frame.world_from_wall(np.column_stack([along * frame.width, down * frame.height]))
     points: NDArray[np.float64] = (
         top_left
         + along[:, None] * (top_right - top_left)
@@ -176,19 +213,15 @@ def _variances(
     resection: Resection, wall: KnownWall, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return variances (n,) and pixels (n, 2) of wall points; NaN where not visible."""
-    pixels = _seen(resection.camera, points, wall.normal)
+    axes = wall.axes_at(points)
+    pixels = _seen(resection.camera, points, axes[..., 2, :])
     variances = np.full(len(points), np.nan)
     shown = np.isfinite(pixels[:, 0])
     if not shown.any():
         return variances, pixels
-    top_left, bottom_left, _, top_right = wall.corners_world
-    axes = np.vstack(
-        [
-            (top_right - top_left) / np.linalg.norm(top_right - top_left),
-            (bottom_left - top_left) / np.linalg.norm(bottom_left - top_left),
-        ]
-    )
-    plane_by_pixel = np.linalg.inv(pixels_by_point(resection.camera, points[shown]) @ axes.T)
+    along = axes[shown, :2] if axes.ndim > 2 else axes[:2]
+    along = np.swapaxes(along, -1, -2)
+    plane_by_pixel = np.linalg.inv(pixels_by_point(resection.camera, points[shown]) @ along)
     covariances = plane_by_pixel @ predicted_covariances(resection, points[shown])
     covariances = covariances @ plane_by_pixel.transpose(0, 2, 1)
     variances[shown] = 0.5 * np.trace(covariances, axis1=1, axis2=2)
@@ -201,7 +234,11 @@ def _seen(
     """Return pixels (n, 2) of wall points; NaN outside the image or at grazing angles."""
     pixels = camera.project(points)[:, :2]
     towards = camera.centre_world - points
-    cosine = np.abs(towards @ normal) / np.linalg.norm(towards, axis=1)
+    if normal.ndim > 1:
+        # The far side of a tower faces away.
+        cosine = np.einsum("ij,ij->i", towards, normal) / np.linalg.norm(towards, axis=1)
+    else:
+        cosine = np.abs(towards @ normal) / np.linalg.norm(towards, axis=1)
     pixels[~camera.sees(pixels) | (cosine < _GRAZING_COSINE)] = np.nan
     return pixels
 
@@ -392,7 +429,7 @@ class Candidate:
         used = self.walls[self.control]
         return min(
             (
-                float((centre - wall.corners_world.mean(axis=0)) @ wall.normal)
+                _before_m(centre, wall)
                 for wall in self.known
                 if wall.has_side and (used == wall.index).sum() >= _MIN_ON_WALL
             ),

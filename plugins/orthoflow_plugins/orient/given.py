@@ -191,10 +191,11 @@ def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
         frame = wall.frame
         steps = (np.arange(_SIDE) + 0.5) / _SIDE
         places = np.stack(np.meshgrid(steps * frame.width, steps * frame.height), axis=-1)
-        points = frame.world_from_wall(places.reshape(-1, 2))
+        places = places.reshape(-1, 2)
+        points, normals = frame.world_from_wall(places), frame.axes_at(places)[:, 2]
         for camera in oriented:
-            is_before = (camera.centre_world - frame.origin_world) @ frame.normal_world > 0.0
-            if is_before and camera.sees(camera.project(points)[:, :2]).any():
+            is_before = np.einsum("ij,ij->i", camera.centre_world - points, normals) > 0.0
+            if (is_before & camera.sees(camera.project(points)[:, :2])).any():
                 return
     if not oriented:
         return

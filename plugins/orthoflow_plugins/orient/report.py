@@ -366,6 +366,8 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         if len(ctx.figures) >= _MAX_FIGURES:
             return
         across, down = np.linalg.norm(wall.corners_world[[3, 1]] - wall.corners_world[0], axis=1)
+        if (curved := wall.frame) is not None:
+            across, down = curved.width * curved.gsd_m, curved.height * curved.gsd_m
         cell_m = max(across, down) / _MAP_CELLS
         shape = (max(1, round(down / cell_m)), max(1, round(across / cell_m)))
         best = np.full(shape, np.inf)
@@ -379,7 +381,10 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         error_mm = np.where(shown, 1e3 * best, np.nan)
         label = "predicted error of a coordinate [mm]"
-        frame = frame_over(wall.corners_world, wall.normal, gsd_m=cell_m)
+        if curved is None:
+            frame = frame_over(wall.corners_world, wall.normal, gsd_m=cell_m)
+        else:
+            frame = replace(curved, gsd_m=cell_m, width=shape[1], height=shape[0])
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
             partial(map_chart, error_mm, label, frame, low=0.0, high=round_scale(1e3 * high_m)),
@@ -418,7 +423,7 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     for panel, axis, label in zip(panels, (2, 1), ("before it", "down it"), strict=True):
         shown = axes_world[[0, axis]].T
         for wall in walls.values():
-            ring = (wall.corners_world[[0, 1, 2, 3, 0]] - origin) @ shown
+            ring = (wall.ring_world - origin) @ shown
             panel.plot(*ring.T, color=plane_ink(wall.number), linewidth=1.2)
         for candidate in candidates:
             _draw_position(panel, candidate, origin, shown, is_named=axis == 1)
