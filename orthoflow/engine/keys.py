@@ -299,9 +299,6 @@ def _digest(files: _States) -> str:
     return digest.hexdigest()
 
 
-# Other installations ----------------------------------------------------------------------------
-
-
 def methods_text(methods: Mapping[str, MethodFacts]) -> str:
     """Return the code digests and library versions of methods as JSON, for `misfit`."""
     return json.dumps({name: _facts(facts) for name, facts in methods.items()}, sort_keys=True)

@@ -56,11 +56,11 @@ _THREAD_VARIABLES: Final = (
     "RAYON_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
-# These environment variables are read when Python starts or the server loads libraries. They
-# prevent a module in the working folder from replacing a standard module. OpenBLAS threads spin
-# for 2**26 clock cycles (about 0.05 s) when they start and after each matrix product; 2**20 cycles
-# take less than 1 ms. Numba would spend time on colouring the error messages of all functions that
-# it tries.
+# Environment variables that are read when Python starts or the server loads libraries. With the
+# first, a module in the working folder cannot replace a standard module. By default, OpenBLAS
+# threads spin for 2**26 clock cycles (about 0.05 s) when they start and after each matrix product;
+# 2**20 cycles take less than 1 ms. Without the last, Numba would spend time on colouring the error
+# messages of all functions that it tries.
 _AT_START: Final = {
     "PYTHONSAFEPATH": "1",
     "PYTHONHASHSEED": "0",

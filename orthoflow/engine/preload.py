@@ -34,8 +34,8 @@ _LIBRARIES: Final = (
 def load_libraries() -> None:
     """Load the libraries. Errors are ignored here, because the steps report them."""
     if address_space() is not None:
-        # If the limit on the address space is low, some libraries crash, and no step could be
-        # started.
+        # With a low limit on the address space, some libraries crash when they are loaded, and then
+        # no step can be started.
         return
     for name in _LIBRARIES:
         with suppress(Exception):

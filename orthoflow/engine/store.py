@@ -178,8 +178,6 @@ class Store:
         with shared_lock(self.lock_file):
             yield
 
-    # Products -----------------------------------------------------------------------------------
-
     def put_product(self, product: Product, publisher: Publisher | None = None) -> ProductRef:
         """Store a product and its published files.
 
@@ -269,8 +267,6 @@ class Store:
         inside = f"{PUBLISHED}/"
         return {folder / name: sha256 for name, (_, sha256) in files if name.startswith(inside)}
 
-    # Figures ------------------------------------------------------------------------------------
-
     def put_blob(self, content: bytes) -> str:
         """Store bytes and return their SHA-256 as hexadecimal digits.
 
@@ -302,8 +298,6 @@ class Store:
         self.is_sound(sha256)
         raise DamageError(f"the figure {sha256[:12]} in the store {self.folder} is damaged")
 
-    # Damage -------------------------------------------------------------------------------------
-
     def is_sound(self, name: str) -> bool:
         """Whether a product or figure is undamaged; see `damage`."""
         return not self.damage(name)
@@ -333,8 +327,6 @@ class Store:
             folder = self.objects / name
             with contextlib.suppress(OSError):
                 self._sound.update(_identity(folder / path) for path in _files_of(folder))
-
-    # Results ------------------------------------------------------------------------------------
 
     def result(self, key: str) -> CellResult | None:
         """Return the result with a key; None if the result is missing or unusable."""
@@ -414,8 +406,6 @@ class Store:
             if len(found) == limit:
                 break
         return tuple(found)
-
-    # Private ------------------------------------------------------------------------------------
 
     def _object(self, digest: str) -> Path:
         name = digest.removeprefix("sha256:")

@@ -259,8 +259,6 @@ def _parts_of(annotations: Iterable[object]) -> Iterator[object]:
         yield from _parts_of(typing.get_args(annotation))
 
 
-# Units and decimals ------------------------------------------------------------------------------
-
 # Factors by which units are converted to the first of their family; keys are suffixes of
 # parameters.
 _FAMILIES: Final[tuple[Mapping[str, float], ...]] = (

@@ -42,8 +42,8 @@ _WHAT: Final = "a camera file"
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
 _ORTHONORMAL: Final = 1e-4
-# Up to the first limit, a lens is equivalent for matching; beyond the second, the error is visible
-# in an orthoimage.
+# Up to the first limit, omitted lens terms do not affect matching; beyond the second, they are
+# visible in an orthoimage.
 NEGLIGIBLE_PX: Final = 0.05
 #: error in pixels due to lens terms in a camera file that cannot be represented
 MAX_LEFT_OUT_PX: Final = 0.5

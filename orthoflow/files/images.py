@@ -396,6 +396,6 @@ def before_masks(buffer: DepthBuffer, photo: Photo) -> DepthBuffer:
         nearest = np.full(shape, buffer.nearest[0, 0], dtype=np.float32)
     rows, columns = (np.arange(0, side, reduction) for side in used.shape)
     whole = np.logical_and.reduceat(np.logical_and.reduceat(used, rows, axis=0), columns, axis=1)
-    # This is nearer than anything else, even if the camera is within the buffer of a wall.
+    # Minus infinity is nearer than any surface, even if the camera is within the buffer of a wall.
     nearest = np.where(whole, nearest, np.float32(-np.inf))
     return buffer._replace(nearest=np.ascontiguousarray(nearest), reduction=float(reduction))

@@ -34,13 +34,14 @@ _BLIND_M: Final = 0.3
 # 1 mm stops a larger share of the rays through a cube of 0.2 m.
 _PASSING_RAYS: Final = 200
 _N_ELEVATIONS: Final = 90
-# Half the number of points in 3 x 3 x 3 voxels if a surface crosses these with the point spacing of
-# the wall.
+# Half the number of points in 3 x 3 x 3 voxels that are crossed by a surface with the point spacing
+# of the wall.
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
 # Around a corner of a surface, there are a quarter as many points; along its edges, half as many.
 _CORNER_SHARE: Final = 0.25
-# Points are scattered if a smaller share of point pairs is in the same voxel. The limit is closer
-# to 1/27 (scattered points) than to 1/9 (a surface).
+# The points in 3 x 3 x 3 voxels are considered scattered if both points of less than this share of
+# their pairs are in the same voxel. The limit is closer to 1/27 (scattered points) than to 1/9 (a
+# surface).
 _SPREAD_SHARE: Final = 0.07
 _SAMPLED_MOST: Final = 1 << 20
 # Points with fewer points around them (including the point itself) are outliers and hide nothing.

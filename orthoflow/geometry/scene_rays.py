@@ -658,8 +658,8 @@ def _enclosing_ring(scene: Scene, index: int) -> NDArray[np.float64]:
     """Return points (n, 3) whose bounding box contains a bent rectangle: corners of prisms."""
     bend = float(scene.curvatures_per_m[index])
     a = np.linspace(scene.extent[index, 0], scene.extent[index, 1], _RING_POINTS)
-    # Between two of its points, the arc is inside the box around these points and their
-    # displacements outwards by the sagitta.
+    # Between two adjacent points, the arc is inside the box around these points and their copies
+    # shifted by the sagitta along each axis.
     radius_m = 1.0 / abs(bend)
     sagitta_m = radius_m * (1.0 - math.cos(0.5 * abs(bend) * float(a[1] - a[0])))
     rectangle = np.full(2 * len(a), index)

@@ -25,8 +25,9 @@ from orthoflow.products.walls import Wall
 # A photo counts as upside down if the cosine of the angle between its up direction and the vertical
 # is below minus this value.
 _UPRIGHT: Final = 0.5
-# Ties of floors and ceilings do not determine the image of the vertical: their relief is below the
-# first share of their extent, and the scale along the vertical below the second share.
+# Ties on a floor or a ceiling do not determine the direction of the vertical in a photo. Directions
+# along which ties extend less than _MIN_RELIEF of their longest extent are ignored, and the
+# vertical is unknown if its scale is less than _MIN_VERTICAL of the scale over all axes.
 _MIN_RELIEF: Final = 0.1
 _MIN_VERTICAL: Final = 0.3
 PHOTOS_UPSIDE_DOWN: Final = DiagnosticSpec(

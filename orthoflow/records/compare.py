@@ -356,7 +356,8 @@ class ComparedMetric:
         is_cached: whether an earlier run computed the cell; if so, costs are those of the earlier
             run.
         environment: id of the environment in which the metric was computed.
-        better: which values are better; empty if the metric has no better direction.
+        better: which values are better; empty if neither lower nor higher
+            values are better.
         headline: whether the metric describes the quality of the result.
     """
 

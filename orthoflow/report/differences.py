@@ -143,9 +143,6 @@ def _parameter_text(parameter: ParameterValue) -> str:
     return f"{text} (set)" if parameter.is_set else text
 
 
-# --- grouping of equal rows and their order ---
-
-
 @dataclass(frozen=True, kw_only=True)
 class RowGroup(Generic[Side]):
     """Rows that are equal apart from their cells.

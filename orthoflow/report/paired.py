@@ -496,7 +496,7 @@ def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1")
     Args:
         worse: (n,) finite amounts by which the method is worse than the reference on each dataset,
             with n at least 1; 0 if both are equally good.
-        better: better direction of the metric, which determines the sign of the median difference.
+        better: which values are better; this determines the sign of the median difference.
         unit: unit of the metric.
     """
     from scipy.stats import quantile_test, rankdata, wilcoxon  # noqa: PLC0415 - half a second

@@ -134,7 +134,8 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
 
     Args:
         values: values of a column.
-        better: better direction, a key of `BETTER`; metrics with other directions are not ranked.
+        better: which values are better, a key of `BETTER`; metrics with other entries are not
+            ranked.
         unit: unit of the values.
     """
     if better not in BETTER:
@@ -183,8 +184,7 @@ def cost_share(unit: str) -> float:
     return _LEVEL_COST_SHARES.get(unit, 0.0)
 
 
-# Better directions that a method may declare (`MetricSpec.better`); metrics without one are not
-# ranked.
+# Values of `MetricSpec.better` that a method may declare; metrics without one are not ranked.
 BETTER: Final = {"lower": "lower is better", "higher": "higher is better", "one": "1 is best"}
 
 
@@ -197,7 +197,7 @@ def badness(value: float, better: str) -> float:
     """Return a number that is smaller for better values; signed errors count by absolute value.
 
     Raises:
-        ValueError: the metric has no better direction.
+        ValueError: neither lower nor higher values of the metric are better.
     """
     if better == "lower":
         return abs(value)

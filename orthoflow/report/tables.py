@@ -34,7 +34,7 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        label: heading on pages, which may contain the unit and better direction.
+        label: heading on pages, which may contain the unit, and which values are better.
         name: heading in CSV files.
         is_numeric: whether the column is right-aligned and sorted numerically.
         digits: number of significant digits.

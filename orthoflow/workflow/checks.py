@@ -29,9 +29,6 @@ from orthoflow.workflow.source import ProblemLog
 _WILDCARDS: Final = frozenset("*?[")
 
 
-# Connections --------------------------------------------------------------------------------------
-
-
 def check_wiring(
     steps: Sequence[DraftStep],
     step_names: Collection[str],
@@ -180,9 +177,6 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
         log.report(wires[edges[0]][0], f"the steps form a cycle: {listed}")
         for name in names_in_cycle:
             sources.pop(name, None)
-
-
-# Comparison ---------------------------------------------------------------------------------------
 
 
 def check_comparison(
@@ -365,8 +359,6 @@ def _may_match(declared: str, metric: str) -> bool:
 def _has_wildcard(text: str) -> bool:
     return not _WILDCARDS.isdisjoint(text)
 
-
-# Valid but implausible settings -------------------------------------------------------------------
 
 _GSD: Final = "gsd_m"
 _CROP: Final = "crop"

@@ -253,8 +253,6 @@ class _Reader:
             self.log.report((), message, shown=("name",))
         return file.name or self.path.stem
 
-    # Steps ----------------------------------------------------------------------------------------
-
     def _steps(self, sections: Mapping[str, StepSection]) -> Iterator[DraftStep]:
         for name, section in sections.items():
             location = (_STEPS, name)

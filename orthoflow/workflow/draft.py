@@ -365,8 +365,6 @@ def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recogni
         return _unknown(path, error)
 
 
-# Workflow ----------------------------------------------------------------------------------------
-
 Recipe: TypeAlias = Literal["photos-on-scan", "direct", "plan"]
 
 # Steps of the recipe that replace a missing scan by a simulated room.

@@ -149,9 +149,6 @@ def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
     return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)
 
 
-# Graph of steps -----------------------------------------------------------------------------------
-
-
 def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set[str]:
     reached: set[str] = set()
     waiting = [name for start in starts for name in edges[start]]
@@ -172,9 +169,6 @@ def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
         waiting.remove(name)
         ordered[name] = None
     return tuple(ordered)
-
-
-# Selections ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,9 +242,6 @@ def select_cells(
     return tuple(cell for cell in cells if cell.address in kept)
 
 
-# Combinations -------------------------------------------------------------------------------------
-
-
 def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignment]:
     """Yield the combinations of variants that affect a step; the last factor varies fastest.
 
@@ -290,9 +281,6 @@ def _require_few(workflow: Workflow, count: int) -> None:
 def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
     excluded = workflow.compare.exclude if workflow.compare else ()
     return any(combination.items() <= assignment.items() for combination in excluded)
-
-
-# Expansion ----------------------------------------------------------------------------------------
 
 
 def expand_cells(workflow: Workflow, catalog: Catalog) -> tuple[Cell, ...]:

@@ -173,9 +173,6 @@ def some_of(names: Collection[str]) -> str:
     return first_few(list(names), most=_MOST_LISTED) or "none"
 
 
-# Search for files ---------------------------------------------------------------------------------
-
-
 def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
     """Return input -> files, sorted by name; None for an optional input without files.
 
@@ -280,9 +277,6 @@ def _below(folder: Path) -> Iterator[Path]:
     for place, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if name[0] != "."]
         yield from (Path(place, name) for name in names if name[0] != ".")
-
-
-# Datasets -----------------------------------------------------------------------------------------
 
 
 def check_no_step(
@@ -496,9 +490,6 @@ def choose_data(
                     f"datasets: {some_of(datasets)}",
                 )
     return tuple(chosen)
-
-
-# Tables of datasets -------------------------------------------------------------------------------
 
 
 def read_rows(log: ProblemLog) -> Document:

@@ -58,9 +58,6 @@ _METRIC: Final = r"[^.]+\.(.|\n)+"
 _Item = TypeVar("_Item")
 
 
-# Values -------------------------------------------------------------------------------------------
-
-
 def check_name(name: str) -> str:
     """Return a name if it is allowed in addresses and file names.
 
@@ -190,9 +187,6 @@ _Sources: TypeAlias = Annotated[
 _Metrics: TypeAlias = Annotated[
     _Patterns, BeforeValidator(_listed, json_schema_input_type=_Metric | _Patterns)
 ]
-
-
-# The file -----------------------------------------------------------------------------------------
 
 
 class FileSection(BaseModel):
@@ -433,8 +427,6 @@ class WorkflowFile(FileSection):
         examples=[{"design": "product", "baseline": {"plane": "hough2d"}}],
     )
 
-
-# Checked workflow -------------------------------------------------------------------------------
 
 # A reference as it is written in records.
 _Recorded: TypeAlias = Annotated[Reference, BeforeValidator(_reference), PlainSerializer(str)]

@@ -97,9 +97,6 @@ class DraftStep:
     is_varied: bool
 
 
-# Settings -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Override:
     """One parameter of one method call, set from the command line or by a dataset.
@@ -247,9 +244,6 @@ def _select_calls(step: DraftStep, parts: list[str]) -> tuple[tuple[DraftCall, .
     )
 
 
-# Resolution ---------------------------------------------------------------------------------------
-
-
 def resolve_call(
     draft: DraftCall,
     overrides: Sequence[Override],
@@ -340,8 +334,6 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
     # Copy the value, because several calls may share it and later settings may modify it.
     place[last] = deepcopy(override.value)
 
-
-# Sweeps -------------------------------------------------------------------------------------------
 
 # Parameter -> swept values, each with a function that reports a problem with it.
 _Sweeps: TypeAlias = dict[str, list[tuple[JsonValue, Report]]]

@@ -85,8 +85,6 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
         ) from error
 
 
-# Problems -----------------------------------------------------------------------------------------
-
 #: problems of a workflow that are reported at once
 MOST_PROBLEMS: Final = 100
 _SNIPPET_WIDTH: Final = 120

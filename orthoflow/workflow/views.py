@@ -126,9 +126,6 @@ def _or_sweep(schema: Schema) -> Schema:
     return {**shown, "anyOf": [*choices, _SWEEP]}
 
 
-# Flowchart ----------------------------------------------------------------------------------------
-
-
 def mermaid(workflow: Workflow, catalog: Catalog) -> str:
     """Return a Mermaid flowchart with the inputs, steps, variants and connections.
 
@@ -178,8 +175,6 @@ def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[str, str, str
         if name:
             yield f"{INPUTS}.{name}", "-.->", word
 
-
-# Resolved form in records -----------------------------------------------------------------------
 
 _STEP: Final = TypeAdapter(WorkflowStep)
 _PLACE: Final = "the resolved workflow"

@@ -71,7 +71,7 @@ class UnsafeFileError(RecordFormatError):
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """Label, unit and better direction of a measured quantity.
+    """Label and unit of a measured quantity, and whether lower or higher values are better.
 
     Attributes:
         label: name in tables, without unit.

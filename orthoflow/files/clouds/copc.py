@@ -105,7 +105,8 @@ def write_copc(path: Path, attributed: AttributedCloud) -> int:
 # Any: laspy and lazrs have no types.
 def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
     lazrs = load_library("lazrs", Path(file.name))
-    # A cube in steps of the file is also a cube in metres, since all axes have the same scale.
+    # A cube in the file's integer coordinates is also a cube in metres, since all axes have the
+    # same scale.
     half = 0.5 * waiting.side * float(header.scales[0])
     middle = header.offsets + header.scales * waiting.low + half
     sizes = (*middle.tolist(), half, 2.0 * half / 2**_GRID_BITS)

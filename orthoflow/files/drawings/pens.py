@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 POINTS_PER_MM: Final = 72.0 / 25.4
 FONT: Final = "DejaVuSans"
-# Line widths of ISO 128-2, each of which is about the square root of two times the previous one.
+# Line widths of the ISO 128-2 series, whose ratio is about sqrt(2); 0.18 is not used.
 FINE_MM: Final = 0.13
 THIN_MM: Final = 0.25
 MEDIUM_MM: Final = 0.35
@@ -227,9 +227,6 @@ def paragraph(
         for font, part in _runs(shown(text), is_bold=is_bold)
     )
     return Paragraph("".join(parts), style)
-
-
-# --- fonts ---
 
 
 @lru_cache(maxsize=1)

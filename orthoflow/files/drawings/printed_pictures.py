@@ -588,7 +588,7 @@ _SAMPLED_ROWS: Final = 128
 _FIGURE_PX: Final = 1600
 # Contours are smoothed as in a drawing at this scale, over 0.5 mm on paper.
 _CONTOUR_SCALE: Final = 20
-# Colours in front of the plane and behind it.
+# Colours of contours in front of the plane and behind it.
 _CONTOUR_COLOURS: Final = ("#5a0014", "#00204a")
 
 

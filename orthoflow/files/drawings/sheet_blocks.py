@@ -182,9 +182,6 @@ def _packed(
     return placed
 
 
-# --- notes, legend, key plans ---
-
-
 def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
     language = drawing.language
     found: list[Any] = [_scale_bar(drawing)]
@@ -351,9 +348,6 @@ def _sheet_key(drawing: Drawing, sheet: Sheet) -> tuple[str, NDArray[np.float64]
 
     heading = label("key_sheets", drawing.language, wall=drawing.text.name)
     return heading, np.vstack(list(boxes.values())), draw
-
-
-# --- the title block ---
 
 
 def _title_block(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:

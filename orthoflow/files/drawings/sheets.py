@@ -114,7 +114,7 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
     for text, x in _with_room(columns, drawing, (left - 4.0, right + 4.0)):
         at = (x, bottom - _TICK_MM - 1.0 - pens.TEXT_MM)
         pens.write_text(canvas, text, at, is_centred=True)
-    # Write these beside the picture, without overlapping the coordinates below it.
+    # Write the coordinates of rows beside the picture, without overlapping those below it.
     for text, y in _with_room(rows, drawing, (bottom, top)):
         pens.write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
     for x in columns.values():
@@ -214,7 +214,7 @@ def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
         pens.write_text(placed.canvas, text, at, turned_deg=turned_deg, is_centred=True)
 
 
-# Paper of the sheets if a wall does not fit on a single sheet.
+# Paper size of the sheets if a wall does not fit on a single sheet.
 _CUT_PAPER: Final = "A1"
 #: a sheet with its pictures, and the blocks beside them
 LaidOut: TypeAlias = tuple[Sheet, Furniture]

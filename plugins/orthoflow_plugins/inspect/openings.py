@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 MAX_SAMPLES: Final = 1 << 24
 # Maximum depth of a recess in the scene, in metres.
 _BEHIND_MOST_M: Final = 2.0
-# The first value is the width, in cells, of the rim around a recess. The recess belongs to the wall
-# if at least the second value, as a share of the cells of the rim, is on the face of the wall.
+# A recess belongs to the wall if at least _RIM_LEAST of the cells in the rim around it, which is
+# _RIM_CELLS wide, are on the face of the wall.
 _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
 # An outline matches an opening if the intersection over union (IoU) is at least this.

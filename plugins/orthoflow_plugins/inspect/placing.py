@@ -23,8 +23,8 @@ _SAME_DIRECTION_DEG: Final = 2.0
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
     """Return orthoimages whose `wall` is the index of their wall among the given walls.
 
-    Orthoimages from other programs, and those of walls that were rasterised in another step, only
-    refer to a plane.
+    Orthoimages from other programs, and those of walls that were rasterised in another step,
+    contain the index of a plane but not of one of these walls.
 
     Raises:
         MethodError: none of the walls is on the plane of an orthoimage.

@@ -161,14 +161,14 @@ _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
-# The nine depths around a cell form a relief step if their range exceeds both this many cell sizes
-# and this many point spreads. On a smooth surface, their range is about three spreads and rarely
-# five.
+# The nine depths around a cell form a relief step if their range exceeds both _STEP_CELLS cell
+# sizes and _STEP_SPREADS point spreads. On a smooth surface, their range is about three spreads and
+# rarely five.
 _STEP_CELLS: Final = 1.0
 _STEP_SPREADS: Final = 6.0
-# The surface around a cell consists mainly of relief if more than this share of the known cells is
-# next to steps, in a window with sides of this many cells. The share is 0.06 to 0.11 in rooms with
-# mouldings and 0.21 on a carved fountain.
+# The surroundings of a cell count as relief if, in a window of _RELIEF_CELLS x _RELIEF_CELLS cells,
+# more than _RELIEF_SHARE of the known cells are next to relief steps. The share is 0.06 to 0.11 in
+# rooms with mouldings and 0.21 on a carved fountain.
 _RELIEF_CELLS: Final = 121
 _RELIEF_SHARE: Final = 0.16
 # Minimum distance between textured positions. They are selected in turn from the fields of a grid.

@@ -131,7 +131,7 @@ class MatchGuided(Method):
         ties: Ties
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Match the oriented photos with the walls, followed by the photos without a pose."""
+        """Match the oriented photos with the walls first, then the photos without a pose."""
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         if inputs.cloud is not None:
@@ -166,7 +166,7 @@ def _traced(
     params: MatchGuided.Params,
     ctx: StepContext,
 ) -> dict[str, Trace]:
-    """Match oriented photos with the walls, followed by the others; return results by name."""
+    """Match oriented photos with the walls first, then the others; return results by name."""
     from orthoflow_plugins.match.channels import WallTarget, in_cells_of_points
     from orthoflow_plugins.match.tracing import (
         Setup,

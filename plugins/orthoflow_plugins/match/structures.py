@@ -44,7 +44,7 @@ _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
 # This energy limit prevents high scores for parts that hardly overlap the wall.
 _MIN_ENERGY: Final = 0.25
-# Two positions are distinct if they differ by at least the first value, relative to the width of
+# Two positions are distinct if their distance is at least the first of these shares of the width of
 # the photo, or if the logarithms of their scales differ by at least the second value.
 _ELSEWHERE: Final = (0.25, 0.25)
 # Maximum number of cells along the longer side of a photo; larger photos are compared in cells that

@@ -14,7 +14,7 @@ from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import Colours, light_of_levels
 from orthoflow.products import Layer, LayerMask
 
-# Levels below the first value are almost black, and levels above the second value are clipped.
+# Levels below _DARKEST are almost black, and levels above _BRIGHTEST are clipped.
 _DARKEST: Final = 10.0 / 255.0
 _BRIGHTEST: Final = 245.0 / 255.0
 # Minimum share of levels within these limits in blocks whose brightness is measured.

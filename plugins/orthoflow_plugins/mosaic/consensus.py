@@ -34,8 +34,8 @@ _LEAST_PAINTED: Final = 0.5
 # This is added to brightness, so that noise in almost black cells does not count as a difference.
 _DARK: Final = 0.02
 # Two observations contradict each other if the logarithms of their brightness differ by at least a
-# limit. The limit is the second value times the standard deviation over all blocks, but it is at
-# least the first value and at most twice the first value.
+# limit, which is _DEVIATIONS times the standard deviation over all blocks, but not less than _APART
+# and not more than twice _APART.
 _APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
 # In the core of a contradicted region, differences exceed the limit by at least this factor.

@@ -47,7 +47,7 @@ _PATCH_M: Final = 0.05
 # by 1.2 and 2.4 mm in a stuccoed hall, and by 1.7 and 5.2 mm in a stereo cloud of a fountain.
 _PATCHY_TIMES: Final = 1.5
 # Depth errors can be estimated from overlaps if the tangents of the two viewing angles differ by at
-# least the first value in at least the second number of patches.
+# least _LEAST_TANGENTS in at least _LEAST_SLANTED patches.
 _LEAST_TANGENTS: Final = 0.3
 _LEAST_SLANTED: Final = 20
 # Displacements of more than this many standard deviations are false matches.

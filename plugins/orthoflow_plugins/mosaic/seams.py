@@ -64,7 +64,8 @@ _NAMED_MOST: Final = 24
 _LONG_NAME: Final = 16
 # Weight of the source colours when they are blended with the grey image.
 _TINT: Final = 0.45
-# Shares from which empty cells, contradicted cells and a single cause of empty cells are reported.
+# Minimum shares of cells that are empty, that are contradicted, and that are empty for the same
+# reason, for a report.
 _EMPTY_WORTH_WORDS: Final = 0.1
 _CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01

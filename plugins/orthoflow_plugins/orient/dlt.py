@@ -64,10 +64,10 @@ _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
 _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
 # Relief of less than this many standard deviations of the points is mostly noise.
 _RELIEF_SIGMAS: Final = 10.0
-# With a larger condition number, control points are so close to a plane that rounding errors of the
-# coordinates affect the eleven parameters.
+# If the condition number exceeds this, the control points are so close to a plane that rounding
+# errors of the coordinates affect the eleven parameters.
 _MAX_CONDITION: Final = 5000.0
-# With a larger standard deviation of unit weight, the lens model is insufficient.
+# The lens model is considered insufficient if the standard deviation of unit weight exceeds this.
 _MAX_SIGMA0: Final = 1.5
 # Lens models are compared on a grid with this many points per side of the photo.
 _FRAME: Final = 12

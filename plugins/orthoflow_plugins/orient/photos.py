@@ -231,8 +231,8 @@ _SEED_LIMIT: Final = 2**31 - 1
 _STRATA: Final = 6
 # The EXIF focal length of a lens is tested with at most this many photos.
 _TESTED_PER_LENS: Final = 5
-# If at least this many photos of a camera agree on the focal length within this factor, they take
-# precedence over a contradicting EXIF value of another photo.
+# If the focal lengths of at least _MIN_OTHERS photos of a camera agree within a factor of
+# _SAME_FOCAL, they take precedence over a contradicting EXIF value of another photo.
 _MIN_OTHERS: Final = 2
 _SAME_FOCAL: Final = 1.05
 EXIF_CONTRADICTED: Final = DiagnosticSpec(

@@ -45,7 +45,7 @@ POINTS_AT_ONCE: Final = 1 << 24
 _PLACE_M: Final = 0.05
 # Minimum number of points that each scan must have in a square.
 _POINTS_LEAST: Final = 4
-# Levels below the first value are almost black, and levels above the second value are clipped.
+# Levels below _DARKEST are almost black, and levels above _BRIGHTEST are clipped.
 _DARKEST: Final = 10
 _BRIGHTEST: Final = 245
 # Scans that share fewer squares than this with other scans are ignored.

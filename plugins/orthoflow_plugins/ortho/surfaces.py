@@ -28,8 +28,8 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     look_at_cells,
 )
 
-# A surface blocks a ray if it is above the ray by more than this number of standard deviations of
-# depth plus this number of cells. The second term allows for detail finer than the raster.
+# A surface blocks a ray if it is above the ray by more than _TOLERANCE_SIGMAS standard deviations
+# of depth plus _TOLERANCE_CELLS cells. The second term allows for detail finer than the raster.
 _TOLERANCE_SIGMAS: Final = 3.0
 _TOLERANCE_CELLS: Final = 0.5
 # Width of the border strip of a photo in which quality decreases to 0, relative to the shorter

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# Rays from all cells of a block are traced up to a common height. This height is only computed for
-# small blocks if that of the large block does not exclude occlusion.
+# Rays from all cells of a block are traced up to a common height. This height is computed for small
+# blocks only if that of the large block does not exclude occlusion.
 BLOCK_CELLS: Final = 32
 FINE_CELLS: Final = 8
 

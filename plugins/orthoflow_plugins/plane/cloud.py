@@ -144,7 +144,7 @@ class PreparedCloud:
         import cv2
 
         # Use a table with an entry for each value of a byte, including -1, because indexing `names`
-        # would convert all claims to 64 bits.
+        # would convert the whole array to 64 bits.
         table = np.full(256, names[-1], dtype=names.dtype)
         table[: len(names) - 1] = names[:-1]
 

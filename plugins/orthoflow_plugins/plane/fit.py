@@ -64,8 +64,8 @@ _TUKEY: Final = 3.5
 # the division into cells: a seventh of the information would be lost, and rotating a wall would
 # displace the plane by half its standard deviation.
 _FULL_SHARE: Final = 0.571
-# The densest layer contains this share of the cells. In a normal distribution, this share is within
-# +-0.385 standard deviations.
+# Share of the cells that the densest layer contains. In a normal distribution, 30 % of the values
+# are within +-0.385 standard deviations of the mean.
 _LAYER_SHARE: Final = 0.3
 _LAYER_SIGMAS: Final = 0.7706
 # Weight, as a number of points, of the usual variance near a cell when it is averaged with the

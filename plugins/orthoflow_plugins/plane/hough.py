@@ -34,8 +34,9 @@ from orthoflow_plugins.plane.search import Search
 # Minimum number of votes for a candidate, as a share of the required number of points. It is low
 # because votes may be distributed over several bins until the candidate is refined.
 _VOTE_CAUTION: Final = 0.25
-# In steps between directions: around a rejected candidate, directions up to this angle are excluded
-# near its distance; in sections, directions up to the second angle represent each other.
+# Angles as multiples of the angle between neighbouring directions. After a candidate has been
+# rejected, directions within _NOT_AGAIN_STEPS are excluded near its distance. In sections,
+# directions within _STANDS_FOR_STEPS represent each other.
 _NOT_AGAIN_STEPS: Final = 2.2
 _STANDS_FOR_STEPS: Final = 1.5
 # Slopes tested around a maximum, in steps between directions, and factors by which they are reduced
@@ -120,7 +121,7 @@ class Voters:
         self.smear_bins = max(1, round(0.3 * reach_m * float(self.slopes.max()) / bin_m))
 
     def recount(self, claims: NDArray[np.int16]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Count the unassigned points of the sample: those with negative claims (s,).
+        """Count the points of the sample that are not assigned to a plane (negative claims).
 
         Returns:
             The positions (3, k) whose votes have changed, and the changes (k,).

@@ -88,9 +88,6 @@ def in_blocks(offsets: Offsets, *, parts: int) -> BlockedPoints:
     return points
 
 
-# --- points against slabs ---
-
-
 @kernel_part
 def _meet(box: NDArray[np.float32], slab: NDArray[np.float64], bounds: NDArray[np.float64]) -> int:
     """Return 0 if a slab and a box are disjoint, 2 if the slab contains the box, otherwise 1."""
@@ -267,8 +264,8 @@ def assign_points(
         start = block * BLOCK_POINTS
         taken = claims[start : min(start + BLOCK_POINTS, claims.size)]
         if n_active == 0 or holder >= 0:
-            # Most blocks are a short piece of a wall and inside a single slab, so their points need
-            # not be tested.
+            # Most blocks are short pieces of a wall inside a single slab, so their points need not
+            # be tested.
             taken[:] = np.int8(holder)
             continue
         _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest, distances)
@@ -379,16 +376,14 @@ def measure_deviations(
             extents[k, 2], extents[k, 3] = min(extents[k, 2], v), max(extents[k, 3], v)
 
 
-# --- planes through points ---
-
 # Constraints on the plane of a fit: none, normal perpendicular to up, and normal along up.
 FREE: Final = 0
 VERTICAL: Final = 1
 LEVEL: Final = 2
 
 _STEPS_MOST: Final = 20
-# A fit has converged if it moves a point of the plane ten metres away by less than this share of
-# the tolerance.
+# A fit has converged if it moves no point of the plane within ten metres of the origin by more than
+# this share of the tolerance.
 _SETTLED_SHARE: Final = 5e-4
 # Points whose RMS distance from a line is smaller than this do not determine a rotation about the
 # line.

@@ -566,7 +566,7 @@ def _faced(
     side = side_of_stations(plane, corners_m.mean(axis=0), cloud, members)
     is_guessed = side == 0
     if is_guessed:
-        # The last entry is for points on no plane, which have a claim of -1.
+        # The last entry is for points on no plane, whose index is -1.
         turns = [abs(float(item.raster.plane.normal @ plane.normal)) for item in found]
         every = max(1, len(claims) // _WITNESSES_MOST)
         side = side_of_remaining(

@@ -180,7 +180,7 @@ class Proposer:
         """Exclude the last candidate from further proposals."""
 
     def relabel(self, found: Any, cloud: Any) -> None:
-        """Change the claims of the cloud's points after all points have been labelled."""
+        """Reassign points to planes after all points have been labelled."""
 
     def draw(self, ctx: StepContext, planes: Planes, cloud: PointCloud) -> None:
         """Report and draw results that are specific to this detector."""

@@ -53,8 +53,8 @@ _BINS: Final = 100
 # they are scored.
 _DRAWN_MOST: Final = 50_000
 _ASKED_MOST: Final = 150_000
-# Number of points with which all hypotheses are scored, number with which the best are scored
-# again, and share and minimum number of these.
+# All hypotheses are scored with _FIRST_POINTS points. The best _SECOND_SHARE of them, but at least
+# _SECOND_LEAST, are scored again with _SECOND_POINTS points.
 _FIRST_POINTS: Final = 2_000
 _SECOND_POINTS: Final = 20_000
 _SECOND_SHARE: Final = 0.1
@@ -72,17 +72,17 @@ _SIMILAR_MOST: Final = 5
 _CROWDED_SHARE: Final = 0.5
 # Number of times that new hypotheses are drawn after all have been rejected.
 _REDRAWS: Final = 2
-# Minimum number of points in a section. The possible lengths are the total number of points, half
-# of it, a quarter, and so on.
+# Minimum number of points in a section of the sorted points. Sections contain all points, half of
+# them, a quarter, and so on.
 _STRETCH_LEAST: Final = 32
 # Minimum ratio of the height of a triangle to its longest side.
 _FLATTEST: Final = 0.02
 _CURVE_BITS: Final = 10
 # Shifts and masks that spread the bits of a number to every third position.
 _SPREADS: Final = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
-# A hypothesis is similar to another if the angle between them is smaller than this and their
+# Two hypotheses are similar if the angle between them is smaller than _SIMILAR_DEG and their
 # distance is within the tolerance. After a hypothesis has been rejected, similar ones are proposed
-# again only if the second value, a share of the points near it, has been removed.
+# again only if _LOST_SHARE of the points near it have been removed.
 _SIMILAR_DEG: Final = 2.0
 _LOST_SHARE: Final = 0.05
 

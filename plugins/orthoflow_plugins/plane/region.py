@@ -64,7 +64,7 @@ _NARROWEST: Final = 0.2
 _FLATNESS_STEP: Final = 1.0 / 2000.0
 _MEAN_SHIFTS: Final = 12
 # Maximum number of times that the width of voxels is doubled. It is doubled if neighbourhoods have
-# fewer points than the second value times the number needed for a normal.
+# fewer than _THIN times the number of points needed for a normal.
 _WIDENINGS: Final = 2
 _THIN: Final = 3.0
 

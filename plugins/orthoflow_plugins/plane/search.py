@@ -69,12 +69,12 @@ _CROWDED_LEAST: Final = 0.5
 # Minimum width of a plane in cells; a narrower strip does not determine the rotation of the plane
 # about the axis of the strip.
 _STRIP_CELLS: Final = 2.5
-# A surface is rejected as curved if its radius is smaller than the first value and its curvature
-# explains at least the second value, a share, of the variance of its cells.
+# A surface is rejected as curved if its radius is smaller than _RADIUS_LEAST_M and its curvature
+# explains at least _BENT_SHARE of the variance of its cells.
 _RADIUS_LEAST_M: Final = 5.0
 _BENT_SHARE: Final = 0.3
 # Maximum number of passes over the points for a plane. Another pass is needed if a fit moves the
-# plane by more than the second value, a share of the fit tolerance.
+# plane by _SETTLED_SHARE of the fit tolerance or more.
 _PASSES_MOST: Final = 3
 _SETTLED_SHARE: Final = 0.1
 # Convergence limit for planes in the sample, which are fitted to all points later.
@@ -82,8 +82,8 @@ _SETTLED_ON_SAMPLE_M: Final = 2e-5
 # Minimum number of points before the cells of a candidate are fitted, as a share of the required
 # number.
 _SAMPLE_CAUTION: Final = 0.7
-# Parts belong to the same plane if, on the largest part, the common fit is not much worse than a
-# fit to this part alone: at most this ratio of the residuals, and a tolerance.
+# Parts belong to the same plane if the residuals of the common fit on the largest part do not
+# exceed _ASKEW times those of a fit to this part alone, plus _SAME_M.
 _ASKEW: Final = 1.5
 _SAME_M: Final = 2e-4
 # Number of points used to move a candidate to the surface near it. Later fits, to cells of the
@@ -133,8 +133,8 @@ _ADVICE: Final = (
     "small planes, min_share for sparse ones, or raise max_tilt_deg"
 )
 _ADVICE_WIDER: Final = "with tolerance_m {wider:.3g} one is found"
-# Multiples of the tolerance with which no plane was found; planes are searched for with these to
-# give advice.
+# If no plane is found, the search is repeated with these multiples of the tolerance, so that the
+# message can recommend one of them.
 _WIDER: Final = (1.5, 2.0, 3.0, 4.0, 6.0)
 _NO_INTENSITY: Final = (
     "materials are distinguished by the intensity of points, which this cloud does not have: omit "

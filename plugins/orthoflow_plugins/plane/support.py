@@ -33,8 +33,8 @@ _POINTS_PER_CELL: Final = 12.0
 # inner slab.
 INNER_SHARE: Final = 0.4
 _CROWDED_SHARE: Final = 0.6
-# Minimum share of the plane's cells in a part; a smaller part is there by chance and does not
-# belong to the wall.
+# Minimum share of the plane's cells in a part; a smaller part is due to chance and does not belong
+# to the wall.
 PART_SHARE: Final = 0.03
 # Cells are connected across gaps of up to twice this number of cells.
 _GAP_CELLS: Final = 2

@@ -22,8 +22,8 @@ from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.proposing import Materials
 
-# Side of the tiles of a wall, and length of the pieces of a row, from whose means distances are
-# measured.
+# Side of the tiles of a wall, and length of the pieces of a scan row. Distances are measured from
+# the mean of a tile or piece.
 _TILE_M: Final = 0.1
 _TILE_LEAST: Final = 4
 # Minimum number of points for a standard deviation.

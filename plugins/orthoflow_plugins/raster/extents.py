@@ -29,7 +29,7 @@ _SIDES: Final[tuple[Side, ...]] = ("left", "right", "top", "bottom")
 
 # Maximum number of points in the sample, which consists of one in n points, chosen by hashing.
 _POINTS_MOST: Final = 1 << 21
-# Multiplier of Fibonacci hashing, so that the sample is independent of the rows and columns of a
+# Multiplier of Fibonacci hashing, which makes the sample independent of the rows and columns of a
 # scan.
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 # Maximum growth of a rectangle on each side.

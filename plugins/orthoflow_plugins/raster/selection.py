@@ -18,8 +18,8 @@ from orthoflow_plugins.raster.parameters import Constraint, RasterParams
 
 # Maximum angle between a vertical or horizontal plane and the exact direction.
 _LEAN_DEG: Final = 10.0
-# A plane is part of the relief of a larger wall if the angle between the two is less than the first
-# value and the wall contains more than the second value, a share, of the plane's area.
+# A plane is part of the relief of a larger wall if the angle between the two is less than
+# _PARALLEL_DEG and the wall contains more than _COVERED_SHARE of the plane's area.
 _PARALLEL_DEG: Final = 5.0
 _COVERED_SHARE: Final = 0.8
 

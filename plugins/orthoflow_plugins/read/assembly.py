@@ -29,8 +29,8 @@ _MOST_SCANS: Final = 2**16
 _POPULATE_WRITE: Final = 23
 _ROUNDING_SAMPLE: Final = 20_000
 _ROUNDING_VALUES: Final = 10
-# However coarsely coordinates are rounded, a twentieth of the points of a scan cannot have the same
-# position.
+# A position stands for missing points if at least this share of a sample has it. Even coarsely
+# rounded coordinates do not give so many points the same position.
 _REPEATED_SAMPLE: Final = 2000
 _REPEATED_SHARE: Final = 0.05
 _FEWEST_REPEATED: Final = 20

@@ -19,8 +19,7 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, ScanCount, resolution_m
 from orthoflow_plugins.read.scales import IntensityScale
 
-# If two sides of a scan are shorter than the first value or longer than the second, the unit is
-# probably wrong.
+# If the second-longest side of a scan is outside this range, the unit is probably wrong.
 _SMALL_M: Final = 1.0
 _LARGE_M: Final = 1000.0
 # Maximum number of names in a sentence.

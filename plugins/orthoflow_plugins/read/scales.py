@@ -38,7 +38,7 @@ _ROUNDING_LEVELS: Final = 0.7
 # A value is extreme if its distance from the range of these percentiles exceeds the width of this
 # range.
 _PERCENTILES: Final = (2.0, 98.0)
-# If no scan reaches more than this part of the range in its metadata, that is the range of the
+# If no scan reaches at least this part of the range in its metadata, the range is that of the
 # sensor, and images scaled by it would be black.
 _SMALLEST_PART: Final = 0.25
 # Scans whose ranges overlap by at least this part get a common scale, so that the same surfaces
@@ -272,7 +272,7 @@ class ColourScale:
         if self.scale is None:
             self.scale = seen
         elif full[seen] > full[self.scale]:
-            # The stored values were scaled with a full brightness that was too low.
+            # The values stored so far were scaled with too low a value for full brightness.
             before = self._stored[: self._count]
             before[:] = np.rint(before * np.float32(full[self.scale] / full[seen]))
             self.scale = seen

@@ -38,8 +38,6 @@ _UNIFORM: Final = 1.0 / math.sqrt(12.0)
 # cells.
 _BORDER_CELLS: Final = 2.0
 
-# --- edges in the image ---
-
 _LONG_CELLS: Final = 20.0
 _PROFILE_ENDS_CELLS: Final = 4.0
 # Profiles extend this far to the inside and outside of an outline.
