@@ -76,6 +76,13 @@ class Surface:
         return self.arc_rad[1] - self.arc_rad[0] >= _FULL_TURN - 1e-9
 
     @property
+    def radius_m(self) -> float:
+        """Radius of a cylinder; of a cone, at the middle of its points along the axis."""
+        if isinstance(self.shape, Cylinder):
+            return self.shape.radius_m
+        return 0.5 * (self.along_m[0] + self.along_m[1]) * math.tan(self.shape.half_angle_rad)
+
+    @property
     def sigma_axis_deg(self) -> float:
         """Largest standard deviation of the axis direction."""
         largest = float(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1])

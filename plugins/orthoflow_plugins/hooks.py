@@ -34,6 +34,7 @@ _METHODS: Final = {
     "comparison",
     "plane.comparators:Open3dPatches": "open3d's detect_planar_patches, for comparison",
     "plane.given:GivenPlane": "a reference plane given by the user",
+    "surface.cylinder:SurfaceCylinder": "vaults, apses, towers and columns, from pairs of normals",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
     "match.sift:MatchSift": "match RootSIFT key points of photos and walls, if mutually best and "
     "distinct by the ratio test",

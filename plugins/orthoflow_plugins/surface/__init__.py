@@ -1,0 +1,1 @@
+"""Detection of curved surfaces: cylinders and cones."""

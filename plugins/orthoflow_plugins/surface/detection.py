@@ -1,0 +1,187 @@
+"""The order of work of a detection: sample, planes, voxels, search, fit to all points, tests."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.products import PointCloud, Surface
+from orthoflow_plugins.surface.fit import FittedSurface, fit_all, named
+from orthoflow_plugins.surface.parameters import DetectorParams
+from orthoflow_plugins.surface.search import (
+    BLOCK_VOXELS,
+    LEAST_RADIUS,
+    MOST_RADIUS,
+    Found,
+    Limits,
+    Rejected,
+    search,
+    with_bridged_gaps,
+)
+from orthoflow_plugins.surface.strips import PlaneTest, tested_planes
+from orthoflow_plugins.surface.voxels import Sample, Voxels, draw_sample, in_voxels, noise_of
+
+# Smallest voxels: in metres, and in multiples of the noise and of the spacing of the sample.
+_VOXEL_M: Final = 0.04
+_VOXEL_NOISES: Final = 3.0
+_VOXEL_SPACINGS: Final = 2.0
+# Voxels in which noise and spacing are measured.
+_FIRST_VOXEL_M: Final = 0.1
+# Coarse voxels need fewer points.
+_MOST_STRIDE: Final = 8
+# Gaps of an arc up to this angle, such as windows, belong to the surface.
+_BRIDGED_RAD: Final = math.radians(15.0)
+_LEAST_POINTS: Final = 100
+# A surface found among voxels is wrong if the fit to all points moves it by more than the tolerance
+# times this factor.
+_LARGEST_SHIFT: Final = 1.0
+_OUTSIDE_RAD: Final = math.radians(200.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detection:
+    """The result of a detection.
+
+    Attributes:
+        surfaces: the surfaces, in descending order of their numbers of points.
+        fitted: their fits, in the same order.
+        accepted: what was found among voxels, in the same order.
+        labels: (n,) int16 surface of each point, -1 for none.
+        plane_tests: tests of the given planes.
+        rejected: hypotheses that were no surfaces.
+        noise_m: standard deviation of points across surfaces.
+        voxel_m: size of the smallest voxels.
+    """
+
+    surfaces: tuple[Surface, ...]
+    fitted: tuple[FittedSurface, ...]
+    accepted: tuple[Found, ...]
+    labels: NDArray[np.int16]
+    plane_tests: list[PlaneTest]
+    rejected: list[Rejected]
+    noise_m: float
+    voxel_m: float
+
+
+def detect(
+    cloud: PointCloud,
+    plane_index: NDArray[np.int16] | None,
+    params: DetectorParams,
+    rng: np.random.Generator,
+    progress: Callable[[float, str], None],
+    *,
+    is_cone: bool,
+    cores: int,
+) -> Detection:
+    """Detect the curved surfaces of a cloud.
+
+    Args:
+        cloud: the cloud.
+        plane_index: (n,) plane of each point, -1 for none, or None.
+        params: parameters of the search.
+        rng: random generator for pairs of voxels.
+        progress: receives the share that is done and a text.
+        is_cone: whether to search cones instead of cylinders.
+        cores: number of threads.
+    """
+    progress(0.0, "sample")
+    sample = draw_sample(cloud, plane_index)
+    tests = [] if plane_index is None else tested_planes(sample)
+    flat = [test.index for test in tests if not test.is_strip]
+    searched = sample.take(~np.isin(sample.label, flat)) if flat else sample
+    levels, noise_m = _levels(searched, cloud, params)
+    limits = Limits(
+        tolerance_m=max(params.tolerance_m, 3.0 * noise_m),
+        noise_m=noise_m,
+        radius_m=(params.min_radius_m, params.max_radius_m),
+        min_arc_rad=math.radians(params.min_arc_deg),
+        min_area_m2=params.min_area_m2,
+        is_cone=is_cone,
+    )
+    is_oriented = cloud.stations is not None and len(cloud.stations) > 0
+    found, rejected = search(levels, limits, cloud.up, rng, progress, is_oriented=is_oriented)
+    found = [with_bridged_gaps(item, _BRIDGED_RAD) for item in found[: params.max_surfaces]]
+    progress(0.8, f"fit of {len(found)} surfaces")
+    planes = None
+    if plane_index is not None and tests:
+        planes = np.full((int(plane_index.max(initial=-1)) + 1, 4), np.nan)
+        for test in tests:
+            if not test.is_strip:
+                planes[test.index] = np.append(test.normal, test.offset_m)
+    fitted, labels = fit_all(
+        found,
+        cloud,
+        None if plane_index is None or planes is None else (plane_index, planes),
+        [limits.tolerance_at(item.round.radius_m) for item in found],
+        noise_m,
+        is_cone=is_cone,
+        cores=cores,
+    )
+    counts = np.bincount(labels.astype(np.int64) + 1, minlength=len(found) + 1)[1:]
+    kept = []
+    for index in np.argsort(-counts, kind="stable").tolist():
+        shift_m = fitted[index].shift_m
+        if counts[index] < _LEAST_POINTS or shift_m > _LARGEST_SHIFT * limits.tolerance_m:
+            evidence = found[index].evidence | {"shift_mm": 1000.0 * shift_m}
+            rejected.append(Rejected(reason="unstable", evidence=evidence))
+        else:
+            kept.append(index)
+    rank = np.full(len(found) + 1, -1, dtype=np.int16)
+    rank[kept] = np.arange(len(kept))
+    return Detection(
+        surfaces=tuple(
+            named(
+                _with_side(fitted[index], is_oriented=is_oriented),
+                place,
+                int(counts[index]),
+                cloud.up,
+            )
+            for place, index in enumerate(kept)
+        ),
+        fitted=tuple(fitted[index] for index in kept),
+        accepted=tuple(found[index] for index in kept),
+        labels=rank[labels] if len(kept) < len(found) or kept != sorted(kept) else labels,
+        plane_tests=tests,
+        rejected=rejected,
+        noise_m=noise_m,
+        voxel_m=levels[-1][0] if levels else 0.0,
+    )
+
+
+def _levels(
+    sample: Sample, cloud: PointCloud, params: DetectorParams
+) -> tuple[list[tuple[float, Voxels]], float]:
+    """Return voxels of several sizes, descending, and the noise of the cloud."""
+    if len(sample) < _LEAST_POINTS:
+        return [], 0.0
+    first = in_voxels(sample, cloud, _FIRST_VOXEL_M, BLOCK_VOXELS)
+    noise_m = noise_of(first)
+    # The points of a voxel on a surface cover about the square of its size.
+    per_voxel = max(1.0, len(sample) / max(1, first.n_occupied))
+    spacing_m = _FIRST_VOXEL_M / math.sqrt(per_voxel)
+    smallest = max(_VOXEL_M, _VOXEL_NOISES * noise_m, _VOXEL_SPACINGS * spacing_m)
+    levels: list[tuple[float, Voxels]] = []
+    for step in itertools.count():
+        voxel_m = smallest * 2.0**step
+        if MOST_RADIUS * voxel_m / 2.0 >= params.max_radius_m and step:
+            break
+        if LEAST_RADIUS * voxel_m < params.max_radius_m:
+            thinned = sample.take(slice(None, None, min(_MOST_STRIDE, 2**step)))
+            levels.append((voxel_m, in_voxels(thinned, cloud, voxel_m, BLOCK_VOXELS, noise_m)))
+    return levels[::-1], noise_m
+
+
+def _with_side(fitted: FittedSurface, *, is_oriented: bool) -> Surface:
+    """Return a surface whose side is assumed from its arc if no stations are known."""
+    surface = fitted.surface
+    if is_oriented:
+        return surface
+    start, end = surface.arc_rad
+    shape = replace(surface.shape, is_concave=end - start < _OUTSIDE_RAD)
+    return replace(surface, shape=shape)

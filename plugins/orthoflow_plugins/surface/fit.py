@@ -1,0 +1,244 @@
+"""Fit of surfaces to all points of a cloud, by the means of cells, with covariances."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.slabs import Offsets, read_only
+from orthoflow.geometry.surfaces import zero_direction
+from orthoflow.geometry.threads import even_parts, in_threads
+from orthoflow.products import PointCloud, Surface, surface_kind
+from orthoflow_plugins.surface.kernels import Cells, sum_cells
+from orthoflow_plugins.surface.rounds import design, robust_solution
+from orthoflow_plugins.surface.search import Found, longest_gap
+
+# Cells of a surface: smallest size, and largest number.
+_CELL_M: Final = 0.03
+_MOST_CELLS: Final = 60_000
+_LEAST_CELLS: Final = 8
+# The sums of a fixed number of parts do not depend on the number of threads.
+_PARTS: Final = 4
+# Sums use distances up to this many standard deviations.
+_SUM_SIGMAS: Final = 5.0
+_LEAST_SUM_M: Final = 0.012
+# Sizes of the tiles, in cells, whose scatter gives the covariance.
+_TILES: Final = (1, 4, 16)
+_OPEN_SHARE: Final = 0.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedSurface:
+    """A surface fitted to all points.
+
+    Attributes:
+        surface: the surface, without a name.
+        cell_scatter_m: scatter of the means of cells beyond the noise of points.
+        noise_m: standard deviation of points inside cells.
+        counts: (around, along) points of each cell.
+        means_m: (around, along) mean distance of each cell from the surface, positive towards the
+            viewer; NaN for empty cells.
+        shift_m: largest change from the surface found among voxels.
+    """
+
+    surface: Surface
+    cell_scatter_m: float
+    noise_m: float
+    counts: NDArray[np.int64]
+    means_m: NDArray[np.float64]
+    shift_m: float
+
+
+def fit_all(
+    found: list[Found],
+    cloud: PointCloud,
+    plane_labels: tuple[NDArray[np.int16], NDArray[np.float64]] | None,
+    tolerances_m: list[float],
+    noise_m: float,
+    *,
+    is_cone: bool,
+    cores: int,
+) -> tuple[list[FittedSurface], NDArray[np.int16]]:
+    """Fit surfaces to all points near them, and label the points.
+
+    Args:
+        found: the surfaces.
+        cloud: the cloud.
+        plane_labels: planes of the points (n,), and normal and offset (k, 4) of each plane whose
+            points are only used where they are nearer to the surface; NaN for other planes.
+        tolerances_m: largest distance of labelled points, for each surface.
+        noise_m: standard deviation of points across surfaces.
+        is_cone: whether the surfaces are cones.
+        cores: number of threads.
+
+    Returns:
+        The fitted surfaces, and the index of the surface of each point, -1 for none.
+    """
+    labels = np.full(len(cloud), -1, dtype=np.int16)
+    if not found:
+        return [], labels
+    cells = _cells_of(found, tolerances_m, noise_m)
+    n_cells = int(cells.sizes[-1, 0] + cells.sizes[-1, 1] * cells.sizes[-1, 2])
+    offsets = read_only(cloud.x, cloud.y, cloud.z)
+    planes = plane_labels or (np.zeros(0, dtype=np.int16), np.zeros((0, 4)))
+    parts = even_parts(len(cloud), _PARTS)
+    sums = np.zeros((_PARTS, n_cells, 3))
+
+    def run(part: int) -> None:
+        own = parts[part]
+        mine = Offsets(*(values[own] for values in offsets))
+        sum_cells(mine, planes[0][own], planes[1], cells, sums[part], labels[own])
+
+    in_threads([partial(run, part) for part in range(_PARTS)], threads=cores)
+    total = sums.sum(axis=0)
+    fitted = []
+    for index, item in enumerate(found):
+        first, around, along, _ = cells.sizes[index].tolist()
+        own = total[first : first + around * along].reshape(around, along, 3)
+        fitted.append(
+            _fitted(item, own, cells.bounds[index], cloud.origin, cloud.up, is_cone=is_cone)
+        )
+    return fitted, labels
+
+
+def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> Cells:
+    rounds, bounds, sizes, opens = [], [], [], []
+    first, first_open = 0, 0
+    for item, tolerance_m in zip(found, tolerances_m, strict=True):
+        low_m, high_m = item.along_m
+        radius_m = item.round.radius_m
+        area_m2 = 2.0 * math.pi * radius_m * (high_m - low_m)
+        size_m = max(_CELL_M, math.sqrt(area_m2 / _MOST_CELLS))
+        # A whole number of cells for each part of the circle that may be open.
+        n_open = len(item.is_open)
+        around = n_open * max(1, round(2.0 * math.pi * radius_m / size_m / n_open))
+        along = max(_LEAST_CELLS, round((high_m - low_m) / size_m))
+        rounds.append(item.round.row(item.zero))
+        within_m = min(tolerance_m, max(_LEAST_SUM_M, _SUM_SIGMAS * noise_m))
+        bounds.append((low_m, high_m, tolerance_m, within_m))
+        sizes.append((first, around, along, first_open))
+        opens.append(np.repeat(item.is_open, around // n_open))
+        first += around * along
+        first_open += around
+    return Cells(np.array(rounds), np.array(bounds), np.array(sizes), np.concatenate(opens))
+
+
+def _fitted(
+    found: Found,
+    sums: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    up: NDArray[np.float64],
+    *,
+    is_cone: bool,
+) -> FittedSurface:
+    around, along = sums.shape[:2]
+    size_m = (bounds[1] - bounds[0]) / along
+    i, j = np.nonzero(sums[:, :, 0] >= 1.0)
+    n, total, square = sums[i, j].T
+    angles = ((i + 0.5) / around - 0.5) * 2.0 * math.pi
+    places = bounds[0] + (j + 0.5) * size_m
+    means = total / n
+    many = n >= 4.0
+    within = np.maximum(square - n * means**2, 0.0)
+    noise_m = math.sqrt(float(within[many].sum() / max(1.0, (n[many] - 1.0).sum())))
+    matrix = design(angles, places, found.round.steepness, is_cone=is_cone)
+    change, weights, extra_m = robust_solution(matrix, means, max(noise_m, 1e-5) ** 2 / n)
+    rest = means - matrix @ change
+    own = _covariance(matrix, rest, weights, (i, j))
+    best = found.round.corrected(found.zero, change)
+    zero = zero_direction(best.axis, up)
+    middle_m = float(n @ places / n.sum())
+    best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
+    counts = np.zeros((around, along), dtype=np.int64)
+    counts[i, j] = n
+    sign = -1.0 if found.side > 0.0 else 1.0
+    means_m = np.full((around, along), np.nan)
+    means_m[i, j] = sign * rest
+    near = np.abs(rest) < bounds[3]
+    rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[near].sum() / n[near].sum())))
+    arc, ends = _extent(counts)
+    surface = Surface(
+        name="",
+        shape=best.shape(origin, is_concave=found.side > 0.0),
+        covariance=best.covariance(zero, own),
+        n_points=0,
+        rms_m=rms_m,
+        zero_world=zero,
+        along_m=(bounds[0] + size_m * ends[0] - middle_m, bounds[0] + size_m * ends[1] - middle_m),
+        arc_rad=arc,
+    )
+    return FittedSurface(
+        surface=surface,
+        cell_scatter_m=extra_m,
+        noise_m=noise_m,
+        counts=counts,
+        means_m=means_m,
+        shift_m=float(np.abs(matrix @ change).max()),
+    )
+
+
+def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.float64]:
+    """Return the covariance after the point of the axis has moved along it."""
+    turn = np.eye(len(own))
+    turn[0, 2] = turn[1, 3] = along_m
+    if len(own) > 5:
+        turn[4, 5] = along_m
+    return np.asarray(turn @ own @ turn.T)
+
+
+def _covariance(
+    matrix: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    cell: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> NDArray[np.float64]:
+    """Return the covariance of the parameters from the scatter of tiles.
+
+    Neighbouring cells share errors, so tiles of several sizes are used; the largest result counts
+    (White's estimator with clusters).
+    """
+    inverse = np.linalg.pinv(matrix.T @ (matrix * weights[:, None]), hermitian=True)
+    best = np.zeros_like(inverse)
+    for side in _TILES:
+        tile = (cell[0] // side) * 100_003 + cell[1] // side
+        _, own = np.unique(tile, return_inverse=True)
+        n_tiles = int(own.max()) + 1
+        if n_tiles <= 3 * len(inverse):
+            break
+        scores = np.zeros((n_tiles, len(inverse)))
+        np.add.at(scores, own, matrix * (weights * rest)[:, None])
+        factor = n_tiles / (n_tiles - len(inverse))
+        found = factor * inverse @ (scores.T @ scores) @ inverse
+        best = found if np.trace(found) > np.trace(best) else best
+    return np.asarray(best if best.any() else inverse)
+
+
+def _extent(counts: NDArray[np.int64]) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Return the range of angles, and first and last + 1 cell along the axis, with points."""
+    is_full = counts > 0
+    length = float(np.quantile(is_full.sum(axis=1), 0.95))
+    is_open = is_full.sum(axis=1) >= max(1.0, _OPEN_SHARE * length)
+    rows = np.flatnonzero(is_full[is_open].sum(axis=0) >= 0.1 * is_open.sum())
+    ends = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, counts.shape[1])
+    count = len(is_open)
+    gap = longest_gap(is_open)
+    step = 2.0 * math.pi / count
+    if gap <= max(2, count // 60):
+        return (-math.pi, math.pi), ends
+    opens = np.flatnonzero(is_open)
+    steps = np.diff(np.append(opens, opens[0] + count))
+    start = int(opens[(int(np.argmax(steps)) + 1) % len(opens)])
+    low = start * step - math.pi
+    return (low, low + (count - gap) * step), ends
+
+
+def named(fitted: Surface, index: int, n_points: int, up: NDArray[np.float64]) -> Surface:
+    """Return a surface with its name and number of points."""
+    name = f"{surface_kind(fitted.shape, up)} {index}"
+    return replace(fitted, name=name, n_points=n_points)

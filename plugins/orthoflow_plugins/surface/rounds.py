@@ -1,0 +1,197 @@
+"""Surfaces of revolution with straight generatrices: cylinders, and cones by a slope."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Cone, Cylinder, basis_from_up
+from orthoflow.geometry.surfaces import along_and_across, zero_direction
+
+# Tukey's constant, in standard deviations, and the number of iterations.
+_TUKEY: Final = 4.685
+_ROUNDS: Final = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round:
+    """A cylinder, or a cone if the radius changes along the axis.
+
+    Attributes:
+        point: (3,) float64 point of the axis, metres from the cloud's origin.
+        axis: (3,) float64 unit vector.
+        radius_m: radius at the point.
+        slope: change of the radius per metre along the axis.
+    """
+
+    point: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    radius_m: float
+    slope: float = 0.0
+
+    @property
+    def steepness(self) -> float:
+        """Cosine of the angle between axis and generatrices."""
+        return 1.0 / math.hypot(1.0, self.slope)
+
+    def row(self, zero: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the numbers (12,) for kernels; angles count from a direction (3,)."""
+        numbers = (self.radius_m, self.slope, self.steepness)
+        return np.concatenate([self.point, self.axis, zero, numbers])
+
+    def outwards(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return distances (n,), positive outside, and outward normals (n, 3) of points."""
+        along, across = along_and_across(points, self.point, self.axis)
+        radius = np.linalg.norm(across, axis=1)
+        distances = (radius - self.radius_m - self.slope * along) * self.steepness
+        normals = across / np.maximum(radius, 1e-12)[:, None] - self.slope * self.axis
+        return distances, normals * self.steepness
+
+    def places(
+        self, points: NDArray[np.float64], zero: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return angles (n,), -pi to pi, and positions along the axis (n,) of points."""
+        relative = points - self.point
+        sine = relative @ np.cross(self.axis, zero)
+        return np.arctan2(sine, relative @ zero), relative @ self.axis
+
+    def corrected(self, zero: NDArray[np.float64], change: NDArray[np.float64]) -> Round:
+        """Return the surface with the parameters of `design` changed."""
+        aside = np.cross(self.axis, zero)
+        axis = self.axis + change[2] * zero + change[3] * aside
+        return Round(
+            point=self.point + change[0] * zero + change[1] * aside,
+            axis=axis / np.linalg.norm(axis),
+            radius_m=self.radius_m + float(change[4]),
+            slope=self.slope + (float(change[5]) if len(change) > 5 else 0.0),
+        )
+
+    def moved(self, along_m: float) -> Round:
+        """Return the same surface with its point moved along the axis."""
+        return replace(
+            self,
+            point=self.point + along_m * self.axis,
+            radius_m=self.radius_m + self.slope * along_m,
+        )
+
+    def directed(self, up: NDArray[np.float64]) -> Round:
+        """Return the same surface with the direction of the axis that `Surface.shape` states.
+
+        The axis of a cone opens away from its apex.
+        """
+        along = basis_from_up(up) @ self.axis
+        steep = abs(along[2]) >= math.sqrt(0.5)
+        sign = along[2] if steep else along[int(np.argmax(np.abs(along[:2])))]
+        if (self.slope or sign) < 0.0:
+            return replace(self, axis=-self.axis, slope=-self.slope)
+        return self
+
+    def shape(self, origin: NDArray[np.float64], *, is_concave: bool) -> Cylinder | Cone:
+        """Return the surface in world coordinates; the axis of a cone must open."""
+        if self.slope == 0.0:
+            return Cylinder(
+                point_world=origin + self.point,
+                axis_world=self.axis,
+                radius_m=self.radius_m,
+                is_concave=is_concave,
+            )
+        return Cone(
+            apex_world=origin + self.point - self.radius_m / self.slope * self.axis,
+            axis_world=self.axis,
+            half_angle_rad=math.atan(self.slope),
+            is_concave=is_concave,
+        )
+
+    def covariance(
+        self, zero: NDArray[np.float64], own: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the covariance (7, 7) of a `Surface` from that of the parameters of `design`."""
+        aside = np.cross(self.axis, zero)
+        turn = np.zeros((7, len(own)))
+        turn[:3, 0], turn[:3, 1] = zero, aside
+        turn[3:6, 2], turn[3:6, 3] = zero, aside
+        if self.slope == 0.0:
+            turn[6, 4] = 1.0
+        else:
+            reach_m = self.radius_m / self.slope
+            turn[:3, 2], turn[:3, 3] = -reach_m * zero, -reach_m * aside
+            turn[:3, 4] = -self.axis / self.slope
+            turn[:3, 5] = reach_m / self.slope * self.axis
+            turn[6, 5] = self.steepness**2
+        return np.asarray(turn @ own @ turn.T)
+
+
+def design(
+    angles: NDArray[np.float64], along: NDArray[np.float64], steepness: float, *, is_cone: bool
+) -> NDArray[np.float64]:
+    """Return the derivatives (n, 5 or 6) of positions of the surface along its normal.
+
+    The parameters are the displacement of the axis (2), its tilt (2), the radius, and, for cones,
+    the slope.
+    """
+    cosine, sine = np.cos(angles), np.sin(angles)
+    columns = [cosine, sine, along * cosine, along * sine, np.ones_like(along)]
+    if is_cone:
+        columns.append(along)
+    return steepness * np.column_stack(columns)
+
+
+def robust_solution(
+    matrix: NDArray[np.float64], distances: NDArray[np.float64], variances: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Solve matrix x = distances by least squares with Tukey's weights.
+
+    Args:
+        matrix: (n, k) design.
+        distances: (n,) observations.
+        variances: (n,) variances of the measurement; the scatter beyond them is estimated.
+
+    Returns:
+        The solution (k,), the weights (n,), and the standard deviation of the additional scatter.
+    """
+    weights, extra = 1.0 / variances, 0.0
+    solution: NDArray[np.float64] = np.zeros(matrix.shape[1])
+    for _ in range(_ROUNDS):
+        normal = matrix.T @ (matrix * weights[:, None])
+        normal += 1e-12 * np.trace(normal) * np.eye(len(normal))
+        solution = np.asarray(np.linalg.solve(normal, matrix.T @ (weights * distances)))
+        rest = distances - matrix @ solution
+        squares = rest * rest
+        # The median of squared residuals without measurement noise is 0.455 times the variance.
+        extra = math.sqrt(max(0.0, float(np.median(squares - 0.455 * variances)) / 0.455))
+        spread = variances + extra * extra
+        share = np.clip(1.0 - squares / (_TUKEY**2 * spread), 0.0, None)
+        weights = share * share / spread
+        if np.count_nonzero(weights) < 2 * matrix.shape[1]:
+            break
+    return solution, weights, extra
+
+
+def fitted(
+    start: Round,
+    points: NDArray[np.float64],
+    sigma_m: float,
+    up: NDArray[np.float64],
+    *,
+    is_cone: bool,
+) -> Round:
+    """Fit a surface to points (n, 3) near it, by Gauss-Newton with robust weights."""
+    found = start
+    variances = np.full(len(points), max(sigma_m, 1e-4) ** 2)
+    for _ in range(3):
+        found = found.moved(float(np.mean((points - found.point) @ found.axis)))
+        zero = zero_direction(found.axis, up)
+        distances, _ = found.outwards(points)
+        matrix = design(*found.places(points, zero), found.steepness, is_cone=is_cone)
+        change, _, _ = robust_solution(matrix, distances, variances)
+        change[:2] = np.clip(change[:2], -0.3 * found.radius_m, 0.3 * found.radius_m)
+        change[2:4] = np.clip(change[2:4], -0.3, 0.3)
+        change[4] = np.clip(change[4], -0.5 * found.radius_m, found.radius_m)
+        found = found.corrected(zero, change)
+    return found

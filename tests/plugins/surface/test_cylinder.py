@@ -1,0 +1,181 @@
+"""Cylinders in simulated buildings are found with the stated accuracy; nothing else is found."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.simulate.curved import SimulateCurved
+from orthoflow_plugins.simulate.room import SimulateRoom
+from orthoflow_plugins.surface.cylinder import SurfaceCylinder
+
+from orthoflow.products import PointCloud, PointLabels, Surface, Surfaces, Truth
+from orthoflow.testing import Trial, run_trial
+from orthoflow.testing.surveyed import few_points
+from orthoflow.testing.trials import TrialRun
+
+SHIFT_M = (4e5, 5e6, 100.0)
+
+
+@cache
+def scanned(subject: str, seed: int = 3) -> tuple[PointCloud, Truth]:
+    params = {"subject": subject, "scan_step_m": 0.025, "shift_world_m": SHIFT_M}
+    trial = Trial(method=SimulateCurved, inputs={}, params=params, seed=seed)
+    with TemporaryDirectory() as folder:
+        out = run_trial(trial, Path(folder)).outputs
+    return out["cloud"], out["truth"]
+
+
+def found_in(folder: Path, cloud: PointCloud, labels: Any = None, **params: Any) -> TrialRun:
+    inputs = {"cloud": cloud} | ({} if labels is None else {"labels": labels})
+    return run_trial(Trial(method=SurfaceCylinder, inputs=inputs, params=params), folder)
+
+
+def off(found: Surface, true: Surface) -> tuple[float, float, float]:
+    """Errors of the direction (degrees), radius and place of the axis (metres)."""
+    axis = true.shape.axis_world
+    turn = math.degrees(np.linalg.norm(np.cross(found.shape.axis_world, axis)))
+    apart = found.shape.point_world - true.shape.point_world
+    across = float(np.linalg.norm(apart - (apart @ axis) * axis))
+    return turn, abs(found.radius_m - true.radius_m), across
+
+
+@pytest.mark.parametrize(
+    ("subject", "kind", "arc_deg"),
+    [
+        ("barrel-vault", "vault", (140, 160)),
+        ("cross-vault", "vault", (90, 150)),
+        ("apse", "apse", (150, 185)),
+        ("tower", "tower", (260, 330)),
+        ("column", "column", (120, 230)),
+    ],
+)
+def test_surfaces_are_found_as_accurately_as_stated(
+    subject: str, kind: str, arc_deg: tuple[float, float], tmp_path: Path
+) -> None:
+    cloud, truth = scanned(subject)
+    assert truth.surfaces is not None
+    run = found_in(tmp_path, cloud)
+    found: Surfaces = run.outputs["surfaces"]
+    assert [item.name for item in found.surfaces] == [f"{kind} {i}" for i in range(len(found))]
+    assert len(found) == len(truth.surfaces)
+    points = cloud.points_world()
+    for index, surface in enumerate(found.surfaces):
+        true = min(truth.surfaces.surfaces, key=lambda item: off(surface, item)[0])
+        turn_deg, radius_m, across_m = off(surface, true)
+        assert turn_deg < min(0.03, 5.0 * surface.sigma_axis_deg)
+        assert radius_m < min(0.001, 5.0 * surface.sigma_radius_m)
+        assert across_m < 0.001
+        assert surface.shape.is_concave == true.shape.is_concave
+        assert arc_deg[0] < math.degrees(surface.arc_rad[1] - surface.arc_rad[0]) < arc_deg[1]
+        own = run.outputs["labels"].plane_index == index
+        assert np.abs(surface.shape.distances_m(points[own])).max() < 0.051
+        # Points of a cross vault are on both cylinders near the crown.
+        is_true = (np.abs(true.shape.distances_m(points)) < 0.004) & (truth.labels < 0)
+        assert own[is_true].mean() > (0.8 if subject == "cross-vault" else 0.93)
+        assert surface.n_points == np.count_nonzero(own)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_room_of_planes_has_no_cylinder(seed: int, tmp_path: Path) -> None:
+    params = {"geometry": "drawn", "decoration": "drawn", "scan_step_m": 0.02}
+    room = run_trial(
+        Trial(method=SimulateRoom, inputs={}, params=params, seed=seed), tmp_path / "room"
+    )
+    run = found_in(tmp_path, room.outputs["cloud"])
+    assert run.outputs["surfaces"].surfaces == ()
+    assert (run.outputs["labels"].plane_index == -1).all()
+
+
+def test_planes_that_are_strips_of_a_vault_are_searched_and_walls_are_not(tmp_path: Path) -> None:
+    """A detector with a tolerance of 5 cm takes a vault for strips of planes 1.1 m wide."""
+    cloud, truth = scanned("barrel-vault")
+    assert truth.surfaces is not None
+    (vault,) = truth.surfaces.surfaces
+    points = cloud.points_world()
+    labels = truth.labels.copy()
+    normals = vault.shape.normals(points)
+    aside = np.cross(vault.shape.axis_world, vault.zero_world)
+    angles = np.arctan2(-normals @ aside, -normals @ vault.zero_world)
+    on = (labels < 0) & (np.abs(vault.shape.distances_m(points)) < 0.03)
+    on &= np.abs(angles) < vault.arc_rad[1]
+    n_flat, width = len(truth.planes), 2.0 * math.acos(1.0 - 0.05 / vault.radius_m)
+    labels[on] = n_flat + np.floor((angles[on] - angles[on].min()) / width)
+    run = found_in(tmp_path, cloud, PointLabels(plane_index=labels))
+    (found,) = run.outputs["surfaces"].surfaces
+    assert off(found, vault)[1] < 0.001
+    assert found.n_points > 0.95 * np.count_nonzero(on)
+    tests = run.outputs["surfaces"].details["planes"]
+    assert {test["index"] for test in tests if not test["is_strip"]} == set(range(n_flat))
+    assert sum(test["is_strip"] for test in tests) == len(tests) - n_flat >= 5
+    # Points of flat walls are on the surface only where they are nearer to it.
+    own = run.outputs["labels"].plane_index == 0
+    assert (own & (truth.labels >= 0)).mean() < 0.002
+
+
+def directions(n_points: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    vectors = rng.normal(size=(n_points, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def prism(n_sides: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Points of the sides of a prism with an inscribed circle of 2 m."""
+    side = 2.0 * math.pi / n_sides * rng.integers(0, n_sides, 60_000)
+    along = rng.uniform(-1.0, 1.0, len(side)) * 2.0 * math.tan(math.pi / n_sides)
+    x = 2.0 * np.cos(side) - along * np.sin(side)
+    y = 2.0 * np.sin(side) + along * np.cos(side)
+    return np.column_stack([x, y, rng.uniform(-1.5, 1.5, len(side))])
+
+
+def bent_wall(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Points of a wall 6 m long that is bent by 5 cm."""
+    x, z = rng.uniform(-3.0, 3.0, (2, 60_000)) * np.array([[1.0], [0.5]])
+    return np.column_stack([x, 3.0 + 0.05 * (x / 3.0) ** 2, z])
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("octagon", "flat parts"), ("dome", "dome"), ("bent wall", None)]
+)
+def test_what_is_no_cylinder_is_rejected_with_the_reason(
+    name: str, reason: str | None, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(1)
+    points = {
+        "octagon": lambda: prism(8, rng),
+        "dome": lambda: 2.5 * np.abs(directions(60_000, rng)),
+        "bent wall": lambda: bent_wall(rng),
+    }[name]()
+    points += rng.normal(scale=0.002, size=points.shape)
+    run = found_in(tmp_path, few_points(points))
+    assert run.outputs["surfaces"].surfaces == ()
+    reasons = [item["reason"] for item in run.outputs["surfaces"].details["rejected"]]
+    assert reason is None or reason in reasons
+
+
+@pytest.mark.parametrize("noise_m", [0.005, 0.02])
+def test_a_leaning_cylinder_without_stations_is_found_despite_noise(
+    noise_m: float, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(2)
+    axis = np.array([0.6, 0.0, 0.8])
+    angles, along = rng.uniform(-2.6, 2.6, 200_000), rng.uniform(0.0, 4.0, 200_000)
+    radial = np.array([0.8, 0.0, -0.6]) * np.cos(angles)[:, None]
+    radial += np.array([0.0, 1.0, 0.0]) * np.sin(angles)[:, None]
+    distances = 1.2 + rng.normal(scale=noise_m, size=len(angles))
+    points = along[:, None] * axis + distances[:, None] * radial
+    points[:20_000] = rng.uniform(-4.0, 4.0, (20_000, 3))
+    cloud = few_points(points)
+    cloud = PointCloud(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z, up=cloud.up)
+    run = found_in(tmp_path, cloud)
+    (found,) = run.outputs["surfaces"].surfaces
+    assert found.name == "cylinder 0"
+    assert abs(found.radius_m - 1.2) < min(6.0 * found.sigma_radius_m, 0.1 * noise_m)
+    turn = np.linalg.norm(np.cross(found.shape.axis_world, axis))
+    assert math.degrees(turn) < 6.0 * found.sigma_axis_deg
+    assert not found.shape.is_concave
