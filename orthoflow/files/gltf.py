@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -17,7 +18,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.images import encode_jpeg, encode_png
 from orthoflow.files.sidecars import OrthoFile, numbers, write_bytes
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import Bend, WallFrame
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import JsonValue
 from orthoflow.untrusted_text import json_bytes
@@ -114,7 +115,7 @@ class _Document:
         mesh = flat_mesh(frame) if depth is None else relief_mesh(frame, depth)
         attributes: dict[str, JsonValue] = {"POSITION": self._array(mesh.vertices, "VEC3")}
         if depth is None:
-            normals = np.array([[0, 0, 1]] * len(mesh.vertices), np.float32)
+            normals = _normals(frame, mesh.places)
             attributes["NORMAL"] = self._array(normals, "VEC3")
         attributes["TEXCOORD_0"] = self._array(mesh.places, "VEC2")
         indices = self._array(mesh.triangles.ravel(), "SCALAR")
@@ -142,7 +143,9 @@ class _Document:
                     "width": frame.width,
                     "height": frame.height,
                     "product_digest": ortho.digest,
-                    "surface": "plane" if depth is None else "depths of the wall",
+                    "surface": "depths of the wall"
+                    if depth is not None
+                    else ("plane" if frame.bend is None else "cylinder"),
                 },
             }
         )
@@ -234,6 +237,8 @@ def _columns(matrix: NDArray[np.float64]) -> JsonValue:
 # Number of nodes along a wall's longer side: at most about 500,000 triangles, which phones can
 # display.
 LONGEST_NODES: Final = 512
+# Arc of a flat strip of a cylinder; its middle is off by 0.03 % of the radius.
+_STRIP_RAD: Final = math.radians(2.9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,13 +257,41 @@ class WallMesh:
 
 
 def flat_mesh(frame: WallFrame) -> WallMesh:
-    """Return the rectangle of a wall."""
+    """Return the rectangle of a wall, or strips along the arc of a cylinder."""
+    if frame.bend is not None:
+        return _strips(frame, frame.bend)
     places = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], dtype=np.float32)
     return WallMesh(
         vertices=_lifted(frame, places, np.zeros(4)),
         places=places,
         triangles=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint16),
     )
+
+
+def _strips(frame: WallFrame, bend: Bend) -> WallMesh:
+    n_cells = frame.width if bend.along == "u" else frame.height
+    turn = n_cells * frame.gsd_m / abs(bend.radius_m)
+    shares = np.linspace(0.0, 1.0, max(2, math.ceil(turn / _STRIP_RAD)) + 1)
+    first, last = (np.column_stack([shares, np.full(shares.size, side)]) for side in (0.0, 1.0))
+    places = np.vstack([first, last])
+    top, bottom = np.arange(shares.size - 1), np.arange(shares.size - 1) + shares.size
+    corners = [top, bottom, bottom + 1, top + 1]
+    if bend.along == "v":
+        places, corners = places[:, ::-1], corners[::-1]
+    triangles = np.concatenate([np.stack([corners[k] for k in (0, i, i + 1)], 1) for i in (1, 2)])
+    places = np.ascontiguousarray(places, dtype=np.float32)
+    return WallMesh(
+        vertices=_lifted(frame, places, np.zeros(len(places))),
+        places=places,
+        triangles=triangles.astype(np.uint16),
+    )
+
+
+def _normals(frame: WallFrame, places: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the normals (n, 3) at positions of a mesh, in its axes."""
+    normals = frame.axes_at(places.astype(np.float64) * [frame.width, frame.height])[:, 2]
+    axes = np.array([frame.u_world, -frame.v_world, frame.normal_world])
+    return np.ascontiguousarray(normals @ axes.T, dtype=np.float32)
 
 
 def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
@@ -312,5 +345,11 @@ def _places(count: int) -> NDArray[np.float32]:
 def _lifted(
     frame: WallFrame, places: NDArray[np.float32], depths_m: NDArray[np.generic]
 ) -> NDArray[np.float32]:
+    if frame.bend is not None:
+        near = replace(frame, origin_world=np.zeros(3))
+        axes = np.array([frame.u_world, -frame.v_world, frame.normal_world])
+        cells = places.astype(np.float64) * [frame.width, frame.height]
+        points = near.world_from_wall(cells, depths_m.astype(np.float64))
+        return np.ascontiguousarray(points @ axes.T, dtype=np.float32)
     sides_m = np.array([frame.width, -frame.height]) * frame.gsd_m
     return np.column_stack([places * sides_m, depths_m]).astype(np.float32)

@@ -229,7 +229,7 @@ class _Renderer:
         self._rectangle = truth.rectangle.reshape(-1)
         self._seen = truth.seen.reshape(-1)
         self._width = frame.width
-        self._origin = scene.origin
+        self._frame, self._origin = frame, scene.origin
         self._normal = frame.normal_world[:, None]
         self._corner = (frame.origin_world - scene.origin)[:, None] + front_m * self._normal
         self._step_u = frame.gsd_m * frame.u_world[:, None]
@@ -237,8 +237,7 @@ class _Renderer:
 
     def look(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         """Set depths and rectangles of cells (n,); return the points (3, n) at their centres."""
-        starts = self._starts(cells, 0.5, 0.5)
-        ways = np.broadcast_to(-self._normal, starts.shape)
+        starts, ways = self._starts(cells, 0.5, 0.5)
         hits = self._rays.cast(starts, ways, within=self._reach_m)
         hit = hits.rectangle >= 0
         self._rectangle[cells] = hits.rectangle
@@ -272,12 +271,11 @@ class _Renderer:
     def colour(self, cells: NDArray[np.int64], n_sub: int) -> None:
         """Set the mean colours of cells, each from n_sub^2 rays."""
         sums, n_hits = np.zeros((3, len(cells)), dtype=np.float32), np.zeros(len(cells))
-        ways = np.broadcast_to(-self._normal, (3, len(cells)))
         for sub in range(n_sub * n_sub):
             # A sheared grid has n^2 different positions along each axis, so that edges along rows
             # or columns, which are frequent on walls, are not rendered in steps of 1/n of a cell.
             i, j = sub % n_sub, sub // n_sub
-            starts = self._starts(
+            starts, ways = self._starts(
                 cells, (i + (j + 0.5) / n_sub) / n_sub, (j + (n_sub - i - 0.5) / n_sub) / n_sub
             )
             hits = self._rays.cast(starts, ways, within=self._reach_m)
@@ -286,10 +284,17 @@ class _Renderer:
         shown = n_hits > 0
         self._rgb[cells[shown]] = (sums[:, shown] / n_hits[shown]).T
 
-    def _starts(self, cells: NDArray[np.int64], right: float, down: float) -> NDArray[np.float64]:
-        """Return the starts (3, n) of rays through a position (right, down) in each cell."""
+    def _starts(
+        self, cells: NDArray[np.int64], right: float, down: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return starts and directions (3, n) of rays through (right, down) in each cell."""
         rows, columns = np.divmod(cells, self._width)
-        return self._corner + (columns + right) * self._step_u + (rows + down) * self._step_v
+        if self._frame.bend is not None:
+            places = np.column_stack([columns + right, rows + down])
+            points = self._frame.world_from_wall(places, self._front_m) - self._origin
+            return points.T, -self._frame.axes_at(places)[:, 2].T
+        starts = self._corner + (columns + right) * self._step_u + (rows + down) * self._step_v
+        return starts, np.broadcast_to(-self._normal, starts.shape)
 
 
 def _exposed(

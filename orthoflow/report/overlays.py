@@ -138,7 +138,7 @@ def residuals_on_wall(
     at = viewing.project(points)[:, :2]
     along = [
         (viewing.project(points + _STEP_M * axis)[:, :2] - at) / _STEP_M
-        for axis in (frame.u_world, frame.v_world)
+        for axis in _axes_at(frame, points_world)
     ]
     jacobian = np.stack(along, axis=2)
     found = np.full((len(points), 2), np.nan)
@@ -146,6 +146,14 @@ def residuals_on_wall(
     solvable = np.isfinite(jacobian).all(axis=(1, 2)) & (np.linalg.det(jacobian) != 0.0)
     found[solvable] = np.linalg.solve(jacobian[solvable], residual_px[solvable, :, None])[..., 0]
     return found
+
+
+def _axes_at(frame: WallFrame, points_world: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return u and v, (3,) each on a plane and (n, 3) each at the points of a cylinder."""
+    if frame.bend is None:
+        return [frame.u_world, frame.v_world]
+    local = frame.axes_at(frame.wall_from_world(points_world)[:, :2])
+    return [local[:, 0], local[:, 1]]
 
 
 def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float:

@@ -155,7 +155,13 @@ def _drawn(
     viewing = {camera.photo: camera.viewing() for camera in oriented}
     return (
         tuple(
-            (name, number, np.asarray(frame.corners_world(), dtype=np.float64) @ axes)
+            (
+                name,
+                number,
+                frame.corners_world() @ axes
+                if frame.bend is None
+                else frame.outline_world() @ axes,
+            )
             for number, (name, frame) in walls.items()
         ),
         # The third row of the rotation matrix is the viewing direction.

@@ -399,6 +399,7 @@ def cursor_places(
                     "u": frame.u_world.tolist(),
                     "v": frame.v_world.tolist(),
                     "n": frame.normal_world.tolist(),
+                    **_bend_of(frame),
                     "gsd": frame.gsd_m,
                     "width": frame.width,
                     "height": frame.height,
@@ -406,6 +407,13 @@ def cursor_places(
                 }
             )
     return places
+
+
+def _bend_of(frame: WallFrame) -> dict[str, object]:
+    """Return the arc of a curved wall for the scripts of pages."""
+    if frame.bend is None:
+        return {}
+    return {"bend": {"along": frame.bend.along, "radius": frame.bend.radius_m}}
 
 
 def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:
@@ -446,12 +454,16 @@ def _placed(picture: Picture, reference: WallFrame) -> dict[str, object]:
     frame = frame_of(picture)
     offset = frame.origin_world - reference.origin_world
     across_m, down_m = reference.width * reference.gsd_m, reference.height * reference.gsd_m
+    left_m, top_m = float(offset @ reference.u_world), float(offset @ reference.v_world)
+    if reference.bend is not None:
+        at = reference.wall_from_world(frame.origin_world[None])[0]
+        left_m, top_m = (reference.gsd_m * at[:2]).tolist()
     return {
         "id": picture.id,
         "title": shown(picture.title),
         "layer": shown(picture.layer),
-        "left": 100 * float(offset @ reference.u_world) / across_m,
-        "top": 100 * float(offset @ reference.v_world) / down_m,
+        "left": 100 * left_m / across_m,
+        "top": 100 * top_m / down_m,
         "width": 100 * frame.width * frame.gsd_m / across_m,
         "height": 100 * frame.height * frame.gsd_m / down_m,
     }
@@ -468,7 +480,8 @@ def _is_same_place(one: WallFrame, other: WallFrame) -> bool:
     longest_m = max(one.width, one.height) * one.gsd_m
     centres = one.corners_world().mean(axis=0), other.corners_world().mean(axis=0)
     return (
-        float(one.normal_world @ other.normal_world) > _SAME_NORMAL_COSINE
+        (one.bend is None) == (other.bend is None)
+        and float(one.normal_world @ other.normal_world) > _SAME_NORMAL_COSINE
         and float(one.u_world @ other.u_world) > _SAME_NORMAL_COSINE
         and float(np.linalg.norm(centres[0] - centres[1])) < _SAME_PLACE_SHARE * longest_m
     )

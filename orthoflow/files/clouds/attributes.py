@@ -215,6 +215,9 @@ class AttributedCloud:
 
     def _deviations(self, part: slice) -> NDArray[np.float32] | None:
         """Return signed distances (n,), metres, from the plane of the wall or of each point."""
+        if self.wall is not None and self.wall.frame.bend is not None:
+            on_wall = self.wall.frame.wall_from_world(self.cloud.points_world(part))
+            return np.asarray(on_wall[:, 2], dtype=np.float32)
         if self.wall is not None:
             plane = self.wall.frame.plane
             distances = self.cloud.points_world(part) @ plane.normal - plane.offset_m

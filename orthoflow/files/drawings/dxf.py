@@ -69,7 +69,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
     """
     document, space = _wall_document()
     frame = wall.frame
-    corners = wall.place_m(frame.corners_world())
+    corners = wall.corners_m
     _add_polygon(space, corners, "A-ELEV-OTLN")
     if wall.image:
         definition = document.add_image_def(wall.image, (frame.width, frame.height))
@@ -249,7 +249,11 @@ def _add_placed_wall(document: Drawing, space: Modelspace, wall: DrawnWall) -> N
         f"wall_{wall.number}",
         dxfattribs={name: tuple(vector.tolist()) for name, vector in axes.items()},
     )
-    if wall.image:
+    if frame.bend is not None:
+        # Images are flat, so a curved wall is placed by its outline.
+        outline = frame.outline_world().tolist()
+        space.add_polyline3d(outline, dxfattribs={"layer": "A-WALL-OTLN"})
+    elif wall.image:
         definition = document.add_image_def(wall.image, (frame.width, frame.height))
         bottom_left = frame.corners_world()[1]
         layer = {"layer": "A-ELEV-IMAG"}

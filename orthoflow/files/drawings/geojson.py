@@ -39,7 +39,7 @@ SEAM_CELLS: Final = 16_000_000
 def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
     """Write a wall in the coordinates of its GeoTIFF."""
     own: dict[str, JsonValue] = {"wall": wall.number, "name": wall.name}
-    features = [_polygon(wall.place_m(wall.frame.corners_world()), {"kind": "frame", **own})]
+    features = [_polygon(wall.corners_m, {"kind": "frame", **own})]
     if lines is not None:
         if wall.plane_index is not None:
             corners = lines.planes.corners[wall.plane_index]

@@ -101,6 +101,8 @@ def key_plan(planes: Planes, frame: WallFrame, number: int = -1) -> KeyPlan:
     """Return a plan of planes, seen from above, that marks the position of a raster."""
     corners = frame.corners_world()
     is_map = is_map_crs(frame.map_crs)
+    if frame.bend is not None:
+        return marked_plan(planes, frame.outline_world(), None, number, is_map=is_map)
     if abs(float(frame.normal_world @ planes.up)) > math.cos(math.radians(60.0)):
         return marked_plan(planes, corners, None, number, is_map=is_map)
     ends = np.array([corners[:2].mean(axis=0), corners[2:].mean(axis=0)])
@@ -231,6 +233,16 @@ class DrawnWall:
     def place_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return X and Y (n, 2) of points (n, 3)."""
         return self.frame.raster_from_wall(self.frame.wall_from_world(points_world)[:, :2])
+
+    @property
+    def corners_m(self) -> NDArray[np.float64]:
+        """X and Y (4, 2) of the corners of the raster: top-left first, counter-clockwise."""
+        if self.frame.bend is None:
+            return self.place_m(self.frame.corners_world())
+        # The ends of a whole turn are at the same place in the world.
+        rows, columns = float(self.frame.height), float(self.frame.width)
+        corners = np.array([[0.0, 0.0], [0.0, rows], [columns, rows], [columns, 0.0]])
+        return self.frame.raster_from_wall(corners)
 
     def near(self, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which points (n, 3) are inside or near the raster's rectangle."""

@@ -487,7 +487,7 @@ def unfolded(
     """
     e1, e2, _ = basis_from_up(up)
     middles = np.array([wall.frame.corners_world().mean(axis=0) for wall in walls])
-    normals = np.array([wall.frame.normal_world for wall in walls])
+    normals = np.array([wall.frame.facing_world for wall in walls])
     outwards = np.einsum("wi,wi->w", middles - middles.mean(axis=0), normals)
     is_inside = bool(outwards.sum() <= 0.0)
     looks = -normals

@@ -509,6 +509,9 @@ def axes_of(frame: WallFrame) -> Axes:
         top_m += frame.height * frame.gsd_m
     values = {"crs": frame.map_crs, "up": up_words(np.array(frame.up))}
     phrase = Phrase(key=f"axes_{frame.raster_axes}", values=values)
+    if frame.bend is not None:
+        radius = f"{abs(frame.bend.radius_m):.3f}"
+        phrase = Phrase(key="axes_unrolled", values={"radius": radius})
     return Axes(across=(left_m, 1.0), down=(top_m, -1.0), phrase=phrase)
 
 
@@ -527,7 +530,7 @@ def up_words(up: NDArray[np.float64]) -> str:
 
 def north_of(frame: WallFrame) -> tuple[float, float] | None:
     """Return the paper direction (right, up) of the key plan's top; None for upright walls."""
-    if frame.up is None or frame.raster_axes == "wall":
+    if frame.up is None or frame.raster_axes == "wall" or frame.bend is not None:
         return None
     north_world = basis_from_up(np.array(frame.up))[1]
     right, down = float(north_world @ frame.u_world), float(north_world @ frame.v_world)

@@ -100,6 +100,10 @@ def write_viewer(folder: Path, images: Mapping[str, OrthoFile]) -> None:
 
 def _image(name: str, ortho: OrthoFile) -> JsonValue:
     frame = ortho.frame
+    arc: dict[str, JsonValue] = {}
+    if frame.bend is not None:
+        arc = {"n": numbers(frame.normal_world), "along": frame.bend.along}
+        arc["radius"] = frame.bend.radius_m
     return {
         "file": name,
         "title": ortho.name,
@@ -112,6 +116,7 @@ def _image(name: str, ortho: OrthoFile) -> JsonValue:
         "origin": numbers(frame.origin_world),
         "u": numbers(frame.u_world),
         "v": numbers(frame.v_world),
+        **arc,
         # X and Y of the corner, as in the GeoTIFF.
         "corner": list(frame.raster_corner_m),
         "down": frame.raster_down,

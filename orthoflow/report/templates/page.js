@@ -293,8 +293,16 @@
       const known = place.mm.length > 0
         ? place.mm[Math.floor(y * place.rows) * place.columns + Math.floor(x * place.columns)] : null;
       const depth = known === null ? NaN : known / 1000;
+      let [right, below, before] = [place.gsd * u, place.gsd * v, known === null ? 0 : depth];
+      if (place.bend) {
+        // A cylinder: the arc begins at the left or upper edge.
+        const { along, radius } = place.bend, angle = (along === "u" ? right : below) / radius;
+        const bent = (radius - before) * Math.sin(angle);
+        before = radius - (radius - before) * Math.cos(angle);
+        if (along === "u") right = bent; else below = bent;
+      }
       const world = [0, 1, 2].map((axis) => place.origin[axis]
-        + place.gsd * (u * place.u[axis] + v * place.v[axis]) + (known === null ? 0 : depth) * place.n[axis]);
+        + right * place.u[axis] + below * place.v[axis] + before * place.n[axis]);
       return { id: place.id, x, y, wall: place.wall, of: place.name, u, v, depth, world };
     };
     const words = (point) => `u ${point.u.toFixed(1)} px, v ${point.v.toFixed(1)} px, depth ${

@@ -158,7 +158,7 @@ class _TrueWall:
         """Return the depths (n,) of openings at positions (n, 2) = (column, row); NaN elsewhere."""
         frame, front_m = self.frame, self.slab.front_m
         starts = frame.world_from_wall(places, front_m) - self.scene.origin
-        hits = self.views.cast(starts, np.broadcast_to(-frame.normal_world, starts.shape))
+        hits = self.views.cast(starts, -frame.axes_at(places)[:, 2])
         depth_m = front_m - hits.t
         is_open = (hits.rectangle >= 0) & (depth_m <= self.deep_m)
         is_open &= self.scene.role[hits.rectangle] == SurfaceRole.RECESS

@@ -192,8 +192,10 @@ def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float
             frame = walls.walls[index].frame
             points = ties.points_world[mine]
             axes = np.vstack([frame.u_world, frame.v_world])
+            if frame.bend is not None:
+                axes = frame.axes_at(frame.wall_from_world(points)[:, :2])[:, :2]
             off_px = ties.pixels_photo[mine] - camera.project(points)[:, :2]
-            pixels_by_plane = pixels_by_point(camera, points) @ axes.T
+            pixels_by_plane = pixels_by_point(camera, points) @ np.swapaxes(axes, -1, -2)
             seen = np.asarray(np.isfinite(off_px).all(axis=1), dtype=np.bool_)
             seen[seen] = np.linalg.det(pixels_by_plane[seen]) != 0.0
             off_m = np.linalg.solve(pixels_by_plane[seen], off_px[seen, :, None])[:, :, 0]
@@ -211,6 +213,12 @@ def most_shown(camera: ViewingCamera, walls: Sequence[Wall]) -> int:
     nearest, shown = np.full(len(rays), np.inf), np.full(len(rays), -1)
     for index, wall in enumerate(walls):
         frame, centre = wall.frame, camera.centre_world
+        if frame.bend is not None:
+            apart = np.linalg.norm(frame.met_by(centre, rays) - centre, axis=1)
+            along = apart / np.linalg.norm(rays, axis=1)
+            hit = np.flatnonzero(along < nearest)
+            nearest[hit], shown[hit] = along[hit], index
+            continue
         if float((centre - frame.origin_world) @ frame.normal_world) <= 0.0:
             continue
         with np.errstate(divide="ignore"):
@@ -289,10 +297,15 @@ def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]
     for index in range(len(walls.walls)):
         slab = walls.slab(index)
         frame = slab.frame
-        relative = seen.points[hit] - (frame.origin_world - scene.origin)
-        columns, rows = relative @ frame.u_world, relative @ frame.v_world
-        depths = relative @ frame.normal_world
-        facing = np.abs(scene.normal[seen.rectangle[hit]] @ frame.normal_world)
+        if frame.bend is not None:
+            on_wall = frame.wall_from_world(seen.points[hit] + scene.origin)
+            columns, rows = frame.gsd_m * on_wall[:, 0], frame.gsd_m * on_wall[:, 1]
+            depths, facing = on_wall[:, 2], np.ones(len(on_wall))
+        else:
+            relative = seen.points[hit] - (frame.origin_world - scene.origin)
+            columns, rows = relative @ frame.u_world, relative @ frame.v_world
+            depths = relative @ frame.normal_world
+            facing = np.abs(scene.normal[seen.rectangle[hit]] @ frame.normal_world)
         on_walls[hit] |= (
             (facing > _LEAST_COSINE)
             & (columns > 0.0)

@@ -77,8 +77,10 @@ def wall_of(image: Orthoimage, walls: Walls, allocate: Allocate = in_memory) -> 
 
 def _require_nearness(image: Orthoimage, wall: Wall, walls: Walls) -> None:
     middle = image.frame.corners_world().mean(axis=0)
-    aside = float(wall.frame.plane.distances_m(middle[None])[0])
-    angle = angle_between_deg(image.frame.normal_world, wall.frame.normal_world)
+    if image.frame.bend is not None:
+        middle = image.frame.middle_world
+    aside = float(wall.frame.wall_from_world(middle[None])[0, 2])
+    angle = angle_between_deg(image.frame.facing_world, wall.frame.facing_world)
     slab = walls.slab(image.wall)
     if angle > _SAME_DIRECTION_DEG or not (-slab.behind_m <= aside <= slab.front_m):
         raise MethodError(

@@ -188,12 +188,7 @@ def find_by_truth(
     rim = search_cells + 4
     side = PATCH_CELLS + 2 * rim
     corner = np.floor(expected).astype(np.int64) - side // 2
-    part = replace(
-        frame,
-        origin_world=frame.world_from_wall(corner[None].astype(np.float64))[0],
-        width=side,
-        height=side,
-    )
+    part = frame.part(corner.astype(np.float64), width=side, height=side)
     true = render(truth.scene, part, front_m=buffers_m[0], behind_m=buffers_m[1])
     known = np.asarray(np.isfinite(true.rgb).all(axis=2), dtype=np.bool_)
     reference = GreyImage(

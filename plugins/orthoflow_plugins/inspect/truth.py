@@ -303,7 +303,8 @@ class InspectTruth(Method):
             ctx.progress(place / len(orthoimages.images), image.name)
             verdict = judge.verdict_on(image)
             verdicts.append(verdict)
-            findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
+            if image.frame.bend is None:
+                findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
             findings += _findings([verdict], image.wall)
             findings += verdict.quality
             _draw(image, verdict, ctx)

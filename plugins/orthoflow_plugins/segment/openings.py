@@ -35,6 +35,7 @@ from orthoflow.sdk import (
     Ports,
     StepContext,
 )
+from orthoflow.untrusted_text import first_few
 from orthoflow_plugins.segment.areas import Area, Relief, open_areas, relief_of, sight_lines
 from orthoflow_plugins.segment.outlines import Outline, moved_to_edges, outline_of
 
@@ -80,6 +81,13 @@ OTHER_CELLS: Final = DiagnosticSpec(
     text="{subject}: the cells of its orthoimage differ from those of its depth raster, so sides "
     "are measured from depth alone",
     remedy="use the same gsd_m for both",
+)
+
+
+CURVED: Final = DiagnosticSpec(
+    code="openings-of-curved-walls",
+    severity="warning",
+    text="{subject}: openings are searched for on planes only, not on curved walls",
 )
 
 
@@ -156,10 +164,14 @@ class SegmentOpenings(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Find the openings of each wall."""
         walls = inputs.walls
+        curved = [wall.name for wall in walls.walls if wall.frame.bend is not None]
+        if curved:
+            ctx.report(CURVED, subject=first_few(curved))
         chosen = [
             place
             for place, wall in enumerate(walls.walls)
-            if params.level or abs(float(wall.frame.normal_world @ walls.up)) < _UPRIGHT
+            if wall.frame.bend is None
+            and (params.level or abs(float(wall.frame.normal_world @ walls.up)) < _UPRIGHT)
         ]
         if not chosen:
             raise MethodError(

@@ -1,0 +1,104 @@
+"""Photos matched with an unrolled vault and oriented, judged by the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from orthoflow_plugins.match.guided import MatchGuided
+from orthoflow_plugins.match.sift import MatchSift
+from orthoflow_plugins.orient.bundle import OrientColmapBundle
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.raster.grid import RasterGrid
+
+from orthoflow.files.images import encode_png
+from orthoflow.geometry import WallFrame
+from orthoflow.products import Cameras, Intrinsics, Layer, LayerMask, Photo, Photos
+from tests import curved_scenes, ortho_scenes
+from tests.curved_scenes import Drum
+from tests.method_runs import run
+from tests.raster_scenes import cloud_of, context
+
+GSD_M = 0.004
+# Limit per coordinate: 0.35 mm and a tenth of a cell.
+LIMIT_M = 0.35e-3 + 0.1 * GSD_M
+BLOCK_CELLS = 24
+LOOSE = {
+    "min_quadrant_ties": 0,
+    "min_hull_ratio": 0.1,
+    "max_sigma_wall_cells": 4,
+    "max_sigma_corner_cells": 8,
+}
+
+
+def shifts_m(layer: Layer, drum: Drum, frame: WallFrame) -> NDArray[np.float64]:
+    """Displacements (n, 2) along u and v of blocks of a layer, by least squares, in metres."""
+    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
+    places = drum.places(frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()])))
+    true = curved_scenes.texture(places).reshape(frame.shape)
+    down, right = np.gradient(true)
+    off, found = layer.rgb[..., 0] / 255.0 - true, []
+    for row in range(0, frame.height - BLOCK_CELLS, BLOCK_CELLS):
+        for column in range(0, frame.width - BLOCK_CELLS, BLOCK_CELLS):
+            part = slice(row, row + BLOCK_CELLS), slice(column, column + BLOCK_CELLS)
+            shown = layer.mask[part] == LayerMask.PAINTED
+            if shown.mean() > 0.98:
+                slopes = [values[part][shown] for values in (right, down, true)]
+                design = np.column_stack([*slopes, np.ones(shown.sum())])
+                solution = np.linalg.lstsq(design, off[part][shown], rcond=None)[0]
+                found.append(-GSD_M * solution[:2])
+    return np.array(found)
+
+
+def test_an_oriented_vault_is_unrolled_to_a_tenth_of_a_cell(tmp_path: Path) -> None:
+    drum = curved_scenes.vault(length_m=1.2, band_m=(0.2, 0.35), height_m=0.08)
+    random = np.random.default_rng(11)
+    points = drum.cloud(0.7 * GSD_M)
+    world = points.points_world()
+    world += random.normal(0.0, 1e-3, len(world))[:, None] * drum.cylinder.normals(world)
+    cloud = replace(cloud_of(world, intensity=points.intensity), rgb=points.rgb)
+    poses = [(-50.0, -0.2, 2.4), (-18.0, 0.2, 2.5), (15.0, -0.2, 2.4), (50.0, 0.2, 2.4)]
+    viewers = [curved_scenes.camera(drum, *pose, width=1000) for pose in poses]
+    pictures = [drum.rendered(viewer) for viewer in viewers]
+    noisy = [
+        np.clip(picture + random.normal(0.0, 2.0, picture.shape), 0.0, 255.0).astype(np.uint8)
+        for picture in pictures
+    ]
+    photos = Photos(
+        photos=tuple(
+            Photo(
+                name=f"{k}.png",
+                encoded=encode_png(picture),
+                width=viewer.width,
+                height=viewer.height,
+                intrinsics=Intrinsics.of(viewer),
+            )
+            for k, (picture, viewer) in enumerate(zip(noisy, viewers, strict=True))
+        )
+    )
+    scan = {"cloud": cloud, "planes": curved_scenes.NO_PLANES, "surfaces": drum.surfaces()}
+    walls = run(RasterGrid, context(tmp_path), scan, gsd_m=GSD_M).walls
+    given = {"photos": photos, "walls": walls}
+    ties = run(MatchSift, context(tmp_path), given).ties
+    assert ties.walls[0].frame.has_cells_of(walls.walls[0].frame)
+    inputs = {"ties": ties, "photos": photos}
+    first = run(OrientColmapBundle, context(tmp_path), inputs, **LOOSE).cameras
+    more = {**given, "cameras": first, "cloud": cloud}
+    again = run(MatchGuided, context(tmp_path), more).ties
+    inputs = {"ties": again, "photos": photos}
+    cameras = run(OrientColmapBundle, context(tmp_path), inputs).cameras
+    assert [camera.status for camera in cameras.cameras] == ["ok"] * 4
+    for camera, viewer in zip(cameras.cameras, viewers, strict=True):
+        assert np.linalg.norm(camera.viewing().centre_world - viewer.centre_world) < 1.5e-3
+
+    def rmse_m(oriented: Cameras) -> NDArray[np.float64]:
+        shown = {**given, "cloud": cloud, "cameras": oriented}
+        layers = run(DsmBackward, context(tmp_path), shown).layers.layers
+        shifts = np.vstack([shifts_m(layer, drum, walls.walls[0].frame) for layer in layers])
+        assert len(shifts) > 100
+        return np.sqrt((shifts**2).mean(axis=0))
+
+    assert (rmse_m(ortho_scenes.cameras(*viewers)) < LIMIT_M).all()
+    assert (rmse_m(cameras) < LIMIT_M).all()
