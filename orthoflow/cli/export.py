@@ -106,8 +106,8 @@ _HELP: Final = "\n\n".join(
     "--scale",
     type=_Scale(min=1, max=100_000),
     metavar="N",
-    help="scale 1:N (50 or 1:50); by default the largest common scale at which each drawing fits "
-    "on one sheet.",
+    help="scale 1:N (50 or 1:50); by default the largest standard scale at which each drawing "
+    "fits on one sheet.",
 )
 @_for(
     _DRAWN,
@@ -129,8 +129,8 @@ _HELP: Final = "\n\n".join(
     "sheet",
     "--units",
     type=click.Choice(["m", "ft"]),
-    help="unit of coordinates, heights and scale bar; m by default. With ft, the common scales are "
-    "1:48 (1/4 inch to the foot) and so on.",
+    help="unit of coordinates, heights and scale bar; m by default. With ft, the standard scales "
+    "are 1:48 (1/4 inch to the foot) and so on.",
 )
 @_for(
     _DRAWN,

@@ -210,8 +210,8 @@ class _Lens(BaseModel):
         values = values or (0.0,) * len(terms)
         if len(values) != len(terms):
             raise ValueError(
-                f"expected the {len(terms)} numbers [{', '.join(terms)}], got {len(values)} "
-                "values; pad with 0; other lens models are not supported"
+                f"expected the {len(terms)} numbers [{', '.join(terms)}], got {len(values)}; "
+                "add 0 for terms that are not used; other lens models are not supported"
             )
         if len(info.data) == _FIELDS_ABOVE and (problem := _problem(_lens(info.data, values))):
             raise ValueError(

@@ -135,10 +135,11 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
     }
     if len(of_photos) == 1:
         return list(of_photos.pop())
-    counts = ", ".join(f"{name} ({len(names)} lines)" for name, names in lists.items())
+    counts = ", ".join(f"{name} (lines: {len(names)})" for name, names in lists.items())
     raise InputError(
-        f"{path.name} has {n_cameras} cameras without names: pass its folder, in which a list "
-        f"(.txt) names the same number of photos, one per line; found {counts or 'no such file'}"
+        f"{path.name} does not contain the names of its photos: pass its folder, in which a list "
+        f"(.txt) names one photo per line (lines needed: {n_cameras}); found "
+        f"{counts or 'no such file'}"
     )
 
 
@@ -167,7 +168,7 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
     matrix = np.array(entry["K"], dtype=np.float64)
     distortion = tuple(float(value) for value in entry["distortion"])
     if matrix.shape != (3, 3) or len(distortion) != 5:
-        raise damaged(path, f"the lens of {name} must be K (3 x 3) and k1, k2, p1, p2, k3")
+        raise damaged(path, f"the lens of {name} must consist of K (3 x 3) and k1, k2, p1, p2, k3")
     lens = Intrinsics(
         width=int(entry["width"]),
         height=int(entry["height"]),

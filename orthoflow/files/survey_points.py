@@ -213,7 +213,7 @@ class _Table:
 
     def check(self) -> None:
         left_out = len(self.problems) - _MAX_PROBLEMS
-        more = [f"... and {left_out} more problems"] if left_out > 0 else []
+        more = [f"... and {left_out} more"] if left_out > 0 else []
         if self.problems:
             raise InputError("\n".join(self.problems[:_MAX_PROBLEMS] + more))
 
@@ -298,7 +298,7 @@ class _Table:
         separator = next((mark for mark in _SEPARATORS if mark in first), ",")
         for place, (number, line) in enumerate(numbered):
             if len(line) > MOST_LINE:
-                problem = f"the line has over {MOST_LINE} characters: expected {self.content}"
+                problem = f"the line has more than {MOST_LINE} characters: expected {self.content}"
             elif place >= max_rows:
                 problem = f"the file contains more than {max_rows} {self.content}; split it"
             else:
@@ -336,7 +336,8 @@ class _Table:
             self.add(line, f"unknown {what} {found}; known columns: {expected}")
         missing = [name for name in self.required if name not in names]
         if missing:
-            self.add(line, f"the column {', '.join(missing)} is missing")
+            what = "column" if len(missing) == 1 else "columns"
+            self.add(line, f"missing {what}: {', '.join(missing)}")
         if self.measured:
             self.measured_by(line, names, is_row=False)
         return tuple(names) if len(self.problems) == n_before else ()

@@ -271,8 +271,8 @@ def _intensity(
                 "laser": "laser intensity",
                 "luminance": "grey of the scan's colours, because the scan has no laser intensity",
             }.get(source, source),
-            reading="Photos are matched with this picture: texture everywhere is good; no ties can "
-            "be found in uniform grey areas.",
+            reading="Photos are matched with this picture, which should have texture everywhere: "
+            "no ties can be found in uniform grey areas.",
         ),
     )
 

@@ -128,7 +128,7 @@ def stated_errors_of_poses_hold(subject: Subject) -> None:
 
 
 def _check_ratios(ratios: list[float], what: str) -> None:
-    require(ratios, "no plane of a drawn room was found")
+    require(ratios, "no plane of a random room was found")
     factor = math.sqrt(float(np.mean(np.square(ratios))))
     low, high = _STATED_LIMITS
     require(

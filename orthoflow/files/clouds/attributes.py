@@ -413,12 +413,12 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
         "colour": attributed.colouring,
         "colour_meaning": _MEANINGS[attributed.colouring],
         "normals": (
-            "normals of least-squares planes through the points of a voxel and its neighbours, "
-            f"cubes of {3.0 * attributed.neighbourhoods.side_m:.4g} m, towards the viewer; 0 0 "
-            "0: no surface"
+            "surface normals towards the viewer, from least-squares planes through the points in a "
+            f"cube of {3.0 * attributed.neighbourhoods.side_m:.4g} m around each voxel; 0 0 0: no "
+            "surface"
         ),
-        "cleaned": "points with fewer than 10 neighbours, in 3 x 3 x 3 cubes of "
-        f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, are omitted"
+        "cleaned": "points with fewer than 10 neighbours in the surrounding 3 x 3 x 3 cubes, each "
+        f"with sides of {3.0 * attributed.neighbourhoods.side_m:.4g} m, are omitted"
         if attributed.is_cleaned
         else None,
         "wall": None

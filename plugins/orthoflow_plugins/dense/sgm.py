@@ -107,9 +107,9 @@ class DenseSgm(Method):
         pairs = [(left, right) for left, right in neighbours if right is not None]
         if not pairs:
             raise MethodError(
-                f"no pairs were found among {len(views)} oriented photos: neighbouring photos with "
-                "similar viewing directions must overlap sideways by 50 to 95 % at a distance of "
-                f"{distance_m:.2g} m (from nearest_m and farthest_m)"
+                f"no pairs were found among the oriented photos ({len(views)}): neighbouring "
+                "photos with similar viewing directions must overlap sideways by 50 to 95 % at a "
+                f"distance of {distance_m:.2g} m (from nearest_m and farthest_m)"
             )
         parts = []
         n_pixels = n_matched = 0

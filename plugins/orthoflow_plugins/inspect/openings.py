@@ -109,9 +109,9 @@ class InspectOpenings(Method):
         missing = [number for number in inputs.openings.walls if number not in places]
         if missing:
             raise MethodError(
-                f"there are openings on wall {missing[0]}, but the walls are "
-                f"{', '.join(map(str, places)) or 'none'}: connect the walls on which they "
-                "were found"
+                f"there are openings on wall {missing[0]}, which is not among the connected walls "
+                f"({', '.join(map(str, places)) or 'none'}): connect the walls on which they were "
+                "found"
             )
         views = SceneCameras(inputs.truth.scene, cores=ctx.cores)
         verdicts = []

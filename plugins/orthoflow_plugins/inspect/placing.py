@@ -35,9 +35,9 @@ def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
         index = image.wall if image.plane_index is None else places.get(image.plane_index, -1)
         if not 0 <= index < len(walls.walls):
             raise MethodError(
-                f"orthoimage {image.name} shows wall {image.number}, but the walls are "
-                f"{', '.join(str(place) for place in sorted(places)) or 'none'}: connect the "
-                "walls that the orthoimages were made from"
+                f"orthoimage {image.name} shows wall {image.number}, which is not among the "
+                f"connected walls ({', '.join(map(str, sorted(places))) or 'none'}): connect the "
+                "walls from which the orthoimages were made"
             )
         number = walls.walls[index].plane_index
         placed.append(replace(image, wall=index, plane_index=number))
@@ -84,8 +84,9 @@ def _require_nearness(image: Orthoimage, wall: Wall, walls: Walls) -> None:
     slab = walls.slab(image.wall)
     if angle > _SAME_DIRECTION_DEG or not (-slab.behind_m <= aside <= slab.front_m):
         raise MethodError(
-            f"orthoimage {image.name} is {aside:.3f} m in front of {wall.name} and rotated by "
-            f"{angle:.2f} deg: connect the walls that the orthoimages show"
+            f"orthoimage {image.name} is {abs(aside):.3f} m "
+            f"{'behind' if aside < 0.0 else 'in front of'} {wall.name} and rotated by {angle:.2f} "
+            "deg: connect the walls that the orthoimages show"
         )
 
 

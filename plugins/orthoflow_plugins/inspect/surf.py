@@ -149,8 +149,8 @@ class InspectSurf(Method):
         if reason is None and not fit:
             most = max(len(item.pairs) for item in verdicts)
             reason = (
-                f"orthoimage and intensity are too different: at most {most} pairs of SURF key "
-                f"points were found on one wall, but at least {_FEWEST_PAIRS} are needed"
+                f"orthoimage and intensity are too different: at least {_FEWEST_PAIRS} pairs of "
+                f"SURF key points are needed on a wall, and the largest number found is {most}"
             )
         if reason is not None:
             if params.unfit == "refuse":

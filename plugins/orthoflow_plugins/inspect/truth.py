@@ -157,8 +157,8 @@ NOT_COMPARED: Final = DiagnosticSpec(
 NOT_TRACED: Final = DiagnosticSpec(
     code="truth-not-traced",
     severity="warning",
-    text="for cells coloured from {names}, displacements are not computed, since the cameras "
-    "contain no oriented photo with this name",
+    text="displacements are not computed for cells from sources that are not oriented photos of "
+    "the connected cameras: {names}",
     rank_by="n",
 )
 

@@ -14,7 +14,7 @@ class SeamsParams(MethodParams):
 
     seams: Literal["best-view", "voronoi", "graph-cut", "priority"] = Field(
         "best-view",
-        description="Rule that selects the layer of a cell if there are several. best-view: by "
+        description="Rule that selects one of several layers for a cell. best-view: by "
         "angle of incidence, resolution and distance from the border of the photo; voronoi: "
         "with seams in the middle of overlaps; graph-cut: with seams where photos look "
         "similar, away from depth edges; priority: in the order given.",

@@ -146,9 +146,9 @@ class OrientColmapBundle(Method):
         intrinsics: Sharing = Field(
             default="focal-group",
             description="Which photos share a lens. focal-group: photos with the same image size "
-            "and the same EXIF focal length or calibration, and photos of the same size without "
-            "either unless their ties contradict this; shared: all photos of the same size; "
-            "per-photo: none.",
+            "and the same EXIF focal length or calibration, or with neither of these unless their "
+            "ties contradict this; shared: all photos of the same size; per-photo: each photo has "
+            "its own lens.",
         )
         photo_ties: bool = Field(
             default=True, description="Also match overlapping photos with each other."

@@ -587,8 +587,8 @@ GATES: Final = (
         value=lambda c: c.poor_quarter[0] if c.poor_quarter else None,
         limit="min_quadrant_ties",
         reason=lambda c, value, limit: (
-            f"a quarter of the photo has {value} ties; each quarter needs at least "
-            f"{limit:g}{c.poor_quarter[1] if c.poor_quarter else ''}"
+            f"one quarter of the photo has too few ties ({value}; each needs at least {limit:g})"
+            f"{c.poor_quarter[1] if c.poor_quarter else ''}"
         ),
     ),
     _SIDE,
@@ -613,7 +613,7 @@ GATES_BEFORE_BLOCK: Final = (*CONTROL_GATES, _SIDE)
 def _unchecked_tie(c: Candidate, value: float, limit: float) -> str:
     u, v = (math.nan, math.nan) if c.needed_tie is None else c.needed_tie[1]
     return (
-        f"without the tie at (u {u:.0f}, v {v:.0f}), its predicted error on the wall would be "
+        f"without the tie at (u {u:.0f}, v {v:.0f}), the predicted error on the wall would be "
         f"{value:.1f} cells of {1000.0 * (c.gsd_m or math.nan):g} mm; the limit is {limit:g} "
         "cells. An error of that tie could not be detected: measure more ties, farther apart"
     )
@@ -661,9 +661,9 @@ def too_few(n_ties: int) -> str:
     if n_ties >= _MIN_TIES:
         return ""
     return (
-        f"only {n_ties} ties to the walls were found; at least {_MIN_TIES} are required: the photo "
-        "shows none of the walls, its colours differ too much from the intensity, or the cells "
-        "are too coarse"
+        f"too few ties to the walls were found ({n_ties}; at least {_MIN_TIES} are required): the "
+        "photo shows none of the walls, its colours differ too much from the intensity, or the "
+        "cells are too coarse"
     )
 
 

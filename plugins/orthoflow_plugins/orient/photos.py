@@ -62,7 +62,7 @@ BY_HAND: Final = DiagnosticSpec(
 HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
     code="ties-by-hand-contradict",
     severity="warning",
-    text="photo {subject}: {n} ties measured by hand contradict the others and were ignored: "
+    text="photo {subject}: ties measured by hand that contradict the others were ignored ({n}): "
     "{places}",
     remedy="measure them again",
     rank_by="n",

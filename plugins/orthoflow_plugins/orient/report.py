@@ -388,8 +388,8 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
             partial(map_chart, error_mm, label, frame, low=0.0, high=round_scale(1e3 * high_m)),
-            f"Predicted error of a coordinate on {wall.name}, at each position for the "
-            f"most accurate photo; median {1e3 * median_m:.2g} mm. Grey: no oriented "
+            f"Predicted error of a coordinate on {wall.name}, for the most accurate photo at "
+            f"each position; median {1e3 * median_m:.2g} mm. Grey: no oriented "
             "photo shows the wall. In bright areas far from ties, the orthoimage may "
             "be displaced; more ties there would help.",
         )
@@ -495,8 +495,8 @@ def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -
         "residuals",
         figure,
         "Residuals of all oriented photos. Narrow peaks around 0 are good. A peak away from 0, a "
-        "density with secondary peaks, or a broader one for check than for control ties indicates "
-        "a systematic error or a group of wrong ties.",
+        "density with secondary peaks, or a density that is broader for check ties than for "
+        "control ties indicates a systematic error or a group of wrong ties.",
     )
 
 

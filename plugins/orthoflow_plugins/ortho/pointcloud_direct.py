@@ -311,6 +311,6 @@ def _report(ctx: StepContext, layers: list[Layer], names: Sequence[str], n_fille
         if n_void:
             ctx.log(
                 f"{names[layer.wall]}: {n_void / layer.mask.size:.1%} of its cells contain no "
-                "point and are not part of a small gap; increase void_limits and inpaint_radius_px "
-                "to fill larger gaps (recover_gap_cells affects only depths)"
+                "point and are not part of a small gap; to fill larger gaps, increase void_limits "
+                "and inpaint_radius_px (recover_gap_cells affects only depths)"
             )

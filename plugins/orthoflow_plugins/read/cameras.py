@@ -27,13 +27,13 @@ _OF_RUN: Final = "cameras.json"
 _EXPORT_OTHERWISE = "align with the model Brown3, or export a COLMAP model"
 LIMITED: Final = DiagnosticSpec(
     code="cameras-limited",
-    text="{note} ({n} photos, such as {subject})",
+    text="{note} (affected photos: {n}, e.g. {subject})",
     rank_by="n",
 )
 WITHOUT_TIES: Final = DiagnosticSpec(
     code="cameras-without-ties",
-    text="{subject} of a run was given without the ties.csv of the same folder: which walls have "
-    "ties is unknown, so the accuracy of orthoimages is not assessed",
+    text="{subject} of a run was given without the ties.csv of the same folder, so it is unknown "
+    "which walls have ties, and the accuracy of orthoimages is not assessed",
     remedy="give the folder that contains both files",
 )
 NOT_ORIENTED: Final = DiagnosticSpec(
@@ -119,12 +119,11 @@ class ReadCameras(Method):
         cameras = tuple(_camera(photo, by_name, UNITS_M[params.unit], notes) for photo in photos)
         n_oriented = sum(camera.status == "ok" for camera in cameras)
         if not n_oriented:
+            why = f" ({photos[0].name}: {cameras[0].status})" if photos else ""
             raise InputError(
-                f"the input {inputs.files.name} orients none of the {len(photos)} photos, such as "
-                f"{photos[0].name if photos else 'none'}: it contains "
-                f"{first_few([item.name for item in given])}; "
-                f"{cameras[0].status if cameras else ''}"
-                "; without these files, photos are oriented by matching with the scan"
+                f"the input {inputs.files.name} orients none of the photos{why}; it contains "
+                f"{first_few([item.name for item in given])}; without this input, photos are "
+                "oriented by matching with the scan"
             )
         for note, of_photos in notes.items():
             ctx.report(LIMITED, subject=of_photos[0], note=note, n=len(of_photos))
@@ -289,9 +288,13 @@ def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> Giv
     if len(best) == 1 and (is_only or max(scores) > 0 or not own):
         return best[0]
     names = first_few([camera.name for camera in best])
-    count = f"{len(best)} cameras with its name ({names})" if len(best) > 1 else f"only {names}"
+    if len(best) > 1:
+        what = f"{len(best)} cameras with its name ({names})"
+        unknown = "which of them belongs"
+    else:
+        what, unknown = f"only {names} for this file name", "whether it belongs"
     return GivenCamera(
         name=found[0].name,
-        reason=f"the camera files contain {count}, and the folder names do not tell which one "
-        "belongs to this photo: use the same folder names for photos and cameras",
+        reason=f"the camera files contain {what}, and the folder names do not show {unknown} to "
+        "this photo: use the same folder names for photos and cameras",
     )

@@ -187,7 +187,7 @@ class ReadPhotos(Method):
                 problems.append(str(error))
         if problems:
             more = len(problems) - _MOST_PROBLEMS
-            counted = [f"... and {more} more problems"] if more > 0 else []
+            counted = [f"... and {more} more"] if more > 0 else []
             raise InputError("\n".join(problems[:_MOST_PROBLEMS] + counted))
         masks.warn_of_unused(ctx)
         _warn(ctx, read, calibration)

@@ -39,7 +39,7 @@ NO_EFFECT: Final = DiagnosticSpec(
 FILE_NOTE: Final = DiagnosticSpec(code="scan-file-differs", text="{text}")
 FIELD_ZERO: Final = DiagnosticSpec(
     code="scan-field-zero",
-    text="{subject}: the {field} of all points is zero: it is treated as missing, not as black",
+    text="{subject}: the {field} of all points is zero and is treated as missing, not as black",
 )
 COLOUR_LIMIT: Final = DiagnosticSpec(
     code="scan-colour-limit-misfit",

@@ -75,7 +75,7 @@ class ReadTies(Method):
         wrong = [tie for tie in found if not _is_in_photo(tie, photos)]
         if wrong:
             left_out = len(wrong) - _MOST_PROBLEMS
-            more = [f"... and {left_out} more problems"] if left_out > 0 else []
+            more = [f"... and {left_out} more"] if left_out > 0 else []
             # Finding similar names is slow, so this is only done for the ties in the message.
             shown = [_problem(tie, photos) for tie in wrong[:_MOST_PROBLEMS]]
             raise InputError("\n".join(shown + more))

@@ -89,8 +89,8 @@ class RegisterSimilarity(Method):
         n_free = 3 * len(names) - (7 if params.with_scale else 6)
         if n_free < 1:
             raise MethodError(
-                f"{len(names)} names are in both lists of points ({', '.join(names) or 'none'}), "
-                "but at least 3 pairs are needed (register.similarity)"
+                "at least 3 names must be in both lists of points, but only these are: "
+                f"{', '.join(names) or 'none'} (register.similarity)"
             )
         try:
             fitted = fit_similarity(source, target, with_scale=params.with_scale)

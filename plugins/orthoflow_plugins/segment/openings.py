@@ -140,7 +140,7 @@ class SegmentOpenings(Method):
             default=0.25,
             gt=0.0,
             le=100.0,
-            description="Side of the smallest square that must fit into an opening.",
+            description="Side of a square that must fit into each opening.",
         )
         area_least_m2: float = Field(
             default=0.1, gt=0.0, le=10_000.0, description="Smallest area of an opening."

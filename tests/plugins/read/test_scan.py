@@ -240,7 +240,7 @@ def test_zero_intensity_and_zero_colours_are_absent_not_black(
     assert cloud.intensity is None
     assert cloud.rgb is None
     assert cloud.source["intensity_source"] == "none"
-    assert "the intensity of all points is zero: it is treated as missing" in read.warnings
+    assert "the intensity of all points is zero and is treated as missing" in read.warnings
     assert "the colour of all points is zero" in read.warnings
 
 
