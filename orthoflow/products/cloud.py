@@ -147,7 +147,7 @@ class PointCloud(Product):
         """
         if len(self) < n_least:
             raise ProductError(
-                f"the cloud has {len(self)} points, but at least {n_least} are needed"
+                f"the cloud has too few points: {len(self)}; at least {n_least} are needed"
             )
         for name, values in (("x", self.x), ("y", self.y), ("z", self.z), ("origin", self.origin)):
             # The sum is finite if and only if all values are finite, since it cannot overflow

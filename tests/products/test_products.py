@@ -216,7 +216,9 @@ def test_percentiles_that_do_not_fit_their_rasters_are_refused() -> None:
 
 def test_a_cloud_with_few_points_or_coordinates_that_are_not_finite_is_refused() -> None:
     CLOUD.require_points(3)
-    with pytest.raises(ProductError, match="the cloud has 3 points, but at least 4 are needed"):
+    with pytest.raises(
+        ProductError, match="the cloud has too few points: 3; at least 4 are needed"
+    ):
         CLOUD.require_points(4)
     for bad in (np.nan, np.inf, -np.inf):
         y = np.array([0.0, 0.0, bad], dtype=np.float32)

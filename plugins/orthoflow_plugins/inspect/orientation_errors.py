@@ -88,8 +88,7 @@ def true_camera(truth: Truth, photo: str) -> ViewingCamera:
         if camera.photo == photo:
             return camera.viewing()
     raise MethodError(
-        f"the truth does not contain the photo {photo}, only {len(cameras)} others: connect the "
-        "cameras of the simulated photos"
+        f"the truth does not contain the photo {photo}: connect the cameras of the simulated photos"
     )
 
 

@@ -137,7 +137,7 @@ class ReadCameras(Method):
         if sigmas_mm:
             ctx.metric("sigma_wall_mm_median", float(np.median(sigmas_mm)), "mm")
             ctx.metric("sigma_wall_mm_worst", max(sigmas_mm), "mm")
-        ctx.log(f"{n_oriented} poses are taken as given; they are not checked here")
+        ctx.log(f"given poses, which are not checked here: {n_oriented}")
         ties = _ties(inputs.files.paths, [photo.name for photo in photos], params)
         if ties is None and any(camera.covariance is not None for camera in cameras):
             ctx.report(WITHOUT_TIES, subject=_OF_RUN)

@@ -360,8 +360,8 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     _refuse_raw(files.name, [source.name for source in sources], others)
     if not sources:
         raise InputError(
-            f"the input {files.name} contains no photo, only {len(others)} other files: "
-            f"{first_few(others)}; expected JPEG, PNG, TIFF, WebP or HEIC (.jpg, .png, .tif ...)"
+            f"the input {files.name} contains no photo, only {first_few(others)}; expected JPEG, "
+            "PNG, TIFF, WebP or HEIC (.jpg, .png, .tif ...)"
         )
     if others:
         counts = {"n": len(others), "n_files": len(files.paths)}
