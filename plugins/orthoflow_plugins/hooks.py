@@ -36,10 +36,10 @@ _METHODS: Final = {
     "plane.given:GivenPlane": "a reference plane given by the user",
     "surface.cylinder:SurfaceCylinder": "vaults, apses, towers and columns, from pairs of normals",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
-    "match.sift:MatchSift": "match RootSIFT key points of photos and walls, if mutually best and "
-    "distinct by the ratio test",
-    "match.sides:FaceByPhotos": "determine the fronts of planes from photos, where they were "
-    "only guessed",
+    "match.sift:MatchSift": "match RootSIFT key points of photos with those of the walls, by "
+    "mutual nearest neighbours and the ratio test",
+    "match.sides:FaceByPhotos": "determine from photos which side of a plane is its front, if it "
+    "was only guessed",
     "match.guided:MatchGuided": "match photos with the walls again, starting from a first pose",
     "orient.pnp:OrientPnp": "orient each photo separately from its ties, with its accuracy or "
     "the reason for its rejection",

@@ -125,11 +125,11 @@ def _beside(surveyed: CheckPoints, index: int, picture: Picture, walls: Walls) -
         "right of": (column - frame.width) * frame.gsd_m,
         "above": -row * frame.gsd_m,
         "below": (row - frame.height) * frame.gsd_m,
-        "before": depth_m - slab.front_m,
+        "in front of": depth_m - slab.front_m,
         "behind": -depth_m - slab.behind_m,
     }
     side = max(off_m, key=off_m.__getitem__)
     far_m = float(np.linalg.norm([max(0.0, value) for value in off_m.values()]))
     said = f"{1e3 * off_m[side]:.3g} mm" if off_m[side] < _NEAR_M else f"{off_m[side]:.3g} m"
-    limit = ", beyond its buffer" if side in {"before", "behind"} else ""
+    limit = ", beyond its buffer" if side in {"in front of", "behind"} else ""
     return far_m, f"{said} {side} {picture.image.name}{limit}"

@@ -100,9 +100,9 @@ def test_points_that_no_picture_shows_are_told_with_the_reason(tmp_path: Path) -
     found = missed(0, -1, -1, -1, -1)
     assert (found["n_missed"], found["n_points"]) == (4, 5)
     assert found["reasons"] == (
-        f"P1 (2 mm below {image.name}), P2 (1.2 m left of {image.name}), P3 (250 mm before "
-        f"{image.name}, beyond its buffer), P4 (no black and white quadrant target was recognised "
-        f"on {image.name})"
+        f"P1 (2 mm below {image.name}), P2 (1.2 m left of {image.name}), P3 (250 mm in "
+        f"front of {image.name}, beyond its buffer), P4 (no black and white quadrant target was "
+        f"recognised on {image.name})"
     )
 
 
