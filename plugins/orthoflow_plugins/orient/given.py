@@ -202,7 +202,7 @@ def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
     centres = np.array([camera.centre_world for camera in oriented])
     corners = np.concatenate([wall.frame.corners_world() for wall in walls.walls])
     raise MethodError(
-        f"none of the {len(oriented)} given poses shows a wall: the cameras are at "
+        f"no given pose shows a wall: the cameras are at "
         f"{_extent(centres)}, the walls at {_extent(corners)} (x, y, z in metres). Cameras and "
         "scan must use the same coordinate system and unit: transform the cameras to the system "
         "of the scan before exporting them, or match the photos instead"
