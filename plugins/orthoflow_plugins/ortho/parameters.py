@@ -51,7 +51,8 @@ class DirectParams(MethodParams):
     ] = Field(
         default=(7, 23, 46),
         description="A void cell is filled if the 3x3, 5x5 and 7x7 windows around it contain at "
-        "most this many void cells. The cell itself and cells outside the image count as void.",
+        "most these numbers of void cells. The cell itself and cells outside the image count as "
+        "void.",
     )
     colouring: Literal["topmost", "centre", "gaussian", "median"] = Field(
         default="topmost",

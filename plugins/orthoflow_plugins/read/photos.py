@@ -40,7 +40,6 @@ from orthoflow.files.images import (
     encode_png,
 )
 from orthoflow.files.photo_files import (
-    HOW_TO_DEVELOP,
     Exif,
     FocalLength,
     count_pages,
@@ -399,8 +398,9 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
     if raw:
         raise InputError(
             f"the input {input_name} contains camera raw files, which are not supported: "
-            f"{_counted(raw)}; {HOW_TO_DEVELOP}, so that a calibration stays valid, or list only "
-            "the other photos, e.g. 'FOLDER/*.jpg'"
+            f"{_counted(raw)}; develop each first to 16-bit TIFF or JPEG, without lens "
+            "corrections, so that a calibration stays valid, or list only the other photos, e.g. "
+            "'FOLDER/*.jpg'"
         )
 
 

@@ -79,8 +79,8 @@ def test_what_is_left_out_of_a_lens_is_reported_or_refused(tmp_path: Path) -> No
     cameras, warnings = read_cameras(tmp_path, rows, [photo(name) for name in rows])
     assert places(cameras) == [1, 2, None]
     assert (
-        "closest OpenCV lens, with a deviation of up to 0.11 pixels (affected photos: 1, e.g. slight.jpg)"
-        in warnings[0]
+        "closest OpenCV lens, with a deviation of up to 0.11 pixels (affected photos: 1, e.g. "
+        "slight.jpg)" in warnings[0]
     )
     assert "differs from the closest OpenCV lens by up to 11 pixels" in warnings[1]
 

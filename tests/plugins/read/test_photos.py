@@ -173,7 +173,7 @@ def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
     paths = made.write(tmp_path, {**developed, "A.CR2": b"II*\0", f"b{suffix}": b"MM\0*"})
     raw = f"photo b{suffix}" if developed else rf"2 photos \(A.CR2, b{suffix}\)"
     with pytest.raises(
-        InputError, match=f"camera raw files, .*: {raw}; develop it first to 16-bit TIFF"
+        InputError, match=f"camera raw files, .*: {raw}; develop each first to 16-bit TIFF"
     ):
         read(*paths)
 
