@@ -129,7 +129,7 @@ class LazyGroup(click.Group):
     def __init__(
         self, *args: Any, summaries: Mapping[str, str], target: str, **kwargs: Any
     ) -> None:
-        # Click requires a callback for a group, although this callback has nothing to do.
+        # Click requires a callback even for a group that does nothing itself.
         super().__init__(
             *args, **{"callback": lambda: None, "context_settings": HELP_OPTIONS, **kwargs}
         )

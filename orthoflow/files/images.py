@@ -360,7 +360,7 @@ def reduced(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
     # The width of the Gaussian matches the resolution of the coarser grid.
     sigma = 0.5 * np.sqrt(max(0.0, factor**-2 - 1.0))
     soft = cv2.GaussianBlur(grey, (0, 0), sigma) if sigma > 0.1 else grey
-    # (0.5, 0.5) / factor in OpenCV's pixel convention.
+    # In OpenCV's pixel convention, this is the centre of the first pixel of the reduced image.
     shift = HALF_PIXEL / factor - HALF_PIXEL
     matrix = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

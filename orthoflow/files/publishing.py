@@ -72,7 +72,7 @@ from orthoflow.products import (
 )
 from orthoflow.untrusted_text import Value, csv_text
 
-# Maximum number of characters of a source's name that are used in a file name.
+# Maximum number of characters that a file name takes from the name of a source.
 _LONGEST_SOURCE: Final = 100
 ERROR_CONTENT: Final = (
     "expected error of a point measured in the orthoimage, one standard deviation along u and "

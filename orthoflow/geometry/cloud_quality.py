@@ -48,7 +48,8 @@ def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
     return sums
 
 
-# Sides of the surface pieces in metres. If pieces contain too few points, the next value is used.
+# Sides of the surface pieces in metres. If pieces with one side contain too few points, the next
+# larger side is used.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
 _PIECES_MOST: Final = 300
 _PIECES_LEAST: Final = 20
@@ -75,7 +76,7 @@ _NEAR_SIGMAS: Final = 4.0
 # Standard deviation of the median of n values, relative to that of one value divided by sqrt(n).
 _MEDIAN_SIGMA: Final = 1.2533
 _SURE_SIGMAS: Final = 3.0
-# Scans whose distance is smaller than this agree, even if their scatter is still smaller.
+# Two scans agree if their distance is below this limit, even if it exceeds their scatter.
 _AGREE_M: Final = 0.001
 # Maximum tilt of horizontal and vertical pieces; noise tilts the smallest pieces by 2 degrees.
 _SQUARE_DEG: Final = 5.0

@@ -26,7 +26,8 @@ _MAX_CELLS_OF_SEVERAL: Final = 280
 # Side of the smallest cells, as a share of the extent of the points of a photo.
 _FINEST_CELL: Final = 0.02
 _COARSER: Final = 1.15
-# Directions of the residuals are omitted if the adjustment leaves less than this share of them.
+# Components of the errors are omitted if less than this share of them remains in the residuals of
+# the adjustment.
 _ABSORBED: Final = 1e-3
 
 
@@ -125,7 +126,8 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
         return sigma0**2 * points.cofactors
 
     evidence, variances, errors = [], [], []
-    # Mean square of the effect, in standard deviations, of a position error of one metre.
+    # Mean square, in units of the variance, of the residuals that a position error of one metre
+    # causes.
     unit = float((points.by_place**2).sum()) / (2 * len(cells))
     apart = np.linalg.norm(places[:, None] - places, axis=2) / extent_m
     correlations = [np.exp(-apart / length) for length in _ROUGH]

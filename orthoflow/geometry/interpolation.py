@@ -21,15 +21,15 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.threads import in_parts
 
-# Cells are used up to the distance of the nearest one plus this number of cells.
+# Cells are used if they are at most this many cells farther away than the nearest one.
 _BEYOND_CELLS: Final = 1.0
 # Cells within this squared distance, the eight neighbours, are always used.
 _NEIGHBOURS_SQUARE: Final = 2.0
 # Standard deviation of the Gaussian weights, relative to the distance to the nearest cell (at least
 # 1 cell).
 _SIGMA_SHARE: Final = 0.5
-# Minimum weight. (1 - x / 8)^8, which approximates exp(-x) in a tenth of the time, is 0 for the
-# outermost cells.
+# Minimum weight. The weights (1 - x / 8)^8, which approximate exp(-x) and take a tenth of the time,
+# would be 0 for the outermost cells.
 _WEIGHT_LEAST: Final = 1e-6
 # Regularisation that reduces the slope of the plane to zero if the points hardly determine it.
 _RIDGE: Final = 0.005

@@ -37,7 +37,8 @@ _N_ELEVATIONS: Final = 90
 # Half the number of points in 3 x 3 x 3 voxels that are crossed by a surface with the point spacing
 # of the wall.
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
-# Around a corner of a surface, there are a quarter as many points; along its edges, half as many.
+# Compared with the interior of a surface, there are a quarter as many points around a corner, and
+# half as many along an edge.
 _CORNER_SHARE: Final = 0.25
 # The points in 3 x 3 x 3 voxels are considered scattered if both points of less than this share of
 # their pairs are in the same voxel. The limit is closer to 1/27 (scattered points) than to 1/9 (a

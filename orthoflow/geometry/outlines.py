@@ -151,8 +151,8 @@ def _spans(
     relative = surface.rectangles_world - start
     along = relative @ direction
     aside = relative @ np.cross(surface.plane.normal, direction)
-    # The part of a rectangle within the maximum distance ends at corners within this distance and
-    # at points where the sides cross the limit.
+    # The ends of an interval are at corners within the maximum distance, and where the sides of the
+    # rectangle cross this limit.
     places = [np.where(np.abs(aside) <= reach_m, along, np.nan)]
     over = np.roll(aside, -1, axis=1) - aside
     for limit in (-reach_m, reach_m):

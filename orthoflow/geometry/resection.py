@@ -195,7 +195,7 @@ def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
     middle = seen.points_world.mean(axis=0) if len(seen) else np.zeros(3)
     near = camera.shifted(middle)
     linear = linearised(near, seen.points_world - middle, LensFreedom())
-    # A lens model has no pixels beyond the radius at which it folds back.
+    # Beyond the radius at which it folds back, a lens model gives no pixels.
     folds = camera.distortion.any()
     pixels = near.project(seen.points_world - middle)[:, :2] if folds else linear.pixels
     residuals = seen.pixels_photo - pixels

@@ -21,7 +21,7 @@ from orthoflow.geometry.threads import in_runs
 # A viewer sees a point unless the ray hits a surface more than this distance, in metres, before the
 # point.
 _SEEN_WITHIN_M: Final = 0.0005
-# The same for a camera, as a share of its distance from the point.
+# The corresponding limit for cameras, as a share of the distance from the camera to the point.
 _SEEN_WITHIN_SHARE: Final = 2e-4
 
 

@@ -19,7 +19,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products.planes import plane_name
 from orthoflow.products.product import Array, JsonValue, Product, Tolerance
 
-# Percentiles of larger rasters are estimated from some of their rows.
+# Percentiles of rasters with more cells are estimated from a subset of the rows.
 _CELLS_ASKED: Final = 1 << 25
 # Source of a wall's intensity: the laser, the luminance of the colours, or none.
 IntensitySource = Literal["laser", "luminance", "none"]

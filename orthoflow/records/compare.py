@@ -619,7 +619,7 @@ def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
     none.
     """
     if address not in readdressed and address in readdressed.values():
-        # No cell of the first run corresponds, and the address belongs to a different cell there.
+        # The first run has no corresponding cell, and there the address belongs to another cell.
         return f"{address} ({right.record.run_id})"
     return readdressed.get(address, address)
 

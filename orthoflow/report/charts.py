@@ -33,7 +33,7 @@ _LOGARITHMIC_RATIO: Final = 20.0
 # If the smallest value is less than this share of the largest, the axis starts at 0, because a
 # truncated axis exaggerates differences.
 _NEAR_ZERO: Final = 0.6
-# Length of the arrow for a viewing direction, as a share of the plan's size, and maximum number of
+# Length of the arrow for a viewing direction, as a share of the plan's size; maximum number of
 # photos whose names are shown.
 _ARROW_SHARE: Final = 0.06
 _NAMED_PHOTOS: Final = 60

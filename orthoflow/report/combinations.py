@@ -118,7 +118,7 @@ class Combination:
         spread = float((values - values[0]).std(ddof=1)) if len(values) > 1 else math.nan
         own = next(cell.address for cell in self.cells if cell.step == step)
         varied = {cell.address for cell in self.varied_cells}
-        # Cells without inputs provide the data, which are the same for all values compared.
+        # Cells without inputs only provide the data, which are the same for all values.
         is_seeded = any(
             cell.determinism == "seeded"
             for cell in self.run.upstream(own)

@@ -42,8 +42,8 @@ from orthoflow.workflow.model import DATA
 _NOTHING: Final = "-"
 _MAX_DESCRIBED: Final = 12  # metrics shown if no quality metric differs
 _MAX_NAMED: Final = 3  # metrics listed in which a combination is best
-# Costs of the steps in which combinations differ; unlike the elapsed time, processor time hardly
-# depends on the load of the machine.
+# Costs that are summed over the steps in which combinations differ. Unlike elapsed time, processor
+# time hardly depends on the load of the machine.
 _SUMMED: Final = tuple(
     MetricRow(cell="", step="", method="", name=name, value=0.0, unit=unit, label=label,
               better="lower", headline=True)

@@ -168,7 +168,7 @@ class RowGroup(Generic[Side]):
         if self.n == 1:
             return ".".join(part for part in (cell, name) if part)
         step = step_of.get(cell, cell)
-        # If the row is about the step itself, `name` equals the step or is empty.
+        # In a row about the whole step, `name` is the name of the step or empty.
         what = ".".join(dict.fromkeys(part for part in (step, name) if part))
         return f"{what}, {self.n} steps"
 

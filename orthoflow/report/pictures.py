@@ -41,7 +41,8 @@ _FULL_PICTURES: Final = 24
 # limit of a page allows; a cell takes about 0.15 bytes.
 _CLOSE_CELLS: Final = 12_000_000
 
-# Maximum number of positions per wall for which the page contains depths; they take about 40 kB.
+# Maximum number of positions per wall for which the page contains depths; 8000 depths take about 40
+# kB.
 _PLACES_MOST: Final = 8_000
 # Maximum length of the scale bar as a share of the picture's width.
 _BAR_SHARE: Final = 0.3

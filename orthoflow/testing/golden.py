@@ -39,7 +39,7 @@ _UNSTATED: Final = 1e-6
 _METADATA_SHARE: Final = 1e-2
 _DIGITS: Final = 9
 _ROUNDING: Final = 10.0 ** (1 - _DIGITS)
-# An odd number that does not divide raster sizes, so that consecutive samples are far apart.
+# This odd number does not divide raster sizes, so consecutive samples are far apart.
 _STRIDE: Final = 2_654_435_761
 _METADATA: Final = "metadata"
 

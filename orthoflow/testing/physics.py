@@ -45,7 +45,8 @@ _JOINED_SHARE: Final = 0.97
 _DRAWS: Final = (2, 3, 4)
 # A plane farther than this from all true planes is not part of the room.
 _SAME_PLANE_M: Final = 0.02
-# Replaces a variance of zero, so that the ratio of actual to predicted error is far too large.
+# A variance of zero is replaced by this value, so that the ratio of actual to predicted error
+# becomes far too large.
 _NO_VARIANCE: Final = 1e-30
 # Limits of the ratio of actual to predicted RMS error. The RMS is accurate to one eighth; built-in
 # methods have ratios of 0.82 to 0.93.

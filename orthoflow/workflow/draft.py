@@ -373,7 +373,8 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
 _FEW_SCANS: Final = 3
-# A relative path that begins with this is replaced by the absolute path, which is easier to read.
+# A relative path that begins with this is replaced by the absolute path, because that is easier to
+# read.
 _FAR: Final = "../../.."
 
 

@@ -324,8 +324,8 @@ class _Node:
     causes: tuple[str, ...] = ()
 
 
-# Source of a port, which is the first available candidate or None; factors on which this choice
-# depends; and changes of inputs after which there would be a source.
+# Three values: the source of a port (the first available candidate, or None); the factors on which
+# this choice depends; and the changes of inputs that would make a source available.
 _Choice: TypeAlias = tuple[CellOutput | WorkflowInput | None, Assignment, tuple[str, ...]]
 
 

@@ -122,8 +122,7 @@ class Problem:
 
     def __str__(self) -> str:
         head = f"{self.place}{self.message}"
-        # Show only the part of a long line that is close to the column, so that the message remains
-        # visible.
+        # Show only the part of a long line around the column, so that the message remains visible.
         is_long = len(self.text) > _SNIPPET_WIDTH
         start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2) if is_long else 0
         cut = self.text[start : start + _SNIPPET_WIDTH]

@@ -156,8 +156,8 @@ def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path)
         return None
     records = np.memmap(folder / "records", dtype=kind, mode="r")
     n_points = len(records)
-    # A margin of one step and an odd number of steps keep all points off the borders between nodes,
-    # which readers compute from rounded metres.
+    # Readers compute the borders between nodes from rounded metres. A margin of one unit of the
+    # integer coordinates, and an odd number of units per side, keep all points off these borders.
     low = np.min(lowest, axis=0) - 1
     span = int((np.max(highest, axis=0) - low).max())
     waiting = _Waiting(

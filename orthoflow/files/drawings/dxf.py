@@ -325,7 +325,8 @@ def save_document(document: Drawing, path: Path) -> None:
 
 
 _SAMPLE_M: Final = 0.01
-# Permitted deviation of a side from a straight line: about the accuracy of masonry and outlines.
+# Permitted deviation of a side from a straight line, which is about the accuracy of masonry and of
+# outlines.
 _TOLERANCE_M: Final = 0.02
 _SPRINGINGS: Final = 40
 _ARC_POINTS: Final = 33

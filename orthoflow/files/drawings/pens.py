@@ -46,7 +46,7 @@ BEHIND: Final = (0.05, 0.30, 0.75)
 OPENING: Final = (0.0, 0.40, 0.45)
 # Line type 10 of ISO 128-2: long dash, gap, dot, gap.
 MATCH_DASHES_MM: Final = (8.0, 1.5, 0.5, 1.5)
-# Height of capital letters of the font relative to its size.
+# Height of the capital letters of the font, relative to the font size.
 _CAPITALS: Final = 0.729
 
 Colour = tuple[float, float, float]

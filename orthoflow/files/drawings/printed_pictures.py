@@ -55,10 +55,10 @@ _JPEG_QUALITY: Final = 95
 _CONTOUR_PITCH_MM: Final = 0.5
 _SHORTEST_CONTOUR_MM: Final = 6.0
 _OVERVIEW_PX: Final = 1000
-# Minimum interval of contours in standard deviations of the noise.
+# Minimum contour interval, in standard deviations of the noise.
 _CLEAR_OF_NOISE: Final = 4.0
-# Maximum difference between averaged depths in standard deviations, and sigma of the Gaussian in
-# cells.
+# For the smoothing of depths: maximum difference between depths that are averaged, in standard
+# deviations, and sigma of the Gaussian, in cells.
 _SAME_SURFACE: Final = 5.0
 _CALM_CELLS: Final = 4.0
 # Side of the square of cells in which a surface is tested for being level, and the permitted rise
@@ -69,8 +69,8 @@ _LEVEL_SHARE: Final = 0.02
 _LEAST_WIDTHS: Final = 5.0
 _APART_MM: Final = 12.0
 _TRIED: Final = (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
-# Minimum ratio of chord to length of the line behind a number; on curved lines, the number would be
-# next to the line.
+# Minimum ratio of the chord to the length of the part of a contour that a number covers; on a more
+# curved part, the number would be next to the line.
 _STRAIGHT: Final = 0.9
 
 

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 _LEAST_ANGLE_DEG: Final = 20.0
 # Longer stretches without points are drawn as openings; shorter ones are gaps between points.
 _LEAST_OPENING_M: Final = 0.15
-# A line whose points end within this distance of its corner with another line, e.g. because of
-# furniture, is extended to the corner.
+# Furniture may hide the end of a line. If its points end within this distance of the corner with
+# another line, it is extended to the corner.
 _REACH_M: Final = 0.3
 _SHORTEST_M: Final = 0.05
 # Minimum and maximum thickness of a wall, between two sides that face away from each other.
@@ -323,8 +323,7 @@ def _trace(cut: Cut, planes: Planes, index: int) -> _Trace | None:
     if size < math.sin(math.radians(_LEAST_ANGLE_DEG)):
         return None
     middle = cut.place_m(planes.corners[index].mean(axis=0)[None])[0]
-    # The point in both the plane (n . p = offset) and the cut that is nearest to the plane's
-    # middle.
+    # Of the points on both the plane and the cut, this is the nearest to the middle of the plane.
     away = float(normal @ cut.forward_world) * middle[2] / size**2
     point = middle[:2] + away * in_cut
     towards = in_cut / size

@@ -39,10 +39,10 @@ _COLUMNS_MM: Final = (90.0, 110.0, 130.0, 150.0, 180.0)
 # ISO 7200: a title block is 180 mm wide at most.
 _TITLE_MM: Final = 180.0
 _STRIP_COLUMN_MM: Final = 85.0
-# Minimum height of strips, and the step by which they grow.
+# Minimum height of strips; if necessary, it is increased in steps of _STRIP_STEP_MM.
 _LOWEST_MM: Final = 40.0
 _STRIP_STEP_MM: Final = 2.5
-# Maximum share of the paper that is not for pictures.
+# Maximum share of the paper for everything except pictures.
 _MOST_SHARE: Final = 0.55
 _PLAN_MM: Final = (35.0, 90.0)
 _MOST_SEGMENTS: Final = 5

@@ -80,7 +80,8 @@ def _draw_around(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
         middle = foot + np.array([0.0, 6.0])
         direction = np.array(drawing.north)
         pens.arrow(canvas, middle + np.outer([-6.0, 6.0], direction))
-        # The middle of the label is 3.2 mm from the tip, so that descenders do not touch it.
+        # The middle of the label is 3.2 mm from the tip of the arrow, so that descenders do not
+        # touch it.
         at = tuple(middle + 9.2 * direction - [0.0, 0.5 * pens.TEXT_MM])
         pens.write_text(canvas, drawing.up_label, at, is_centred=True)
 

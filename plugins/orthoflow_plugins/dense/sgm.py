@@ -22,9 +22,9 @@ _ALONG_ROWS: Final = np.cos(np.radians(30.0))
 _SIDEWAYS: Final = np.sin(np.radians(25.0))
 # Maximum angle between the optical axes.
 _SAME_VIEW: Final = np.cos(np.radians(30.0))
-# Best parallax, as a share of the photo width. Image blocks usually have 70 % overlap. With less
-# than 50 %, photos look too different to be matched, and with a very short base, depths are
-# inaccurate.
+# Best parallax, as a share of the photo width, corresponding to the usual overlap of 70 %. With an
+# overlap of less than 50 %, photos look too different to be matched; with a very short base, depths
+# are inaccurate.
 _BEST_PARALLAX: Final = 0.3
 _LEAST_PARALLAX: Final = 0.05
 _MOST_PARALLAX: Final = 0.5

@@ -28,9 +28,10 @@ Number: TypeAlias = tuple[str, float, str]
 lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "higher"))
 
 _AXES: Final = ("x", "y")
-# Maximum share of the points that the iterated rule may remove.
+# Maximum share of the points that the iterated outlier rule may remove.
 _OUTLIERS_MOST: Final = 0.25
-# Higher limit, used to find out whether the iterated rule would remove more points without the cap.
+# Higher limit, with which the iterated rule is repeated to find out whether _OUTLIERS_MOST stopped
+# it.
 _MOST_WITHOUT_CAP: Final = 0.5
 # Minimum distance between check points, relative to the longest distance. Shorter distances depend
 # more on single points than on the scale.

@@ -145,7 +145,7 @@ def agreeing_pairs(places: NDArray[np.float64], shift: NDArray[np.float64]) -> N
     # of all neighbours.
     needed = max(_AGREEING, _AGREEING_SHARE * n_near)
     agreed = np.ones(len(places), dtype=np.bool_)
-    # Repeat until accepted pairs are supported by accepted pairs only.
+    # Repeat until each accepted pair is supported by other accepted pairs.
     while True:
         kept: NDArray[np.bool_] = np.count_nonzero(agrees & agreed[near], axis=1) >= needed
         if np.array_equal(kept, agreed):

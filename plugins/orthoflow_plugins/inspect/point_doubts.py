@@ -14,7 +14,7 @@ from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
 # Maximum number of unused points that a message lists.
 _NAMED: Final = 4
-# Messages give longer distances in metres, shorter ones in millimetres.
+# In messages, distances of at least this are in metres, and shorter ones in millimetres.
 _NEAR_M: Final = 1.0
 OWN_POINTS: Final = DiagnosticSpec(
     code="check-points-of-the-image",

@@ -87,8 +87,8 @@ _APART_ROUGHLY_CELLS: Final = 6.0
 _MIN_AGREEING: Final = 0.6
 # Minimum number of coarse cells that overlapping photos have in common.
 _OVERLAP_CELLS: Final = 200
-# A group of agreeing photos is accepted if it has at least this many photos, or if the position of
-# one of them is clear by itself.
+# A group of agreeing photos is accepted if it contains at least this many photos, or a photo whose
+# position is clear without the others.
 _MANY: Final = 3
 
 

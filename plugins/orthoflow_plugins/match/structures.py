@@ -290,8 +290,8 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
-    # Energy of the wall under a part for each (wrapped) position of its corner. It is the same for
-    # all parts.
+    # Energy of the wall within a part of the photo, for each position of the corner of the part
+    # (positions wrap around). It is the same for all parts, because these have the same size.
     box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
     under = np.asarray(fft.irfft2(wall.energy * np.conj(box), wall.padded), dtype=np.float32)
     maps = [

@@ -293,7 +293,8 @@ def _measured(view: View, setup: Setup, radius: int, content: str) -> _Round:
     occupied: set[tuple[int, int]] = set()
     pieces: list[TiePiece] = []
     n_measured = 0
-    # Start with the largest wall, since planes close to each other contain the same surface.
+    # Start with the largest wall. Planes close to each other may contain the same surface, which is
+    # then measured on the largest.
     for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
         projection, target = view.projections[index], targets[index]
         if projection is None or target.wall.intensity is None or sizes[index] == 0:

@@ -48,9 +48,9 @@ _BLOCKS_LEAST: Final = 4_000
 _ALIKE: Final = 0.02
 # Standard deviation of the smoothing of differences, in blocks.
 _SMOOTH_BLOCKS: Final = 1.5
-# Regularisation for areas in which differences are known in few blocks.
+# Regularisation, which takes effect where differences are known in only a few blocks.
 _KNOWN_LEAST: Final = 0.02
-# Larger differences between balanced photos are due to different objects rather than lighting.
+# If balanced photos differ by more than this, they probably show different objects there.
 _SAME_THING: Final = 0.15
 # Photos may have the same lens if the logarithms of their focal lengths differ by less than about
 # this value.

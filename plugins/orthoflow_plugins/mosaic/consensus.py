@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _BLOCK_M: Final = 0.025
 _BLOCK_CELLS: Final = (4, 32)
 _LEAST_PAINTED: Final = 0.5
-# This is added to brightness, so that noise in almost black cells does not count as a difference.
+# Added to brightness values, so that noise in almost black cells does not count as a difference.
 _DARK: Final = 0.02
 # Two observations contradict each other if the logarithms of their brightness differ by at least a
 # limit, which is _DEVIATIONS times the standard deviation over all blocks, but not less than _APART
@@ -43,7 +43,7 @@ _CORE_TIMES: Final = 2.0
 _LEAST_CORE_BLOCKS: Final = 6
 # Differences that vary only over distances longer than this, in blocks, are attributed to lighting.
 _SMOOTH_BLOCKS: Final = 40.0
-# Regions thinner than this are due to misaligned edges.
+# Regions narrower than this are ignored, because misaligned edges cause them.
 _OPENING_BLOCKS: Final = 2
 # Gaps of up to this many blocks in a region are closed.
 _CLOSING_BLOCKS: Final = 9

@@ -292,7 +292,8 @@ def _excess_of_overlaps(
         columns.append((apart**2).ravel())
     matrix, wanted = np.column_stack(columns), squares.ravel()
     known_part = np.broadcast_to(fixed, squares.shape).ravel()
-    # Half of all normally distributed displacements are below 0.67 standard deviations.
+    # The absolute values of half of all normally distributed displacements are below 0.67 standard
+    # deviations.
     predicted = np.full(len(wanted), max(float(np.median(wanted)) * NMAD_FACTOR**2, 1e-12))
     found = np.zeros(len(columns))
     for _ in range(_ROUNDS):

@@ -79,7 +79,7 @@ _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7
 # Two photos are matched if each of them shows at least this share of the wall points of the other.
 _MIN_OVERLAP: Final = 0.2
-# More tie points only increase the computing time.
+# More tie points would only increase the computing time.
 _MAX_PHOTO_POINTS: Final = 1000
 # The sharing mode in which the photos of a lens are tested for a common focal length.
 _TESTED: Final = "focal-group"

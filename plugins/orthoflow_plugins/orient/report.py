@@ -469,7 +469,8 @@ def _draw_position(
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
     axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
-    # In the other view, the names of photos one above the other would overlap.
+    # Names are shown in only one view: in the other, those of photos one above the other would
+    # overlap.
     if is_named:
         axes.annotate(
             candidate.photo.name, (x, y), xytext=(2, 2), textcoords="offset points", fontsize=6.0

@@ -125,7 +125,8 @@ def project_photos(
     surfaces = surfaces_of(inputs.walls, ctx, hides=hides)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = ctx.clock_s()
-    # Find occluders once for all photos, since the choice of outliers depends on all cameras.
+    # Find occluders once for all photos, because it depends on all cameras which points are
+    # outliers.
     viewers = [camera.viewing() for _, camera in oriented]
     occluders = _occluders(inputs, viewers, ctx) if hides else None
     seconds["occluders_s"] = ctx.clock_s() - started

@@ -32,8 +32,7 @@ SAMPLE_POINTS: Final = 200_000
 _BOX_POINTS: Final = 20_000
 _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
-# Margin of the robust box on each side, as a share of the size of the box, and an additional
-# margin.
+# Margin of the robust box on each side: this share of the size of the box, plus a constant.
 _MARGIN_SHARE: Final = 0.02
 MARGIN_M: Final = 2.5
 # Share of the points that may be outside the box on each side, far below the minimum share of a

@@ -454,7 +454,7 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     points_m = np.column_stack([cloud.x[::every], cloud.y[::every], cloud.z[::every]])
     basis = basis_from_up(planes.up)
     framed = points_m.astype(np.float64) @ basis.T
-    # Do not use the extent of all points, because some appear far away behind mirrors and windows.
+    # Do not use the extent of all points: some seem to be far away, behind mirrors and windows.
     corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ basis.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     cell_m = max(cell_m, float((high - low).max()) / _SECTION_CELLS_MOST)

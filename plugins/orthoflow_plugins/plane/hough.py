@@ -447,7 +447,8 @@ def sections_of(
     best = np.full((n_turns, n_turns + 1), np.nan)
     row, column = np.rint((angles_rad + np.array([0.0, 0.5 * math.pi])) / step_rad).astype(int).T
     best[row, column] = scores
-    # Each direction represents all values of omega up to the next direction with the same phi.
+    # A direction also represents the larger values of omega, up to the next direction with the same
+    # phi.
     last_asked = np.where(np.isnan(best), 0, np.arange(n_turns)[:, None])
     best = np.take_along_axis(best, np.maximum.accumulate(last_asked, axis=0), axis=0)
     omegas, phis = step_rad * np.arange(n_turns), step_rad * np.arange(n_turns + 1) - 0.5 * math.pi

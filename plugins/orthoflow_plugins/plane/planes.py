@@ -45,11 +45,12 @@ _PROBABILITIES: Final = (
     0.001, 0.0025, 0.005, 0.01, 0.025, *(0.05 * step for step in range(1, 20)),
     0.975, 0.99, 0.995, 0.9975, 0.999,
 )  # fmt: skip
-# Maximum numbers of points of a plane, and of points of the cloud, from which its visible side is
-# determined.
+# The visible side of a plane is determined from at most this many of its points, and at most this
+# many points of the cloud.
 _MEMBERS_MOST: Final = 5000
 _WITNESSES_MOST: Final = 40_000
-# Planes are parallel if the cosine of the angle between them exceeds this: cos(20 degrees).
+# Planes count as parallel if the cosine of the angle between them exceeds this (cosine of 20
+# degrees).
 _PARALLEL: Final = 0.94
 # A station closer to the plane than this does not determine its visible side.
 _CLEAR_M: Final = 0.05
@@ -59,7 +60,7 @@ _FULL_VOTE_M: Final = 1.0
 # The projections of points may be this far outside the rectangle, because the floor and the ceiling
 # are at its edges.
 _BESIDE_M: Final = 0.3
-# Minimum majority of the weighted votes, as a share of the sum of votes if all points were at the
+# Minimum majority of the weighted votes, relative to the votes of all points if each were at the
 # minimum distance from the plane.
 _DOUBT: Final = 0.01
 SIDES_GUESSED: Final = DiagnosticSpec(

@@ -27,7 +27,7 @@ from orthoflow_plugins.plane.kernels import (
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
-# Mean number of points per cell that the test for concentration needs.
+# The test for concentration on the plane needs this mean number of points per cell.
 _POINTS_PER_CELL: Final = 12.0
 # Thickness of the inner slab as a share of the tolerance, and minimum share of the points in the
 # inner slab.

@@ -129,7 +129,7 @@ def mapped(
             name, tilt_deg = planes.names[index], math.degrees(tilt_rad)
             ctx.report(TILTED, subject=name, tilt_deg=tilt_deg, off_mm=1e3 * off_m)
             continue
-        # The raster, which has whole cells, extends beyond the rectangle: by the same length on
+        # The raster has whole cells, so it extends beyond the rectangle, by the same length on
         # opposite sides.
         middle = frame.wall_from_world(planes.corners[index].mean(axis=0)[None])[0, :2]
         beyond = middle - 0.5 * np.array([frame.width, frame.height])

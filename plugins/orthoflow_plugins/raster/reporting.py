@@ -17,7 +17,7 @@ from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Cause, Emptiness
 
-# For walls with more cells, medians are estimated from only some of the rows.
+# For walls with more cells, medians are estimated from a subset of the rows.
 CELLS_ASKED: Final = 1 << 26
 # Maximum spacing of the points of a scan, in cells.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0

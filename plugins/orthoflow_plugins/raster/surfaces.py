@@ -74,8 +74,8 @@ _CLOSE_SIGMAS: Final = 4.0
 # Maximum differences in depth in the two passes of the filter, in standard deviations of the noise
 # of a cell. The first pass removes most of the noise, so the second pass can be stricter at steps.
 _REACHES: Final = (3.0, 1.5)
-# Void cells are filled with a depth far below all others, by this multiple of the maximum
-# difference, so that they get no weight.
+# So that void cells get no weight, they are filled with a depth that is below all others by this
+# multiple of the maximum difference.
 _VOID_REACHES: Final = 8.0
 # Depths with less noise are not filtered.
 _NOISE_LEAST_M: Final = 2.0e-5

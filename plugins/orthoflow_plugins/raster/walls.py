@@ -33,7 +33,7 @@ _REACH_OF_OUTLIERS: Final = 32
 def bytes_needed(shapes: Sequence[tuple[int, int]], *, is_tin: bool = False) -> int:
     """Estimate the memory in bytes needed to rasterise walls of given shapes (rows, columns)."""
     sizes = [rows * columns for rows, columns in shapes]
-    # Finished large walls are stored in files; while they are processed, they need the memory of
+    # Finished large walls are stored in files; while they are processed, they only need memory for
     # one band.
     kept = _BYTES_KEPT * sum(size for size in sizes if size <= IN_MEMORY_CELLS)
     if is_tin:

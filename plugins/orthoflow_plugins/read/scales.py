@@ -41,8 +41,8 @@ _PERCENTILES: Final = (2.0, 98.0)
 # If no scan reaches at least this part of the range in its metadata, the range is that of the
 # sensor, and images scaled by it would be black.
 _SMALLEST_PART: Final = 0.25
-# Scans whose ranges overlap by at least this part get a common scale, so that the same surfaces
-# have the same brightness.
+# Scans whose ranges overlap by at least this part are scaled together, so that the same surface has
+# the same brightness in all of them.
 _COMMON_PART: Final = 0.4
 # Ranges that scanners and programs write. They are used for scans that have no limits and differ
 # from other scans. The first range that contains the data of a scan is used if the data cover

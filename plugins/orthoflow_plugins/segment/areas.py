@@ -36,8 +36,8 @@ BLOCK: Final = 1 << 18
 # used.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 1.5
-# Minimum number and share of the rays of a tile that must pass through it, or end in front of it,
-# because isolated distant points are gross errors.
+# Minimum number and minimum share of the rays to a tile that pass through it or end in front of it.
+# Fewer rays are ignored, because isolated distant points are gross errors.
 _RAYS_LEAST: Final = 2
 _SHARE_LEAST: Final = 0.2
 

@@ -26,7 +26,7 @@ _FITTED_CELLS: Final = 8.0
 _TURN_LEAST: Final = math.sin(math.radians(15.0))
 # Length at each end of a side that is part of the corner and not used in the fit.
 _ENDS_CELLS: Final = 3.0
-# Limit for the rejection of cells, as a multiple of the median deviation.
+# Cells whose deviation exceeds this multiple of the median deviation are rejected.
 _FAR_CELLS: Final = 3.0
 # Distances from a side, outwards, at which the wall's face is searched for.
 _BESIDE_CELLS: Final = (2.0, 3.0, 4.0)

@@ -45,7 +45,7 @@ _MEASURED: Final = (
 )
 _PLACES: Final = (("scan", np.uint16), ("row", np.uint32), ("column", np.uint32))
 
-# The zenith is not scanned, because points on the ceiling above the station would be too dense.
+# The zenith is not scanned, because the points on the ceiling above the station would be too dense.
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
 
@@ -57,7 +57,7 @@ _STATIONS_M: Final = (
     (0.10, -0.60, -0.15),
     (0.05, 0.80, 0.20),
 )
-# Maximum random displacements of a station along the same axes.
+# Maximum random displacements of a station along these axes, in metres.
 _STATIONS_DRAWN_M: Final = (0.3, 0.3, 0.15)
 # Ranges of the random values of a material: reflectance of black, decrease with red, increase with
 # green, and exponents of the decrease and the increase.
