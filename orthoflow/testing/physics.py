@@ -35,7 +35,7 @@ from orthoflow.testing.subjects import Subject, output_of, require
 # With errors of 0.3 px and 1 mm at 2.5 m, a single tie is off by 1.3 mm on the wall, and the mean
 # of a hundred ties by a tenth of that. The half-pixel error of a wrong pixel convention is 1.5 mm.
 _POSE_LIMIT_M: Final = 0.0008
-# The smallest side has 2,300 points, which determine its direction to 0.003 deg.
+# The smallest surface of the room has 2,300 points, which determine its direction to 0.003 deg.
 _ROOM_POINTS: Final = 20_000
 _CELL_SIZES_M: Final = (0.006, 0.01)
 _SHIFT_LIMIT_CELLS: Final = 0.2

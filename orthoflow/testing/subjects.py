@@ -1,4 +1,4 @@
-"""A method to be checked, with its runs, each of which is executed once and only if needed."""
+"""A method to be checked, with its runs, each of which is executed at most once."""
 
 from __future__ import annotations
 

@@ -247,8 +247,8 @@ def resolved_json(workflow: Workflow) -> str:
 
 def _input_json(spec: WorkflowInputSpec) -> JsonValue:
     def recorded(name: str) -> str:
-        # Paths in the workflow are in the record anyway, as part of its text; absolute paths in a
-        # table are not.
+        # The record contains the text of the workflow, and thus its paths, but not the absolute
+        # paths in a table of datasets.
         is_private = spec.is_given or (spec.table and Path(name).is_absolute())
         return Path(name).name if is_private else name
 

@@ -1,4 +1,4 @@
-"""Removal of people and vehicles: photos are not used where other photos or the scan disagree.
+"""Removal of people and vehicles: photos are not used where others or the scan contradict them.
 
 Photos of the same area, and the colours of the scan, are independent observations of brightness.
 They are compared in blocks of a few centimetres, after smooth differences (lighting, exposure) have
