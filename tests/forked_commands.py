@@ -146,7 +146,7 @@ def _serve() -> None:
     servers: dict[bool, ForkServer] = {}
     for line in sys.stdin:
         order = json.loads(line)
-        if not order["forgone"] and order["draws"] not in servers:
+        if _forks_steps(order) and order["draws"] not in servers:
             servers[order["draws"]] = _step_server(draws=order["draws"])
         gc.freeze()
         process = os.fork()
@@ -157,6 +157,14 @@ def _serve() -> None:
         code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
         sys.stdout.write(f"{code}\n")
         sys.stdout.flush()
+
+
+# Any: an order is JSON that this module wrote itself.
+def _forks_steps(order: dict[str, Any]) -> bool:
+    """Whether the steps of a command are processes; it takes two seconds to load what they need."""
+    words = order["arguments"]
+    is_here = order["forgone"] or "inline" in " ".join(words)
+    return words[0] in ("run", "replay") and not is_here
 
 
 def _step_server(*, draws: bool) -> ForkServer:
@@ -179,7 +187,6 @@ def _share(server: ForkServer) -> None:
     forkserver.connect_to_new_process = server.connect_to_new_process
 
 
-# Any: an order is JSON that this module wrote itself.
 def _become(order: dict[str, Any], servers: Mapping[bool, ForkServer]) -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     out, err = (os.open(path, os.O_WRONLY | os.O_CREAT) for path in order["streams"])
@@ -188,7 +195,7 @@ def _become(order: dict[str, Any], servers: Mapping[bool, ForkServer]) -> None:
         os.close(descriptor)
     if order["forgone"]:
         _forgo(order["forgone"])
-    else:
+    elif order["draws"] in servers:
         _share(servers[order["draws"]])
     if not order["draws"]:
         sys.path[0] = _TESTS

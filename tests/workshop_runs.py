@@ -11,7 +11,8 @@ from types import MappingProxyType
 
 from tests.forked_commands import run_command
 
-WORKSHOP = Path(__file__).resolve().parent / "workshop"
+ROOT = Path(__file__).resolve().parents[1]
+WORKSHOP = ROOT / "tests" / "workshop"
 
 STUDIO = """\
 orthoflow: 1
@@ -26,10 +27,13 @@ steps:
 
 
 def workshop_environment(*more: Path) -> Mapping[str, str]:
-    """The environment with the workshop installed, and the distributions in more folders."""
-    folders = [str(WORKSHOP), *map(str, more), os.environ.get("PYTHONPATH", "")]
-    path = os.pathsep.join(folders).rstrip(os.pathsep)
-    return {**os.environ, "PYTHONPATH": path}
+    """The environment with the workshop installed, and the distributions in more folders.
+
+    The checkout comes before what is installed, as in tests/road, whose process serves both.
+    """
+    checkout = (ROOT / part for part in ("", "plugins", "provenance"))
+    folders = [WORKSHOP, *more, *checkout, os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders)).rstrip(os.pathsep)}
 
 
 def write_studio(folder: Path, method: str = "paint.plain") -> Path:

@@ -324,7 +324,7 @@ def test_differences_due_to_rounding_are_ties() -> None:
 def test_the_interval_of_a_median_covers_it_as_often_as_stated() -> None:
     rng = np.random.default_rng(5)
     for n, rate in ((6, 0.969), (20, 0.959)):
-        drawn = rng.standard_normal((300, n))
+        drawn = rng.standard_normal((150, n))
         found = [paired_differences(row, "lower").interval for row in drawn]
         covered = np.mean([low <= 0.0 <= high for low, high in found])
         assert covered == pytest.approx(rate, abs=0.04)

@@ -16,9 +16,10 @@ def test_a_bad_scan_ends_in_one_sentence_with_exit_code_two(
 ) -> None:
     (tmp_path / "corrupt.laz").write_bytes(b"LASF" + bytes(range(256)) * 8)
     monkeypatch.chdir(tmp_path)
-    # In this process, whose steps come from one server; the next test starts one of its own.
-    words = ["run", "direct.yaml", "--input", "scan=corrupt.laz", "-o", "run", "--store"]
-    ended = CliRunner().invoke(program, [*words, str(shell.store)])
+    # In this process; the steps of the next test are processes.
+    words = ["run", "direct.yaml", "--input", "scan=corrupt.laz", "-o", "run"]
+    how = ["--executor", "inline", "--store", str(shell.store)]
+    ended = CliRunner().invoke(program, [*words, *how])
     assert ended.exit_code == 2
     assert "Traceback" not in ended.output
     assert "corrupt.laz" in ended.output

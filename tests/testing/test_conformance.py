@@ -133,7 +133,14 @@ def cases() -> list[ConformanceCase]:
 
 CASES = cases()
 FIRST = {case.method_id: case for case in reversed(CASES)}
-ONE_OF_EACH_KIND = {case.method_id.partition(".")[0]: case.method_id for case in CASES}.values()
+# Kinds of which one method is run in a process of its own in every run of the tests: they draw
+# random numbers, go through sets or start threads. The long loop runs all methods so.
+DRAWING_KINDS = {"plane", "match", "orient", "mosaic", "raster"}
+IN_A_NEW_PROCESS = {
+    kind: case.method_id
+    for case in CASES
+    if (kind := case.method_id.partition(".")[0]) in DRAWING_KINDS
+}.values()
 
 
 @pytest.fixture(autouse=True)
@@ -147,7 +154,7 @@ def _blank_charts(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 def is_long(case: ConformanceCase) -> bool:
     """Whether a case takes long: a process of its own for each method, or open3d, which loads."""
     runs_elsewhere = case.check.name in ("nothing-is-written-outside-scratch", "results-repeat")
-    return "open3d" in case.method_id or (runs_elsewhere and case.method_id not in ONE_OF_EACH_KIND)
+    return "open3d" in case.method_id or (runs_elsewhere and case.method_id not in IN_A_NEW_PROCESS)
 
 
 @pytest.mark.parametrize(

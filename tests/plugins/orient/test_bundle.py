@@ -92,7 +92,7 @@ def with_errors_that_reach_far(ties: Ties, seed: int, sigma_m: float) -> Ties:
 def test_errors_of_the_scan_do_not_split_one_camera_into_several_lenses(
     tmp_path: Path, seed: int
 ) -> None:
-    ties = with_errors_that_reach_far(bs.scan_ties(seed), seed, 0.003)
+    ties = with_errors_that_reach_far(bs.scan_ties(seed, n=100), seed, 0.003)
     together = bundle(ties, without_exif(), context(tmp_path), **ALONE)
     assert {camera.status for camera in together.cameras} == {"ok"}
     assert len({camera.intrinsics for camera in together.cameras}) == 1
@@ -168,7 +168,7 @@ def test_photos_that_zoomed_share_no_lens_where_it_matters(
     tmp_path: Path, zoom: float, n_lenses: int
 ) -> None:
     """One of four photos is zoomed; even if unnoticed, its predicted error is not too small."""
-    ties, true = bs.scan_ties(2), [*bs.viewers()]
+    ties, true = bs.scan_ties(2, n=90), [*bs.viewers()]
     middle, pixels = np.array([true[3].cx, true[3].cy]), ties.pixels_photo.copy()
     pixels[ties.photo == 3] = middle + zoom * (pixels[ties.photo == 3] - middle)
     true[3] = replace(true[3], fx=zoom * true[3].fx, fy=zoom * true[3].fy)
