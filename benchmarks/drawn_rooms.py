@@ -357,8 +357,8 @@ def main() -> None:
         stated = [f"{count} for {part}" for part, count in counts.items()]
     made = (
         f"Measured on {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} ({platform.machine()}, "
-        f"{os.cpu_count()} cores, Python {platform.python_version()}). The two sets of "
-        f"seeds define {', '.join(stated)}"
+        f"{os.cpu_count()} cores, Python {platform.python_version()}). The rooms "
+        f"were generated from two sets of seeds: {', '.join(stated)}"
     )
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)

@@ -580,7 +580,7 @@ def canonical_json(value: object) -> str:
         text.encode("utf-8")
     except UnicodeEncodeError as error:
         raise RecordFormatError(
-            f"text must be valid Unicode to be stored, got half a surrogate pair ({error})"
+            f"text must be valid Unicode to be stored, got an unpaired surrogate ({error})"
         ) from error
     return text
 

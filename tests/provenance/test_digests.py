@@ -42,7 +42,7 @@ def test_canonical_json_reads_back_to_the_same_value(value: object) -> None:
         ({"a": [0, float("inf")]}, "got inf at /a/1"),
         ({1: 2}, "keys of a JSON object must be text, got 1 at root"),
         ({"a": np.zeros(2)}, "JSON does not support ndarray, found at /a"),
-        ("\ud800", "half a surrogate pair"),
+        ("\ud800", "an unpaired surrogate"),
     ],
 )
 def test_what_is_not_json_is_refused(value: object, message: str) -> None:

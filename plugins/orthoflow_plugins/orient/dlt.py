@@ -74,9 +74,10 @@ _FRAME: Final = 12
 DLT_MISFIT: Final = DiagnosticSpec(
     code="dlt-without-distortion",
     severity="warning",
-    text="photo {subject}: the ties deviate {sigma0:.1f} times as much as expected, and a "
-    "complete lens model moves points by {moved_px:.1f} px: the lens has distortion, mostly at "
-    "the corners, that this DLT does not model; the predicted error was multiplied by {factor:.1f}",
+    text="photo {subject}: the ties deviate {sigma0:.1f} times as much as expected, since the "
+    "lens has distortion that this DLT does not model (a complete lens model moves points by "
+    "{moved_px:.1f} px, mostly at the corners); the predicted error was multiplied by "
+    "{factor:.1f}",
     remedy='set {step}.distortion to "k1 k2 p1 p2", or provide a calibration',
     rank_by="sigma0",
 )

@@ -96,8 +96,8 @@ class RasterGrid(Method):
     result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
-        MetricSpec("omega_deg", label="direction of the first normal (omega)"),
-        MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
+        MetricSpec("omega_deg", label="direction of the first wall's normal (omega)"),
+        MetricSpec("phi_deg", label="inclination of the first wall's normal (phi)"),
         MetricSpec("area_m2", label="area of the first wall's raster"),
         MetricSpec("gsd_mm", label="cell size"),
         MetricSpec("n_points_inside", label="points used for the walls"),

@@ -107,7 +107,7 @@ def detect(
     is_oriented = cloud.stations is not None and len(cloud.stations) > 0
     found, rejected = search(levels, limits, cloud.up, rng, progress, is_oriented=is_oriented)
     found = [with_bridged_gaps(item, _BRIDGED_RAD) for item in found[: params.max_surfaces]]
-    progress(0.8, f"fit of {len(found)} surfaces")
+    progress(0.8, "fitting surfaces")
     planes = None
     if plane_index is not None and tests:
         planes = np.full((int(plane_index.max(initial=-1)) + 1, 4), np.nan)

@@ -33,15 +33,15 @@ REJECTED: Final = DiagnosticSpec(
     code="surface-rejected",
     severity="note",
     text="{subject} of radius {radius_m:.2f} m was rejected ({reason}): arc {arc_deg:.0f} deg, "
-    "area {area_m2:.2f} m2, scatter {scatter_mm:.1f} mm, sagitta {sagitta_mm:.0f} mm, normals turn "
-    "by {turning:.2f} of the angle",
+    "area {area_m2:.2f} m2, scatter {scatter_mm:.1f} mm, sagitta {sagitta_mm:.0f} mm, rotation of "
+    "the normals divided by the angle {turning:.2f} (1 on a cylinder, 0 on flat parts)",
     rank_by="area_m2",
 )
 SIDE_GUESSED: Final = DiagnosticSpec(
     code="surface-sides-unknown",
     severity="warning",
-    text="no scanner station shows from which side {n} curved surfaces were seen; those whose arc "
-    "exceeds 200 deg are assumed to be seen from outside",
+    text="the positions of the scanner are unknown, and so are the sides from which the curved "
+    "surfaces ({n}) were seen; those whose arc exceeds 200 deg are assumed to be seen from outside",
     remedy="set {step[read.scan]}.view_from",
     rank_by="n",
 )

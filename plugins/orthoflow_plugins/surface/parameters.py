@@ -16,7 +16,10 @@ class DetectorParams(MethodParams):
     min_radius_m: float = Field(0.15, gt=0.0, description="Smallest radius.")
     max_radius_m: float = Field(20.0, gt=0.0, le=200.0, description="Largest radius.")
     min_arc_deg: float = Field(
-        40.0, ge=10.0, le=360.0, description="Shortest arc around the axis that has points."
+        40.0,
+        ge=10.0,
+        le=360.0,
+        description="Minimum angle around the axis over which there are points.",
     )
     min_area_m2: float = Field(0.3, gt=0.0, description="Smallest area of a surface.")
     max_surfaces: int = Field(32, ge=1, le=1000, description="Maximum number of surfaces.")
