@@ -1,4 +1,4 @@
-"""Points near a cylinder, unrolled onto a plane, where rasters of planes can be computed."""
+"""Unrolling of points near a cylinder onto a plane, so that they can be rasterised like a wall."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.slabs import OffsetPoints, Slab
 
 _CHUNK: Final = 1 << 20
-# Places of a curved slab whose bounding box contains the whole slab, along the arc.
+# Number of positions along the arc from which the bounding box of a curved slab is computed.
 _PLACES: Final = 65
 
 
@@ -85,7 +85,8 @@ def box_around(slab: Slab) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     places = np.vstack(
         [frame.world_from_wall(grid, depth_m) for depth_m in (-slab.behind_m, slab.front_m)]
     )
-    # Between two places of a whole turn, the arc is farther out by less than 0.2 % of its radius.
+    # Between two of these positions, the arc of a full turn exceeds their box by less than 0.2 % of
+    # its radius.
     bend = frame.bend
     slack_m = 1e-3 + (
         0.0 if bend is None else 2e-3 * (abs(bend.radius_m) + max(slab.behind_m, slab.front_m))

@@ -17,9 +17,9 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.extents import Extent, Reach, SampledPoints, extent_of
 from orthoflow_plugins.raster.parameters import RasterParams
 
-# Axes closer than this to the vertical are upright.
+# Axes within 45 degrees of the vertical are upright.
 _UPRIGHT_COSINE: Final = math.sqrt(0.5)
-# Depths reach at most this share of the radius towards the axis, where cells shrink to nothing.
+# Maximum depth towards the axis, as a share of the radius; at the axis, cells have no width.
 _RADIUS_SHARE: Final = 0.8
 # A plane belongs to the relief of a cylinder if at least this share of it is in its buffer.
 _COVERED_SHARE: Final = 0.8
@@ -98,7 +98,7 @@ class CurvedWalls:
 
 
 def limits_m(frame: WallFrame) -> tuple[float, float]:
-    """Return the largest depths behind and in front of a wall that stay away from the axis."""
+    """Return the maximum depths behind and in front of a wall, limited towards its axis."""
     if frame.bend is None:
         return math.inf, math.inf
     most_m = _RADIUS_SHARE * abs(frame.bend.radius_m)
@@ -106,7 +106,7 @@ def limits_m(frame: WallFrame) -> tuple[float, float]:
 
 
 def flattened(cloud: PointCloud, slab: Slab) -> tuple[PointCloud, Slab]:
-    """Unroll the points in the slab of a curved wall, and the slab; others remain as they are."""
+    """Return a cloud and a slab, unrolled onto a plane if the wall is curved, else unchanged."""
     if slab.frame.bend is None:
         return cloud, slab
     near = unrolled(cloud, slab)
@@ -134,9 +134,9 @@ def _frame_of(
 ) -> WallFrame:
     """Return the grid over a cylinder's points, widened on all sides.
 
-    Where the axis is upright, it runs down the image, as a person in front of it sees it. A vault
-    is shown with its axis to the right, as if the walls below it continued upwards: its springing
-    lines are the upper and lower edges.
+    An upright axis is vertical in the image, as a person in front of the wall sees it. The axis of
+    a vault points right, as if the walls below the vault continued upwards, so its springing lines
+    are the upper and lower edges of the image.
     """
     axis, radius_m, gsd_m = shape.axis_world, shape.radius_m, params.gsd_m
     is_upright = abs(float(axis @ up)) >= _UPRIGHT_COSINE
@@ -145,11 +145,12 @@ def _frame_of(
     margin_rad = min(params.margin_m / radius_m, max(0.0, 0.5 * (math.tau - (end_rad - start_rad))))
     start_rad, end_rad = start_rad - margin_rad, end_rad + margin_rad
     low_m, high_m = surface.along_m[0] - params.margin_m, surface.along_m[1] + params.margin_m
-    # Down for towers, to the right for vaults.
+    # Direction of the axis in the image: downwards for towers, to the right for vaults.
     straight = (-axis if is_upwards else axis) if is_upright else axis
     first_m = high_m if float(straight @ axis) < 0.0 else low_m
-    # Angles about the axis decrease along the arc if a surface is seen from inside and the axis of
-    # an upright one points upwards. Seen from outside, or with the axis downwards, they increase.
+    # Along the arc in the image, angles about the axis decrease if a surface is seen from inside
+    # and an upright axis points upwards. They increase if it is seen from outside or its axis
+    # points downwards.
     is_from_end = shape.is_concave == (float(straight @ axis) < 0.0 or not is_upright)
     angle = end_rad if is_from_end else start_rad
     beside = np.cross(axis, surface.zero_world)
@@ -157,7 +158,7 @@ def _frame_of(
     normal = -outwards if shape.is_concave else outwards
     u = np.cross(normal, straight) if is_upright else straight
     arc_m, length_m = (end_rad - start_rad) * radius_m, high_m - low_m
-    # A whole turn ends with its last whole cell.
+    # A full turn contains only whole cells.
     n_arc = min(math.ceil(arc_m / gsd_m - 1e-6), math.floor(math.tau * radius_m / gsd_m + 1e-6))
     n_along = math.ceil(length_m / gsd_m - 1e-6)
     east, north, top = up.tolist()

@@ -9,20 +9,20 @@ from orthoflow_plugins.surface.parameters import DetectorParams
 class SurfaceCylinder(Detector):
     """Find cylinders with axes in any direction and arcs of at least 40 degrees.
 
-    A sample of the points is sorted into voxels of several sizes, each with a normal from the
-    points around it. Pairs of neighbouring voxels whose normals are not parallel give an axis, a
-    centre and a radius; the cylinder with which most pairs agree is fitted to the voxels and
-    tested. Coarse voxels find large radii, fine ones columns. All surfaces are then fitted to all
-    points by the means of small cells, with Tukey's weights, so mouldings and furniture have no
-    weight. The covariance follows from the scatter of tiles of cells, as neighbouring points share
-    errors.
+    A sample of the points is sorted into voxels of several sizes, and a normal is computed for each
+    voxel from the points around it. Each pair of neighbouring voxels whose normals are not parallel
+    defines an axis, a centre and a radius. The cylinder with which most pairs agree is fitted to
+    the voxels and tested. Coarse voxels are used to find large radii, and fine voxels to find
+    columns. All surfaces are then fitted to the means of all points in small cells, with Tukey's
+    weights, so mouldings and furniture have no influence. Neighbouring points have common errors,
+    so the covariance is computed from the scatter between tiles of cells.
 
-    A cylinder is rejected if its arc or area is small, if its normals do not turn with the angle
-    (flat facets, corners of a room), if its scatter is large relative to its radius, or if it is
-    also curved along its axis (domes). The report states the numbers.
+    A cylinder is rejected if its arc or area is small, if its normals do not rotate with the angle
+    (as on flat facets and in corners of a room), if its scatter is large relative to its radius, or
+    if it is also curved along its axis (as a dome is). Diagnostics state these values.
 
-    With labels of planes, points of flat planes are left out. Planes that are strips of a curved
-    surface, because their sagitta exceeds their noise, are searched.
+    If labels of planes are given, the points of planes are excluded, except those of planes that
+    are strips of a curved surface, i.e. whose sagitta exceeds their noise.
     """
 
     id = "surface.cylinder"

@@ -15,10 +15,11 @@ from orthoflow_plugins.surface.voxels import Sample
 
 _LEAST_POINTS: Final = 100
 _MOST_POINTS: Final = 3_000
-# A strip turns by at least this angle across its width; walls that are merely bent turn less.
+# The normal of a strip rotates by at least this angle across its width; that of a slightly bent
+# wall rotates less.
 _LEAST_TURN_DEG: Final = 4.0
-# Its scatter about a curved surface is at most this share of that about the plane, and its sagitta
-# at least this many times the former.
+# A plane is a strip if the scatter of its points about a curved surface is at most _LARGEST_SHARE
+# of that about the plane, and if its sagitta is at least _LEAST_RATIO times the former.
 _LARGEST_SHARE: Final = 0.6
 _LEAST_RATIO: Final = 4.0
 
@@ -30,12 +31,12 @@ class PlaneTest:
     Attributes:
         index: index of the plane.
         normal: (3,) float64 unit vector of the plane through its points.
-        offset_m: its offset, from the cloud's origin.
+        offset_m: offset of this plane from the cloud's origin.
         is_strip: whether the points are on a curved surface.
         sagitta_mm: height of the arc across the strip.
         sigma_mm: scatter of the points about the curved surface.
         plane_sigma_mm: scatter of the points about the plane.
-        turn_deg: angle by which the surface turns across the strip.
+        turn_deg: angle by which the normal of the surface rotates across the strip.
     """
 
     index: int
