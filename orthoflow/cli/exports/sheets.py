@@ -176,6 +176,8 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         about = [wall.about.accuracy if wall.about else Phrase(key="not_checked")]
         if wall.about and wall.about.objection:
             about.insert(0, wall.about.objection)
+        if wall.frame.bend is not None:
+            about.append(axes_of(wall.frame).phrase)
         said = "; ".join(phrase.text(language) for phrase in about)
         known.setdefault(said, []).append(surface_name(wall.name, language))
     notes = tuple(

@@ -12,7 +12,7 @@ from typing import Final, Literal
 Language = Literal["en", "de", "fr", "pl", "es"]
 LANGUAGES: Final = ("en", "de", "fr", "pl", "es")
 _TEXTS: Final = Path(__file__).with_name("labels.txt")
-_NUMBERED: Final = re.compile(r"(wall|floor|ceiling) (\d+)")
+_NUMBERED: Final = re.compile(r"(wall|floor|ceiling|vault|apse|tower|column|cylinder) (\d+)")
 _NUMBER: Final = re.compile(r"[+-]?[\d,]+(\.\d+)?( \w+)?")
 _SPACED: Final = str.maketrans(".,", ",\N{NO-BREAK SPACE}")
 _SEPARATORS: Final = {"de": str.maketrans(".,", ",."), "fr": _SPACED, "pl": _SPACED, "es": _SPACED}
