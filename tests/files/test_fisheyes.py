@@ -20,7 +20,6 @@ from orthoflow.files.cube_faces import (
     problem_of,
 )
 from orthoflow.files.images import decode_image, encode_png
-from tests.wide_lenses import directions_of
 
 # Wholly on its picture: a circle of 180 degrees is 464 pixels wide.
 LENS = FisheyeLens(
@@ -41,6 +40,21 @@ def coloured(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def picture(lens: FisheyeLens) -> NDArray[np.uint8]:
     return np.rint(coloured(directions_of(lens))).astype(np.uint8)
+
+
+def directions_of(lens: FisheyeLens) -> NDArray[np.float64]:
+    """Unit directions (height, width, 3) of a lens without tangential terms, by a table."""
+    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    b = (v - lens.cy) / lens.fy
+    a = (u - lens.cx - lens.skew * b) / lens.fx
+    angles = np.linspace(0.0, 0.5 * np.pi * 1.2, 40_001)
+    powers = np.stack([angles ** (2 * power + 1) for power in range(5)])
+    bent = np.array([1.0, *lens.radial]) @ powers
+    theta = np.interp(np.hypot(a, b), bent, angles)
+    around = np.arctan2(b, a)
+    return np.stack(
+        [np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)], axis=-1
+    )
 
 
 def random_directions(count: int, widest_deg: float) -> NDArray[np.float64]:

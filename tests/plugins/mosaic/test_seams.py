@@ -149,20 +149,6 @@ def two_halves() -> tuple[Layer, Layer]:
     )
 
 
-def n_patches(source: NDArray[np.int16]) -> int:
-    parts = [(source == index).astype(np.uint8) for index in np.unique(source)]
-    return sum(cv2.connectedComponents(part, connectivity=4)[0] - 1 for part in parts)
-
-
-def test_noisy_qualities_do_not_give_specks(tmp_path: Path) -> None:
-    specks = image_of(tmp_path, *two_halves())
-    calm = image_of(tmp_path, *two_halves(), island_cells_min=100)
-    assert n_patches(specks.source) > 10
-    assert n_patches(calm.source) == 2
-    np.testing.assert_array_equal(calm.mask, specks.mask)
-    np.testing.assert_array_equal(calm.rgb[..., 0], np.where(calm.source == 0, 10, 20))
-
-
 def test_a_filling_is_not_enlarged_over_painted_cells(tmp_path: Path) -> None:
     left, right = two_halves()
     filled = np.ones_like(left.mask)

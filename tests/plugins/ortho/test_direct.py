@@ -18,7 +18,7 @@ from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
 
-from orthoflow.errors import MethodError, ProductError
+from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.levels import light_of_levels, lit
 from orthoflow.products import Layer, LayerMask, PointCloud, Walls
@@ -213,9 +213,6 @@ def test_a_cloud_that_cannot_paint_is_refused(tmp_path: Path) -> None:
         painted(dataclasses.replace(cloud, rgb=None), walls, tmp_path)
     with pytest.raises(MethodError, match="no point of the cloud is within the buffer"):
         painted(dataclasses.replace(cloud, origin=cloud.origin + 9.0), walls, tmp_path)
-    empty = dataclasses.replace(cloud, x=cloud.x[:0], y=cloud.y[:0], z=cloud.z[:0], rgb=None)
-    with pytest.raises(ProductError, match="has 0 points"):
-        painted(empty, walls, tmp_path)
 
 
 def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:

@@ -17,16 +17,15 @@ from orthoflow_plugins.read.photos import ReadPhotos
 
 from orthoflow.files.images import encode_png
 from orthoflow.files.publishing import publish_layers, publish_orthoimages
-from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.levels import sixteen_bits
 from orthoflow.products import InputFiles, Layer, LayerMask, Layers, Orthoimages, OrthoMask, Photos
 from orthoflow.testing import photographed as ms
 from tests import ortho_scenes as scenes
-from tests.box_rooms import BoxRoom
+from tests import samples
 from tests.method_runs import run
-from tests.raster_scenes import SURVEY, context
-from tests.wide_lenses import directions_of_panorama
+from tests.raster_scenes import context
 
 SIDE_PX = (1000, 800)
 
@@ -111,83 +110,61 @@ def test_a_block_of_both_depths_has_sixteen_bits_and_says_so(tmp_path: Path) -> 
     assert joined(tmp_path, layers, seams="graph-cut").images[0].rgb.dtype == np.uint16
 
 
-ROOM = BoxRoom(size_m=(2.4, 1.8, 1.6), middle=SURVEY, gsd_m=0.008)
-CENTRE = SURVEY + np.array([0.2, -0.1, 0.75])
-# Rotation from camera axes (x right, y down, z forward) to the world, for a view to the north,
-# tilted and rolled.
-WORLD_FROM_CAMERA = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) @ rotation_from_vector(
-    np.array([0.11, -0.16, 0.2])
-)
-PANORAMA = (1600, 800)
-# With fewer cells, the displacement is less accurate than a fiftieth of a cell.
-FEWEST_CELLS = 500
-RIM = 2
+# The camera looks past the wall to the north-east and down, so that three faces of the panorama
+# meet on the wall.
+PANORAMA = (2400, 1200)
+WORLD_FROM_CAMERA = looking_at(
+    np.zeros(3), np.array([0.43, -0.36, -0.83]), samples.UP
+).T @ rotation_from_vector(np.array([0.02, -0.03, 0.05]))
 
 
-def words(values: object) -> str:
-    return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values)))
-
-
-def panorama(folder: Path) -> tuple[Path, tuple[Path, ...]]:
-    """Return a panorama of the whole sphere, and its camera as exported by Metashape."""
+def panorama(folder: Path) -> tuple[Path, Path]:
+    """Return a panorama of the wall and its camera as exported by Metashape."""
     photo, xml = folder / "360.png", folder / "cameras.xml"
-    # Metashape uses camera axes; directions have x forward, y left, z up.
-    camera_from_panorama = np.array([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
-    rays = directions_of_panorama(*PANORAMA) @ (WORLD_FROM_CAMERA @ camera_from_panorama).T
-    photo.write_bytes(encode_png(ROOM.seen(CENTRE, rays)))
+    where, (width, height) = scenes.frame(), PANORAMA
+    centre = scenes.camera(where, aside_m=0.0).centre_world
+    azimuth = (width / 2 - np.arange(width) - 0.5) * (2 * np.pi / width)
+    elevation = ((height / 2 - np.arange(height) - 0.5) * (np.pi / height))[:, None]
+    level = np.cos(elevation)
+    # In camera axes: x right, y down, z forward; the panorama has its middle in front.
+    rays = np.stack(
+        [-level * np.sin(azimuth), -np.sin(elevation) + 0 * azimuth, level * np.cos(azimuth)], -1
+    ).reshape(-1, 3)
+    seen = scenes.cast(where, np.broadcast_to(centre, rays.shape), rays @ WORLD_FROM_CAMERA.T)
+    photo.write_bytes(encode_png(scenes.colours(seen).reshape(height, width, 3)))
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = WORLD_FROM_CAMERA, CENTRE
+    matrix[:3, :3], matrix[:3, 3] = WORLD_FROM_CAMERA, centre
+    numbers = " ".join(repr(float(value)) for value in matrix.ravel())
     xml.write_text(
-        '<document><chunk><sensors><sensor id="0" type="spherical"><resolution width="1600" '
-        'height="800"/></sensor></sensors><cameras><camera sensor_id="0" label="360.png">'
-        f"<transform>{words(matrix)}</transform></camera></cameras></chunk></document>"
+        '<document><chunk><sensors><sensor id="0" type="spherical"><resolution '
+        f'width="{width}" height="{height}"/></sensor></sensors><cameras><camera sensor_id="0" '
+        f'label="360.png"><transform>{numbers}</transform></camera></cameras></chunk></document>'
     )
-    return photo, (xml,)
+    return photo, xml
 
 
-def painted(folder: Path, photo: Path, cameras: tuple[Path, ...]) -> tuple[Layer, ...]:
-    given = InputFiles(name="cameras", paths=cameras)
+def test_the_faces_of_a_panorama_paint_a_wall_where_it_is(tmp_path: Path) -> None:
+    photo, xml = panorama(tmp_path)
+    given = InputFiles(name="cameras", paths=(xml,))
     files = {"files": InputFiles(name="photos", paths=(photo,)), "cameras": given}
-    photos = run(ReadPhotos, context(folder), files, panoramas=("360*",)).photos
-    poses = run(ReadCameras, context(folder), {"files": given, "photos": photos}).cameras
+    photos = run(ReadPhotos, context(tmp_path), files, panoramas=("360*",)).photos
+    poses = run(ReadCameras, context(tmp_path), {"files": given, "photos": photos}).cameras
     assert all(camera.status == "ok" for camera in poses.cameras)
-    inputs = {"walls": ROOM.walls(), "photos": photos, "cameras": poses}
-    layers: tuple[Layer, ...] = run(DsmBackward, context(folder), inputs).layers.layers
-    return layers
-
-
-def away_from_corners(layer: Layer) -> NDArray[np.bool_]:
-    """Return a mask of painted cells, except where pixels show two walls of the room."""
-    inner = np.zeros(layer.mask.shape, dtype=bool)
-    inner[RIM:-RIM, RIM:-RIM] = True
-    return inner & (layer.mask == LayerMask.PAINTED)
-
-
-def displacement_cells(layer: Layer, wall: int) -> NDArray[np.float64]:
-    """Return the displacement of a layer's colours to the right and down, in cells."""
-    cells = ROOM.cell_centres(wall)
-    there = away_from_corners(layer)
-    right, down = (
-        (ROOM.colours(wall, cells + step) - ROOM.colours(wall, cells - step))[there].ravel() / 0.2
-        for step in (np.array([0.1, 0.0]), np.array([0.0, 0.1]))
-    )
-    wrong = (layer.rgb - ROOM.colours(wall, cells))[there].ravel()
-    found, *_ = np.linalg.lstsq(np.column_stack([-right, -down]), wrong, rcond=None)
-    return np.asarray(found)
-
-
-def test_a_room_is_painted_where_it_is(tmp_path: Path) -> None:
-    layers = painted(tmp_path, *panorama(tmp_path))
-    # All surfaces except the floor.
-    for wall in range(5):
-        truth, mine = ROOM.colours(wall, ROOM.cell_centres(wall)), []
-        for layer in (each for each in layers if each.wall == wall):
-            mine.append(layer.mask == LayerMask.PAINTED)
-            there = away_from_corners(layer)
-            if there.sum() < FEWEST_CELLS:
-                continue
-            # A displacement of one cell changes colours by 13 levels (median).
-            assert np.abs(displacement_cells(layer, wall)).max() < 0.02, (layer.source, wall)
-            wrong = np.abs(layer.rgb - truth)[there]
-            assert np.percentile(wrong, 99) < 4.0, (layer.source, wall)
-        assert np.any(mine, axis=0).mean() > 0.98
+    inputs = scenes.inputs(photos=photos, cameras=poses)
+    layers, _ = scenes.laid(DsmBackward, tmp_path, inputs)
+    n_cells = [np.count_nonzero(layer.mask == LayerMask.PAINTED) for layer in layers]
+    assert sorted(layer.source for layer in layers) == [
+        "360_front.png",
+        "360_right.png",
+        "360_up.png",
+    ]
+    assert min(n_cells) > 5_000
+    is_visible, _ = scenes.visible(scenes.camera(scenes.frame(), aside_m=0.0))
+    painted = np.any([layer.mask == LayerMask.PAINTED for layer in layers], axis=0)
+    assert painted[is_visible].mean() > 0.96
+    for layer in layers:
+        off = scenes.places_off(layer)[layer.mask == LayerMask.PAINTED]
+        # Cells where counts begin again and those at the step have mixed colours.
+        is_plain = (np.abs(off) < 2.0).all(axis=1)
+        assert is_plain.mean() > 0.9
+        assert np.abs(off[is_plain].mean(axis=0)).max() < 0.01, layer.source

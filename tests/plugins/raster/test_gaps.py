@@ -95,7 +95,11 @@ def test_what_the_scanner_looked_through_stays_void(tmp_path: Path) -> None:
     window = np.zeros(KNOWN.shape, dtype=bool)
     window[10:30, 20:40] = True
     wall = rastered(scanned(0.9, missing=window), tmp_path)
-    assert (wall.mask[11:29, 21:39] == SurfaceMask.VOID).all()
+    is_void = wall.mask == SurfaceMask.VOID
+    assert is_void[11:29, 21:39].all()
+    assert np.isnan(wall.depth_m[is_void]).all()
+    assert np.isnan(wall.intensity[is_void]).all()
+    np.testing.assert_array_equal(wall.rgb_mask > 0, ~is_void)
 
 
 def test_a_depth_step_is_not_bridged(tmp_path: Path) -> None:

@@ -11,18 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect.patches import GreyImage, measure_shifts
 from orthoflow_plugins.simulate import photographs
 from orthoflow_plugins.simulate.building import SceneDraft
 from orthoflow_plugins.simulate.photographs import Film, PhotoLayout, planned_shots, take_photos
 from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow_plugins.simulate.room_model import DESIGNED, build_room
-from scipy.ndimage import map_coordinates
 
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, render
+from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Truth
 from orthoflow.sdk import StepContext
@@ -61,61 +59,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
     return simulate(tmp_path_factory.mktemp("small"), photo_gsd_m=0.016)
 
 
-@pytest.fixture(scope="module")
-def wall(room: SimulateRoom.Out) -> TrueOrthoimage:
-    """Return the true main wall, with cells as large as pixels."""
-    planes = room.truth.planes
-    frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=0.004)
-    return render(
-        room.truth.scene,
-        frame,
-        front_m=0.02,
-        behind_m=0.02,
-        supersample=2,
-        cores=2,
-    )
-
-
 def cameras_of(truth: Truth) -> tuple[ViewingCamera, ...]:
     return tuple(camera.viewing() for camera in truth.cameras.cameras)
-
-
-def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return grey levels at pixels (n, 2); the first centre is at (0.5, 0.5)."""
-    return np.asarray(map_coordinates(image, pixels.T[::-1] - 0.5, order=1))
-
-
-@pytest.mark.parametrize("place", [0, 3, 5])
-def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
-    room: SimulateRoom.Out, wall: TrueOrthoimage, place: int
-) -> None:
-    truth, photo = room.truth, room.photos.photos[place]
-    camera = cameras_of(truth)[place]
-    image = decode_image(photo.encoded, photo.name) @ GREY
-    true, frame = wall, wall.frame
-    rows, columns = np.nonzero(true.rectangle >= 0)
-    cells = np.column_stack([columns + 0.5, rows + 0.5])
-    points = frame.world_from_wall(cells, true.depth_m[rows, columns].astype(np.float64))
-    pixels = camera.project(points)[:, :2]
-    margin = np.array([1.0, 1.0])
-    limit = np.array([camera.width, camera.height]) - margin
-    shown = np.all((pixels > margin) & (pixels < limit), axis=1)
-    shown[shown] = SceneCameras(truth.scene).sees(camera, points[shown])
-    on_wall = np.zeros(frame.shape, dtype=bool)
-    on_wall[rows[shown], columns[shown]] = True
-    grey = np.zeros(frame.shape)
-    grey[on_wall] = bilinear(image, pixels[shown])
-    expected = np.nan_to_num(true.rgb).astype(np.float64) @ GREY
-    shifts = measure_shifts(
-        GreyImage(grey=grey, valid=on_wall, region=on_wall),
-        GreyImage(grey=expected, valid=on_wall, region=on_wall),
-        reach_cells=2,
-    )
-    assert len(shifts.centre) > 15
-    # Shifts are in cells, which are as large as pixels; patches of 32 x 32 are accurate to a few
-    # hundredths.
-    assert np.abs(np.median(shifts.shift, axis=0)).max() < 0.02
-    assert np.abs(shifts.shift).max() < 0.3
 
 
 def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> None:
