@@ -21,8 +21,8 @@ _SMOOTH: Final = (0.05, 0.15, 0.4, 1.0)
 _RATIOS: Final = np.geomspace(0.003, 10.0, 25)
 # Neighbouring points of a photo are averaged in cells. The two limits are the maximum numbers of
 # cells for one photo and for several.
-_MAX_CELLS: Final = 130
-_MAX_CELLS_OF_SEVERAL: Final = 280
+MAX_CELLS: Final = 130
+MAX_CELLS_OF_SEVERAL: Final = 280
 # Side of the smallest cells, as a share of the extent of the points of a photo.
 _FINEST_CELL: Final = 0.02
 _COARSER: Final = 1.15
@@ -96,7 +96,7 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
 
 def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     is_one, extent_m = not points.photo.any(), max(points.extent_m, 1e-9)
-    cells = _cells(points, extent_m, _MAX_CELLS if is_one else _MAX_CELLS_OF_SEVERAL)
+    cells = _cells(points, extent_m, MAX_CELLS if is_one else MAX_CELLS_OF_SEVERAL)
     counts = np.bincount(cells)
     n_cells = len(counts)
 
