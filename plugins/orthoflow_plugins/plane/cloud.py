@@ -88,6 +88,7 @@ class PreparedCloud:
             station is known.
         tolerance_m: maximum distance of points that belong to a plane.
         fit_tolerance_m: maximum distance of points used to fit a plane.
+        noise_m: median standard deviation of the noise of single points; 0 if unknown.
         parts: number of parts that are processed in parallel.
         claims: (n,) int8 plane of each point, set by `search.label`; -1 if not yet assigned.
     """
@@ -100,6 +101,7 @@ class PreparedCloud:
     viewpoint_m: NDArray[np.float64]
     tolerance_m: float
     fit_tolerance_m: float
+    noise_m: float
     parts: int
     claims: NDArray[np.int8]
 
@@ -160,6 +162,7 @@ def prepare(
     fit_tolerance_m: float,
     *,
     parts: int,
+    noise_m: float = 0.0,
     outside_share: float = _OUTSIDE_SHARE,
 ) -> PreparedCloud:
     """Sample a cloud and compute the boxes of its blocks; no point is assigned to a plane yet.
@@ -170,6 +173,7 @@ def prepare(
         fit_tolerance_m: maximum distance of points that are used to fit a plane; at most
             `tolerance_m`.
         parts: number of threads.
+        noise_m: standard deviation of the noise of single points; 0 if unknown.
         outside_share: share of the points that may be outside the box on each side.
 
     Raises:
@@ -199,6 +203,7 @@ def prepare(
         viewpoint_m=viewpoint_m,
         tolerance_m=tolerance_m,
         fit_tolerance_m=fit_tolerance_m,
+        noise_m=noise_m,
         parts=parts,
         claims=np.full(len(cloud), -1, dtype=np.int8),
     )

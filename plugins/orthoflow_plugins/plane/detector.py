@@ -100,7 +100,7 @@ class DetectorOut(Ports):
 class Detector(Method):
     """Base class of methods that detect planes; subclasses provide the proposer."""
 
-    result_version = 3
+    result_version = 4
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = DETECTOR_METRICS
     In = DetectorIn
     Out = DetectorOut

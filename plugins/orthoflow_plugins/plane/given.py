@@ -252,7 +252,9 @@ def _placed(
     up = prepared.up
     placed = members[near] @ wall_axes(plane.normal, up).T
     low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(placed) else np.zeros((2, 2))
-    cell_m = cell_for(len(placed) * prepared.sample.n_represented, float(np.prod(high - low)))
+    cell_m = cell_for(
+        len(placed) * prepared.sample.n_represented, float(np.prod(high - low)), prepared
+    )
     raster = SurfaceRaster.over(plane, prepared.box_corners(), up, cell_m)
     near_it = replace(prepared, tolerance_m=reach_m, fit_tolerance_m=reach_m)
     (sums,) = measure_cells(near_it, [raster])

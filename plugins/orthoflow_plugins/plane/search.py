@@ -245,8 +245,9 @@ def detect(
     ctx.progress(0.0, "preparing the points")
     part = thinned(cloud, params.thinning)
     noise_m = measure_noise(draw_sample(part).offsets_m)
-    tolerances_m = params.tolerances_m(*(noise_m or (0.0, 0.0)))
-    whole = prepare(part, *tolerances_m, parts=ctx.cores)
+    single_m, shared_m = noise_m or (0.0, 0.0)
+    tolerances_m = params.tolerances_m(single_m, shared_m)
+    whole = prepare(part, *tolerances_m, parts=ctx.cores, noise_m=single_m)
     search = Search(cloud=whole, params=params)
     proposer = proposer_of(search)
 
@@ -256,10 +257,10 @@ def detect(
 
     found = find_planes(search, proposer, on_found)
     if not found:
-        wider_m = _wider_tolerance_m(search, noise_m or (0.0, 0.0), proposer_of)
+        wider_m = _wider_tolerance_m(search, (single_m, shared_m), proposer_of)
         raise MethodError(_why_none(cloud, search, wider_m, method))
     if params.thinning > 1:
-        whole = prepare(cloud, *tolerances_m, parts=ctx.cores)
+        whole = prepare(cloud, *tolerances_m, parts=ctx.cores, noise_m=single_m)
     if not params.refit:
         found = [_as_proposed(item, whole.up) for item in found]
     if params.thinning > 1 or not params.refit:
@@ -428,7 +429,7 @@ def _refined(
     # Compute the cell size from the extent of the points.
     placed = _some(near_m @ wall_axes(plane.normal, cloud.up).T, _SPREAD_POINTS)
     low, high = np.quantile(placed, (0.02, 0.98), axis=0) if len(near_m) else np.zeros((2, 2))
-    cell_m = max(cloud.tolerance_m, cell_for(len(near_m), float(np.prod(high - low))))
+    cell_m = max(cloud.tolerance_m, cell_for(len(near_m), float(np.prod(high - low)), cloud))
     raster, sums, support = _observed(search, plane, cell_m)
     if support is None or support.n_points < _SAMPLE_CAUTION * search.least_points:
         search.refuse("scattered" if support is None else "few", support.n_points if support else 0)
@@ -450,7 +451,7 @@ def _refined(
         search.refuse("scattered")
         return None
     area_m2 = float(support.cells.sum()) * raster.cell_m**2
-    return together, cell_for(float(sums.n_near[support.cells].sum()), area_m2)
+    return together, cell_for(float(sums.n_near[support.cells].sum()), area_m2, cloud)
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
@@ -559,7 +560,7 @@ def _fine_raster(item: FoundPlane, cloud: PreparedCloud, every: int) -> SurfaceR
     """Return a raster over the plane's rectangle, as fine as the number of points allows."""
     area_m2 = float(item.support.cells.sum()) * item.raster.cell_m**2
     share = cloud.sample.n_represented / every
-    cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
+    cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2, cloud))
     _, left, right, top, bottom = cloud.bounds_of(item.support.bounds_m)
     rows, columns = math.ceil((bottom - top) / cell_m), math.ceil((right - left) / cell_m)
     shape = (max(1, rows), max(1, columns))

@@ -335,13 +335,16 @@ def waves(rng: np.random.Generator, places_m: NDArray[np.float64]) -> NDArray[np
 
 
 def room(rng: np.random.Generator, noise_m: float, shared_m: float) -> NDArray[np.float64]:
-    """Return six surfaces of a randomly rotated box room, each with noise along its normal."""
+    """Return six surfaces of a randomly rotated box room, each with noise along its normal.
+
+    The noise of two opposite walls is 1.5 times that of the others, like that of dark walls.
+    """
     points = []
     for axis in range(3):
         for level in (0.0, SIZE_M[axis]):
             count = int(500 * np.prod(np.delete(SIZE_M, axis)))
             side = rng.uniform(0.0, 1.0, (count, 3)) * SIZE_M
-            side[:, axis] = level + rng.normal(0.0, noise_m, count)
+            side[:, axis] = level + rng.normal(0.0, noise_m * (1.5 if axis == 0 else 1.0), count)
             side[:, axis] += shared_m * waves(rng, np.delete(side, axis, axis=1))
             points.append(side)
     return np.concatenate(points) @ turned(rng.uniform(0.0, 360.0)).T
