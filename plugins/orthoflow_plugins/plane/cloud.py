@@ -47,7 +47,7 @@ _THINNEST_M: Final = 1e-4
 
 # Number of positions at which noise is measured, radii of the neighbourhoods, and minimum and
 # maximum number of points in a neighbourhood.
-_NOISE_SEEDS: Final = 600
+NOISE_SEEDS: Final = 600
 _RADII_M: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
 _NEAR_LEAST: Final = 12
 _NEAR_MOST: Final = 400
@@ -299,7 +299,7 @@ def measure_noise(points_m: NDArray[np.float64]) -> tuple[float, float] | None:
     if len(points_m) < _NEAR_LEAST:
         return None
     tree = cKDTree(points_m)
-    seeds = points_m[:: max(1, len(points_m) // _NOISE_SEEDS)]
+    seeds = points_m[:: max(1, len(points_m) // NOISE_SEEDS)]
     single = np.full(len(seeds), np.nan)
     shared = np.full(len(seeds), np.nan)
     for radius_m in _RADII_M:
