@@ -76,6 +76,13 @@ class Surface:
         return self.arc_rad[1] - self.arc_rad[0] >= _FULL_TURN - 1e-9
 
     @property
+    def middle_world(self) -> NDArray[np.float64]:
+        """Point (3,) of the axis at the middle of the surface."""
+        shape = self.shape
+        start = shape.point_world if isinstance(shape, Cylinder) else shape.apex_world
+        return start + 0.5 * (self.along_m[0] + self.along_m[1]) * shape.axis_world
+
+    @property
     def radius_m(self) -> float:
         """Radius of a cylinder; of a cone, at the middle of its points along the axis."""
         if isinstance(self.shape, Cylinder):

@@ -62,6 +62,7 @@ _METHODS: Final = {
     "lines of sight and the orthoimage",
     "inspect.openings:InspectOpenings": "compare outlines of openings with a simulated scene",
     "inspect.truth:InspectTruth": "compare orthoimages, walls and planes with a simulated scene",
+    "inspect.surfaces:InspectSurfaces": "compare curved surfaces with a simulated scene",
     "inspect.surf:InspectSurf": "compare orthoimages with the laser's intensity, by SURF key "
     "points",
     "inspect.checkpoints:InspectCheckpoints": "compare orthoimages with surveyed points: "
@@ -158,7 +159,7 @@ def orthoflow_kinds() -> list[KindSpec]:
             name="inspect",
             summary="measure the quality of the orthoimages",
             inputs=_ports(
-                "orthoimages walls checkpoints truth cloud planes labels cameras openings"
+                "orthoimages walls checkpoints truth cloud planes labels surfaces cameras openings"
             ),
             outputs=_ports("inspection"),
         ),

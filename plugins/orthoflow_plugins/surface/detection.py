@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,7 +15,6 @@ from orthoflow_plugins.surface.fit import FittedSurface, fit_all, named
 from orthoflow_plugins.surface.parameters import DetectorParams
 from orthoflow_plugins.surface.search import (
     BLOCK_VOXELS,
-    LEAST_RADIUS,
     MOST_RADIUS,
     Found,
     Limits,
@@ -33,8 +31,7 @@ _VOXEL_NOISES: Final = 3.0
 _VOXEL_SPACINGS: Final = 2.0
 # Voxels in which noise and spacing are measured.
 _FIRST_VOXEL_M: Final = 0.1
-# Coarse voxels need fewer points.
-_MOST_STRIDE: Final = 8
+_FIRST_POINTS: Final = 60_000
 # Gaps of an arc up to this angle, such as windows, belong to the surface.
 _BRIDGED_RAD: Final = math.radians(15.0)
 _LEAST_POINTS: Final = 100
@@ -123,13 +120,20 @@ def detect(
         is_cone=is_cone,
         cores=cores,
     )
-    counts = np.bincount(labels.astype(np.int64) + 1, minlength=len(found) + 1)[1:]
+    counts = np.array([item.surface.n_points for item in fitted], dtype=np.int64)
     kept = []
     for index in np.argsort(-counts, kind="stable").tolist():
-        shift_m = fitted[index].shift_m
-        if counts[index] < _LEAST_POINTS or shift_m > _LARGEST_SHIFT * limits.tolerance_m:
-            evidence = found[index].evidence | {"shift_mm": 1000.0 * shift_m}
+        fit, evidence = fitted[index], dict(found[index].evidence)
+        evidence |= {
+            "scatter_mm": 1000.0 * fit.cell_scatter_m,
+            "radius_m": fit.surface.radius_m,
+            "shift_mm": 1000.0 * fit.shift_m,
+        }
+        largest_m = params.max_scatter_share * fit.surface.radius_m + noise_m
+        if counts[index] < _LEAST_POINTS or fit.shift_m > _LARGEST_SHIFT * limits.tolerance_m:
             rejected.append(Rejected(reason="unstable", evidence=evidence))
+        elif fit.cell_scatter_m > largest_m:
+            rejected.append(Rejected(reason="rough", evidence=evidence))
         else:
             kept.append(index)
     rank = np.full(len(found) + 1, -1, dtype=np.int16)
@@ -139,7 +143,6 @@ def detect(
             named(
                 _with_side(fitted[index], is_oriented=is_oriented),
                 place,
-                int(counts[index]),
                 cloud.up,
             )
             for place, index in enumerate(kept)
@@ -160,20 +163,18 @@ def _levels(
     """Return voxels of several sizes, descending, and the noise of the cloud."""
     if len(sample) < _LEAST_POINTS:
         return [], 0.0
-    first = in_voxels(sample, cloud, _FIRST_VOXEL_M, BLOCK_VOXELS)
-    noise_m = noise_of(first)
+    every = max(1, len(sample) // _FIRST_POINTS)
+    first = in_voxels(sample.take(slice(None, None, every)), _FIRST_VOXEL_M)
+    noise_m = noise_of(first.voxels(cloud, BLOCK_VOXELS))
     # The points of a voxel on a surface cover about the square of its size.
-    per_voxel = max(1.0, len(sample) / max(1, first.n_occupied))
+    per_voxel = max(1.0, every * len(first.index) / first.count)
     spacing_m = _FIRST_VOXEL_M / math.sqrt(per_voxel)
-    smallest = max(_VOXEL_M, _VOXEL_NOISES * noise_m, _VOXEL_SPACINGS * spacing_m)
+    grid = in_voxels(sample, max(_VOXEL_M, _VOXEL_NOISES * noise_m, _VOXEL_SPACINGS * spacing_m))
     levels: list[tuple[float, Voxels]] = []
-    for step in itertools.count():
-        voxel_m = smallest * 2.0**step
-        if MOST_RADIUS * voxel_m / 2.0 >= params.max_radius_m and step:
-            break
-        if LEAST_RADIUS * voxel_m < params.max_radius_m:
-            thinned = sample.take(slice(None, None, min(_MOST_STRIDE, 2**step)))
-            levels.append((voxel_m, in_voxels(thinned, cloud, voxel_m, BLOCK_VOXELS, noise_m)))
+    # The next size finds radii of at most twice those of the last one.
+    while not levels or MOST_RADIUS * levels[-1][0] < params.max_radius_m:
+        levels.append((grid.size_m, grid.voxels(cloud, BLOCK_VOXELS, noise_m)))
+        grid = grid.coarser()
     return levels[::-1], noise_m
 
 

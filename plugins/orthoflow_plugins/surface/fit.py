@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from orthoflow.geometry.slabs import Offsets, read_only
 from orthoflow.geometry.surfaces import zero_direction
@@ -20,7 +21,7 @@ from orthoflow_plugins.surface.search import Found, longest_gap
 
 # Cells of a surface: smallest size, and largest number.
 _CELL_M: Final = 0.03
-_MOST_CELLS: Final = 60_000
+_MOST_CELLS: Final = 30_000
 _LEAST_CELLS: Final = 8
 # The sums of a fixed number of parts do not depend on the number of threads.
 _PARTS: Final = 4
@@ -30,6 +31,11 @@ _LEAST_SUM_M: Final = 0.012
 # Sizes of the tiles, in cells, whose scatter gives the covariance.
 _TILES: Final = (1, 4, 16)
 _OPEN_SHARE: Final = 0.15
+# Cells beside others without weight are left out if at least this share remains.
+_LEAST_USED: Final = 0.4
+# Cells belong to the extent if their mean is within this many standard deviations, and a slack.
+_EXTENT_SIGMAS: Final = 3.0
+_EXTENT_SLACK_M: Final = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,20 +85,21 @@ def fit_all(
     Returns:
         The fitted surfaces, and the index of the surface of each point, -1 for none.
     """
-    labels = np.full(len(cloud), -1, dtype=np.int16)
     if not found:
-        return [], labels
+        return [], np.full(len(cloud), -1, dtype=np.int16)
+    labels = np.empty(len(cloud), dtype=np.int16)
     cells = _cells_of(found, tolerances_m, noise_m)
     n_cells = int(cells.sizes[-1, 0] + cells.sizes[-1, 1] * cells.sizes[-1, 2])
     offsets = read_only(cloud.x, cloud.y, cloud.z)
     planes = plane_labels or (np.zeros(0, dtype=np.int16), np.zeros((0, 4)))
     parts = even_parts(len(cloud), _PARTS)
     sums = np.zeros((_PARTS, n_cells, 3))
+    counts = np.zeros((_PARTS, len(found)), dtype=np.int64)
 
     def run(part: int) -> None:
         own = parts[part]
         mine = Offsets(*(values[own] for values in offsets))
-        sum_cells(mine, planes[0][own], planes[1], cells, sums[part], labels[own])
+        sum_cells(mine, planes[0][own], planes[1], cells, sums[part], labels[own], counts[part])
 
     in_threads([partial(run, part) for part in range(_PARTS)], threads=cores)
     total = sums.sum(axis=0)
@@ -100,9 +107,8 @@ def fit_all(
     for index, item in enumerate(found):
         first, around, along, _ = cells.sizes[index].tolist()
         own = total[first : first + around * along].reshape(around, along, 3)
-        fitted.append(
-            _fitted(item, own, cells.bounds[index], cloud.origin, cloud.up, is_cone=is_cone)
-        )
+        n_points = int(counts[:, index].sum())
+        fitted.append(_fitted(item, own, cells.bounds[index], n_points, cloud, is_cone=is_cone))
     return fitted, labels
 
 
@@ -112,7 +118,7 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
     for item, tolerance_m in zip(found, tolerances_m, strict=True):
         low_m, high_m = item.along_m
         radius_m = item.round.radius_m
-        area_m2 = 2.0 * math.pi * radius_m * (high_m - low_m)
+        area_m2 = 2.0 * math.pi * radius_m * (high_m - low_m) * float(item.is_open.mean())
         size_m = max(_CELL_M, math.sqrt(area_m2 / _MOST_CELLS))
         # A whole number of cells for each part of the circle that may be open.
         n_open = len(item.is_open)
@@ -132,8 +138,8 @@ def _fitted(
     found: Found,
     sums: NDArray[np.float64],
     bounds: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    up: NDArray[np.float64],
+    n_points: int,
+    cloud: PointCloud,
     *,
     is_cone: bool,
 ) -> FittedSurface:
@@ -148,11 +154,18 @@ def _fitted(
     within = np.maximum(square - n * means**2, 0.0)
     noise_m = math.sqrt(float(within[many].sum() / max(1.0, (n[many] - 1.0).sum())))
     matrix = design(angles, places, found.round.steepness, is_cone=is_cone)
-    change, weights, extra_m = robust_solution(matrix, means, max(noise_m, 1e-5) ** 2 / n)
+    variances = max(noise_m, 1e-5) ** 2 / n
+    _, weights, _ = robust_solution(matrix, means, variances)
+    # Cells beside those without weight contain a few points of mouldings and edges, too.
+    is_out = np.zeros((around, along), dtype=np.bool_)
+    is_out[i, j] = weights == 0.0
+    is_in = ~ndimage.binary_dilation(is_out, np.ones((3, 3), dtype=np.bool_))[i, j]
+    used = is_in if is_in.mean() > _LEAST_USED else weights > 0.0
+    change, weights, extra_m = robust_solution(matrix[used], means[used], variances[used])
     rest = means - matrix @ change
-    own = _covariance(matrix, rest, weights, (i, j))
+    own = _covariance(matrix[used], rest[used], weights, (i[used], j[used]))
     best = found.round.corrected(found.zero, change)
-    zero = zero_direction(best.axis, up)
+    zero = zero_direction(best.axis, cloud.up)
     middle_m = float(n @ places / n.sum())
     best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
     counts = np.zeros((around, along), dtype=np.int64)
@@ -162,12 +175,15 @@ def _fitted(
     means_m[i, j] = sign * rest
     near = np.abs(rest) < bounds[3]
     rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[near].sum() / n[near].sum())))
-    arc, ends = _extent(counts)
+    is_on = np.zeros((around, along), dtype=np.bool_)
+    largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
+    is_on[i, j] = np.abs(rest) < largest_m
+    arc, ends = _extent(is_on)
     surface = Surface(
         name="",
-        shape=best.shape(origin, is_concave=found.side > 0.0),
+        shape=best.shape(cloud.origin, is_concave=found.side > 0.0),
         covariance=best.covariance(zero, own),
-        n_points=0,
+        n_points=n_points,
         rms_m=rms_m,
         zero_world=zero,
         along_m=(bounds[0] + size_m * ends[0] - middle_m, bounds[0] + size_m * ends[1] - middle_m),
@@ -219,14 +235,16 @@ def _covariance(
     return np.asarray(best if best.any() else inverse)
 
 
-def _extent(counts: NDArray[np.int64]) -> tuple[tuple[float, float], tuple[int, int]]:
+def _extent(is_full: NDArray[np.bool_]) -> tuple[tuple[float, float], tuple[int, int]]:
     """Return the range of angles, and first and last + 1 cell along the axis, with points."""
-    is_full = counts > 0
     length = float(np.quantile(is_full.sum(axis=1), 0.95))
     is_open = is_full.sum(axis=1) >= max(1.0, _OPEN_SHARE * length)
-    rows = np.flatnonzero(is_full[is_open].sum(axis=0) >= 0.1 * is_open.sum())
-    ends = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, counts.shape[1])
+    # Single columns are clutter.
     count = len(is_open)
+    wide = ndimage.binary_opening(np.tile(is_open, 3), np.ones(3, dtype=np.bool_))
+    is_open = wide[count : 2 * count] if wide.any() else is_open
+    rows = np.flatnonzero(is_full[is_open].sum(axis=0) >= 0.1 * is_open.sum())
+    ends = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, is_full.shape[1])
     gap = longest_gap(is_open)
     step = 2.0 * math.pi / count
     if gap <= max(2, count // 60):
@@ -238,7 +256,6 @@ def _extent(counts: NDArray[np.int64]) -> tuple[tuple[float, float], tuple[int, 
     return (low, low + (count - gap) * step), ends
 
 
-def named(fitted: Surface, index: int, n_points: int, up: NDArray[np.float64]) -> Surface:
-    """Return a surface with its name and number of points."""
-    name = f"{surface_kind(fitted.shape, up)} {index}"
-    return replace(fitted, name=name, n_points=n_points)
+def named(fitted: Surface, index: int, up: NDArray[np.float64]) -> Surface:
+    """Return a surface with its name."""
+    return replace(fitted, name=f"{surface_kind(fitted.shape, up)} {index}")

@@ -50,23 +50,33 @@ def _find(keys: NDArray[np.int64], i: int, j: int, k: int) -> np.int64:
     return entry
 
 
+@kernel_part
+def _voxel_at(table: VoxelTable, count: int, i: int, j: int, k: int) -> np.int64:
+    """Return the index of a voxel, which is `count` and is added if it is new."""
+    entry = _find(table.keys, i, j, k)
+    if table.keys[entry] == -1:
+        table.keys[entry] = (i << (2 * _KEY_BITS)) | (j << _KEY_BITS) | k
+        table.slots[entry] = count
+        table.places[count, 0] = i
+        table.places[count, 1] = j
+        table.places[count, 2] = k
+    return np.int64(table.slots[entry])
+
+
 @compiled
-def fill_voxels(points: NDArray[np.float64], voxel_m: float, table: VoxelTable) -> int:
-    """Sort points (m, 3), which are positive, into voxels; return the number of voxels."""
-    n_voxels = 0
+def fill_voxels(
+    points: NDArray[np.float64], low: NDArray[np.float64], voxel_m: float, table: VoxelTable
+) -> int:
+    """Sort points (m, 3) into voxels that begin at `low`; return the number of voxels."""
+    count = 0
     for p in range(points.shape[0]):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        i, j, k = int(x / voxel_m) + 1, int(y / voxel_m) + 1, int(z / voxel_m) + 1
-        entry = _find(table.keys, i, j, k)
-        if table.keys[entry] == -1:
-            table.keys[entry] = (i << (2 * _KEY_BITS)) | (j << _KEY_BITS) | k
-            table.slots[entry] = n_voxels
-            table.places[n_voxels, 0] = i
-            table.places[n_voxels, 1] = j
-            table.places[n_voxels, 2] = k
-            table.first[n_voxels] = p
-            n_voxels += 1
-        own = table.moments[table.slots[entry]]
+        x, y, z = points[p, 0] - low[0], points[p, 1] - low[1], points[p, 2] - low[2]
+        i, j, k = int(x / voxel_m) + 2, int(y / voxel_m) + 2, int(z / voxel_m) + 2
+        v = _voxel_at(table, count, i, j, k)
+        if v == count:
+            table.first[v] = p
+            count += 1
+        own = table.moments[v]
         own[0] += 1.0
         own[1] += x
         own[2] += y
@@ -77,7 +87,22 @@ def fill_voxels(points: NDArray[np.float64], voxel_m: float, table: VoxelTable) 
         own[7] += y * y
         own[8] += y * z
         own[9] += z * z
-    return n_voxels
+    return count
+
+
+@compiled
+def merge_voxels(fine: VoxelTable, n_fine: int, coarse: VoxelTable) -> int:
+    """Join voxels to voxels of twice the size; return their number."""
+    count = 0
+    for f in range(n_fine):
+        i, j, k = fine.places[f, 0], fine.places[f, 1], fine.places[f, 2]
+        v = _voxel_at(coarse, count, i // 2 + 1, j // 2 + 1, k // 2 + 1)
+        if v == count:
+            coarse.first[v] = fine.first[f]
+            count += 1
+        for m in range(MOMENTS):
+            coarse.moments[v, m] += fine.moments[f, m]
+    return count
 
 
 @compiled
@@ -208,17 +233,33 @@ class Cells(NamedTuple):
 
 
 @kernel_part
+def _quick_angle(sine: float, cosine: float) -> float:
+    """Return atan2 with an error of at most 1e-4 rad (a polynomial of degree 7), for cells."""
+    high, low = max(abs(sine), abs(cosine)), min(abs(sine), abs(cosine))
+    ratio = low / max(high, 1e-300)
+    square = ratio * ratio
+    angle = ((-0.0464964749 * square + 0.15931422) * square - 0.327622764) * square
+    angle = angle * ratio + ratio
+    if abs(sine) > abs(cosine):
+        angle = 0.5 * math.pi - angle
+    if cosine < 0.0:
+        angle = math.pi - angle
+    return angle if sine >= 0.0 else -angle
+
+
+@kernel_part
 def _cell_at(cells: Cells, s: int, x: float, y: float, z: float, along: float) -> int:
     """Return the cell of a place relative to the point of a surface, -1 if not accepted there."""
-    r = cells.rounds[s]
-    cosine = x * r[6] + y * r[7] + z * r[8]
+    # Rows as arrays would be reference-counted at each use.
+    r = cells.rounds
+    cosine = x * r[s, 6] + y * r[s, 7] + z * r[s, 8]
     sine = (
-        x * (r[4] * r[8] - r[5] * r[7])
-        + y * (r[5] * r[6] - r[3] * r[8])
-        + z * (r[3] * r[7] - r[4] * r[6])
+        x * (r[s, 4] * r[s, 8] - r[s, 5] * r[s, 7])
+        + y * (r[s, 5] * r[s, 6] - r[s, 3] * r[s, 8])
+        + z * (r[s, 3] * r[s, 7] - r[s, 4] * r[s, 6])
     )
     around, rows = cells.sizes[s, 1], cells.sizes[s, 2]
-    i = min(int((math.atan2(sine, cosine) / (2.0 * math.pi) + 0.5) * around), around - 1)
+    i = min(int((_quick_angle(sine, cosine) / (2.0 * math.pi) + 0.5) * around), around - 1)
     if not cells.is_open[cells.sizes[s, 3] + i]:
         return -1
     share = (along - cells.bounds[s, 0]) / (cells.bounds[s, 1] - cells.bounds[s, 0])
@@ -232,8 +273,8 @@ def _distance_of_plane(
     """Return the distance of a point from its plane; inf if it has none, or a curved one."""
     if index < 0:
         return math.inf
-    n = planes[index]
-    distance = n[0] * x + n[1] * y + n[2] * z - n[3]
+    distance = planes[index, 0] * x + planes[index, 1] * y + planes[index, 2] * z
+    distance -= planes[index, 3]
     return math.inf if math.isnan(distance) else distance
 
 
@@ -245,6 +286,7 @@ def sum_cells(
     cells: Cells,
     sums: NDArray[np.float64],
     labels: NDArray[np.int16],
+    counts: NDArray[np.int64],
 ) -> None:
     """Label points by the nearest surface, and sum their distances in its cells.
 
@@ -257,26 +299,27 @@ def sum_cells(
         sums: (cells, 3) output: number of points, sum of the distances and of their squares.
             Distances are positive outwards.
         labels: (n,) output, -1 for points on no surface.
+        counts: (s,) output, number of points of each surface.
     """
-    count = cells.rounds.shape[0]
+    r, bounds = cells.rounds, cells.bounds
+    count = r.shape[0]
     for p in range(offsets.x.shape[0]):
         labels[p] = -1
         x, y, z = float(offsets.x[p]), float(offsets.y[p]), float(offsets.z[p])
         index = plane[p] if plane.shape[0] > 0 else -1
         nearest, best, cell = _distance_of_plane(index, planes, x, y, z), -1, 0
         for s in range(count):
-            r = cells.rounds[s]
-            dx, dy, dz = x - r[0], y - r[1], z - r[2]
-            along = dx * r[3] + dy * r[4] + dz * r[5]
-            if along < cells.bounds[s, 0] or along > cells.bounds[s, 1]:
+            dx, dy, dz = x - r[s, 0], y - r[s, 1], z - r[s, 2]
+            along = dx * r[s, 3] + dy * r[s, 4] + dz * r[s, 5]
+            if along < bounds[s, 0] or along > bounds[s, 1]:
                 continue
-            radius = r[9] + r[10] * along
+            radius = r[s, 9] + r[s, 10] * along
             square = dx * dx + dy * dy + dz * dz - along * along
-            reach = cells.bounds[s, 2] / r[11]
+            reach = bounds[s, 2] / r[s, 11]
             inner = max(0.0, radius - reach)
             if square < inner * inner or square > (radius + reach) * (radius + reach):
                 continue
-            distance = (math.sqrt(square) - radius) * r[11]
+            distance = (math.sqrt(square) - radius) * r[s, 11]
             if abs(distance) >= abs(nearest):
                 continue
             at = _cell_at(cells, s, dx, dy, dz, along)
@@ -284,7 +327,8 @@ def sum_cells(
                 nearest, best, cell = distance, s, at
         if best >= 0:
             labels[p] = best
-            if abs(nearest) < cells.bounds[best, 3]:
+            counts[best] += 1
+            if abs(nearest) < bounds[best, 3]:
                 sums[cell, 0] += 1.0
                 sums[cell, 1] += nearest
                 sums[cell, 2] += nearest * nearest

@@ -22,4 +22,11 @@ class DetectorParams(MethodParams):
         description="Minimum angle around the axis over which there are points.",
     )
     min_area_m2: float = Field(0.3, gt=0.0, description="Smallest area of a surface.")
+    max_scatter_share: float = Field(
+        0.006,
+        gt=0.0,
+        le=0.1,
+        description="Largest scatter of the surface about a cylinder or cone, beyond the noise of "
+        "the scan, as a share of its radius; stepped cornices have more.",
+    )
     max_surfaces: int = Field(32, ge=1, le=1000, description="Maximum number of surfaces.")

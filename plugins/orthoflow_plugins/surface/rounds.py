@@ -15,6 +15,12 @@ from orthoflow.geometry.surfaces import along_and_across, zero_direction
 # Tukey's constant, in standard deviations, and the number of iterations.
 _TUKEY: Final = 4.685
 _ROUNDS: Final = 12
+# The iteration ends when the solution changes by less than this, metres or radians.
+_SETTLED: Final = 1e-8
+# The scatter is estimated from about this many observations.
+_SCATTER_SAMPLE: Final = 4_000
+# A fit among voxels uses at most this many.
+_MOST_VOXELS: Final = 3_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,15 +166,19 @@ def robust_solution(
     for _ in range(_ROUNDS):
         normal = matrix.T @ (matrix * weights[:, None])
         normal += 1e-12 * np.trace(normal) * np.eye(len(normal))
+        before = solution
         solution = np.asarray(np.linalg.solve(normal, matrix.T @ (weights * distances)))
         rest = distances - matrix @ solution
         squares = rest * rest
         # The median of squared residuals without measurement noise is 0.455 times the variance.
-        extra = math.sqrt(max(0.0, float(np.median(squares - 0.455 * variances)) / 0.455))
+        step = max(1, len(squares) // _SCATTER_SAMPLE)
+        beyond = np.median(squares[::step] - 0.455 * variances[::step]) / 0.455
+        extra = math.sqrt(max(0.0, float(beyond)))
         spread = variances + extra * extra
         share = np.clip(1.0 - squares / (_TUKEY**2 * spread), 0.0, None)
         weights = share * share / spread
-        if np.count_nonzero(weights) < 2 * matrix.shape[1]:
+        is_settled = np.abs(solution - before).max() < _SETTLED
+        if is_settled or np.count_nonzero(weights) < 2 * matrix.shape[1]:
             break
     return solution, weights, extra
 
@@ -183,8 +193,9 @@ def fitted(
 ) -> Round:
     """Fit a surface to points (n, 3) near it, by Gauss-Newton with robust weights."""
     found = start
+    points = points[:: max(1, len(points) // _MOST_VOXELS)]
     variances = np.full(len(points), max(sigma_m, 1e-4) ** 2)
-    for _ in range(3):
+    for _ in range(2):
         found = found.moved(float(np.mean((points - found.point) @ found.axis)))
         zero = zero_direction(found.axis, up)
         distances, _ = found.outwards(points)

@@ -28,7 +28,10 @@ BLOCK_VOXELS: Final = 6
 # Radii searched with one voxel size, in voxels.
 LEAST_RADIUS: Final = 3.5
 MOST_RADIUS: Final = 30.0
+# A surface found among coarse voxels is tested again among voxels of this share of its radius.
+_SUITED_RADIUS: Final = 24.0
 _PAIRS: Final = 30_000
+_PAIRS_PER_VOXEL: Final = 4
 _HYPOTHESES: Final = 1_500
 _LEAST_TURN: Final = math.sin(math.radians(12.0))
 # Largest disagreement between hypotheses of one surface: sine of the angle between the axes, and
@@ -102,7 +105,7 @@ class Found:
         side: 1 if the normals of the voxels point to the axis, -1 if they point away from it, 0 if
             their signs are arbitrary.
         is_open: (a,) bool, parts of the circle from angle -pi that have voxels.
-        along_m: range along the axis.
+        along_m: range along the axis, with a margin of one cell.
         evidence: numbers of the tests.
     """
 
@@ -168,9 +171,13 @@ def search(
             free = voxels.take(is_free)
             result = _tested(_mean_of(guesses[agree], best), free, voxel_m, limits, up)
             is_live[agree] = False
-            if isinstance(result, Found) and voxel_m > levels[-1][0]:
-                finest_m, finest = levels[-1]
-                result = _tested((result.round, result.side), finest, finest_m, limits, up)
+            if isinstance(result, Found):
+                small_m, small = _suited(levels, result.round.radius_m)
+                if small_m < voxel_m:
+                    start = result.round, result.side
+                    result = _tested(start, small, small_m, limits, up)
+            if isinstance(result, Found) and any(_is_fringe(result, item) for item in found):
+                result = Rejected(reason="part of another surface", evidence=result.evidence)
             if isinstance(result, Rejected):
                 rejected.append(result)
                 continue
@@ -178,6 +185,26 @@ def search(
             is_free &= ~claimed(result, voxels, limits)
             is_live &= is_free[ends].all(axis=1)
     return found, rejected
+
+
+def _suited(levels: list[tuple[float, Voxels]], radius_m: float) -> tuple[float, Voxels]:
+    """Return the largest voxels that are small relative to a radius, otherwise the smallest."""
+    for voxel_m, voxels in levels:
+        if voxel_m <= radius_m / _SUITED_RADIUS:
+            return voxel_m, voxels
+    return levels[-1]
+
+
+def _is_fringe(new: Found, old: Found) -> bool:
+    """Return whether a surface consists of points around another one, such as noise and relief."""
+    row = [np.append(item.round.point, item.round.axis) for item in (new, old)]
+    ends = [np.append(item.round.radius_m, item.side) for item in (new, old)]
+    one, other = (np.concatenate(pair) for pair in zip(row, ends, strict=True))
+    along_m = float((new.round.point - old.round.point) @ old.round.axis)
+    is_beside = (
+        along_m + new.along_m[1] < old.along_m[0] or along_m + new.along_m[0] > old.along_m[1]
+    )
+    return bool(_agreeing(one[None], other)[0]) and not is_beside
 
 
 def claimed(found: Found, voxels: Voxels, limits: Limits) -> NDArray[np.bool_]:
@@ -285,7 +312,7 @@ def _pairs(
     keys = (blocks[:, 0] << 40) + (blocks[:, 1] << 20) + blocks[:, 2]
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    seeds = rng.integers(0, max(1, len(free)), _PAIRS if len(free) else 0)
+    seeds = rng.integers(0, max(1, len(free)), min(_PAIRS, _PAIRS_PER_VOXEL * len(free)))
     steps = rng.integers(-1, 2, (len(seeds), 3))
     wanted = keys[seeds] + (steps[:, 0] << 40) + (steps[:, 1] << 20) + steps[:, 2]
     start = np.searchsorted(ordered, wanted, side="left")
@@ -463,7 +490,7 @@ def _judged(
         zero=zero,
         side=side,
         is_open=is_open,
-        along_m=(low_m, high_m),
+        along_m=(low_m - size_m, high_m + size_m),
         evidence=evidence,
     )
 

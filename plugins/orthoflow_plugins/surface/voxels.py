@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,10 +16,11 @@ from orthoflow_plugins.surface.kernels import (
     VoxelTable,
     fill_voxels,
     find_normals,
+    merge_voxels,
 )
 
 # Points of the cloud that are searched; the final fit uses all points.
-SAMPLE_POINTS: Final = 400_000
+SAMPLE_POINTS: Final = 250_000
 _GOLDEN: Final = 0.6180339887498949
 # Fewest points of a normal, and the largest ratio of its scatter across and along the surface.
 _NORMAL_POINTS: Final = 8
@@ -28,7 +29,7 @@ _FLATNESS: Final = 0.4
 _THICKEST_NOISES: Final = 3.0
 _THICKEST_VOXELS: Final = 0.09
 # A larger scene would need more bits per coordinate of a voxel.
-_MOST_VOXELS: Final = 1_000_000
+_MOST_VOXELS: Final = 1_000_000 - 4
 _NOISE_QUANTILE: Final = 0.3
 
 
@@ -56,14 +57,12 @@ class Voxels(Rows):
         normals: (v, 3) float64 unit vectors, towards the viewer if stations are known.
         spread_m: (v,) float64 standard deviation of the points along the normal.
         block: (v, 3) int64 position of each voxel in a coarser grid.
-        n_occupied: number of voxels, including those without a normal.
     """
 
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     spread_m: NDArray[np.float64]
     block: NDArray[np.int64]
-    n_occupied: int
 
 
 def draw_sample(cloud: PointCloud, labels: NDArray[np.int16] | None) -> Sample:
@@ -78,58 +77,86 @@ def draw_sample(cloud: PointCloud, labels: NDArray[np.int16] | None) -> Sample:
     return Sample(index=index, offsets_m=offsets.astype(np.float64), label=label)
 
 
-def in_voxels(
-    sample: Sample,
-    cloud: PointCloud,
-    voxel_m: float,
-    block_voxels: int,
-    noise_m: float | None = None,
-) -> Voxels:
-    """Sort a sample into voxels and find the normals of those with enough points in a plane.
+@dataclass(frozen=True, kw_only=True)
+class VoxelGrid:
+    """Occupied voxels of one size.
 
-    Args:
-        sample: the points.
-        cloud: their cloud, for the stations.
-        voxel_m: size of a voxel.
-        block_voxels: size of a block of voxels.
-        noise_m: standard deviation of points across surfaces, if known; much thicker voxels are at
-            edges.
+    Attributes:
+        table: the voxels.
+        count: their number.
+        size_m: size of a voxel.
+        low: (3,) corner of the grid, metres from the cloud's origin.
+        index: (m,) indices in the cloud of the points to which `table.first` refers.
     """
+
+    table: VoxelTable
+    count: int
+    size_m: float
+    low: NDArray[np.float64]
+    index: NDArray[np.int64]
+
+    def coarser(self) -> VoxelGrid:
+        """Return voxels of twice the size."""
+        table = _empty_table(self.count)
+        count = merge_voxels(self.table, self.count, table)
+        return replace(self, table=table, count=count, size_m=2.0 * self.size_m)
+
+    def voxels(self, cloud: PointCloud, block_voxels: int, noise_m: float | None = None) -> Voxels:
+        """Return the voxels that have a normal: enough points in a plane.
+
+        Args:
+            cloud: the cloud, for the stations.
+            block_voxels: size of a block of voxels.
+            noise_m: standard deviation of points across surfaces, if known; much thicker voxels
+                are at edges.
+        """
+        table, count = self.table, self.count
+        normals, spreads = np.zeros((count, 3)), np.zeros((count, 4))
+        find_normals(table, count, normals, spreads)
+        is_flat = (spreads[:, 3] >= _NORMAL_POINTS) & (spreads[:, 0] < _FLATNESS * spreads[:, 1])
+        if noise_m is not None:
+            is_flat &= spreads[:, 0] < _THICKEST_NOISES * noise_m + _THICKEST_VOXELS * self.size_m
+        chosen = np.flatnonzero(is_flat)
+        moments = table.moments[chosen]
+        means = moments[:, 1:4] / moments[:, :1] + self.low
+        normals = normals[chosen]
+        if cloud.stations is not None and len(cloud.stations):
+            own = self.index[table.first[chosen]]
+            scan = np.zeros(len(own), dtype=np.int64) if cloud.scan is None else cloud.scan[own]
+            stations = cloud.stations[np.minimum(scan, len(cloud.stations) - 1)] - cloud.origin
+            facing = np.einsum("ij,ij->i", stations - means, normals)
+            normals *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
+        return Voxels(
+            points=means,
+            normals=normals,
+            spread_m=spreads[chosen, 0],
+            block=table.places[chosen].astype(np.int64) // block_voxels,
+        )
+
+
+def in_voxels(sample: Sample, voxel_m: float) -> VoxelGrid:
+    """Sort a sample into voxels of a size."""
     points = sample.offsets_m
-    low = points.min(axis=0)
     # Points that are very far away are errors; voxel numbers have 20 bits.
-    near = ((points - low) < voxel_m * (_MOST_VOXELS - 2)).all(axis=1)
-    points, first_of = points[near] - low, np.flatnonzero(near)
-    size = 1 << max(4, math.ceil(math.log2(2 * len(points) + 1)))
-    table = VoxelTable(
+    low = np.array([column.min() for column in points.T])
+    high = np.array([column.max() for column in points.T])
+    index = sample.index
+    if ((high - low) >= voxel_m * _MOST_VOXELS).any():
+        near = ((points - low) < voxel_m * _MOST_VOXELS).all(axis=1)
+        points, index = points[near], index[near]
+    table = _empty_table(len(points))
+    count = fill_voxels(points, low, voxel_m, table)
+    return VoxelGrid(table=table, count=count, size_m=voxel_m, low=low, index=index)
+
+
+def _empty_table(most: int) -> VoxelTable:
+    size = 1 << max(4, math.ceil(math.log2(1.5 * most + 1)))
+    return VoxelTable(
         keys=np.full(size, -1, dtype=np.int64),
-        slots=np.zeros(size, dtype=np.int32),
-        places=np.zeros((len(points), 3), dtype=np.int32),
-        moments=np.zeros((len(points), MOMENTS)),
-        first=np.zeros(len(points), dtype=np.int32),
-    )
-    count = fill_voxels(points, voxel_m, table)
-    normals, spreads = np.zeros((count, 3)), np.zeros((count, 4))
-    find_normals(table, count, normals, spreads)
-    is_flat = (spreads[:, 3] >= _NORMAL_POINTS) & (spreads[:, 0] < _FLATNESS * spreads[:, 1])
-    if noise_m is not None:
-        is_flat &= spreads[:, 0] < _THICKEST_NOISES * noise_m + _THICKEST_VOXELS * voxel_m
-    chosen = np.flatnonzero(is_flat)
-    moments = table.moments[chosen]
-    means = moments[:, 1:4] / moments[:, :1] + low
-    normals = normals[chosen]
-    if cloud.stations is not None and len(cloud.stations):
-        own = sample.index[first_of[table.first[chosen]]]
-        scan = np.zeros(len(own), dtype=np.int64) if cloud.scan is None else cloud.scan[own]
-        stations = cloud.stations[np.minimum(scan, len(cloud.stations) - 1)] - cloud.origin
-        facing = np.einsum("ij,ij->i", stations - means, normals)
-        normals *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
-    return Voxels(
-        points=means,
-        normals=normals,
-        spread_m=spreads[chosen, 0],
-        block=table.places[chosen].astype(np.int64) // block_voxels,
-        n_occupied=count,
+        slots=np.empty(size, dtype=np.int32),
+        places=np.empty((most, 3), dtype=np.int32),
+        moments=np.zeros((most, MOMENTS)),
+        first=np.empty(most, dtype=np.int32),
     )
 
 
