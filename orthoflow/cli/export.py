@@ -239,6 +239,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records.open import open_run
+    from orthoflow.records.runs import find_record
     from orthoflow.records.verify import broken_seal
 
     chosen = Choices(**choices)
@@ -250,6 +251,10 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     _refuse_filled(folder)
     # These formats copy the whole record or print its seal, so check all of it.
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
+    if not opened.is_finished:
+        if hands_on:
+            find_record(run)  # raises an error that states how to get a finished record
+        echo_error(f"note: {run} has not ended; only its results so far are exported")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
         raise RecordError(f"{finding}; changed records are not exported: use an unchanged copy")

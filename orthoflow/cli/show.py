@@ -115,7 +115,7 @@ def _print_cells(run: Run, *, is_whole: bool) -> None:
     for cell in run.record.cells:
         if cell.error_message:
             echo(f"{cell.address} {cell.status}: {cell.error_message}")
-    echo_diagnostics(run.record.cells, run.folder, is_whole=is_whole)
+    echo_diagnostics(run.record.cells, run.home_folder, is_whole=is_whole)
 
 
 def _print_comparison(run: Run, most: int | None) -> bool:
@@ -212,6 +212,9 @@ def _print_environments(run: Run) -> None:
 def _print_files(run: Run) -> None:
     from orthoflow.records.walls import delivered_walls
 
+    if not run.is_finished:
+        echo("", f"the run in {run.home_folder} has not ended: its products are not published yet")
+        return
     published = run.record.published
     n_files = sum((run.folder / file.path).exists() for file in published)
     where = f"{run.products_folder}, {n_files} of {counted(len(published), 'published file')}"

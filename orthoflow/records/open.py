@@ -8,6 +8,7 @@ import json
 import shutil
 import tempfile
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +21,7 @@ from orthoflow_provenance.document import (
 )
 from orthoflow_provenance.record import write_record
 
+from orthoflow.diagnostics import placed, step_names
 from orthoflow.engine.journal import RECORD_FILE, kept_from_others, readable_lines
 from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import Run, find_record, published_state, read_run
@@ -87,12 +89,16 @@ def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
     found = {address: store.result(line.key) for address, line in ended.items() if line.key}
     results = {address: result for address, result in found.items() if result is not None}
 
+    used = {(cell.step, cell.method) for cell in record.cells}
+    named = partial(placed, step_of=step_names(used), methods={method for _, method in used})
+
     def known(cell: RecordedCell) -> RecordedCell:
         result, line = results.get(cell.address), ended.get(cell.address)
         if result is not None and line is not None:
+            texts = tuple(named(one, cell.step) for one in result.diagnostics)
             return recorded_cell(
                 cell,
-                result,
+                dataclasses.replace(result, diagnostics=texts),
                 store,
                 sources=sources.get(cell.address, {}),
                 embedded=embedded,

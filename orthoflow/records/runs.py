@@ -246,7 +246,7 @@ _LONGEST_REASON: Final = 400
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Run:
-    """A finished run.
+    """A run with its record.
 
     Attributes:
         path: the record file.
@@ -288,6 +288,11 @@ class Run:
     def folder(self) -> Path:
         """Folder that contains `products/` and the report, and usually the record."""
         return self.files_folder or self.path.parent
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run has its own record, not one with the results so far."""
+        return self.home is None
 
     @property
     def home_folder(self) -> Path:
@@ -540,8 +545,9 @@ def record_errors(path: Path) -> Iterator[None]:
     except OrthoflowError:
         raise
     except RecordFormatError as error:
-        sentence = _with_path(path, str(error))
-        raise RecordError(f"{sentence}{_AWAY if _DAMAGED in sentence else ''}") from error
+        text = str(error)
+        rest = text.removeprefix(path.name) if text.startswith(path.name) else f": {text}"
+        raise RecordError(f"{path}{rest}{_AWAY if _DAMAGED in text else ''}") from error
     except PermissionError as error:
         raise ArgumentError(f"{path} cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
@@ -549,13 +555,6 @@ def record_errors(path: Path) -> Iterator[None]:
         if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
             raise ArgumentError(f"{path} is not a file; give a run folder or its run.h5") from error
         raise RecordError(f"{path} is not a record or is damaged: {error}{_AWAY}") from error
-
-
-def _with_path(path: Path, sentence: str) -> str:
-    """Put the path that the user gave at the start of a message, instead of the file name."""
-    if sentence.startswith(path.name):
-        return f"{path}{sentence.removeprefix(path.name)}"
-    return f"{path}: {sentence}"
 
 
 def path_inside(folder: Path, name: str) -> Path:

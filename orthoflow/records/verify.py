@@ -285,6 +285,10 @@ class Verification:
     unchecked: tuple[str, ...] = ()
     signed_with: str = ""
 
+    def __bool__(self) -> bool:
+        """Whether the record and the files that were checked are unchanged."""
+        return not self.wrong
+
 
 def verify_run(
     path: str | Path, *, also_published: bool = True, signer: Path | None = None

@@ -447,7 +447,7 @@ def build_record(
         found = RecordedCell(
             status="skipped",
             error_type=NOT_YET,
-            error_message="not computed yet: the run was interrupted",
+            error_message="not computed yet",
             address=cell.address,
             step=cell.step,
             assignment=dict(cell.assignment),

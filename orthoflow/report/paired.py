@@ -188,7 +188,9 @@ class MetricOverDatasets:
             return ""
         best, *others = sorted(known, key=lambda one: badness(one.median, better))
         after = others[0]
+        test = "Wilcoxon's test" if len(self.methods) == 2 else "too few datasets"
         if self.ranks is not None:
+            test = "Nemenyi's test"
             is_clear = best.name in self.ranks.leading and after.name not in self.ranks.leading
         else:
             pairs = [one.paired for one in self.methods if one.paired]
@@ -200,7 +202,7 @@ class MetricOverDatasets:
             return f"{values[0]} is level with {first_few(level, most=_MAX_NAMED)}."
         return (
             f"{values[0]} is best, {values[1]} next; the difference is "
-            f"{'' if is_clear else 'not '}significant."
+            f"{'' if is_clear else 'not '}significant ({test})."
         )
 
 

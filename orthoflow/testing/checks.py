@@ -6,9 +6,9 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, get_args, get_type_hints
 
 import numpy as np
 from pydantic import ValidationError
@@ -110,6 +110,8 @@ def outputs_are_valid(subject: Subject) -> None:
             product.type_name == port.type_name,
             f"output {name} is a {product.type_name}, but {port.type_name} is declared",
         )
+        unknown = sorted(set(product.tolerances) - _field_names(type(product), set()))
+        require(not unknown, f"tolerances of {name} name no field: {', '.join(unknown)}")
         again = type(product).from_payload(product.to_payload())
         require(digest_of(again) == run.digests[name], f"storing changes output {name}")
     for metric in run.metrics:
@@ -118,6 +120,16 @@ def outputs_are_valid(subject: Subject) -> None:
             subject.method.may_report(metric.name),
             f"metric {metric.name} is not declared by the method (`metrics`)",
         )
+
+
+def _field_names(hint: Any, seen: set[Any]) -> set[str]:
+    """Return the names of the fields of a dataclass and of the dataclasses in its fields."""
+    if hint in seen:
+        return set()
+    seen.add(hint)
+    hints = get_type_hints(hint) if is_dataclass(hint) else {}
+    own = {field.name for field in fields(hint)} if hints else set()
+    return own.union(*(_field_names(part, seen) for part in (*hints.values(), *get_args(hint))))
 
 
 def inputs_stay_untouched(subject: Subject) -> None:

@@ -151,6 +151,7 @@ def test_a_file_of_another_program_or_version_cannot_be_checked(
     found = verify_run(path)
     assert found.findings[0].startswith(f"/: {said}")
     assert found.wrong == f"{path} cannot be checked"
+    assert not found
 
 
 @pytest.mark.parametrize(

@@ -140,8 +140,9 @@ def test_a_run_that_is_not_finished_opens_as_far_as_it_is(executed: Executed) ->
         "survey": "ok",
         "paint": "skipped",
     }
-    assert run.cells["paint"].error_message == "not computed yet: the run was interrupted"
+    assert run.cells["paint"].error_message == "not computed yet"
     assert run.product("survey", "planes") is not None
+    assert not run.is_finished
     assert [path.name for path in run.files["survey"]]
     assert verify_record(run.path) == ()
     assert run.home_folder == executed.folder
@@ -154,6 +155,7 @@ def test_a_run_that_is_not_finished_opens_as_far_as_it_is(executed: Executed) ->
     journal.write_text("".join(lines))
     finished = executed.write()
     assert open_run(executed.folder).record == finished.record
+    assert open_run(executed.folder).is_finished
     assert not list(executed.folder.glob(".outline*"))
 
 

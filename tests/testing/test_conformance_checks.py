@@ -180,6 +180,18 @@ CHEATS: dict[str, tuple[str, str, str]] = {
             return float(np.random.default_rng().random())
         """,
     ),
+    "misspelling": (
+        "outputs-are-valid",
+        "tolerances of planes name no field: planes.offset",
+        """
+        def run(self, inputs, params, ctx):
+            class Misspelt(Planes):
+                tolerances = {"planes.offset": None}
+
+            made = super().run(inputs, params, ctx)
+            return self.Out(planes=Misspelt(**vars(made.planes)), labels=made.labels)
+        """,
+    ),
     "hashing": (
         "results-repeat",
         "differs in a new process",
