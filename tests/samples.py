@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthoflow.geometry import Cone, Cylinder, WallFrame
-from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import (
     Layer,
     LayerMask,
@@ -69,6 +70,17 @@ def camera(
     """A camera that stands at a place, without distortion."""
     lens = {"distortion": np.zeros(5), **known}
     return ViewingCamera(rotation=rotation, translation=-rotation @ centre, **lens)
+
+
+def aimed(
+    centre: ArrayLike, target: ArrayLike, focal_px: float, size_px: tuple[int, int], **known: Any
+) -> ViewingCamera:
+    """A level camera that looks at a point, whose principal point is in the middle of its image."""
+    width, height = size_px
+    lens = {"fx": focal_px, "fy": focal_px, "cx": 0.5 * width, "cy": 0.5 * height, **known}
+    place = np.array(centre, dtype=np.float64)
+    rotation = looking_at(place, np.array(target, dtype=np.float64), UP)
+    return camera(rotation, place, width=width, height=height, **lens)
 
 
 def wall(frame: WallFrame, **known: Any) -> Wall:
@@ -146,6 +158,22 @@ def ties(pixels_photo: NDArray[np.float64], **known: Any) -> Ties:
         "residual_px": np.full((count, 2), np.nan),
     }
     return Ties(pixels_photo=pixels_photo, **{**plain, **known})
+
+
+def seen(
+    pixels: NDArray[np.float64],
+    points_world: NDArray[np.float64],
+    sigma_px: float = 1.0,
+    sigma_m: float = 0.0,
+) -> SeenPoints:
+    """Points and their pixels, all with the same standard deviations."""
+    n = len(pixels)
+    return SeenPoints(
+        pixels_photo=pixels,
+        points_world=points_world,
+        sigma_px=np.full(n, sigma_px),
+        sigma_m=np.full(n, sigma_m),
+    )
 
 
 def tie_wall(corners_world: NDArray[np.float64], gsd_m: float) -> TieWall:

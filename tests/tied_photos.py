@@ -57,12 +57,9 @@ def seen_by(
     points = rng.uniform([0.2, -0.3, 0.2], [2.8, 0.1, 1.8], (6 * n, 3))
     pixels = camera.project(points)[:, :2]
     inside = np.flatnonzero(camera.sees(pixels))[:n]
-    return SeenPoints(
-        pixels_photo=pixels[inside] + noise_px * rng.normal(size=(n, 2)),
-        points_world=points[inside] + noise_m * rng.normal(size=(n, 3)),
-        sigma_px=np.full(n, sigma_px),
-        sigma_m=np.full(n, sigma_m),
-    )
+    seen = pixels[inside] + noise_px * rng.normal(size=(n, 2))
+    known = points[inside] + noise_m * rng.normal(size=(n, 3))
+    return samples.seen(seen, known, sigma_px, sigma_m)
 
 
 def seen_of(ties: Ties) -> SeenPoints:

@@ -31,18 +31,10 @@ from tests.long_loops import seeds
 def camera(seed: int) -> ViewingCamera:
     rng = np.random.default_rng(seed)
     centre = rng.uniform(-1.0, 1.0, 3) - [0.0, 4.0, 0.0]
-    rotation = looking_at(centre, rng.uniform(-0.3, 0.3, 3), samples.UP)
-    return samples.camera(
-        rotation,
-        centre,
-        width=3000,
-        height=2000,
-        fx=2500.0 + rng.uniform(-100, 100),
-        fy=2510.0,
-        cx=1510.3,
-        cy=992.7,
-        distortion=np.array([-0.11, 0.04, 1.2e-3, -8e-4, -5e-3]),
-    )
+    target, focal_px = rng.uniform(-0.3, 0.3, 3), 2500.0 + rng.uniform(-100, 100)
+    bent = np.array([-0.11, 0.04, 1.2e-3, -8e-4, -5e-3])
+    lens = {"fy": 2510.0, "cx": 1510.3, "cy": 992.7, "distortion": bent}
+    return samples.aimed(centre, target, focal_px, (3000, 2000), **lens)
 
 
 def skewed(seed: int) -> ViewingCamera:
@@ -109,11 +101,8 @@ def test_points_behind_the_camera_are_not_seen() -> None:
 
 
 def test_a_point_beyond_the_fold_of_the_lens_does_not_come_back_into_the_image() -> None:
-    lens = {"fx": 1500.0, "fy": 1500.0, "cx": 1500.0, "cy": 1000.0, "width": 3000, "height": 2000}
-    centre, bent = np.array([0.0, -4.0, 0.0]), np.array([-0.35, 0.0, 0.0, 0.0, 0.0])
-    viewer = samples.camera(
-        looking_at(centre, np.zeros(3), samples.UP), centre, distortion=bent, **lens
-    )
+    bent = np.array([-0.35, 0.0, 0.0, 0.0, 0.0])
+    viewer = samples.aimed((0, -4, 0), (0, 0, 0), 1500.0, (3000, 2000), distortion=bent)
     # r (1 - 0.35 r^2) turns back at r = 0.976; r = 1.6 would appear at 0.17, near the centre.
     seen = viewer.project(np.array([[4.0 * 1.6, 0.0, 0.0], [4.0 * 0.9, 0.0, 0.0]]))
     assert np.isnan(seen[0, 0])

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import AdjustedPoints, honest_covariance
-from orthoflow.geometry.resection import SeenPoints, adjust, predicted_covariances
+from orthoflow.geometry.resection import adjust, predicted_covariances
+from tests import samples
 from tests.long_loops import long_only
 
 VIEW: Final = ViewingCamera(
@@ -83,12 +84,7 @@ def drawn_resection(seed: int, error: Draw, n_seen: int) -> tuple[float, float]:
     points = rng.uniform([-4.0, -2.7, -1.0], [4.0, 2.7, 0.3], (n_seen, 3))
     off = error(points, rng)
     pixels = VIEW.project(points)[:, :2] + 0.3 * rng.normal(size=(n_seen, 2))
-    seen = SeenPoints(
-        pixels_photo=pixels,
-        points_world=points + off - off.mean(axis=0),
-        sigma_px=np.full(n_seen, 0.3),
-        sigma_m=np.full(n_seen, 0.001),
-    )
+    seen = samples.seen(pixels, points + off - off.mean(axis=0), 0.3, 0.001)
     found = adjust(seen, VIEW, independent=False, soft_limit=3.0)
     x, y = np.meshgrid(np.linspace(-3.5, 3.5, 8), np.linspace(-2.2, 2.2, 6))
     wall = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])

@@ -24,26 +24,7 @@ from orthoflow.geometry.scenes import (
 )
 from tests import scenes
 from tests.long_loops import seeds
-from tests.scene_rays import cast, colours_at
-
-
-def a_scene(rows: list[dict[str, object]], holes: list[tuple[int, tuple[float, ...]]]) -> Scene:
-    """A scene of rectangles given by centre, a, b, extent and, if wanted, role and texture."""
-    count = len(rows)
-    params = np.tile([200.0, 160.0, 120.0, 0.5, 0.4, 0.3, 7.0, 0.0], (count, 1))
-    return Scene(
-        origin=np.zeros(3),
-        centre=np.array([row["centre"] for row in rows], dtype=np.float64),
-        axis_a=np.array([row["a"] for row in rows], dtype=np.float64),
-        axis_b=np.array([row["b"] for row in rows], dtype=np.float64),
-        extent=np.array([row["extent"] for row in rows], dtype=np.float64),
-        plane_index=np.full(count, -1, dtype=np.int16),
-        role=np.array([row.get("role", SurfaceRole.WALL) for row in rows], dtype=np.uint8),
-        texture=np.array([row.get("kind", TextureKind.PLAIN) for row in rows], dtype=np.int32),
-        texture_params=params,
-        hole_rectangle=np.array([index for index, _ in holes], dtype=np.int32),
-        hole_extent=np.array([hole for _, hole in holes], dtype=np.float64).reshape(-1, 4),
-    )
+from tests.scene_rays import a_scene, cast, colours_at
 
 
 def random_scene(seed: int, n_rectangles: int = 40) -> Scene:

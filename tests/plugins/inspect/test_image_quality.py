@@ -15,11 +15,10 @@ from orthoflow_plugins.inspect.image_quality import (
 from orthoflow_plugins.inspect.patches import GreyImage
 from scipy.special import erf
 
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Orthoimage, OrthoMask, Wall
 from tests import samples
 
-UP = np.array([0.0, 0.0, 1.0])
 SIDE, GSD_M = 20, 0.01
 # Far from the origin, as in surveys.
 FRAME = samples.facing_south(GSD_M, SIDE, SIDE, (5.0e6, 4.0e5, 100.0))
@@ -86,9 +85,7 @@ def camera(cells_per_pixel: float, turn_deg: float = 0.0) -> ViewingCamera:
     middle = FRAME.world_from_wall(np.array([[SIDE / 2, SIDE / 2]]))[0]
     turn = np.radians(turn_deg)
     centre = middle + 100.0 * np.array([np.sin(turn), -np.cos(turn), 0.0])
-    focal = 100.0 / (cells_per_pixel * GSD_M)
-    lens = {"fx": focal, "fy": focal, "cx": 500.0, "cy": 500.0, "width": 1000, "height": 1000}
-    return samples.camera(looking_at(centre, middle, UP), centre, **lens)
+    return samples.aimed(centre, middle, 100.0 / (cells_per_pixel * GSD_M), (1000, 1000))
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 60.0])

@@ -15,7 +15,7 @@ from orthoflow_plugins.match.displacements import Displacements
 from orthoflow_plugins.match.warping import Projection
 
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.occluders import occluders_before
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Photo, PointCloud, Wall
@@ -35,12 +35,7 @@ def wall_at(y_m: float, *, width: int = 100, height: int = 80, x_m: float = -0.5
 
 def camera_at(x_m: float = 0.0, y_m: float = -2.0, *, size: int = 800) -> ViewingCamera:
     """Return a camera that looks along y with 400 px per radian; a cell at 2 m is 2 px wide."""
-    centre = np.array([x_m, y_m, 0.0])
-    rotation = looking_at(centre, centre + samples.NORTH, samples.UP)
-    half = 0.5 * size
-    return samples.camera(
-        rotation, centre, width=size, height=size, fx=400.0, fy=400.0, cx=half, cy=half
-    )
+    return samples.aimed((x_m, y_m, 0.0), (x_m, y_m + 1.0, 0.0), 400.0, (size, size))
 
 
 def hidden_by_screen(inner_m: float, outer_m: float) -> tuple[NDArray[np.bool_], ...]:
@@ -97,10 +92,7 @@ def test_views_flatter_than_one_in_seven_show_too_little(cosine: float, is_shown
     # From far away, all cells are seen at almost the same angle.
     away_m = 40.0
     centre = away_m * np.array([math.sqrt(1.0 - cosine**2), -cosine, 0.0])
-    rotation = looking_at(centre, np.zeros(3), samples.UP)
-    camera = replace(
-        camera_at(), fx=20_000.0, fy=20_000.0, rotation=rotation, translation=-rotation @ centre
-    )
+    camera = samples.aimed(centre, np.zeros(3), 20_000.0, (800, 800))
     found = warping.project_walls(camera, [wall_at(0.0, width=20, height=20, x_m=-0.1)])
     assert (found[0] is not None) is is_shown
 

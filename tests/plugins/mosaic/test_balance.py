@@ -13,7 +13,6 @@ from orthoflow_plugins.mosaic.blocks import BlockLight, Blocks, block_light, com
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from scipy.ndimage import map_coordinates
 
-from orthoflow.geometry.cameras import looking_at
 from orthoflow.geometry.levels import light_of_levels, lit, lit_shares
 from orthoflow.products import Camera, Layer, LayerMask, Layers, Orthoimages, Walls
 from orthoflow.testing import photographed as ms
@@ -292,10 +291,8 @@ def photographed(fx: float, width: int = 400, height: int = 300) -> Camera:
     frame = inspect_scenes.frame(shape=SHAPE)
     middle = frame.world_from_wall(np.array([[120.0, 60.0]]))[0]
     centre = middle + 3.0 * frame.normal_world
-    cx, cy = 0.5 * width - 7.0, 0.5 * height + 3.0
-    size = {"width": width, "height": height}
-    rotation = looking_at(centre, middle, samples.UP)
-    return ms.oriented(samples.camera(rotation, centre, fx=fx, fy=fx, cx=cx, cy=cy, **size))
+    off = {"cx": 0.5 * width - 7.0, "cy": 0.5 * height + 3.0}
+    return ms.oriented(samples.aimed(centre, middle, fx, (width, height), **off))
 
 
 def test_photos_of_one_lens_lose_light_alike_however_it_was_adjusted() -> None:

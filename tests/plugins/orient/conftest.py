@@ -15,7 +15,7 @@ def _small_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 
     Other tests check pictures at full size.
     """
-    if request.path.stem != "test_figures":
+    if request.path.stem != "test_report":
         monkeypatch.setattr(report, "SIDE_PX", 90)
 
 

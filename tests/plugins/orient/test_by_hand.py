@@ -21,7 +21,6 @@ from scipy import stats
 from orthoflow.errors import MethodError
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
@@ -175,11 +174,8 @@ def by_hand(
     """Return the pose by ties to points that are exact except for the given noise."""
     n = len(points)
     noise = noise_px * np.random.default_rng(3).normal(size=(n, 2))
-    seen = SeenPoints(
-        pixels_photo=CAMERA.project(points)[:, :2] + noise,
-        points_world=points,
-        **{"sigma_px": np.full(n, SIGMA_PX), "sigma_m": np.full(n, 1e-4), **sigmas},
-    )
+    seen = samples.seen(CAMERA.project(points)[:, :2] + noise, points, SIGMA_PX, 1e-4)
+    seen = replace(seen, **sigmas)
     return pose_by_hand(tp.tied(tp.photo(CAMERA), seen, by_hand=np.ones(n, dtype=np.bool_)))
 
 

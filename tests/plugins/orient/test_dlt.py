@@ -15,7 +15,7 @@ from orthoflow_plugins.orient.pose import Estimate
 
 from orthoflow.errors import GeometryError
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo, Ties
@@ -34,18 +34,9 @@ orient = partial(tp.oriented, dlt.OrientDlt)
 
 def camera(*coefficients: float, skew: float = 0.0) -> ViewingCamera:
     """Return a wide-angle camera 2.6 m in front of the middle of a wall in the plane y = 0."""
-    return samples.camera(
-        looking_at(CENTRE, np.zeros(3), samples.UP),
-        CENTRE,
-        width=SIZE_PX[0],
-        height=SIZE_PX[1],
-        fx=3200.0,
-        fy=3204.0,
-        cx=2012.0,
-        cy=1490.0,
-        distortion=np.pad(np.array(coefficients, dtype=np.float64), (0, 5 - len(coefficients))),
-        skew=skew,
-    )
+    distortion = np.pad(np.array(coefficients, dtype=np.float64), (0, 5 - len(coefficients)))
+    lens = {"fy": 3204.0, "cx": 2012.0, "cy": 1490.0, "distortion": distortion, "skew": skew}
+    return samples.aimed(CENTRE, np.zeros(3), 3200.0, SIZE_PX, **lens)
 
 
 DISTORTED = camera(-0.08)
@@ -160,12 +151,7 @@ def seen_by(
     """Return exact ties distributed over the photo, on two planes at the given distance."""
     pixels = np.random.default_rng(1).uniform([100.0, 100.0], [3900.0, 2900.0], (n, 2))
     depth = np.where(np.arange(n) % 2 == 0, 0.0, relief_m)
-    return SeenPoints(
-        pixels_photo=pixels,
-        points_world=points_behind(viewer, pixels, depth),
-        sigma_px=np.full(n, 0.5),
-        sigma_m=np.full(n, sigma_m),
-    )
+    return samples.seen(pixels, points_behind(viewer, pixels, depth), 0.5, sigma_m)
 
 
 def estimated(

@@ -15,8 +15,8 @@ from orthoflow_plugins.orient import gates
 from orthoflow_plugins.orient.pose import OrientParams
 from scipy import optimize, stats
 
-from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, looking_at
-from orthoflow.geometry.resection import Resection, SeenPoints
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera
+from orthoflow.geometry.resection import Resection
 from orthoflow.products import Photo
 from tests import samples
 
@@ -30,16 +30,7 @@ def camera(*, turn_deg: float = 0.0) -> ViewingCamera:
     centre = np.array([0.0, -DISTANCE_M, 0.0])
     turn = math.radians(turn_deg)
     ahead = centre + np.array([math.sin(turn), math.cos(turn), 0.0])
-    return samples.camera(
-        looking_at(centre, ahead, samples.UP),
-        centre,
-        width=SIZE_PX[0],
-        height=SIZE_PX[1],
-        fx=600.0,
-        fy=600.0,
-        cx=400.0,
-        cy=300.0,
-    )
+    return samples.aimed(centre, ahead, 600.0, SIZE_PX)
 
 
 def wall(half_m: tuple[float, float] = (1.0, 0.5)) -> gates.KnownWall:
@@ -116,12 +107,7 @@ def candidate(**changes: Any) -> gates.Candidate:
         changes["error"] = replace(error, **changes["error"])
     usual: dict[str, Any] = {
         "photo": Photo(name="a.png", encoded=b"", width=1000, height=800),
-        "seen": SeenPoints(
-            pixels_photo=pixels,
-            points_world=np.zeros((N_TIES, 3)),
-            sigma_px=np.ones(N_TIES),
-            sigma_m=np.zeros(N_TIES),
-        ),
+        "seen": samples.seen(pixels, np.zeros((N_TIES, 3))),
         "is_check": is_check,
         "walls": np.zeros(N_TIES, dtype=np.int32),
         "estimate": estimate,

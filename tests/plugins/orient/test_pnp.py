@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from orthoflow_plugins.orient.pnp import OrientPnp
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import adjust
-from orthoflow.products import Photos, TieRole
+from orthoflow.products import Photo, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import tied_photos as tp
-from tests.adverse_cases import KINDS, adverse_case
 from tests.long_loops import seeds
 from tests.scenes import SURVEY_SHIFT_M
 from tests.tied_photos import context, known_ties
@@ -101,6 +103,170 @@ def test_ties_searched_within_a_small_radius_prove_less(tmp_path: Path) -> None:
     jitter = np.random.default_rng(0).uniform(-12.0, 12.0, ties.pixels_photo.shape)
     guessed = replace(ties, pixels_photo=ties.pixels_photo + jitter, search_radius_px=(12.0,))
     assert orient(guessed, calibrated(camera), context(tmp_path)).cameras[0].status != "ok"
+
+
+# --- photos that are easy, hard or impossible to orient ---
+
+PERIOD_M: Final = 0.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdverseCase:
+    """A photo with its ties.
+
+    Attributes:
+        camera: the true one.
+        ties: what a matcher would give.
+        photo: what is known of the lens; by default all.
+        shift_m: (3,) the ties are in a world shifted by this.
+    """
+
+    camera: ViewingCamera
+    ties: Ties
+    photo: Photo
+    shift_m: NDArray[np.float64]
+
+    def wall_error_m(self, found: ViewingCamera) -> float:
+        return ms.wall_error_m(tp.SCENE, found.shifted(self.shift_m), self.camera)
+
+
+def adverse_case(kind: str, seed: int) -> tuple[AdverseCase, bool]:
+    """One photo of a kind, and whether an orientation has to succeed."""
+    rng = np.random.default_rng([list(KINDS).index(kind), seed])
+    is_solvable, build = KINDS[kind]
+    return build(rng), is_solvable
+
+
+Random = np.random.Generator
+
+
+def _case(
+    rng: Random,
+    n: int,
+    *,
+    relief: float = 0.0,
+    tilt_deg: float = 15.0,
+    aim_m: float = 1.5,
+    wrong_share: float = 0.0,
+    survey: bool = False,
+) -> AdverseCase:
+    """Ties all over a photo from aside, some of them at random pixels."""
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    aside = 2.6 * np.tan(np.radians(tilt_deg) * rng.uniform(0.7, 1.0))
+    centre = (aim_m + aside * np.cos(turn), -2.6, 1.0 + aside * np.sin(turn))
+    camera = ms.camera_before(centre=centre, towards=(aim_m, 0.0, 1.0))
+    shift = SURVEY_SHIFT_M if survey else np.zeros(3)
+    ties = tp.known_ties(
+        camera,
+        int(rng.integers(1 << 30)),
+        n=n,
+        wrong_share=wrong_share,
+        relief=relief,
+        shift_m=shift,
+    )
+    return AdverseCase(camera=camera, ties=ties, photo=tp.photo(camera), shift_m=shift)
+
+
+def _exif(case: AdverseCase, factor: float) -> AdverseCase:
+    """A photo without calibration; of a factor 0 EXIF states nothing either."""
+    return replace(case, photo=tp.photo(exif_focal_px=factor * case.camera.fx or None))
+
+
+def _guessed(case: AdverseCase, chosen: NDArray[np.bool_], rng: Random) -> AdverseCase:
+    """Chosen ties lie at random pixels."""
+    pixels = case.ties.pixels_photo.copy()
+    pixels[chosen] = rng.uniform([0.0, 0.0], tp.SIZE_PX, (int(chosen.sum()), 2))
+    return replace(case, ties=replace(case.ties, pixels_photo=pixels))
+
+
+def _periods(
+    case: AdverseCase, chosen: NDArray[np.bool_], steps: NDArray[np.float64]
+) -> AdverseCase:
+    """Chosen ties are shifted along the wall by whole periods of a textile."""
+    points = case.ties.points_world.copy()
+    points[chosen] += (PERIOD_M * np.atleast_2d(steps)) @ np.array([[1.0, 0, 0], [0, 0, 1.0]])
+    return replace(case, ties=replace(case.ties, points_world=points))
+
+
+def _half_shifted(rng: Random) -> AdverseCase:
+    """Two fifths of the ties agree with each other one period beside the truth."""
+    case = _case(rng, 240, relief=1.0, wrong_share=0.2)
+    return _periods(case, rng.random(240) < 0.4, np.array([1.0, 0.0]))
+
+
+def _obstacle(rng: Random) -> AdverseCase:
+    """A quarter of the photo shows something before the wall."""
+    case = _case(rng, 300)
+    hidden = (case.ties.pixels_photo > 0.5 * np.array(tp.SIZE_PX)).all(axis=1)
+    return _guessed(case, hidden, rng)
+
+
+def _crowded_elsewhere(rng: Random) -> AdverseCase:
+    """Another room, whose key points all look like a few of this wall's."""
+    case = _case(rng, 200, wrong_share=1.0)
+    few = case.ties.points_world[rng.integers(0, 12, 200)]
+    return replace(case, ties=replace(case.ties, points_world=few))
+
+
+def _mirrored(rng: Random) -> AdverseCase:
+    case = _case(rng, 200, relief=float(rng.integers(0, 2)))
+    pixels = [tp.SIZE_PX[0], 0.0] + case.ties.pixels_photo * [-1.0, 1.0]
+    return replace(case, ties=replace(case.ties, pixels_photo=pixels))
+
+
+def _other_textile(rng: Random) -> AdverseCase:
+    """Another wall with the same textile: each tie at any of its repeats."""
+    steps = rng.integers(-5, 6, (300, 2)).astype(np.float64)
+    return _periods(_case(rng, 300), np.ones(300, np.bool_), steps)
+
+
+def _textile_alone(rng: Random) -> AdverseCase:
+    """Ties on a textile that fills a third of the photo agree one period beside the truth."""
+    case = _case(rng, 300)
+    on_textile = case.ties.pixels_photo[:, 0] < tp.SIZE_PX[0] / 3
+    step = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 1.0]])[rng.integers(3)]
+    return _guessed(_periods(case, on_textile, step), ~on_textile, rng)
+
+
+def _wrong_calibration(rng: Random) -> AdverseCase:
+    """The calibration of another lens, a tenth to a third longer or shorter."""
+    case = _case(rng, 200, relief=float(rng.integers(0, 2)), wrong_share=0.2)
+    factor = rng.uniform(1.1, 1.33) ** rng.choice([-1.0, 1.0])
+    other = replace(case.camera, fx=factor * case.camera.fx, fy=factor * case.camera.fy)
+    return replace(case, photo=tp.photo(other))
+
+
+KINDS: Final[Mapping[str, tuple[bool, Callable[[Random], AdverseCase]]]] = {
+    "plane": (True, lambda rng: _case(rng, 200, wrong_share=0.3)),
+    "plane, EXIF 2 % off": (
+        True,
+        lambda rng: _exif(_case(rng, 300, wrong_share=0.3), rng.choice([0.98, 1.02])),
+    ),
+    "relief, 60 % wrong": (True, lambda rng: _case(rng, 300, relief=2.0, wrong_share=0.6)),
+    "relief, EXIF 5 % off": (
+        True,
+        lambda rng: _exif(_case(rng, 300, relief=2.0, wrong_share=0.4), rng.choice([0.95, 1.05])),
+    ),
+    "80 % wrong": (True, lambda rng: _case(rng, 500, relief=1.0, wrong_share=0.8)),
+    "40 ties": (True, lambda rng: _case(rng, 40)),
+    "oblique": (True, lambda rng: _case(rng, 300, tilt_deg=45.0, wrong_share=0.3)),
+    "two fifths a period off": (True, _half_shifted),
+    "end of the wall": (True, lambda rng: _case(rng, 200, aim_m=2.7, wrong_share=0.3)),
+    "obstacle": (True, _obstacle),
+    "survey coordinates": (True, lambda rng: _case(rng, 200, wrong_share=0.3, survey=True)),
+    "8 to 14 ties": (False, lambda rng: _case(rng, int(rng.integers(8, 15)), wrong_share=0.2)),
+    "no focal length": (False, lambda rng: _exif(_case(rng, 300, wrong_share=0.3), 0.0)),
+    "EXIF 30 % off": (
+        False,
+        lambda rng: _exif(_case(rng, 300, wrong_share=0.3), rng.choice([0.7, 1.3])),
+    ),
+    "calibration of another lens": (False, _wrong_calibration),
+    "another room": (False, lambda rng: _case(rng, 300, wrong_share=1.0)),
+    "another room, few places": (False, _crowded_elsewhere),
+    "mirrored": (False, _mirrored),
+    "the same textile elsewhere": (False, _other_textile),
+    "textile a period off": (False, _textile_alone),
+}
 
 
 @pytest.mark.parametrize("seed", seeds(10))

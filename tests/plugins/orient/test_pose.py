@@ -14,7 +14,7 @@ from orthoflow_plugins.orient.pnp import estimate_by_opencv
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.resection import SeenPoints, adjust, misfit, predicted_covariances
+from orthoflow.geometry.resection import adjust, misfit, predicted_covariances
 from orthoflow.products import Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
@@ -103,12 +103,7 @@ def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
     rng = np.random.default_rng(5)
     places = rng.uniform(-1.0, 1.0, (4000, 2))
     points = np.column_stack([places[:, 0], np.zeros(4000), places[:, 1]])
-    seen = SeenPoints(
-        pixels_photo=500.0 * places,
-        points_world=points,
-        sigma_px=np.full(4000, 0.6),
-        sigma_m=np.full(4000, 0.002),
-    )
+    seen = samples.seen(500.0 * places, points, 0.6, 0.002)
     known = replace(seen, sigma_m=np.zeros(4000))
     assert lenses.expected_px(known) == pytest.approx(0.6)
     in_space = np.sqrt(lenses.expected_px(seen) ** 2 - 0.6**2)
@@ -352,12 +347,7 @@ def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:
     # The points are 2 mm and 2 m in front of the camera, with a sigma of 3 mm, so the first may be
     # anywhere in the image.
     points = CAMERA.centre_world + np.array([[0.002], [2.0]]) * ahead
-    seen = SeenPoints(
-        pixels_photo=CAMERA.project(points)[:, :2] + [1.0, 0.0],
-        points_world=points,
-        sigma_px=np.full(2, 0.5),
-        sigma_m=np.full(2, 0.003),
-    )
+    seen = samples.seen(CAMERA.project(points)[:, :2] + [1.0, 0.0], points, 0.5, 0.003)
     near, far = misfit(seen, CAMERA).normalised
     assert np.isinf(near)
     assert 0.5 < far < 1.5

@@ -1,4 +1,4 @@
-"""`raster.grid`: depth, spread, intensity and colour of walls with known cells."""
+"""`raster.grid`: depth, spread, intensity and colour of walls with known cells, gaps and crops."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from orthoflow_plugins.raster import grid
 from orthoflow_plugins.raster.extents import Extent
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.selection import frame_of
+from pydantic import ValidationError
 
 from orthoflow.errors import MethodError, OrthoflowError
 from orthoflow.products import PointCloud, SurfaceMask, Wall
+from orthoflow.sdk import StepContext
 from tests import raster_scenes as scenes
 from tests import samples
 from tests.raster_scenes import rastered
@@ -216,3 +218,213 @@ def test_a_wall_of_one_tone_is_reported_with_its_cause(tmp_path: Path) -> None:
         if what is not None:
             assert what in found[0]
             assert ("0.0 to 65535.0 (stated)" in found[0]) == ("intensity" in what)
+
+
+# --- missing points between neighbours in the grid of the scan ---
+
+
+SCANNED_WALL = scenes.upright_wall(shape=(40, 60))
+# Slope per cell: steep, but points two steps apart differ by less than layer_m.
+SLOPE_M = 0.004
+
+
+def with_gaps(cloud: PointCloud, folder: Path, **params: object) -> Wall:
+    more: dict[str, object] = {"gsd_m": SCANNED_WALL.gsd_m, "buffer_m": 1.0, **params}
+    return scenes.rastered(cloud, SCANNED_WALL.planes(), folder, **more)[0].walls[0]
+
+
+def depth_m(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    return SLOPE_M * columns
+
+
+def scanned(
+    step_cells: float, *, missing: NDArray[np.bool_] | None = None, depths: str = "slope"
+) -> PointCloud:
+    """Return a scan with given row and column spacing on the wall, rotated by a few degrees."""
+    n = int(120 / step_cells)
+    row, column = (grid.ravel() for grid in np.mgrid[:n, :n])
+    turned = np.radians(7.0)
+    u = 0.3 + step_cells * (np.cos(turned) * column + np.sin(turned) * (row - n / 3))
+    v = 0.3 + step_cells * (np.cos(turned) * row - np.sin(turned) * column)
+    kept = (u > 0) & (u < SCANNED_WALL.shape[1]) & (v > 0) & (v < SCANNED_WALL.shape[0])
+    if missing is not None:
+        kept &= ~missing[np.clip(v, 0, 39.9).astype(int), np.clip(u, 0, 59.9).astype(int)]
+    u, v, row, column = u[kept], v[kept], row[kept], column[kept]
+    depths_m = depth_m(u) if depths == "slope" else np.where(u < 30.0, 0.0, 0.1)
+    cloud = scenes.cloud_of(
+        SCANNED_WALL.world(u, v, depths_m),
+        intensity=(0.2 + 0.01 * u).astype(np.float32),
+        rgb=np.repeat(np.rint(2.0 * v)[:, None], 3, axis=1).astype(np.uint8),
+    )
+    # Row and column numbers may begin with any number, here above 12,000.
+    return dataclasses.replace(
+        cloud, row=(row + 12_000).astype(np.uint32), column=column.astype(np.uint32)
+    )
+
+
+def test_a_coarse_scan_is_recovered_linear_between_its_points(tmp_path: Path) -> None:
+    wall = with_gaps(scanned(2.4), tmp_path, surface="topmost")
+    recovered = wall.mask == SurfaceMask.RECOVERED
+    # The border is not between points.
+    inner = np.zeros(SCANNED_WALL.shape, dtype=bool)
+    inner[4:-4, 4:-4] = True
+    assert (wall.mask[inner] != SurfaceMask.VOID).all()
+    assert np.mean(recovered[inner]) > 0.7
+    rows, columns = np.nonzero(recovered & inner)
+    expected_m = depth_m(columns.astype(np.float64) + 0.5)
+    np.testing.assert_allclose(wall.depth_m[rows, columns], expected_m, atol=1e-6)
+    np.testing.assert_allclose(
+        wall.intensity[rows, columns], 0.2 + 0.01 * (columns + 0.5), atol=1e-6
+    )
+    # Colours are rounded for the points, and again after interpolation.
+    np.testing.assert_allclose(wall.rgb[rows, columns, 0], 2.0 * (rows + 0.5), atol=1.01)
+    assert (wall.count[recovered] == 0).all()
+    assert np.isnan(wall.sigma_m[recovered]).all()
+
+
+def test_single_missing_points_are_recovered_on_the_slope_they_lie_on(
+    tmp_path: Path,
+) -> None:
+    missing = np.random.default_rng(4).random(SCANNED_WALL.shape) < 0.08
+    errors_m = []
+    for steps in (2, 0):
+        wall = with_gaps(
+            scanned(0.9, missing=missing), tmp_path, surface="centre", recover_scan_steps=steps
+        )
+        rows, columns = np.nonzero(wall.mask == SurfaceMask.RECOVERED)
+        errors_m.append(
+            np.abs(wall.depth_m[rows, columns] - depth_m(columns.astype(np.float64) + 0.5))
+        )
+    assert np.median(errors_m[0]) < 1e-6
+    # Cells surrounded by others are on their slope; at the border, they are on that of their
+    # neighbours.
+    assert np.median(errors_m[1]) < 0.02 * SLOPE_M
+    assert errors_m[1].max() < 2.0 * SLOPE_M
+
+
+def test_what_the_scanner_looked_through_stays_void(tmp_path: Path) -> None:
+    window = np.zeros(SCANNED_WALL.shape, dtype=bool)
+    window[10:30, 20:40] = True
+    wall = with_gaps(scanned(0.9, missing=window), tmp_path)
+    is_void = wall.mask == SurfaceMask.VOID
+    assert is_void[11:29, 21:39].all()
+    assert np.isnan(wall.depth_m[is_void]).all()
+    assert np.isnan(wall.intensity[is_void]).all()
+    np.testing.assert_array_equal(wall.rgb_mask > 0, ~is_void)
+
+
+def test_a_depth_step_is_not_bridged(tmp_path: Path) -> None:
+    wall = with_gaps(scanned(2.4, depths="step"), tmp_path, surface="topmost")
+    known = wall.depth_m[np.isfinite(wall.depth_m)]
+    assert set(known.round(4).tolist()) == {0.0, np.float32(0.1).item()}
+
+
+@pytest.mark.parametrize(
+    ("without", "reach"),
+    [
+        (("row", "column"), {}),
+        ((), {"recover_scan_steps": 0}),
+        ((), {"recover_gap_cells": 0}),
+    ],
+)
+def test_without_grid_or_reach_nothing_is_spanned(
+    tmp_path: Path, without: tuple[str, ...], reach: dict[str, object]
+) -> None:
+    cloud = dataclasses.replace(scanned(2.4), **dict.fromkeys(without))
+    params: dict[str, object] = {"surface": "topmost", "recover_gap_cells": 1, **reach}
+    wall = with_gaps(cloud, tmp_path, **params)
+    # Cells in the middle between four points are too far away for a gap of one cell.
+    assert np.mean(wall.mask[4:-4, 4:-4] == SurfaceMask.VOID) > 0.1
+
+
+# --- parts of walls ---
+
+
+# The wall has 40 x 30 cells of 0.125 m, so it is 5 m wide and 3.75 m high.
+WHOLE = scenes.upright_wall()
+
+
+def cropped(folder: Path, **params: object) -> tuple[Wall, StepContext]:
+    columns, rows = scenes.cell_centres(WHOLE.shape)
+    points = WHOLE.world(columns, rows, scenes.relief_m(columns))
+    intensity = np.linspace(0.1, 0.9, columns.size, dtype=np.float32)
+    cloud = scenes.cloud_of(points, rgb=scenes.checker(columns, rows), intensity=intensity)
+    walls, ctx = scenes.rastered(cloud, WHOLE.planes(), folder, gsd_m=WHOLE.gsd_m, **params)
+    return walls.walls[0], ctx
+
+
+def assert_same(part: Wall, whole: Wall, cells: Any, kept: NDArray[np.bool_]) -> None:
+    for name in ("depth_m", "sigma_m", "count", "mask", "intensity", "rgb", "rgb_mask"):
+        one, other = getattr(part, name), getattr(whole, name)[cells]
+        np.testing.assert_array_equal(one[kept], other[kept], err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("crop", "part"),
+    [
+        ((1.0, 0.5, 2.0, 1.5), np.s_[4:12, 8:16]),
+        ((0.99, 0.51, 2.01, 1.49), np.s_[4:12, 7:17]),
+        ((4.0, 3.0, 9.0, 9.0), np.s_[24:30, 32:40]),
+        ((-3.0, -1.0, 0.25, 0.125), np.s_[0:1, 0:2]),
+        (((1.0, 0.5), (1.0, 1.5), (2.0, 1.5), (2.0, 0.5)), np.s_[4:12, 8:16]),
+    ],
+    ids=["whole cells", "cells in part", "past a corner", "past the origin", "square polygon"],
+)
+def test_a_crop_holds_the_cells_of_the_whole_wall(
+    tmp_path: Path, crop: object, part: tuple[slice, slice]
+) -> None:
+    whole, _ = cropped(tmp_path)
+    wall, ctx = cropped(tmp_path, crop=crop)
+    assert_same(wall, whole, part, np.ones(wall.frame.shape, dtype=np.bool_))
+    corner = np.array([[part[1].start, part[0].start]], dtype=np.float64)
+    np.testing.assert_allclose(
+        wall.frame.origin_world, whole.frame.world_from_wall(corner)[0], atol=1e-12
+    )
+    assert not any(one.code.startswith("crop") for one in ctx.diagnostics)
+
+
+def test_cells_beyond_a_polygon_are_void(tmp_path: Path) -> None:
+    whole, _ = cropped(tmp_path)
+    # The crop is the triangle to the right of the line from (1, 3) to (3, 1), below v = 1.
+    wall, _ = cropped(tmp_path, crop=[[1.0, 3.0], [3.0, 1.0], [3.0, 3.0]])
+    assert wall.frame.shape == (16, 16)
+    rows, columns = np.mgrid[8:24, 8:24] + 0.5
+    # Cells with their centres on the diagonal may be on either side.
+    inside, on = columns + rows > 32.0, columns + rows == 32.0
+    kept = wall.mask == SurfaceMask.MEASURED
+    np.testing.assert_array_equal(kept[~on], inside[~on])
+    assert_same(wall, whole, np.s_[8:24, 8:24], kept)
+    assert np.isnan(wall.depth_m[~kept]).all()
+    assert np.isnan(wall.intensity[~kept]).all()
+    assert not wall.count[~kept].any()
+    assert not wall.rgb[~kept].any()
+
+
+def test_a_notch_of_a_polygon_is_outside(tmp_path: Path) -> None:
+    notched = [[0, 0], [4, 0], [4, 3], [2.5, 3], [2.5, 1], [1.5, 1], [1.5, 3], [0, 3]]
+    wall, _ = cropped(tmp_path, crop=notched)
+    expected = np.ones((24, 32), dtype=bool)
+    expected[8:, 12:20] = False
+    np.testing.assert_array_equal(wall.mask == SurfaceMask.MEASURED, expected)
+
+
+def test_a_crop_without_an_area_or_beside_the_wall_is_refused(tmp_path: Path) -> None:
+    for crop in ((1, 1, 1, 2), ((0, 0), (1, 1)), ((0, 0), (1, 1), (2, 2))):
+        with pytest.raises(ValidationError, match="that span an area"):
+            RasterGrid.Params.model_validate({"crop": crop})
+    with pytest.raises(MethodError, match=r"wall 0 is 5\.000 m wide and 3\.750 m high"):
+        cropped(tmp_path, crop=(6.0, 0.0, 7.0, 1.0))
+
+
+@pytest.mark.parametrize(("away_m", "is_told"), [(0.95, False), (1.05, True)])
+def test_a_point_a_metre_beside_the_nearest_wall_is_told_of(
+    tmp_path: Path, away_m: float, *, is_told: bool
+) -> None:
+    _, ctx = cropped(tmp_path, near=[[2.0, -away_m, -1.0]])
+    apart = [one.values["apart_m"] for one in ctx.diagnostics if one.code == "near-is-far"]
+    assert apart == [pytest.approx(away_m)] * is_told
+
+
+def test_walls_are_chosen_in_one_way() -> None:
+    with pytest.raises(ValidationError, match="by ranks or by near, not by both"):
+        RasterGrid.Params.model_validate({"ranks": [0], "near": [[0, 0, 0]]})

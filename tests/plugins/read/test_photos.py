@@ -36,14 +36,19 @@ class PhotoReader(Reader):
     """Function that returns the photos in files."""
 
     def __call__(
-        self, *paths: Path, calibration: str | None = None, **params: object
+        self,
+        *paths: Path,
+        calibration: str | None = None,
+        masks: dict[str, bytes] | None = None,
+        **params: object,
     ) -> tuple[Photo, ...]:
-        given = None
-        if calibration is not None:
-            path = self.folder / "calibration.yaml"
-            path.write_text(calibration)
-            given = InputFiles(name="calibration", paths=(path,))
-        photos: tuple[Photo, ...] = self.run(paths, params, calibration=given).photos.photos
+        calibrations = None if calibration is None else {"calibration.yaml": calibration.encode()}
+        given = {
+            name: InputFiles(name=name, paths=made.write(self.folder / name, contents))
+            for name, contents in (("calibration", calibrations), ("masks", masks))
+            if contents is not None
+        }
+        photos: tuple[Photo, ...] = self.run(paths, params, **given).photos.photos
         return photos
 
     def files(self, contents: dict[str, bytes], **more: Any) -> tuple[Photo, ...]:
@@ -225,15 +230,14 @@ def test_photos_of_one_name_live_together_under_their_paths(read: PhotoReader) -
 # Transparency and pages
 
 
-@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
-def test_what_is_transparent_is_masked(read: PhotoReader, kind: str) -> None:
+def test_what_is_transparent_is_masked(read: PhotoReader) -> None:
     alpha = np.full((48, 64), 255, dtype=np.uint8)
     alpha[:, :21] = 0
     stream = io.BytesIO()
-    Image.fromarray(np.dstack([made.picture(), alpha])).save(stream, kind)
+    Image.fromarray(np.dstack([made.picture(), alpha])).save(stream, "PNG")
     mask = np.full((48, 64), 255, dtype=np.uint8)
     mask[:8] = 0
-    files = {f"a.{kind.lower().replace('tiff', 'tif')}": stream.getvalue()}
+    files = {"a.png": stream.getvalue()}
     (photo,) = read.files(files)
     np.testing.assert_array_equal(used_pixels(photo), alpha > 0)
     (photo,) = read.files(files | {"a_mask.png": encode_png(mask)})
@@ -342,26 +346,7 @@ def picture() -> bytes:
     return encode_png(grey)
 
 
-def photo_in(folder: Path, name: str = "a.jpg") -> Path:
-    path = folder / name
-    path.write_bytes(encode_jpeg(np.full((*SIZE[::-1], 3), 99, dtype=np.uint8)))
-    return path
-
-
-def file_in(folder: Path, name: str, content: bytes | str) -> Path:
-    path = folder / name
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
-def read_masked(
-    folder: Path, photos: list[Path], masks: list[Path] | None = None
-) -> tuple[tuple[Photo, ...], str]:
-    reader = Reader(ReadPhotos, folder)
-    given = None if masks is None else InputFiles(name="masks", paths=tuple(masks))
-    found = reader.run(tuple(photos), {}, masks=given).photos.photos
-    return found, reader.warnings
+PHOTO = encode_jpeg(np.full((*SIZE[::-1], 3), 99, dtype=np.uint8))
 
 
 def masked(photo: Photo) -> NDArray[np.bool_]:
@@ -376,49 +361,47 @@ def expected() -> NDArray[np.bool_]:
     return cells
 
 
-def polygons(photo: str, *rings: list[tuple[float, float]]) -> str:
+def polygons(photo: str, *rings: list[tuple[float, float]]) -> bytes:
     geometry = {"type": "Polygon", "coordinates": [[*ring, ring[0]] for ring in rings]}
     feature = {"type": "Feature", "properties": {"photo": photo}, "geometry": geometry}
-    return json.dumps({"type": "FeatureCollection", "features": [feature]})
+    return json.dumps({"type": "FeatureCollection", "features": [feature]}).encode()
 
 
 RING = [(30.0, 10.0), (50.0, 10.0), (50.0, 20.0), (30.0, 20.0)]
 
 
-def test_a_mask_beside_its_photo_is_no_photo(tmp_path: Path) -> None:
-    files = [photo_in(tmp_path), file_in(tmp_path, "a_mask.png", picture())]
-    (photo,), said = read_masked(tmp_path, files)
+def test_a_mask_beside_its_photo_is_no_photo(read: PhotoReader) -> None:
+    (photo,) = read.files({"a.jpg": PHOTO, "a_mask.png": picture()})
     assert photo.name == "a.jpg"
     np.testing.assert_array_equal(masked(photo), expected())
-    assert "masks that match no photo" not in said
+    assert "masks that match no photo" not in read.warnings
     # A file named like a mask, but without its photo, is a photo.
-    alone, _ = read_masked(tmp_path, [file_in(tmp_path, "white_mask.png", picture())])
-    assert [item.name for item in alone] == ["white_mask.png"]
+    (alone,) = read.files({"white_mask.png": picture()})
+    assert alone.name == "white_mask.png"
 
 
-def test_masks_of_no_photo_and_files_that_are_none_are_named(tmp_path: Path) -> None:
-    masks = [
-        file_in(tmp_path / "masks", "c.png", picture()),
-        file_in(tmp_path / "masks", "a.png", picture()),
-        file_in(tmp_path / "masks", "notes.txt", "drawn on Friday"),
-        file_in(tmp_path, "none.geojson", polygons("x*.jpg", RING)),
-    ]
-    (photo,), said = read_masked(tmp_path, [photo_in(tmp_path)], masks)
+def test_masks_of_no_photo_and_files_that_are_none_are_named(read: PhotoReader) -> None:
+    masks = {
+        "c.png": picture(),
+        "a.png": picture(),
+        "notes.txt": b"drawn on Friday",
+        "none.geojson": polygons("x*.jpg", RING),
+    }
+    (photo,) = read.files({"a.jpg": PHOTO}, masks=masks)
     np.testing.assert_array_equal(masked(photo), expected())
-    assert (
-        "masks that match no photo: c.png, x*.jpg: a mask must have the name of its photo" in said
-    )
-    assert "only images (PNG, JPEG, TIFF) and polygons (GeoJSON) can be masks: notes.txt" in said
+    named = "masks that match no photo: c.png, x*.jpg: a mask must have the name of its photo"
+    assert named in read.warnings
+    kinds = "only images (PNG, JPEG, TIFF) and polygons (GeoJSON) can be masks: notes.txt"
+    assert kinds in read.warnings
 
 
-def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
-    files = [photo_in(tmp_path, "a.jpg"), photo_in(tmp_path, "b.jpg")]
-    one = file_in(tmp_path, "one.geojson", polygons("a.jpg", RING))
-    (first, second), _ = read_masked(tmp_path, files, [one])
+def test_polygons_mask_photos_by_name_or_pattern(read: PhotoReader) -> None:
+    files = {"a.jpg": PHOTO, "b.jpg": PHOTO}
+    first, second = read.files(files, masks={"one.geojson": polygons("a.jpg", RING)})
     np.testing.assert_array_equal(masked(first), expected())
     assert second.mask is None
-    every = file_in(tmp_path, "all.geojson", polygons("*", RING, [(35, 12), (45, 12), (40, 18)]))
-    (first, second), _ = read_masked(tmp_path, files, [every])
+    every = polygons("*", RING, [(35, 12), (45, 12), (40, 18)])
+    first, second = read.files(files, masks={"all.geojson": every})
     holed = masked(first)
     # The hole has 30 pixels, except for those with centres on its border.
     assert not (holed & ~expected()).any()
@@ -430,19 +413,14 @@ def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
     ("name", "content", "said"),
     [
         ("a.png", encode_png(np.full(SIZE, 255, np.uint8)), "a.png has 48 x 64 pixels, but a.jpg"),
-        (
-            "a.png",
-            encode_png(np.zeros(SIZE[::-1], np.uint8)),
-            "the mask of a.jpg excludes the whole",
-        ),
+        ("a.png", encode_png(np.zeros(SIZE[::-1], np.uint8)), "of a.jpg excludes the whole"),
         ("a.png", b"no picture", "mask a.png"),
-        ("a.txt", "words", r"the masks contain no pictures .* only a\.txt"),
-        ("a.json", " " * (MOST_BYTES + 1), f"more than {MOST_BYTES} bytes"),
+        ("a.txt", b"words", r"the masks contain no pictures .* only a\.txt"),
+        ("a.json", b" " * (MOST_BYTES + 1), f"more than {MOST_BYTES} bytes"),
     ],
 )
 def test_what_is_no_mask_is_refused(
-    tmp_path: Path, name: str, content: bytes | str, said: str
+    read: PhotoReader, name: str, content: bytes, said: str
 ) -> None:
-    mask = file_in(tmp_path / "masks", name, content)
     with pytest.raises(InputError, match=said):
-        read_masked(tmp_path, [photo_in(tmp_path)], [mask])
+        read.files({"a.jpg": PHOTO}, masks={name: content})

@@ -22,7 +22,8 @@ from orthoflow_plugins.simulate.scanning import (
 )
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from orthoflow.geometry.scenes import Scene, TextureKind
+from tests.scene_rays import a_scene
 
 NOISE_M = 0.002
 SIDE = 200
@@ -39,32 +40,17 @@ def surface(
     incidence_deg: float = 0.0,
     kind: TextureKind = TextureKind.PLAIN,
     material: float = 7.0,
-) -> Scene:
+) -> dict[str, object]:
     """Return a rectangle on the x axis at a distance, rotated about the vertical."""
     turn = math.radians(incidence_deg)
-    return Scene(
-        origin=np.zeros(3),
-        centre=np.array([[distance_m, 0.0, 0.0]]),
-        axis_a=np.array([[math.sin(turn), math.cos(turn), 0.0]]),
-        axis_b=np.array([[0.0, 0.0, 1.0]]),
-        extent=np.array([[-1.0, 1.0, -1.0, 1.0]]),
-        plane_index=np.zeros(1, dtype=np.int16),
-        role=np.array([SurfaceRole.WALL], dtype=np.uint8),
-        texture=np.array([kind], dtype=np.int32),
-        texture_params=np.array([[200.0, 180.0, 160.0, 0.5, 0.3, 0.3, material, 0.0]]),
-        hole_rectangle=np.zeros(0, dtype=np.int32),
-        hole_extent=np.zeros((0, 4)),
-    )
-
-
-def together(one: Scene, other: Scene) -> Scene:
-    """Return a scene with two surfaces."""
-    names = ("centre", "axis_a", "axis_b", "extent", "plane_index", "role", "texture")
-    joined = {
-        name: np.concatenate([getattr(one, name), getattr(other, name)])
-        for name in (*names, "texture_params")
+    return {
+        "centre": (distance_m, 0.0, 0.0),
+        "a": (math.sin(turn), math.cos(turn), 0.0),
+        "b": (0.0, 0.0, 1.0),
+        "extent": (-1.0, 1.0, -1.0, 1.0),
+        "kind": kind,
+        "params": (200.0, 180.0, 160.0, 0.5, 0.3, 0.3, material, 0.0),
     }
-    return replace(one, **joined)
 
 
 def scanned(scene: Scene, step: float = STEP, **errors: float) -> Scanned:
@@ -119,7 +105,7 @@ def azimuths(step: float = STEP) -> NDArray[np.float64]:
 def test_noise_grows_with_slope_range_and_on_cloth(
     distance_m: float, incidence_deg: float, kind: TextureKind, expected: float
 ) -> None:
-    points = scanned(surface(distance_m, incidence_deg, kind), noise_m=NOISE_M)
+    points = scanned(a_scene([surface(distance_m, incidence_deg, kind)]), noise_m=NOISE_M)
     assert (points.rectangle == 0).all()
     # On the surface, x cos(turn) - y sin(turn) = distance cos(turn); all rays are close to x.
     turned = np.tan(azimuths()) * math.tan(math.radians(incidence_deg))
@@ -131,7 +117,7 @@ def test_noise_grows_with_slope_range_and_on_cloth(
 
 
 def test_gross_outliers_fall_short_four_times_in_five() -> None:
-    points = scanned(surface(3.0), outlier_share=1.0)
+    points = scanned(a_scene([surface(3.0)]), outlier_share=1.0)
     distance = distances_m(points)
     assert (points.rectangle == SPOILT).all()
     short = distance < 3.0
@@ -149,8 +135,7 @@ def test_gross_outliers_fall_short_four_times_in_five() -> None:
 def test_distances_mix_where_the_spot_falls_on_two_surfaces() -> None:
     step, beam_m = 2e-5, 0.006
     # The near surface is at negative y and ends at the x axis.
-    scene = together(surface(3.0), surface(3.5))
-    scene.extent[0, 1] = 0.0
+    scene = a_scene([surface(3.0) | {"extent": (-1.0, 0.0, -1.0, 1.0)}, surface(3.5)])
     points = scanned(scene, step, beam_m=beam_m)
     distance, azimuth = distances_m(points), azimuths(step)
     for side, own_m, other_m in ((azimuth < 0.0, 3.0, 3.5), (azimuth > 0.0, 3.5, 3.0)):
@@ -201,7 +186,7 @@ def test_a_bent_cloud_is_off_by_the_stated_bend_five_metres_from_its_middle() ->
 
 # --- laser reflectance of materials ---
 
-MATERIALS = together(surface(3.0), surface(3.0, material=8.0))
+MATERIALS = a_scene([surface(3.0), surface(3.0, material=8.0)])
 
 
 def seen(
