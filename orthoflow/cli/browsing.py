@@ -18,9 +18,9 @@ from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.open import open_run
-from orthoflow.records.runs import Run, cell_metrics, parts_of
+from orthoflow.records.runs import Run, parts_of
 from orthoflow.records.verify import broken_seal
-from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.combinations import baseline_cells, baseline_metrics
 from orthoflow.report.rankings import FLAG, is_flag, middle_of
 from orthoflow.report.summaries import headline_keys
 from orthoflow.untrusted_text import open_file, parse_json
@@ -52,8 +52,8 @@ class RunSummary:
         run_id: id of the run.
         started: start of the run, ISO 8601, UTC; empty if unknown.
         metrics: `step.metric` -> value for the baseline, and `metric` -> value for the last step
-            that reports the metric. For several datasets, the value is the median, or the share of
-            "yes" for yes/no metrics.
+            that reports the metric, averaged over repeats. For several datasets, the value is the
+            median, or the share of "yes" for yes/no metrics.
         n_datasets: number of datasets; 0 if the workflow lists none.
         headlines: names of the headline metrics, most important first.
         facts: name -> property, other than parameters, that may differ between runs: `seed`,
@@ -191,18 +191,15 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
     values: dict[str, list[float]] = {}
     flags: set[str] = set()
     of_parts = [baseline_cells(part) for part in parts.values() or (run,)]
-    for cells in of_parts:
+    for part, cells in zip(parts.values() or (run,), of_parts, strict=True):
+        facts |= {f"{cell.step}.use": cell.method for cell in cells if cell.status != "skipped"}
         own: dict[str, float] = {}
-        for cell in cells:
-            if cell.status != "skipped":
-                facts[f"{cell.step}.use"] = cell.method
-            for row in cell_metrics(cell):
-                # For several datasets, use absolute values, because errors of both signs would
-                # cancel.
-                is_size = len(parts) > 1 and row.better == "lower"
-                for name in (f"{row.step}.{row.metric}", row.metric):
-                    own[name] = abs(row.value) if is_size else row.value
-                    flags |= {name} if is_flag(row.unit) else set()
+        for row in baseline_metrics(part):
+            # For several datasets, use absolute values, because errors of both signs would cancel.
+            is_size = len(parts) > 1 and row.better == "lower"
+            for name in (f"{row.step}.{row.metric}", row.metric):
+                own[name] = abs(row.value) if is_size else row.value
+                flags |= {name} if is_flag(row.unit) else set()
         for name, value in own.items():
             values.setdefault(name, []).append(value)
     return RunSummary(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
-from orthoflow.cli.tables import counted, echo, echo_json, echo_table, number
+from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.untrusted_text import csv_text, first_few
 
 if TYPE_CHECKING:
@@ -73,12 +73,12 @@ def runs(
     """List the runs in and below each FOLDER, by default the working directory.
 
     A row shows when and with which workflow a run was made, its outcome, the quality of its
-    baseline (the median over several datasets), and the parameters and inputs in which it differs
-    from other runs of the workflow. Results of `export --split` inside a run are listed only if
-    their folder is given. For runs without a record, and for unreadable records, the reason is
-    shown. --table FILE merges the given runs, or those in the given folders, into one table with a
-    row per cell and metric; cells with the same methods, parameters, seeds and data in several runs
-    are merged, and `environments` is the number of environments in which they were computed.
+    baseline (mean over repeats, median over datasets), and the parameters and inputs in which it
+    differs from other runs of the workflow. Results of `export --split` inside a run are listed
+    only if their folder is given. For runs without a record, and for unreadable records, the reason
+    is shown. --table FILE merges the given runs, or those in the given folders, into one table with
+    a row per cell and metric; cells with the same methods, parameters, seeds and data in several
+    runs are merged, and `environments` is the number of environments in which they were computed.
     """
     if table is not None:
         return _write_table(folders, table)
@@ -139,6 +139,7 @@ def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[d
 def print_runs(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
     """Print a table of runs, and their problems."""
     from orthoflow.cli.browsing import differing_facts, key_metrics
+    from orthoflow.report.rankings import number
 
     names = key_metrics(kept, most=_METRICS_MOST)
     facts = differing_facts(found)

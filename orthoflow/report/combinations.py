@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -15,7 +15,7 @@ from orthoflow.catalog.distributions import canonical_name, required_distributio
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell, RecordedEnvironment
-from orthoflow.records.runs import Run, cell_metrics
+from orthoflow.records.runs import MetricRow, Run, cell_metrics
 from orthoflow.records.write import NOT_YET
 from orthoflow.report.rankings import cost_share
 from orthoflow.untrusted_text import first_few, parse_json
@@ -134,6 +134,20 @@ class Combination:
             unit=found[0][0].unit,
             environment=found[0][1],
             is_of_sizes=is_of_sizes,
+        )
+
+    @property
+    def metrics(self) -> tuple[MetricRow, ...]:
+        """All metrics, averaged over the repeats like those of `measured`."""
+        found: dict[tuple[str, str], MetricRow] = {}
+        for cell in self.cells:
+            for row in cell_metrics(cell):
+                found.setdefault((row.step, row.metric), row)
+        repeated = {cell.step for cell in self.cells if cell.repeat}
+        means = {key: self.measured(*key) for key in found if key[0] in repeated}
+        return tuple(
+            replace(row, value=mean.value) if (mean := means.get(key)) else row
+            for key, row in found.items()
         )
 
     def n_items(self, step: str, counted_by: str) -> float:
@@ -261,11 +275,22 @@ def baseline_of(run: Run) -> Mapping[str, str]:
     return {str(step): str(variant) for step, variant in found.items()}
 
 
-def baseline_cells(run: Run) -> tuple[RecordedCell, ...]:
-    """Return the cells of the baseline, or of the first combination if there is no baseline."""
+def baseline_combination(run: Run) -> Combination | None:
+    """Return the baseline, or the first combination if there is no baseline."""
     found = combinations_of(run)
-    chosen = next((one for one in found if one.is_baseline), found[0] if found else None)
+    return next((one for one in found if one.is_baseline), found[0] if found else None)
+
+
+def baseline_cells(run: Run) -> tuple[RecordedCell, ...]:
+    """Return the cells of `baseline_combination` without repeats."""
+    chosen = baseline_combination(run)
     return tuple(cell for cell in chosen.cells if cell.repeat == 0) if chosen else ()
+
+
+def baseline_metrics(run: Run) -> tuple[MetricRow, ...]:
+    """Return the metrics of `baseline_combination`, averaged over the repeats."""
+    chosen = baseline_combination(run)
+    return chosen.metrics if chosen else ()
 
 
 def baseline_addresses(run: Run) -> tuple[str, ...]:

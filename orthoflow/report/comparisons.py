@@ -18,6 +18,7 @@ from orthoflow.report.combinations import (
     EnvironmentGroups,
     Measured,
     baseline_cells,
+    baseline_metrics,
     baseline_of,
     combinations_of,
     group_environments,
@@ -471,12 +472,7 @@ _Measured = Mapping[tuple[str, str], MetricRow]
 
 
 def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
-    return {
-        (row.step, row.metric): row
-        for cell in baseline_cells(part)
-        if cell.address in own
-        for row in cell_metrics(cell)
-    }
+    return {(row.step, row.metric): row for row in baseline_metrics(part) if row.cell in own}
 
 
 def _picture(part: Run, own: AbstractSet[str], n_rows: int) -> str:

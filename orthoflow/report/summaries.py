@@ -13,6 +13,7 @@ from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.report.combinations import (
     baseline_cells,
+    baseline_metrics,
     combinations_of,
     gives,
     improved_on,
@@ -72,23 +73,23 @@ def headline_keys(cells: Iterable[RecordedCell]) -> list[tuple[str, str]]:
 
 def answers(run: Run) -> tuple[Answer, ...]:
     """Return the headline metrics of the baseline."""
-    cells = {cell.step: cell for cell in baseline_cells(run)}
-    rows = {step: {row.metric: row for row in cell_metrics(cell)} for step, cell in cells.items()}
-    keys = [key for key in headline_keys(cells.values()) if key[1] in rows[key[0]]]
-    chosen = [rows[step][metric] for step, metric in keys]
+    rows = {(row.step, row.metric): row for row in baseline_metrics(run)}
+    chosen = [rows[key] for key in headline_keys(baseline_cells(run)) if key in rows]
+    repeated = {cell.step for cell in run.record.cells if cell.repeat}
     found = []
     # Yes/no metrics come first if the answer is no; otherwise, they are omitted.
     for row in sorted(chosen, key=lambda row: not is_flag(row.unit)):
-        if is_flag(row.unit) and row.value:
+        if is_flag(row.unit) and row.value == 1.0:
             continue
-        count = rows[row.step].get(row.counted_by)
+        count = rows.get((row.step, row.counted_by))
         counted = f"{count.title}: {number(count.value)}" if count else ""
+        mean = "mean over the repeats" if row.step in repeated else ""
         found.append(
             Answer(
                 what=row.title,
                 value=number_with_unit(row.value, row.unit, significant=3),
                 cell=row.cell,
-                remark="; ".join(filter(None, (row.description, counted))),
+                remark="; ".join(filter(None, (row.description, counted, mean))),
             )
         )
     return tuple(found[:_MOST_ANSWERS])

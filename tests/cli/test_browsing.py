@@ -95,8 +95,8 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
         "r1",
         "2026-01-02T03:04:05Z",
     )
-    # A later step has the plain name.
-    wanted = {"plane.rms_mm": 3.0, "check.rms_mm": 1.0, "rms_mm": 1.0, "omega_deg": 4.0}
+    # Repeats are averaged, and a later step has the plain name.
+    wanted = {"plane.rms_mm": 6.0, "check.rms_mm": 1.0, "rms_mm": 1.0, "omega_deg": 4.0}
     assert {name: recorded.metrics[name] for name in wanted} == wanted
     assert recorded.n_datasets == 0
     assert recorded.all_facts == {

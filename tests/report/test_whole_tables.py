@@ -130,6 +130,7 @@ def test_products_that_differ_stand_first_with_their_distances() -> None:
 def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:
     whole_run = run(
         cell("plane", metrics=metrics(rms_mm=1.25)),
+        cell("plane#1", metrics=metrics(rms_mm=1.75)),
         cell("first", metrics=metrics(check_rmse_mm_worst=2.0, n_oriented=9.0)),
         cell("second", metrics=metrics(check_rmse_mm_worst=7.0, n_oriented=8.0)),
         cell("check", metrics=metrics(completeness_seen_by_both=0.75, main_found=1.0)),
@@ -141,8 +142,9 @@ def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:
         ("check", "0.75"),
         ("other", "2 mm"),
         ("second", "7 mm"),
-        ("plane", "1.25 mm"),
+        ("plane", "1.5 mm"),
     ]
+    assert found[4].remark == "mean over the repeats"
     assert found[3].remark.endswith("photos oriented: 8")
 
 
