@@ -47,10 +47,12 @@ def our_methods() -> list[type[Method]]:
     return [entry.load() for entry in ours]
 
 
-def test_every_method_of_ours_declares_its_metrics() -> None:
+def test_every_method_of_ours_declares_its_metrics_once() -> None:
     methods = our_methods()
     assert len(methods) >= 25
     assert [method.id for method in methods if not method.metrics] == []
+    names = {method.id: [spec.name for spec in method.metric_specs()] for method in methods}
+    assert {one for one, found in names.items() if len(set(found)) < len(found)} == set()
 
 
 @pytest.mark.parametrize(

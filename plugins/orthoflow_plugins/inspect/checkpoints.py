@@ -37,6 +37,7 @@ from orthoflow_plugins.inspect.figures import draw_arrows
 from orthoflow_plugins.inspect.findings import (
     CAPPED,
     CHECK_TABLE,
+    COMPLETENESS,
     DISPLACEMENTS,
     IMAGE_QUALITY,
     LENGTHS,
@@ -112,7 +113,7 @@ class InspectCheckpoints(Method):
         MetricSpec("max_3d_mm", label="check points in space, largest error"),
         *(*CHECK_TABLE, *LENGTHS, *DISPLACEMENTS),
         *prefixed((*CHECK_TABLE, *DISPLACEMENTS), "*_", "{0}"),
-        *of_walls(IMAGE_QUALITY),
+        *of_walls((COMPLETENESS, *IMAGE_QUALITY)),
     )
     citations: ClassVar[tuple[str, ...]] = (
         (

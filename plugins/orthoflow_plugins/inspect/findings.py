@@ -73,12 +73,12 @@ CHECK_TABLE: Final = (
         label="RMS without outliers, rule iterated up to the limit of a quarter",
     ),
 )
+COMPLETENESS: Final = higher(
+    "completeness",
+    label="share of the scanned surface that is covered or filled",
+    headline=True,
+)
 IMAGE_QUALITY: Final = (
-    higher(
-        "completeness",
-        label="share of the scanned surface that is covered or filled",
-        headline=True,
-    ),
     MetricSpec("n_edges", label="edges whose sharpness was measured"),
     MetricSpec("edge_width_cells", label="edge width"),
     MetricSpec("mtf50_per_cell", label="sharpness (MTF50)"),

@@ -31,6 +31,7 @@ from orthoflow.sdk import (
 )
 from orthoflow_plugins.inspect.figures import draw_arrows
 from orthoflow_plugins.inspect.findings import (
+    COMPLETENESS,
     DISPLACEMENTS,
     IMAGE_QUALITY,
     displacement_findings,
@@ -103,6 +104,7 @@ class InspectSurf(Method):
                 ),
                 *DISPLACEMENTS,
                 *prefixed(DISPLACEMENTS, "floor_", "intensity with itself"),
+                COMPLETENESS,
                 *IMAGE_QUALITY,
             )
         ),
