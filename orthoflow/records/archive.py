@@ -580,13 +580,16 @@ def _add_final(crate: _Crate, source: str, of_tool: str, product: RecordedProduc
 
 
 def _how_to_read(record: RunRecord) -> str:
-    version = record.created_by.partition(" ")[2]
+    packages = {DISTRIBUTION: record.created_by.partition(" ")[2]} | {
+        cell.distribution: cell.distribution_version for cell in record.cells if cell.distribution
+    }
+    named = ", ".join(f"{name} {version}" for name, version in packages.items())
     given = [entry.embedded for entry in record.inputs if entry.files]
     source = "the input files" if given else "the record alone"
     if given and all(given):
         source += ", which are embedded in it"
     return (
-        f"Install the Python package {DISTRIBUTION} {version}, from a package index or a wheel "
+        f"Install the Python packages of the run ({named}), from a package index or from wheels "
         f"provided by the authors of this crate. In this folder, `orthoflow verify {RECORD_FILE}` "
         "then checks that the record and the products have not changed since they were written, "
         f"`orthoflow show {RECORD_FILE}` summarises the record, and `orthoflow replay "
