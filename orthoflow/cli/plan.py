@@ -41,7 +41,8 @@ def plan(
     """Show for every step of WORKFLOW whether its result is stored, and if not, why it would run.
 
     Nothing is computed. "unknown yet" means that the step depends on results that do not exist yet,
-    so that it is not known whether one of its stored results will match.
+    so that it is not known whether one of the stored results of its method will match. If there are
+    none, the step "will run".
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run

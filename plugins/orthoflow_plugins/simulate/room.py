@@ -148,7 +148,8 @@ class SimulateRoom(Method):
             1.0,
             ge=0.0,
             le=2.0,
-            description="Scale of the relief of all mouldings: 1 gives 2 to 15 cm, 0 a flat wall.",
+            description="Scale of the relief of all mouldings: 1 gives 2 to 15 cm, 0 none. "
+            "Niches and doors keep their depth.",
         )
         decoration: Literal["designed", "drawn"] = Field(
             "designed",
