@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import Cone, Cylinder
 from orthoflow.products import PointCloud, Surface
 from orthoflow_plugins.surface.fit import FittedSurface, fit_all, named
 from orthoflow_plugins.surface.parameters import DetectorParams
@@ -38,6 +39,8 @@ _LEAST_POINTS: Final = 100
 # A surface found among voxels is wrong if the fit to all points moves it by more than the tolerance
 # times this factor.
 _LARGEST_SHIFT: Final = 1.0
+# Generatrices of a cylinder are parallel to its axis within one degree, those of a cone are not.
+_CYLINDER_SLOPE: Final = math.radians(1.0)
 _OUTSIDE_RAD: Final = math.radians(200.0)
 
 
@@ -128,10 +131,16 @@ def detect(
             "scatter_mm": 1000.0 * fit.cell_scatter_m,
             "radius_m": fit.surface.radius_m,
             "shift_mm": 1000.0 * fit.shift_m,
+            "half_angle_deg": math.degrees(math.atan(abs(fit.slope))),
         }
+        shape = fit.surface.shape
+        is_steep = abs(fit.slope) > _CYLINDER_SLOPE
+        is_straight = isinstance(shape, Cone) and shape.half_angle_rad < _CYLINDER_SLOPE
         largest_m = params.max_scatter_share * fit.surface.radius_m + noise_m
         if counts[index] < _LEAST_POINTS or fit.shift_m > _LARGEST_SHIFT * limits.tolerance_m:
             rejected.append(Rejected(reason="unstable", evidence=evidence))
+        elif is_steep or (is_cone and (is_straight or isinstance(shape, Cylinder))):
+            rejected.append(Rejected(reason="cone" if is_steep else "cylinder", evidence=evidence))
         elif fit.cell_scatter_m > largest_m:
             rejected.append(Rejected(reason="rough", evidence=evidence))
         else:

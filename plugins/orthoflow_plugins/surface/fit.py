@@ -50,6 +50,7 @@ class FittedSurface:
         means_m: (around, along) mean distance of each cell from the surface, positive towards the
             viewer; NaN for empty cells.
         shift_m: largest change from the surface found among voxels.
+        slope: change of the radius per metre along the axis that a cylinder does not have.
     """
 
     surface: Surface
@@ -58,6 +59,7 @@ class FittedSurface:
     counts: NDArray[np.int64]
     means_m: NDArray[np.float64]
     shift_m: float
+    slope: float
 
 
 def fit_all(
@@ -163,6 +165,10 @@ def _fitted(
     used = is_in if is_in.mean() > _LEAST_USED else weights > 0.0
     change, weights, extra_m = robust_solution(matrix[used], means[used], variances[used])
     rest = means - matrix @ change
+    slope = 0.0
+    if not is_cone:
+        wider = design(angles[used], places[used], 1.0, is_cone=True)
+        slope = float(robust_solution(wider, means[used], variances[used])[0][5])
     own = _covariance(matrix[used], rest[used], weights, (i[used], j[used]))
     best = found.round.corrected(found.zero, change)
     zero = zero_direction(best.axis, cloud.up)
@@ -179,6 +185,8 @@ def _fitted(
     largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
     is_on[i, j] = np.abs(rest) < largest_m
     arc, ends = _extent(is_on)
+    # Positions along a cone count from its apex.
+    start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope else 0.0)
     surface = Surface(
         name="",
         shape=best.shape(cloud.origin, is_concave=found.side > 0.0),
@@ -186,7 +194,7 @@ def _fitted(
         n_points=n_points,
         rms_m=rms_m,
         zero_world=zero,
-        along_m=(bounds[0] + size_m * ends[0] - middle_m, bounds[0] + size_m * ends[1] - middle_m),
+        along_m=(float(start_m + size_m * ends[0]), float(start_m + size_m * ends[1])),
         arc_rad=arc,
     )
     return FittedSurface(
@@ -196,6 +204,7 @@ def _fitted(
         counts=counts,
         means_m=means_m,
         shift_m=float(np.abs(matrix @ change).max()),
+        slope=slope,
     )
 
 

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.simulate.curved import SimulateCurved
 from orthoflow_plugins.simulate.room import SimulateRoom
+from orthoflow_plugins.surface.cone import SurfaceCone
 from orthoflow_plugins.surface.cylinder import SurfaceCylinder
 
 from orthoflow.products import PointCloud, PointLabels, Surface, Surfaces, Truth
@@ -179,3 +180,30 @@ def test_a_leaning_cylinder_without_stations_is_found_despite_noise(
     turn = np.linalg.norm(np.cross(found.shape.axis_world, axis))
     assert math.degrees(turn) < 6.0 * found.sigma_axis_deg
     assert not found.shape.is_concave
+
+
+@pytest.mark.parametrize("half_angle_deg", [3.0, 10.0, 25.0])
+def test_a_cone_is_found_by_its_method_and_no_cylinder_is(
+    half_angle_deg: float, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(3)
+    axis = np.array([0.6, 0.0, -0.8])
+    slope = math.tan(math.radians(half_angle_deg))
+    far_m = 2.5 / slope
+    along = np.sqrt(rng.uniform(max(0.4 * far_m, far_m - 5.0) ** 2, far_m**2, 150_000))
+    angles = rng.uniform(-1.7, 1.7, len(along))
+    outwards = np.array([0.8, 0.0, 0.6]) * np.cos(angles)[:, None]
+    outwards += np.array([0.0, 1.0, 0.0]) * np.sin(angles)[:, None]
+    points = along[:, None] * axis + (along * slope)[:, None] * outwards
+    points += rng.normal(scale=0.002, size=points.shape)
+    middle = points.mean(axis=0)
+    cloud = few_points(points - middle)
+    run = run_trial(Trial(method=SurfaceCone, inputs={"cloud": cloud}, params={}), tmp_path)
+    (found,) = run.outputs["surfaces"].surfaces
+    found_deg = math.degrees(found.shape.half_angle_rad)
+    assert found_deg == pytest.approx(half_angle_deg, abs=0.005)
+    assert np.linalg.norm(found.shape.apex_world + middle) < 0.02
+    assert found.along_m == pytest.approx((along.min(), along.max()), abs=0.1)
+    cylinders = found_in(tmp_path / "cylinder", cloud).outputs["surfaces"]
+    assert cylinders.surfaces == ()
+    assert "cone" in {item["reason"] for item in cylinders.details["rejected"]}
