@@ -186,7 +186,7 @@ def _fitted(
     is_on[i, j] = np.abs(rest) < largest_m
     arc, ends = _extent(is_on)
     # Positions along a cone count from its apex.
-    start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope else 0.0)
+    start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
     surface = Surface(
         name="",
         shape=best.shape(cloud.origin, is_concave=found.side > 0.0),

@@ -99,8 +99,8 @@ class Round:
         return self
 
     def shape(self, origin: NDArray[np.float64], *, is_concave: bool) -> Cylinder | Cone:
-        """Return the surface in world coordinates; the axis of a cone must open."""
-        if self.slope == 0.0:
+        """Return the surface in world coordinates, a cylinder if its radius does not grow."""
+        if self.slope <= 0.0:
             return Cylinder(
                 point_world=origin + self.point,
                 axis_world=self.axis,
@@ -122,7 +122,7 @@ class Round:
         turn = np.zeros((7, len(own)))
         turn[:3, 0], turn[:3, 1] = zero, aside
         turn[3:6, 2], turn[3:6, 3] = zero, aside
-        if self.slope == 0.0:
+        if self.slope <= 0.0:
             turn[6, 4] = 1.0
         else:
             reach_m = self.radius_m / self.slope

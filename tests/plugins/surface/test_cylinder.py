@@ -207,3 +207,12 @@ def test_a_cone_is_found_by_its_method_and_no_cylinder_is(
     cylinders = found_in(tmp_path / "cylinder", cloud).outputs["surfaces"]
     assert cylinders.surfaces == ()
     assert "cone" in {item["reason"] for item in cylinders.details["rejected"]}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_column_is_no_cone_whichever_way_noise_makes_it_taper(seed: int, tmp_path: Path) -> None:
+    cloud, _ = scanned("column", seed)
+    trial = Trial(method=SurfaceCone, inputs={"cloud": cloud}, params={}, seed=seed)
+    surfaces = run_trial(trial, tmp_path).outputs["surfaces"]
+    assert surfaces.surfaces == ()
+    assert "cylinder" in {item["reason"] for item in surfaces.details["rejected"]}
