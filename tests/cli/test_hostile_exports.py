@@ -66,7 +66,7 @@ ELSEWHERE = "/vsicurl/http://127.0.0.1:9/a.tif"
     ("cells", "sentence"),
     [
         ((100_000, 100_000, 0.01, {}), "declares 100000 x 100000 cells in 3 bands, but its "),
-        ((60, 40, 1e-300, {}), "has cells of 1e-300 m, expected 1e-06 to 1e+06 m"),
+        ((60, 40, 1e-300, {}), "has cells of 1e-300 m; expected 1e-06 to 1e+06 m"),
         ((600, 400, 0.01, {"OVERVIEW_FILE": ELSEWHERE}), "stores its overviews in another file"),
     ],
 )
