@@ -42,7 +42,7 @@ from orthoflow.sdk.hooks import (
 from orthoflow.sdk.lines import describe_error
 from orthoflow.version import DISTRIBUTION
 
-# Device names of Windows are excluded because files are named after methods and steps.
+# Windows device names are excluded because files are named after methods and steps.
 NAME_PATTERN: Final = (
     r"(?!(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?![a-z0-9_-]))[a-z][a-z0-9_-]{0,31}"
 )

@@ -1,6 +1,6 @@
 """Cache keys, which are the SHA-256 of everything that determines the result of a cell.
 
-Paths, step names, cores, timeouts and time stamps are deliberately excluded. The code of the
+Paths, step names, cores, timeouts and timestamps are deliberately excluded. The code of the
 method and the versions of the libraries that it may use are always included.
 """
 

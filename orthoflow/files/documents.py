@@ -102,8 +102,8 @@ def mistakes(
 
     Args:
         error: the validation error.
-        model: the model that failed.
-        data: the validated data.
+        model: the model against which the data were checked.
+        data: the data that failed validation.
         owner: name of the method with these parameters; empty for sections of a file.
     """
     # Each alternative of a type union reports its own error.

@@ -74,8 +74,8 @@ _SUB_IFDS_TAG: Final = 330
 _DNG_TAG: Final = 50706
 _COLOUR_FILTER_ARRAY, _LINEAR_RAW = 32803, 34892
 _MAX_PAGES: Final = 200
-# Warnings of libjpeg about headers, which affect no pixel. After any other warning, the rest of the
-# photo is noise.
+# libjpeg warnings about headers; these do not affect the pixels. After any other warning, the rest
+# of the photo is noise.
 _HARMLESS: Final = ("jfif revision", "adobe color transform", "icc marker")
 _EXTRA_BYTES: Final = "extraneous bytes before marker 0xd9"
 _PADDING: Final = b"\0\xff"

@@ -298,7 +298,7 @@ def _first_line(error: YAMLError) -> str:
 
 @dataclass
 class _Converter:
-    """Converter of composed nodes to values; aliases are expanded, and all values are counted."""
+    """Converts composed nodes to values, expands aliases, and counts all values."""
 
     log: Problems
     most_values: int

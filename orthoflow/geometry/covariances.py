@@ -122,7 +122,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     white = whitening.T @ (roots[:, :, 0] * residuals).ravel()
     n_free = white.size + n_scattered
     if not n_free:
-        # Without residuals, the size of a common error is unknown.
+        # Without residuals, the magnitude of an error common to all points is unknown.
         return sigma0**2 * points.cofactors
 
     evidence, variances, errors = [], [], []

@@ -37,7 +37,7 @@ class ProblemsError(OrthoflowError):
 
 
 class RefusedRunError(ProblemsError, RecordError):
-    """A run cannot be repeated without changes, or input files differ from the record."""
+    """A run cannot be repeated unchanged, or input files differ from the record."""
 
 
 class MissingMethodsError(ProblemsError, PluginError):

@@ -214,7 +214,7 @@ def recorded_cell(
     """Return the record entry of a cell with its result.
 
     Args:
-        cell: entry of the cell without a result.
+        cell: the cell's entry, which has no result yet.
         result: result of the cell in the store.
         store: store with the figures.
         sources: input port -> source of the input.
@@ -590,7 +590,7 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
     Args:
         part: part from `parts_of`.
         folder: new folder for the record and the published files.
-        store: store that contains products missing in the record of the run.
+        store: store with the products that are missing from the run's record.
 
     Raises:
         RecordError: the run is damaged.

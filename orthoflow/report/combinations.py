@@ -42,7 +42,7 @@ class Measured:
         unit: `1` for counts and shares.
         environment: id of the environment in which the metric was computed.
         is_of_sizes: whether `value` is the mean of absolute values.
-        scatter: `spread`, or 0 for a single value that depends on no seed.
+        scatter: `spread`, or 0 for a single value that does not depend on a seed.
     """
 
     value: float
@@ -256,7 +256,7 @@ def combinations_of(run: Run) -> tuple[Combination, ...]:
 def combination_of(
     run: Run, assignment: Mapping[str, str], baseline: Mapping[str, str]
 ) -> Combination:
-    """Return the combination of all cells that depend on no variants other than those given."""
+    """Return the combination of all cells that depend only on the given variants."""
     return Combination(
         run=run,
         assignment=assignment,

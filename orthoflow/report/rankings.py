@@ -105,7 +105,8 @@ class Value:
     Attributes:
         text: formatted number; empty if the value is missing.
         sort: number by which the table is sorted; NaN if the value is missing.
-        spread: standard deviation over repeats, 0 if the value depends on no seed; NaN if unknown.
+        spread: standard deviation over repeats; 0 if the value does not depend on a seed; NaN if
+            unknown.
         mark: rank among the values of the group.
         group: letter for the environment and data; empty if they are the same for all values.
         note: remark, such as the number of repeats.

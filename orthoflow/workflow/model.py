@@ -190,7 +190,7 @@ _Metrics: TypeAlias = Annotated[
 
 
 class FileSection(BaseModel):
-    """A mapping in a workflow file, which has fixed keys."""
+    """A mapping with fixed keys in a workflow file."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True

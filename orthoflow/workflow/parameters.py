@@ -58,7 +58,7 @@ class DraftCall:
 
     @property
     def id(self) -> str:
-        """Method id; empty if it is missing in the file."""
+        """Method id; empty if it is missing from the file."""
         return self.call.use or ""
 
     @property

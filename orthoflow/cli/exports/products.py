@@ -54,7 +54,7 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
 
 
 def store_of(run: Run, given: Path) -> Path:
-    """Return the store that contains the most products missing in the record.
+    """Return the store that contains the most products that are missing from the record.
 
     If `given` is the default, the stores in parents of the run folder are considered, too, because
     the user may export a run from another folder than the one where it was executed.

@@ -96,7 +96,7 @@ def _colour(
     colours: PointColours,
     place: int,
 ) -> None:
-    """Colour the points for which a photo has the highest quality so far.
+    """Colour the points for which this photo has the highest quality so far.
 
     `camera` is relative to the cloud's origin; `colours` are updated in place.
     """

@@ -228,7 +228,7 @@ def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
 
 
 def _write_virtual(path: Path, raster: Path, shift_m: float) -> tuple[float, float, float, float]:
-    """Write a virtual raster with X shifted, and return its left, bottom, right and top edge."""
+    """Write a virtual raster with X shifted; return its left, bottom, right and top edges."""
     from rasterio.shutil import copy
 
     with RasterParts(raster) as parts:

@@ -59,7 +59,7 @@ class KeyPlan:
 
 
 def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
-    """Return the planes with the rectangles of their parts; without parts, their own rectangles.
+    """Return the planes, each with the rectangles of its parts or, without parts, its own.
 
     Raises:
         InputError: there are more than `MOST_PLANES` planes or `MOST_PARTS` parts.

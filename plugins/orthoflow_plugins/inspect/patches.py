@@ -407,7 +407,7 @@ class _Sampler:
         return expected.reshape(flat), design, valid.reshape(flat)
 
     def _windows(self, corner: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return coefficients (p, 35, 35) around patches, and a mask (p, 32, 32) of valid cells.
+        """Return spline coefficients (p, 35, 35) of patches, and a mask (p, 32, 32) of valid cells.
 
         An interpolated cell is valid if its four neighbours are valid.
         """

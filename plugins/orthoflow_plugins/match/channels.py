@@ -24,24 +24,24 @@ from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
-# As in rasters, gaps between joined cells are filled if they are too narrow for a disc of this
+# As in rasters, gaps between merged cells are filled if they are too narrow for a disc of this
 # radius.
 _GAP_CELLS: Final = 2
-# Number of cells joined at once, which needs about 100 MB of memory.
+# Number of cells merged at once; this many need about 100 MB of memory.
 _CELLS_AT_ONCE: Final = 1 << 22
 
 
 def in_cells_of_points(wall: Wall) -> Wall:
-    """Join cells of a wall so that each joined cell contains about one point.
+    """Merge cells of a wall so that each merged cell contains about one point.
 
-    Values are interpolated from the centroids of the points to the centres of the joined cells.
+    Values are interpolated from the centroids of the points to the centres of the merged cells.
 
     Args:
         wall: the wall, with or without intensity.
 
     Returns:
         The same wall if it has no intensity, or if its cells are not much finer than its point
-        spacing; otherwise, a wall of joined cells with depths, spreads, counts and intensity, but
+        spacing; otherwise, a wall of merged cells with depths, spreads, counts and intensity, but
         without colours.
     """
     gsd_m = wall.frame.gsd_m
@@ -78,11 +78,11 @@ def _join(
     places: NDArray[np.float32],
     which: tuple[slice, float],
 ) -> None:
-    """Fill some rows of a joined wall with values and centroids computed from measured cells.
+    """Fill some rows of a wall of merged cells with the values and centroids of its measured cells.
 
     Args:
         wall: the wall.
-        factor: number of cells along the side of a joined cell.
+        factor: number of cells along the side of a merged cell.
         joined: the wall whose rows are filled.
         places: (rows, cols, 2) centroids as in `Surroundings`; the same rows are filled.
         which: the rows, and the depth difference beyond which points are on different surfaces.
@@ -119,12 +119,12 @@ def _join(
 
 
 class _Blocks:
-    """Blocks of cells to be joined.
+    """Blocks of cells to be merged.
 
     Args:
-        rows: rows of joined cells.
-        factor: number of cells along the side of a joined cell.
-        width: number of columns of joined cells.
+        rows: rows of merged cells.
+        factor: number of cells along the side of a merged cell.
+        width: number of columns of merged cells.
     """
 
     def __init__(self, rows: slice, factor: int, width: int) -> None:

@@ -604,7 +604,7 @@ GATES: Final = (
     ),
     *_ON_WALLS,
 )
-"""Gates for an orientation from ties of a matcher, in order."""
+"""Gates for an orientation from a matcher's ties, in order."""
 
 GATES_BEFORE_BLOCK: Final = (*CONTROL_GATES, _SIDE)
 """Gates before a bundle adjustment; accuracy is not tested, since other photos may improve it."""

@@ -41,7 +41,7 @@ HALF_STEPS: Final = 1024
 # Number of sums of a voxel: the number of points, the half steps along a, b and c, and their
 # products aa, ab, ac, bb, bc and cc.
 N_SUMS: Final = 10
-# Pairs of axes of the products among the moments.
+# The two axes of each product sum (aa, ab, ac, bb, bc, cc), in the order of the sums.
 _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 # Maximum number of bricks in a scene; larger scenes have larger voxels.
 _BRICKS_MOST: Final = 8_000_000
@@ -66,7 +66,8 @@ class Neighbourhood:
     """The points from which a normal is computed.
 
     Attributes:
-        shape: a cube, a sphere (`radius`), or the nearest voxels with `n_points` points (`knn`).
+        shape: a cube, a sphere (`radius`), or the nearest voxels that together contain at least
+            `n_points` points (`knn`).
         size_m: side of the cube, or radius of the sphere; not used by `knn`.
         n_points: minimum number of points for `knn`.
         voxel_m: side of a voxel.

@@ -1,4 +1,4 @@
-"""Pictures, channels and joined cells of a wall, and points on its surface."""
+"""Pictures, channels and merged cells of a wall, and points on its surface."""
 
 from __future__ import annotations
 
