@@ -280,7 +280,8 @@ def filled_in(text: str, sets: Sets) -> str:
     Args:
         text: text with placeholders `{{part: cell metric}}`, `{{part: cell metric : share}}` for
             per cent, `: mean` without scatter, `: median`, and
-            `{{part: cell metric < cell metric ? text | other text}}`.
+            `{{part: cell metric < cell metric ? text | other text}}`, where COUNTS in a text is
+            replaced by the numbers of rooms in which the first value is smaller.
         sets: for each part, set and room, the numbers by `cell metric`.
     """
     return PLACE.sub(lambda place: _text_of(place[2].strip(), sets[place[1]]), text)
@@ -292,7 +293,11 @@ def _text_of(place: str, sets: Sequence[Sequence[Mapping[str, float]]]) -> str:
         stated, _, otherwise = texts.partition(" | ")
         counts = [counted(*ranking.split(" < "), rooms) for rooms in sets]
         rooms = " and ".join(f"{n_true} of {n_both}" for n_true, n_both in counts)
-        return f"{stated if ranking_holds(counts) else otherwise} ({rooms} rooms)"
+        text = stated if ranking_holds(counts) else otherwise
+        # Without a ranking, the text itself states which of the two the counts refer to.
+        if "COUNTS" in text:
+            return text.replace("COUNTS", f"{rooms} rooms")
+        return f"{text} ({rooms} rooms)"
     key, _, form = place.partition(" : ")
     factor = 100.0 if form == "share" else 1.0
     values = factor * np.abs([room[key] for room in sets[0] if key in room])
@@ -358,7 +363,7 @@ def main() -> None:
     made = (
         f"Measured on {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} ({platform.machine()}, "
         f"{os.cpu_count()} cores, Python {platform.python_version()}). The rooms "
-        f"were generated from two sets of seeds: {', '.join(stated)}"
+        f"were generated from two sets of seeds ({', '.join(stated)})"
     )
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)

@@ -155,7 +155,8 @@ def _check(spec: MethodSpec | KindSpec | ProductSpec) -> None:
     if not (isinstance(spec, MethodSpec) or _KIND.fullmatch(name)):
         raise PluginError(
             "the name of a kind or product must be at most 32 lower-case letters, digits, `_` and "
-            f"`-`, begin with a letter and not be a device name of Windows, got {name!r}"
+            f"`-`, begin with a letter and not be a reserved Windows device name, got "
+            f"{name!r}"
         )
     targets = [] if isinstance(spec, KindSpec) else [spec.target]
     if isinstance(spec, ProductSpec) and spec.publisher:

@@ -330,5 +330,5 @@ def _folder_inside(run: Run, *names: str) -> Path:
 def _refuse_filled(folder: Path) -> None:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ArgumentError(
-            f"{folder} exists already and is not empty: choose another folder with -o, or remove it"
+            f"{folder} already exists and is not empty: choose another folder with -o, or remove it"
         )

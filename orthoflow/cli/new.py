@@ -47,7 +47,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
     from orthoflow.cli.progress import working_on
 
     if output.exists():
-        raise ArgumentError(f"{output} exists already: choose another name with -o")
+        raise ArgumentError(f"{output} already exists: choose another name with -o")
     with working_on("inspecting the files"):
         from orthoflow.workflow.draft import draft_workflow, recognised
 

@@ -343,8 +343,8 @@ def require_orthoimages(run: Run, address: str, wall: int | None) -> None:
         is_wanted = kind == "ortho" and wall in {None, number}
         if is_wanted and not (run.folder / path).exists():
             raise RecordError(
-                f"{path} is missing in {run.folder}, where the run published it: copy it back, or "
-                f"recreate it with `orthoflow replay {shlex.quote(str(run.path))} -o NEW`"
+                f"{path} is missing from {run.folder}, where the run published it: copy it back, "
+                f"or recreate it with `orthoflow replay {shlex.quote(str(run.path))} -o NEW`"
             )
 
 

@@ -356,7 +356,7 @@ class DatasetReader:
             return self._named(_Origin(log=self.log, folder=self.folder))
         if self.log.has((_DATASETS,)):
             form = "a CSV file, or a mapping from names to datasets, as in {hall: {scan: hall.e57}}"
-            self.log.report((_DATASETS,), f"input should be {form}, got {describe(section)}")
+            self.log.report((_DATASETS,), f"must be {form}, got {describe(section)}")
         return {}
 
     def _from_table(self, path: Path, name: str, report: Report) -> dict[str, Dataset]:

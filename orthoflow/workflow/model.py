@@ -48,7 +48,7 @@ DATA: Final = "data"
 SEED: Final = "seed"
 NAME_RULE: Final = (
     "a name starts with a lower-case letter, has at most 32 lower-case letters, digits, - or _, "
-    "and is not a device name of Windows (con, prn, aux, nul, com1, lpt1 ...)"
+    "and is not a reserved Windows device name (con, prn, aux, nul, com1, lpt1 ...)"
 )
 Design = Literal["product", "one-at-a-time"]
 _TIME: Final = re.compile(r"(\d+(?:\.\d+)?) *(s|min|h)")

@@ -372,8 +372,8 @@ def _require_format(file: h5py.File, file_name: str, name: str) -> None:
         found, version = (_short_text(file, one) for one in ("format", "format_version"))
     if found is None or version is None:
         raise UnknownFormatError(
-            f"{file_name} is not a record of orthoflow: it does not declare a format and a "
-            "version; give a run.h5"
+            f"{file_name} is not an orthoflow record: it declares no format or version; "
+            "give a run.h5"
         )
     if found != name:
         raise UnknownFormatError(f"{file_name} must have the format {name}, got {found!r}")

@@ -132,7 +132,7 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("stated", "said"),
     [
-        ({"format": "colmap-db"}, "x.h5 is not a record of orthoflow: it does not declare"),
+        ({"format": "colmap-db"}, "x.h5 is not an orthoflow record: it declares no format"),
         # What a later version writes may be outside this one's format.
         (
             {"format": b"orthoflow-run", "format_version": b"2.0"},

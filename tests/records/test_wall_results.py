@@ -157,7 +157,7 @@ def test_an_orthoimage_that_is_gone_is_asked_for(tmp_path: Path) -> None:
     run = HeldRun(path=tmp_path / "run.h5", record=record([cell("mosaic")], published=files))
     module.require_orthoimages(run, "mosaic", 10)
     for wall in (None, 2):
-        with pytest.raises(RecordError, match=r"wall_2_ortho.tif is missing in .* copy it back"):
+        with pytest.raises(RecordError, match=r"wall_2_ortho.tif is missing from .* copy it back"):
             module.require_orthoimages(run, "mosaic", wall)
     (tmp_path / "products/mosaic").mkdir(parents=True)
     (tmp_path / PUBLISHED[0]).touch()

@@ -136,7 +136,7 @@ def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) 
         (("hall.las", "--recipe", "photos-on-scan"), "the recipe photos-on-scan needs photos"),
         (
             ("hall.las", "-o", "notes.txt"),
-            "notes.txt exists already: choose another name with -o",
+            "notes.txt already exists: choose another name with -o",
         ),
         (("torn.las",), "torn.las"),
     ],

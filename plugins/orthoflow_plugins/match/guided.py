@@ -215,7 +215,7 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
     if not oriented:
         reasons = "; ".join(f"{camera.photo}: {camera.status}" for camera in cameras.cameras[:3])
         raise MethodError(
-            "no photo is oriented, so no photo can be matched at its pose"
+            "no photo is oriented, but guided matching needs the poses of the photos"
             + (f" ({reasons})" if reasons else "")
         )
     return oriented

@@ -111,13 +111,13 @@ class Region(Detector):
 
         preset: Literal["none", "paper"] = Field(
             "none",
-            description="Default values of the other parameters: those of this table, or "
-            "those of markiewicz2015.",
+            description="Default values of the other parameters. none: those of this table; "
+            "paper: those of markiewicz2015.",
         )
         neighbourhood: Literal["cube", "radius", "knn"] = Field(
             "cube",
             description="Points from which a normal is computed. cube: those in a cube; radius: "
-            "in a sphere; knn: in the nearest cells that contain 30 points.",
+            "in a sphere; knn: in the nearest cells that together contain 30 points.",
         )
         neighbourhood_m: Annotated[float, Field(gt=0.0, le=2.0)] | Literal["auto"] = Field(
             "auto",

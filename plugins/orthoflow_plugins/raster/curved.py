@@ -27,7 +27,7 @@ _PLACES: Final = 9
 CONE: Final = DiagnosticSpec(
     code="cone-not-unrolled",
     severity="warning",
-    text="{subject} is a cone, which is not unrolled: it has no wall",
+    text="{subject} is a cone; cones are not unrolled, so no wall is made from it",
 )
 
 

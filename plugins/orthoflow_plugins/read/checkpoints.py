@@ -34,7 +34,7 @@ class ReadCheckpoints(Method):
     metrics = (
         MetricSpec("n_points", label="check points"),
         MetricSpec("n_measured", label="check points measured in images"),
-        MetricSpec("extent_[xyz]_m", label="extent along the world's {0} axis"),
+        MetricSpec("extent_[xyz]_m", label="extent along the world {0} axis"),
     )
     citations: ClassVar[tuple[str, ...]] = ()
 

@@ -67,7 +67,7 @@ class ReadScan(Method):
         MetricSpec("n_stations", label="stations"),
         MetricSpec("n_points_left_out", label="points in the files that are not used"),
         MetricSpec("n_left_out_*", label="points in the files that are not used: {0}"),
-        MetricSpec("extent_[xyz]_m", label="extent along the world's {0} axis"),
+        MetricSpec("extent_[xyz]_m", label="extent along the world {0} axis"),
         MetricSpec("thickness_mm", label="thickness of the cloud in patches of about 10 cm"),
         MetricSpec(
             "thickness_width_mm",

@@ -120,7 +120,7 @@ class SegmentOpenings(Method):
         MetricSpec("openings_share", label="share of the walls that is open"),
         MetricSpec("side_sigma_mm", label="predicted standard deviation of a side, median"),
         MetricSpec("image_side_share", label="share of sides located in the orthoimage"),
-        MetricSpec("n_unbounded", label="open areas rejected by border or shape"),
+        MetricSpec("n_unbounded", label="open areas rejected because of their border or shape"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Pu and Vosselman 2009, doi:10.1016/j.isprsjprs.2009.04.001 (holes of walls as windows)",
