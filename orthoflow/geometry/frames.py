@@ -282,8 +282,8 @@ class WallFrame:
         the top edge. For floors and ceilings, X and Y are the horizontal world axes. Y of a ceiling
         increases with the row number, so that the ceiling can be superimposed on the floor. For
         sloping planes, and if up is unknown, X and Y are distances from the top-left corner.
-        Cylinders with a vertical axis are treated as walls, with heights of the axis; others are
-        treated as sloping planes.
+        Cylinders with a vertical axis are treated as walls, with the heights of the axis; other
+        cylinders are treated as sloping planes.
         """
         if self.map_crs is not None:
             return "map"
@@ -305,7 +305,7 @@ class WallFrame:
             return float(self.origin_world[0]), float(self.origin_world[1])
         if axes == "plane" or self.up is None:
             return 0.0, 0.0
-        # If a tower leans, its edge rises and falls, but the axis has one height at each row.
+        # If a tower leans, the height varies along a row of cells; the height of the axis does not.
         beside = self.origin_world
         if self.bend is not None:
             beside = beside + self.bend.radius_m * self.normal_world
@@ -457,7 +457,7 @@ class WallFrame:
     def met_by(
         self, start_world: NDArray[np.float64], rays: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the points (n, 3) where rays first meet the front of the raster; NaN where not.
+        """Return the points (n, 3) where rays first meet the front of the raster; NaN if they miss.
 
         Args:
             start_world: (3,) start of all rays.
@@ -477,7 +477,7 @@ class WallFrame:
     def _lengths_to_surface(
         self, start_world: NDArray[np.float64], rays: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return lengths (n,) of rays up to the surface that faces them, in lengths of the rays."""
+        """Return distances (n,) along rays to the surface facing them, in units of ray lengths."""
         to_origin = self.origin_world - start_world
         if self.bend is None:
             return np.asarray((to_origin @ self.normal_world) / (rays @ self.normal_world))
@@ -486,13 +486,15 @@ class WallFrame:
         across, beside = from_axis - (from_axis @ axis) * axis, rays - np.outer(rays @ axis, axis)
         a, b = (beside**2).sum(axis=1), beside @ across
         root = np.sqrt(b * b - a * (across @ across - self.bend.radius_m**2))
-        # A cylinder faces rays from inside where they leave it, and others where they enter it.
+        # Rays meet the front of a cylinder where they leave it if it is seen from inside, and where
+        # they enter it if it is seen from outside.
         return np.asarray((-b + math.copysign(1.0, self.bend.radius_m) * root) / a)
 
     def metres_per_cell(self, depths_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sizes (n, 2) of cells along u and v at depths (n,), in metres.
 
-        In front of a cylinder that is seen from inside, cells are shorter along the arc.
+        In front of a cylinder seen from inside, cells are shorter along the arc; in front of one
+        seen from outside, they are longer.
         """
         sizes = np.full((len(depths_m), 2), self.gsd_m)
         if self.bend is not None:
@@ -503,7 +505,7 @@ class WallFrame:
         """Refuse a curved raster where only planes can be processed.
 
         Args:
-            what: what cannot process it, for the message.
+            what: name, for the message, of the method or operation.
 
         Raises:
             GeometryError: the raster is on a cylinder.

@@ -83,7 +83,7 @@ def orthoflow_kinds() -> list[KindSpec]:
     """Return the built-in kinds in order, from scan to inspection."""
     return [
         KindSpec(name="read", summary="files -> products", is_source=True),
-        KindSpec(name="simulate", summary="scenes with exact truth", is_source=True),
+        KindSpec(name="simulate", summary="scenes with ground truth", is_source=True),
         KindSpec(
             name="register",
             summary="transform a cloud into another coordinate system",

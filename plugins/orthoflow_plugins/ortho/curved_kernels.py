@@ -1,8 +1,8 @@
 """Compiled function that finds the cells of an unrolled cylinder that a photo sees.
 
-The axis of the cylinder is the straight direction of the raster. In the plane across it, rays are
-straight lines and depths are distances from the cylinder, so a ray is followed over the relief in
-steps of at most one cell, whose lengths change along the ray.
+The axis of the cylinder is parallel to the straight direction of the raster. In a plane normal to
+the axis, rays are straight lines, and depths are distances from the cylinder. A ray is followed
+over the relief in steps of at most one cell; the lengths of the steps change along the ray.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     WallView,
 )
 
-# Rays are followed again with the highest surface on their way as the new limit.
+# Number of times that the bound of the surface along a ray is refined.
 _ROUNDS: Final = 2
 
 
@@ -35,12 +35,12 @@ class Ray(NamedTuple):
     """A ray from a cell to the camera, relative to the axis of the cylinder.
 
     Attributes:
-        across: position on the tangent at the first cell's edge; `lift` is that along its normal.
-        lift: see across.
-        along: position along the axis, from the first cell's edge.
-        to_across: vector to the camera; `to_lift` and `to_along` likewise.
-        to_lift: see to_across.
-        to_along: see to_across.
+        across: coordinate along the tangent at the first edge of the raster, in metres.
+        lift: coordinate along the normal there, in metres.
+        along: coordinate along the axis from the first edge of the raster, in metres.
+        to_across: component of the vector to the camera along the tangent.
+        to_lift: component of this vector along the normal.
+        to_along: component of this vector along the axis.
     """
 
     across: float
@@ -60,7 +60,7 @@ def look_at_curved_cells(
     first_row: int,
     first_column: int,
 ) -> None:
-    """Project the cells of a tile into a photo and find those that it sees.
+    """Project the cells of a tile into a photo and find those that the photo sees.
 
     Args:
         view: the camera in the axes at the top-left corner of a curved wall.
@@ -127,7 +127,7 @@ def look_at_curved_cells(
 
 @inlined
 def _depth_at(ray, share, radius_m):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Return the depth of a ray at a share of its length."""
+    """Return the depth of the ray at a share of its length."""
     across, lift = ray.across + share * ray.to_across, ray.lift + share * ray.to_lift
     away = math.sqrt(across * across + lift * lift)
     return radius_m - (away if radius_m > 0.0 else -away)
@@ -135,7 +135,7 @@ def _depth_at(ray, share, radius_m):  # type: ignore[no-untyped-def]  # numba in
 
 @kernel_part
 def _place_at(ray: Ray, share: float, view: WallView, relief: Relief) -> tuple[float, float]:
-    """Return row and column of a ray at a share of its length, 0 at the first centre."""
+    """Return the row and column of a ray at a share of its length; (0, 0) is the first centre."""
     across, lift = ray.across + share * ray.to_across, ray.lift + share * ray.to_lift
     n_bent = relief.depth.shape[1] if view.is_along_u else relief.depth.shape[0]
     side, middle = math.copysign(1.0, view.radius_m), 0.5 * n_bent * view.gsd_m / view.radius_m
@@ -201,7 +201,7 @@ def _is_behind_the_wall(view: WallView, relief: Relief, ray: Ray) -> bool:
 
 @kernel_part
 def _highest_in_the_way(view: WallView, relief: Relief, ray: Ray, depth: float) -> float:
-    """Return an upper bound of the surface up to where a ray is above all of it."""
+    """Return an upper bound of the surface along the part of a ray that it may interrupt."""
     top, n_rows, n_columns = relief.highest_m, relief.depth.shape[0], relief.depth.shape[1]
     row, column = _place_at(ray, 0.0, view, relief)
     for _ in range(_ROUNDS):

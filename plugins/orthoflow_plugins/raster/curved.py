@@ -1,4 +1,4 @@
-"""Walls on cylinders: their grids, their extents and their points, unrolled onto a plane."""
+"""Walls on cylinders: their grids and extents, and their points, unrolled onto a plane."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from orthoflow_plugins.raster.parameters import RasterParams
 _UPRIGHT_COSINE: Final = math.sqrt(0.5)
 # Maximum depth towards the axis, as a share of the radius; at the axis, cells have no width.
 _RADIUS_SHARE: Final = 0.8
-# A plane belongs to the relief of a cylinder if at least this share of it is in its buffer.
+# A plane belongs to the relief of a cylinder if at least this share of the plane is in the
+# cylinder's buffer.
 _COVERED_SHARE: Final = 0.8
 _PLACES: Final = 9
 CONE: Final = DiagnosticSpec(
@@ -106,7 +107,7 @@ def limits_m(frame: WallFrame) -> tuple[float, float]:
 
 
 def flattened(cloud: PointCloud, slab: Slab) -> tuple[PointCloud, Slab]:
-    """Return a cloud and a slab, unrolled onto a plane if the wall is curved, else unchanged."""
+    """Return a cloud and a slab; if the wall is curved, both are unrolled onto a plane."""
     if slab.frame.bend is None:
         return cloud, slab
     near = unrolled(cloud, slab)
@@ -135,8 +136,8 @@ def _frame_of(
     """Return the grid over a cylinder's points, widened on all sides.
 
     An upright axis is vertical in the image, as a person in front of the wall sees it. The axis of
-    a vault points right, as if the walls below the vault continued upwards, so its springing lines
-    are the upper and lower edges of the image.
+    a vault points to the right, so that its springing lines are the upper and lower edges of the
+    image.
     """
     axis, radius_m, gsd_m = shape.axis_world, shape.radius_m, params.gsd_m
     is_upright = abs(float(axis @ up)) >= _UPRIGHT_COSINE
@@ -158,7 +159,7 @@ def _frame_of(
     normal = -outwards if shape.is_concave else outwards
     u = np.cross(normal, straight) if is_upright else straight
     arc_m, length_m = (end_rad - start_rad) * radius_m, high_m - low_m
-    # A full turn contains only whole cells.
+    # The cells must not exceed a full turn.
     n_arc = min(math.ceil(arc_m / gsd_m - 1e-6), math.floor(math.tau * radius_m / gsd_m + 1e-6))
     n_along = math.ceil(length_m / gsd_m - 1e-6)
     east, north, top = up.tolist()

@@ -36,7 +36,7 @@ from orthoflow_plugins.simulate.photographs import (
 if TYPE_CHECKING:
     from orthoflow_plugins.simulate.deliverables import Delivery
 
-# Range of elevations that the scanner measures, which includes vaults above the scanner.
+# Range of elevations that the scanner measures; it includes vaults above the scanner.
 _LOWEST_RAD: Final = math.radians(-60.0)
 _HIGHEST_RAD: Final = math.radians(88.0)
 # Distance from the scanner at which the point spacing is `scan_step_m`.

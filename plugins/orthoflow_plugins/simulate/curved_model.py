@@ -70,14 +70,14 @@ class Building:
     """A finished building.
 
     Attributes:
-        scene: its surfaces.
+        scene: the surfaces of the building.
         planes: its large planes; `scene.plane_index` is an index into them.
         cylinders: its cylindrical surfaces.
         on_cylinder: (r,) index of the cylinder that contains each rectangle of the scene; -1 for
             none.
         stations: (s, 3) positions from which it is scanned.
-        photographed: targets of photos: for each, a point, the normal at this point, and the
-            distance of the camera.
+        photographed: for each photo, the point at which it is aimed, the normal at this point, and
+            the distance of the camera.
     """
 
     scene: Scene
@@ -232,7 +232,7 @@ def _turned(true: TrueCylinder, turn: NDArray[np.float64]) -> TrueCylinder:
 
 
 def _targets(bend: _Bend) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
-    """Yield a grid of targets: at least three along the arc, and at least two along the axis."""
+    """Yield a grid of photo targets: at least three along the arc and two along the axis."""
     true, radius_m = bend.true_cylinder(), bend.shape.radius_m
     distance_m = min(0.9 * radius_m, 3.0) if bend.shape.is_concave else 3.0
     n_along = max(2, math.ceil((true.along_m[1] - true.along_m[0]) / 1.5))

@@ -10,7 +10,7 @@ class SurfaceCone(Detector):
     """Find cones with half angles of 1 to about 35 degrees and arcs of at least 40 degrees.
 
     The search is that of `surface.cylinder`, whose hypotheses are cylinders that touch the cone;
-    in the fits, the radius changes along the axis. Half angles below 1 degree are cylinders.
+    in the fits, the radius changes along the axis. Surfaces with smaller half angles are cylinders.
     """
 
     id = "surface.cone"

@@ -14,12 +14,12 @@ class SurfaceCylinder(Detector):
     defines an axis, a centre and a radius. The cylinder with which most pairs agree is fitted to
     the voxels and tested. Coarse voxels are used to find large radii, and fine voxels to find
     columns. All surfaces are then fitted to the means of all points in small cells, with Tukey's
-    weights, so mouldings and furniture have no influence. Neighbouring points have common errors,
-    so the covariance is computed from the scatter between tiles of cells.
+    weights, so mouldings and furniture do not affect the fit. Neighbouring points have common
+    errors, so the covariance is computed from the scatter between tiles of cells.
 
-    A cylinder is rejected if its arc or area is small, if its normals do not rotate with the angle
-    (as on flat facets and in corners of a room), if its scatter is large relative to its radius, or
-    if it is also curved along its axis (as a dome is). Diagnostics state these values.
+    A cylinder is rejected if its arc or area is too small, if its normals do not rotate with the
+    angle (as on flat facets and in corners of a room), if its scatter is large relative to its
+    radius, or if it is also curved along its axis (as a dome is). Diagnostics state these values.
 
     If labels of planes are given, the points of planes are excluded, except those of planes that
     are strips of a curved surface, i.e. whose sagitta exceeds their noise.

@@ -1,4 +1,4 @@
-"""The order of work of a detection: sample, planes, voxels, search, fit to all points, tests."""
+"""Detection of curved surfaces: sampling, planes, voxels, search, fit to all points, and tests."""
 
 from __future__ import annotations
 
@@ -26,20 +26,22 @@ from orthoflow_plugins.surface.search import (
 from orthoflow_plugins.surface.strips import PlaneTest, tested_planes
 from orthoflow_plugins.surface.voxels import Sample, Voxels, draw_sample, in_voxels, noise_of
 
-# Smallest voxels: in metres, and in multiples of the noise and of the spacing of the sample.
+# Minimum size of the smallest voxels: in metres, in multiples of the noise, and in multiples of the
+# point spacing of the sample.
 _VOXEL_M: Final = 0.04
 _VOXEL_NOISES: Final = 3.0
 _VOXEL_SPACINGS: Final = 2.0
-# Voxels in which noise and spacing are measured.
+# Size of the voxels in which noise and spacing are measured.
 _FIRST_VOXEL_M: Final = 0.1
 _FIRST_POINTS: Final = 60_000
-# Gaps of an arc up to this angle, such as windows, belong to the surface.
+# Gaps up to this angle, such as windows, belong to the arc of a surface.
 _BRIDGED_RAD: Final = math.radians(15.0)
 _LEAST_POINTS: Final = 100
-# A surface found among voxels is wrong if the fit to all points moves it by more than the tolerance
-# times this factor.
+# A surface found among voxels is rejected if the fit to all points moves it by more than the
+# tolerance times this factor.
 _LARGEST_SHIFT: Final = 1.0
-# Generatrices of a cylinder are parallel to its axis within one degree, those of a cone are not.
+# A surface is a cylinder if its generatrices are parallel to its axis to within this angle, and
+# otherwise a cone.
 _CYLINDER_SLOPE: Final = math.radians(1.0)
 _OUTSIDE_RAD: Final = math.radians(200.0)
 
@@ -51,11 +53,11 @@ class Detection:
     Attributes:
         surfaces: the surfaces, in descending order of their numbers of points.
         fitted: their fits, in the same order.
-        accepted: what was found among voxels, in the same order.
-        labels: (n,) int16 surface of each point, -1 for none.
+        accepted: the surfaces as found among voxels, in the same order.
+        labels: (n,) int16 index of the surface of each point; -1 for none.
         plane_tests: tests of the given planes.
-        rejected: hypotheses that were no surfaces.
-        noise_m: standard deviation of points across surfaces.
+        rejected: hypotheses that failed the tests.
+        noise_m: standard deviation of the points, normal to the surfaces.
         voxel_m: size of the smallest voxels.
     """
 
@@ -83,11 +85,11 @@ def detect(
 
     Args:
         cloud: the cloud.
-        plane_index: (n,) plane of each point, -1 for none, or None.
+        plane_index: (n,) index of the plane of each point, -1 for none; or None without planes.
         params: parameters of the search.
         rng: random generator for pairs of voxels.
-        progress: receives the share that is done and a text.
-        is_cone: whether to search cones instead of cylinders.
+        progress: receives the completed share of the work, and a text.
+        is_cone: whether to search for cones instead of cylinders.
         cores: number of threads.
     """
     progress(0.0, "sample")
@@ -169,18 +171,18 @@ def detect(
 def _levels(
     sample: Sample, cloud: PointCloud, params: DetectorParams
 ) -> tuple[list[tuple[float, Voxels]], float]:
-    """Return voxels of several sizes, descending, and the noise of the cloud."""
+    """Return voxels of several sizes, largest first, and the noise of the cloud."""
     if len(sample) < _LEAST_POINTS:
         return [], 0.0
     every = max(1, len(sample) // _FIRST_POINTS)
     first = in_voxels(sample.take(slice(None, None, every)), _FIRST_VOXEL_M)
     noise_m = noise_of(first.voxels(cloud, BLOCK_VOXELS))
-    # The points of a voxel on a surface cover about the square of its size.
+    # On a surface, the points of a voxel cover an area of about the square of its size.
     per_voxel = max(1.0, every * len(first.index) / first.count)
     spacing_m = _FIRST_VOXEL_M / math.sqrt(per_voxel)
     grid = in_voxels(sample, max(_VOXEL_M, _VOXEL_NOISES * noise_m, _VOXEL_SPACINGS * spacing_m))
     levels: list[tuple[float, Voxels]] = []
-    # The next size finds radii of at most twice those of the last one.
+    # Voxels of the next size are used to find radii up to twice as large.
     while not levels or MOST_RADIUS * levels[-1][0] < params.max_radius_m:
         levels.append((grid.size_m, grid.voxels(cloud, BLOCK_VOXELS, noise_m)))
         grid = grid.coarser()
@@ -188,7 +190,7 @@ def _levels(
 
 
 def _with_side(fitted: FittedSurface, *, is_oriented: bool) -> Surface:
-    """Return a surface whose side is assumed from its arc if no stations are known."""
+    """Return the surface; if no stations are known, its side is assumed from its arc."""
     surface = fitted.surface
     if is_oriented:
         return surface

@@ -1,4 +1,4 @@
-"""Base class of the detectors: ports, parameters, metrics, diagnostics and the order of work."""
+"""Base class of the detectors of curved surfaces."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SIDE_GUESSED: Final = DiagnosticSpec(
 
 
 class DetectorIn(Ports):
-    """The cloud, and the planes of its points if known."""
+    """The cloud and, if known, the planes of its points."""
 
     cloud: PointCloud
     labels: PointLabels | None = None

@@ -1,4 +1,4 @@
-"""Fit of surfaces to all points of a cloud, by the means of cells, with covariances."""
+"""Fits surfaces, with covariances, to the means of all points of a cloud in small cells."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from orthoflow_plugins.surface.kernels import Cells, sum_cells
 from orthoflow_plugins.surface.rounds import design, robust_solution
 from orthoflow_plugins.surface.search import Found, longest_gap
 
-# Cells of a surface: smallest size, and largest number.
+# Minimum size and maximum number of the cells of a surface.
 _CELL_M: Final = 0.03
 _MOST_CELLS: Final = 30_000
 _LEAST_CELLS: Final = 8
-# The sums of a fixed number of parts do not depend on the number of threads.
+# Number of parts of the sums; it is fixed, so that the sums do not depend on the number of threads.
 _PARTS: Final = 4
-# Sums use distances up to this many standard deviations.
+# Maximum distance, in standard deviations, of the points that are summed.
 _SUM_SIGMAS: Final = 5.0
 _LEAST_SUM_M: Final = 0.012
-# Sizes of the tiles, in cells, whose scatter gives the covariance.
+# Sizes, in cells, of the tiles from whose scatter the covariance is estimated.
 _TILES: Final = (1, 4, 16)
 _OPEN_SHARE: Final = 0.15
-# Cells beside others without weight are left out if at least this share remains.
+# Cells adjacent to cells without weight are ignored if more than this share of all cells remains.
 _LEAST_USED: Final = 0.4
-# Cells belong to the extent if their mean is within this many standard deviations, and a slack.
+# A cell belongs to the extent if its mean distance is within this many standard deviations plus a
+# tolerance.
 _EXTENT_SIGMAS: Final = 3.0
 _EXTENT_SLACK_M: Final = 0.001
 
@@ -45,12 +46,13 @@ class FittedSurface:
     Attributes:
         surface: the surface, without a name.
         cell_scatter_m: scatter of the means of cells beyond the noise of points.
-        noise_m: standard deviation of points inside cells.
-        counts: (around, along) points of each cell.
+        noise_m: standard deviation of the points within cells.
+        counts: (around, along) number of points in each cell.
         means_m: (around, along) mean distance of each cell from the surface, positive towards the
             viewer; NaN for empty cells.
-        shift_m: largest change from the surface found among voxels.
-        slope: change of the radius per metre along the axis that a cylinder does not have.
+        shift_m: maximum displacement from the surface found among voxels.
+        slope: change of the radius per metre along the axis if a cone is fitted to a cylinder's
+            cells; 0 for cones.
     """
 
     surface: Surface
@@ -122,7 +124,7 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
         radius_m = item.round.radius_m
         area_m2 = 2.0 * math.pi * radius_m * (high_m - low_m) * float(item.is_open.mean())
         size_m = max(_CELL_M, math.sqrt(area_m2 / _MOST_CELLS))
-        # A whole number of cells for each part of the circle that may be open.
+        # Each part of the circle that may be open contains a whole number of cells.
         n_open = len(item.is_open)
         around = n_open * max(1, round(2.0 * math.pi * radius_m / size_m / n_open))
         along = max(_LEAST_CELLS, round((high_m - low_m) / size_m))
@@ -158,7 +160,7 @@ def _fitted(
     matrix = design(angles, places, found.round.steepness, is_cone=is_cone)
     variances = max(noise_m, 1e-5) ** 2 / n
     _, weights, _ = robust_solution(matrix, means, variances)
-    # Cells beside those without weight contain a few points of mouldings and edges, too.
+    # Cells adjacent to those without weight also contain a few points of mouldings and edges.
     is_out = np.zeros((around, along), dtype=np.bool_)
     is_out[i, j] = weights == 0.0
     is_in = ~ndimage.binary_dilation(is_out, np.ones((3, 3), dtype=np.bool_))[i, j]
@@ -185,7 +187,7 @@ def _fitted(
     largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
     is_on[i, j] = np.abs(rest) < largest_m
     arc, ends = _extent(is_on)
-    # Positions along a cone count from its apex.
+    # Positions along the axis of a cone are measured from its apex.
     start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
     surface = Surface(
         name="",
@@ -209,7 +211,7 @@ def _fitted(
 
 
 def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.float64]:
-    """Return the covariance after the point of the axis has moved along it."""
+    """Return the covariance after the surface's point has moved along the axis."""
     turn = np.eye(len(own))
     turn[0, 2] = turn[1, 3] = along_m
     if len(own) > 5:
@@ -223,10 +225,10 @@ def _covariance(
     weights: NDArray[np.float64],
     cell: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> NDArray[np.float64]:
-    """Return the covariance of the parameters from the scatter of tiles.
+    """Estimate the covariance of the parameters from the scatter between tiles.
 
-    Neighbouring cells share errors, so tiles of several sizes are used; the largest result counts
-    (White's estimator with clusters).
+    Neighbouring cells have common errors, so tiles of several sizes are used, and the largest
+    covariance is returned (White's estimator with clusters).
     """
     inverse = np.linalg.pinv(matrix.T @ (matrix * weights[:, None]), hermitian=True)
     best = np.zeros_like(inverse)
@@ -245,10 +247,10 @@ def _covariance(
 
 
 def _extent(is_full: NDArray[np.bool_]) -> tuple[tuple[float, float], tuple[int, int]]:
-    """Return the range of angles, and first and last + 1 cell along the axis, with points."""
+    """Return the ranges of angles and of cells along the axis (end exclusive) with points."""
     length = float(np.quantile(is_full.sum(axis=1), 0.95))
     is_open = is_full.sum(axis=1) >= max(1.0, _OPEN_SHARE * length)
-    # Single columns are clutter.
+    # Isolated columns are clutter.
     count = len(is_open)
     wide = ndimage.binary_opening(np.tile(is_open, 3), np.ones(3, dtype=np.bool_))
     is_open = wide[count : 2 * count] if wide.any() else is_open

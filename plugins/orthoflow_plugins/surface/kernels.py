@@ -1,4 +1,4 @@
-"""Kernels of the detectors: voxels and their normals, votes of hypotheses, cells on surfaces.
+"""Kernels of the detectors: voxels and their normals, votes for hypotheses, and cells of surfaces.
 
 A surface of revolution is a row of 12 numbers: point of the axis (3), axis (3), the direction of
 angle 0 (3), radius at the point, change of the radius along the axis, and 1 / sqrt(1 + change^2).
@@ -52,7 +52,7 @@ def _find(keys: NDArray[np.int64], i: int, j: int, k: int) -> np.int64:
 
 @kernel_part
 def _voxel_at(table: VoxelTable, count: int, i: int, j: int, k: int) -> np.int64:
-    """Return the index of a voxel, which is `count` and is added if it is new."""
+    """Return the index of a voxel; a new voxel is added with the index `count`."""
     entry = _find(table.keys, i, j, k)
     if table.keys[entry] == -1:
         table.keys[entry] = (i << (2 * _KEY_BITS)) | (j << _KEY_BITS) | k
@@ -92,7 +92,7 @@ def fill_voxels(
 
 @compiled
 def merge_voxels(fine: VoxelTable, n_fine: int, coarse: VoxelTable) -> int:
-    """Join voxels to voxels of twice the size; return their number."""
+    """Merge voxels into voxels of twice the size, and return the number of these."""
     count = 0
     for f in range(n_fine):
         i, j, k = fine.places[f, 0], fine.places[f, 1], fine.places[f, 2]
@@ -109,12 +109,12 @@ def merge_voxels(fine: VoxelTable, n_fine: int, coarse: VoxelTable) -> int:
 def find_normals(
     table: VoxelTable, n_voxels: int, normals: NDArray[np.float64], spreads: NDArray[np.float64]
 ) -> None:
-    """Find the normals (v, 3) of voxels from the points of 27 voxels each.
+    """Compute the normal of each voxel from the points of the voxel and its 26 neighbours.
 
     Args:
         table: the voxels.
         n_voxels: their number.
-        normals: output, unit vectors.
+        normals: output (v, 3), unit vectors.
         spreads: output (v, 4): standard deviations along the normal and along the two principal
             directions of the surface, ascending, and the number of points.
     """
@@ -186,9 +186,9 @@ def count_votes(
 
     Args:
         guesses: point of the axis (3), axis (3), radius, side (1, -1 or 0) of each hypothesis.
-        max_turn: largest sine of the angle between two axes.
-        max_ratio: largest difference of two radii, as a share of the larger one.
-        max_miss: largest distance of a point from the other axis, as a share of the radius.
+        max_turn: maximum sine of the angle between two axes.
+        max_ratio: maximum difference between two radii, as a share of the larger one.
+        max_miss: maximum distance of a point from the other axis, as a share of the radius.
         votes: (h,) output.
     """
     count = guesses.shape[0]
@@ -215,7 +215,7 @@ def count_votes(
 
 
 class Cells(NamedTuple):
-    """Cells over the surfaces, and sums of the points in them.
+    """The grids of cells on the surfaces.
 
     Attributes:
         rounds: (s, 12) the surfaces.
@@ -249,8 +249,8 @@ def _quick_angle(sine: float, cosine: float) -> float:
 
 @kernel_part
 def _cell_at(cells: Cells, s: int, x: float, y: float, z: float, along: float) -> int:
-    """Return the cell of a place relative to the point of a surface, -1 if not accepted there."""
-    # Rows as arrays would be reference-counted at each use.
+    """Return the cell of a position relative to the surface's point; -1 if it is excluded."""
+    # Arrays of rows would be reference-counted at each use.
     r = cells.rounds
     cosine = x * r[s, 6] + y * r[s, 7] + z * r[s, 8]
     sine = (
@@ -270,7 +270,7 @@ def _cell_at(cells: Cells, s: int, x: float, y: float, z: float, along: float) -
 def _distance_of_plane(
     index: int, planes: NDArray[np.float64], x: float, y: float, z: float
 ) -> float:
-    """Return the distance of a point from its plane; inf if it has none, or a curved one."""
+    """Return the distance of a point from its plane; inf if it has none or the plane is curved."""
     if index < 0:
         return math.inf
     distance = planes[index, 0] * x + planes[index, 1] * y + planes[index, 2] * z
@@ -288,7 +288,7 @@ def sum_cells(
     labels: NDArray[np.int16],
     counts: NDArray[np.int64],
 ) -> None:
-    """Label points by the nearest surface, and sum their distances in its cells.
+    """Label each point with the nearest surface, and sum the distances of the points in each cell.
 
     Args:
         offsets: the points.

@@ -1,4 +1,4 @@
-"""Surfaces of revolution with straight generatrices: cylinders, and cones by a slope."""
+"""Surfaces of revolution with straight generatrices: cylinders and cones."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from orthoflow.geometry.surfaces import along_and_across, zero_direction
 # Tukey's constant, in standard deviations, and the number of iterations.
 _TUKEY: Final = 4.685
 _ROUNDS: Final = 12
-# The iteration ends when the solution changes by less than this, metres or radians.
+# The iteration ends when the solution changes by less than this (metres or radians).
 _SETTLED: Final = 1e-8
 # The scatter is estimated from about this many observations.
 _SCATTER_SAMPLE: Final = 4_000
-# A fit among voxels uses at most this many.
+# Maximum number of voxels in a fit.
 _MOST_VOXELS: Final = 3_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Round:
-    """A cylinder, or a cone if the radius changes along the axis.
+    """A cylinder or, if the radius changes along the axis, a cone.
 
     Attributes:
         point: (3,) float64 point of the axis, metres from the cloud's origin.
@@ -45,7 +45,7 @@ class Round:
         return 1.0 / math.hypot(1.0, self.slope)
 
     def row(self, zero: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the numbers (12,) for kernels; angles count from a direction (3,)."""
+        """Return the row (12,) for kernels; angles are measured from the direction `zero` (3,)."""
         numbers = (self.radius_m, self.slope, self.steepness)
         return np.concatenate([self.point, self.axis, zero, numbers])
 
@@ -68,7 +68,7 @@ class Round:
         return np.arctan2(sine, relative @ zero), relative @ self.axis
 
     def corrected(self, zero: NDArray[np.float64], change: NDArray[np.float64]) -> Round:
-        """Return the surface with the parameters of `design` changed."""
+        """Return the surface after a change of the parameters of `design`."""
         aside = np.cross(self.axis, zero)
         axis = self.axis + change[2] * zero + change[3] * aside
         return Round(
@@ -87,9 +87,9 @@ class Round:
         )
 
     def directed(self, up: NDArray[np.float64]) -> Round:
-        """Return the same surface with the direction of the axis that `Surface.shape` states.
+        """Return the same surface with the axis in the direction that `Surface.shape` requires.
 
-        The axis of a cone opens away from its apex.
+        The axis of a cone points from its apex to its wider end.
         """
         along = basis_from_up(up) @ self.axis
         steep = abs(along[2]) >= math.sqrt(0.5)
@@ -99,7 +99,7 @@ class Round:
         return self
 
     def shape(self, origin: NDArray[np.float64], *, is_concave: bool) -> Cylinder | Cone:
-        """Return the surface in world coordinates, a cylinder if its radius does not grow."""
+        """Return the surface in world coordinates: a cylinder if the radius does not increase."""
         if self.slope <= 0.0:
             return Cylinder(
                 point_world=origin + self.point,
@@ -136,7 +136,7 @@ class Round:
 def design(
     angles: NDArray[np.float64], along: NDArray[np.float64], steepness: float, *, is_cone: bool
 ) -> NDArray[np.float64]:
-    """Return the derivatives (n, 5 or 6) of positions of the surface along its normal.
+    """Return the derivatives (n, 5 or 6) of the surface's displacement along its normal.
 
     The parameters are the displacement of the axis (2), its tilt (2), the radius, and, for cones,
     the slope.
@@ -156,7 +156,7 @@ def robust_solution(
     Args:
         matrix: (n, k) design.
         distances: (n,) observations.
-        variances: (n,) variances of the measurement; the scatter beyond them is estimated.
+        variances: (n,) variances of the observations; additional scatter is estimated.
 
     Returns:
         The solution (k,), the weights (n,), and the standard deviation of the additional scatter.

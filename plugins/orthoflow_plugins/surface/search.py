@@ -1,9 +1,10 @@
 """Search for cylinders and cones among voxels, from coarse to fine.
 
 Two normals that are not parallel give an axis, perpendicular to both, and the circle around it on
-which both points lie with their normals (the great circle on the Gauss sphere and the vote of a
-circle in one). Hypotheses of pairs from one surface agree with each other; those across edges and
-clutter do not. The hypothesis with the most votes is fitted to all voxels and tested.
+which both points lie with their normals. This combines the search for a great circle on the Gauss
+sphere with the votes for a circle. Hypotheses of pairs from one surface agree with each other;
+those across edges and clutter do not. The hypothesis with the most votes is fitted to all voxels
+and tested.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from orthoflow_plugins.surface.kernels import count_votes
 from orthoflow_plugins.surface.rounds import Round, fitted
 from orthoflow_plugins.surface.voxels import Voxels
 
-# Size of a block of voxels; partners are at most two blocks apart.
+# Size of a block, in voxels. The two voxels of a pair are in the same block or in adjacent ones.
 BLOCK_VOXELS: Final = 6
-# Radii searched with one voxel size, in voxels.
+# Range, in voxels, of the radii searched with one voxel size.
 LEAST_RADIUS: Final = 3.5
 MOST_RADIUS: Final = 30.0
 # A surface found among coarse voxels is tested again among voxels of this share of its radius.
@@ -48,24 +49,25 @@ _MIDDLE_COSINE: Final = math.cos(math.radians(14.0))
 _LEAST_VOTES: Final = 6
 _LEAST_VOTE_SHARE: Final = 0.008
 _MOST_TRIES: Final = 10
-# Largest angles between the normals of voxels and of the surface, in the first and last iteration.
+# Maximum angles between the normals of voxels and those of the surface, in the first and last
+# iterations.
 _NORMAL_DEG: Final = (28.0, 15.0)
 _ITERATIONS: Final = 4
 _LEAST_VOXELS: Final = 30
-# Parts of a surface with fewer voxels than this share of the largest one are clutter.
+# Parts of a surface are clutter if they have fewer voxels than this share of the largest part.
 _PART_SHARE: Final = 0.2
-# A column of cells belongs to the arc if this share of the surface's length is occupied.
+# A column of cells belongs to the arc if it is occupied over this share of the surface's length.
 _OPEN_SHARE: Final = 0.15
 _FILLED_LEAST: Final = 0.3
-# Largest scatter of voxels, as a share of the radius, and largest ratio of the two curvatures.
+# Maximum scatter of voxels, as a share of the radius, and maximum ratio of the two curvatures.
 _ROUGHEST_SHARE: Final = 0.02
 _DOUBLY_CURVED: Final = 0.3
-# On a surface, normals turn by as much as the angle; on flat facets they do not.
+# On a curved surface, normals rotate by as much as the angle; on flat facets, they do not.
 _LEAST_TURNING: Final = 0.5
 _FACET_RAD: Final = (math.radians(12.0), math.radians(45.0))
 _FACET_VOXELS: Final = 4.0
 _SECTOR_VOXELS: Final = 8
-# Flat sectors, such as walls below a vault, are left out unless most voxels are in such sectors.
+# Flat sectors, such as walls below a vault, are ignored unless most voxels are in such sectors.
 _MOST_FLAT: Final = 0.7
 _STEEPEST: Final = 1.5
 
@@ -80,7 +82,7 @@ class Limits:
         radius_m: smallest and largest radius.
         min_arc_rad: shortest arc.
         min_area_m2: smallest area.
-        is_cone: whether cones are searched.
+        is_cone: whether to search for cones instead of cylinders.
     """
 
     tolerance_m: float
@@ -91,7 +93,7 @@ class Limits:
     is_cone: bool
 
     def tolerance_at(self, radius_m: float) -> float:
-        """Return the tolerance for a surface; narrow columns have a smaller one."""
+        """Return the tolerance for a surface; it is smaller for narrow columns."""
         return min(self.tolerance_m, 0.1 * radius_m + 3.0 * self.noise_m)
 
 
@@ -106,7 +108,7 @@ class Found:
             their signs are arbitrary.
         is_open: (a,) bool, parts of the circle from angle -pi that have voxels.
         along_m: range along the axis, with a margin of one cell.
-        evidence: numbers of the tests.
+        evidence: values determined by the tests.
     """
 
     round: Round
@@ -119,7 +121,7 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True)
 class Rejected:
-    """A hypothesis that is no surface: the reason, and the numbers of the tests."""
+    """A hypothesis that failed the tests: the reason, and the values determined by the tests."""
 
     reason: str
     evidence: dict[str, float]
@@ -137,11 +139,11 @@ def search(
     """Find surfaces in voxels of several sizes.
 
     Args:
-        levels: sizes of voxels, descending, and the voxels.
+        levels: voxels of several sizes, each with its size, largest first.
         limits: limits of the search.
         up: (3,) unit vector.
         rng: random generator for the pairs.
-        progress: receives the share that is done, 0.2 to 0.8, and a text.
+        progress: receives the completed share of the work (0.2 to 0.8), and a text.
         is_oriented: whether the normals point to the viewer.
     """
     found: list[Found] = []
@@ -196,7 +198,7 @@ def _suited(levels: list[tuple[float, Voxels]], radius_m: float) -> tuple[float,
 
 
 def _is_fringe(new: Found, old: Found) -> bool:
-    """Return whether a surface consists of points around another one, such as noise and relief."""
+    """Return whether a surface consists of noise or relief near another surface."""
     row = [np.append(item.round.point, item.round.axis) for item in (new, old)]
     ends = [np.append(item.round.radius_m, item.side) for item in (new, old)]
     one, other = (np.concatenate(pair) for pair in zip(row, ends, strict=True))
@@ -235,7 +237,7 @@ def _hypotheses(
     p, q = voxels.points[first], voxels.points[second]
     n, m = voxels.normals[first], voxels.normals[second]
     if not is_oriented:
-        # The signs of normals are arbitrary; those of a circle are symmetric to the chord.
+        # The signs of the normals are arbitrary. Normals of a circle are symmetric about the chord.
         chord = q - p
         outwards = np.sign(np.einsum("ij,ij->i", n, chord))
         inwards = np.sign(np.einsum("ij,ij->i", m, chord))
@@ -279,9 +281,9 @@ def _have_middles(
     voxels: Voxels,
     voxel_m: float,
 ) -> NDArray[np.bool_]:
-    """Return a mask (h,) of hypotheses with a voxel in the middle of the arc between their ends.
+    """Return a mask (h,) of hypotheses with a voxel in the middle of the arc between their pair.
 
-    Two walls have none where their pair would have a circle.
+    If the two voxels are on different walls, there is no voxel there.
 
     Args:
         guesses: (h, 8) hypotheses.
@@ -355,7 +357,7 @@ def _tested(
     limits: Limits,
     up: NDArray[np.float64],
 ) -> Found | Rejected:
-    """Fit a surface to voxels and test whether it is one."""
+    """Fit a surface to voxels and test it."""
     found, side = start
     last_m = limits.tolerance_at(found.radius_m)
     first_m = max(2.0 * last_m, 0.15 * found.radius_m)
@@ -400,7 +402,7 @@ def _members(
 def _grid(
     angles: NDArray[np.float64], along: NDArray[np.float64], found: Round, voxel_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, int], float]:
-    """Return the cells of places on a surface: column around, row along, shape, and cell size."""
+    """Return the cells (column around, row along) of positions, grid shape and cell size."""
     size_m = 1.5 * voxel_m
     n_around = max(12, round(2.0 * math.pi * found.radius_m / size_m))
     column = ((angles / (2.0 * math.pi) + 0.5) * n_around).astype(np.int64)
@@ -411,7 +413,7 @@ def _grid(
 def _connected(
     angles: NDArray[np.float64], along: NDArray[np.float64], found: Round, voxel_m: float
 ) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the places in large connected parts; gaps of two cells are bridged."""
+    """Return a mask (n,) of positions in large connected parts; gaps of two cells are bridged."""
     column, row, (n_around, n_along), _ = _grid(angles, along, found, voxel_m)
     counts = np.zeros((n_around, n_along), dtype=np.int64)
     np.add.at(counts, (column, row), 1)
@@ -423,7 +425,7 @@ def _connected(
     own = np.maximum(parts[column, row], 0)
     again = parts[column + n_around, row]
     for _ in range(2):
-        # Parts of the two copies that share a cell are the same.
+        # Parts of the two copies are the same part if they share a cell.
         lookup = np.arange(parts.max() + 1)
         np.minimum.at(lookup, again, own)
         own, again = lookup[own], lookup[again]
@@ -457,7 +459,7 @@ def _judged(
     arc_rad = 2.0 * math.pi * (1.0 - longest_gap(is_open) / len(is_open))
     distances, _ = found.outwards(voxels.points)
     cells = occupied[is_open][:, ends[0] : ends[-1] + 1]
-    # The rise of the middle of the surface over its ends decides between a cylinder and a dome.
+    # The rise of the middle of the surface above its ends distinguishes a dome from a cylinder.
     reach = along - along.mean()
     square = reach**2 - np.mean(reach**2)
     bend = float(square @ distances / max(1e-12, square @ square))
@@ -498,7 +500,7 @@ def _judged(
 def _turning(
     found: Round, zero: NDArray[np.float64], voxels: Voxels, voxel_m: float
 ) -> tuple[float, NDArray[np.bool_]]:
-    """Return by how much normals turn per angle in narrow sectors: 1 on circles, 0 on facets.
+    """Return the rotation of normals per angle in narrow sectors: 1 on circles, 0 on facets.
 
     The second result is a mask (v,) of the voxels in sectors that are flat.
     """

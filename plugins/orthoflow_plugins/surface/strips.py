@@ -1,4 +1,4 @@
-"""Planes that are strips of curved surfaces: a test of the points of each plane."""
+"""Tests whether planes are strips of curved surfaces."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LEAST_RATIO: Final = 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneTest:
-    """Whether a plane is a strip of a curved surface.
+    """Result of the test for whether a plane is a strip of a curved surface.
 
     Attributes:
         index: index of the plane.
@@ -50,7 +50,7 @@ class PlaneTest:
 
 
 def tested_planes(sample: Sample) -> list[PlaneTest]:
-    """Test the points of each plane; planes with few points are not tested and count as flat."""
+    """Test each plane; planes with few points are not tested and are regarded as flat."""
     order = np.argsort(sample.label, kind="stable")
     labels = sample.label[order]
     tests = []

@@ -1,4 +1,4 @@
-"""A sample of a cloud in voxels, with a normal for each."""
+"""A sample of a cloud in voxels, each with a normal."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from orthoflow_plugins.surface.kernels import (
     merge_voxels,
 )
 
-# Points of the cloud that are searched; the final fit uses all points.
+# Maximum number of points used in the search; the final fit uses all points.
 SAMPLE_POINTS: Final = 250_000
 _GOLDEN: Final = 0.6180339887498949
-# Fewest points of a normal, and the largest ratio of its scatter across and along the surface.
+# Minimum number of points for a normal, and maximum ratio of the scatter across the surface to that
+# along it.
 _NORMAL_POINTS: Final = 8
 _FLATNESS: Final = 0.4
 # Largest scatter across a surface: noise, and the sagitta of the smallest radius searched.
@@ -40,7 +41,7 @@ class Sample(Rows):
     Attributes:
         index: (m,) int64 indices of the points in the cloud.
         offsets_m: (m, 3) float64 metres from the cloud's origin.
-        label: (m,) int16 plane of each point, -1 for none.
+        label: (m,) int16 index of the plane of each point; -1 for none.
     """
 
     index: NDArray[np.int64]
@@ -66,7 +67,7 @@ class Voxels(Rows):
 
 
 def draw_sample(cloud: PointCloud, labels: NDArray[np.int16] | None) -> Sample:
-    """Draw points in even steps through the cloud, at positions that follow the golden ratio."""
+    """Draw one point from each equal section of the cloud, placed by the golden ratio."""
     count = min(SAMPLE_POINTS, len(cloud))
     stretch = len(cloud) / max(1, count)
     ordinal = np.arange(count)
@@ -102,13 +103,13 @@ class VoxelGrid:
         return replace(self, table=table, count=count, size_m=2.0 * self.size_m)
 
     def voxels(self, cloud: PointCloud, block_voxels: int, noise_m: float | None = None) -> Voxels:
-        """Return the voxels that have a normal: enough points in a plane.
+        """Return the voxels that have a normal, i.e. enough points close to a plane.
 
         Args:
             cloud: the cloud, for the stations.
             block_voxels: size of a block of voxels.
-            noise_m: standard deviation of points across surfaces, if known; much thicker voxels
-                are at edges.
+            noise_m: standard deviation of the points normal to surfaces, if known; voxels with much
+                more scatter are at edges and are omitted.
         """
         table, count = self.table, self.count
         normals, spreads = np.zeros((count, 3)), np.zeros((count, 4))
@@ -161,7 +162,7 @@ def _empty_table(most: int) -> VoxelTable:
 
 
 def noise_of(voxels: Voxels) -> float:
-    """Estimate the noise of a cloud across its surfaces; 0 without flat voxels."""
+    """Estimate the noise of a cloud normal to its surfaces; 0 if there are no flat voxels."""
     if not len(voxels.spread_m):
         return 0.0
     return float(np.quantile(voxels.spread_m, _NOISE_QUANTILE))
