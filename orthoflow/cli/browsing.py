@@ -39,7 +39,7 @@ _FIRST_LINE_BYTES: Final = 1 << 16
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """Summary of a run, which is a row in a table of runs.
+    """Summary of a run: a row in a table of runs.
 
     Attributes:
         folder: path of the run folder; relative if the user gave a relative path.

@@ -65,7 +65,7 @@ class Payload:
 
 
 class Product:
-    """Base class of product types, which are frozen dataclasses.
+    """Base class of product types; these are frozen dataclasses.
 
     Fields may be numpy arrays, bytes, JSON values, members of an `IntEnum`, other dataclasses, and
     tuples of these; optional fields may also be None.

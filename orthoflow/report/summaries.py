@@ -106,7 +106,7 @@ def has_measured_lengths(run: Run) -> bool:
 
 
 def limits(run: Run) -> tuple[Limit, ...]:
-    """Return the limitations of the results, which are failures, unequal walls and diagnostics.
+    """Return the limitations of the results: failures, unequal walls and diagnostics.
 
     Diagnostics that a later step resolved are omitted. The remaining ones are grouped by code,
     errors first; diagnostics that concern only planes without an orthoimage come last.

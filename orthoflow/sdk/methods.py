@@ -25,7 +25,7 @@ _WILDCARD: Final = re.compile(r"(\*|\[[^\]]+\])")
 
 
 class MethodParams(BaseModel):
-    """Base class of a method's parameters, which are frozen and reject unknown keys.
+    """Base class of a method's parameters; they are frozen and reject unknown keys.
 
     Every field has a default and a description, and its name ends with its unit.
     """

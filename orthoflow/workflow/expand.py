@@ -143,7 +143,7 @@ def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
 
 
 def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
-    """Derive the seed of a cell, which is the same for a method in every step."""
+    """Derive the seed of a cell; it is the same for a method in every step."""
     preimage = json.dumps(["orthoflow/seed", 1, workflow_seed, method_id, repeat])
     digest = hashlib.sha256(preimage.encode()).digest()
     return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)

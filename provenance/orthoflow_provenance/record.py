@@ -548,7 +548,7 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
 
 
 def dataset_sha256(dataset: h5py.Dataset, also: Callable[[bytes], object] = len) -> str:
-    """Return the SHA-256 of a dataset of bytes, which is read block by block.
+    """Return the SHA-256 of a dataset of bytes; the dataset is read block by block.
 
     Args:
         dataset: one-dimensional dataset of uint8.

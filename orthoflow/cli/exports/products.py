@@ -106,7 +106,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
 
 
 def wanted_wall(number: int, known: Mapping[int, _Wall], who: str, does: str) -> _Wall:
-    """Return the wall with a number, which is the index of its plane in `planes.json`.
+    """Return the wall with a number: the index of its plane in `planes.json`.
 
     Args:
         number: value of `--wall`.

@@ -136,7 +136,7 @@ def expected_errors_m(
 
 
 def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
-    """Return the columns and rows (r, c, 2) of the nodes, which are at the centres of blocks."""
+    """Return the columns and rows (r, c, 2) of the nodes, i.e. the centres of blocks."""
     rows, columns = ((np.arange(-(-size // step)) + 0.5) * step for size in frame.shape)
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 

@@ -178,7 +178,7 @@ class Region(Detector):
 
 
 class RegionProposer(Proposer):
-    """Proposes the planes of regions, which are grown using all points.
+    """Proposes the planes of regions; the regions are grown using all points.
 
     Attributes:
         n_points: (r,) int64 number of points in each region.
