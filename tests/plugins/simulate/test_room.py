@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from orthoflow_plugins.simulate import deliverables
-from orthoflow_plugins.simulate.room import SimulateRoom, turn_about_up
+from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.geometry import UpDirection, basis_from_up
+from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import Photo, Photos, PointCloud, Truth
 from orthoflow.sdk import StepContext
 from tests import samples, scenes
@@ -63,8 +64,8 @@ def test_points_planes_and_colours_are_those_of_the_scene_in_any_world(
     assert wrong.mean() < 0.002
     # Columns of the first station's panorama begin at the room's first axis, rows at the bottom.
     first = np.flatnonzero(cloud.scan == 0)
-    rays = cloud.points_world(first) - cloud.stations[0]
-    rays = rays @ basis_from_up(cloud.up).T @ turn_about_up(turn_deg)
+    rays, turn = cloud.points_world(first) - cloud.stations[0], np.radians([0.0, 0.0, turn_deg])
+    rays = rays @ basis_from_up(cloud.up).T @ rotation_from_vector(turn)
     azimuth = (np.arctan2(rays[:, 1], rays[:, 0]) + 1e-3) % (2.0 * np.pi) - 1e-3
     elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1])) + np.radians(62.0)
     for angle, number in ((azimuth, cloud.column[first]), (elevation, cloud.row[first])):
