@@ -103,7 +103,7 @@ def check_damages(laboratory: StoredRuns) -> None:
         answer = laboratory.run(name, name)
         assert answer.code == 0, f"{what}: {answer.said}"
         assert laboratory.sealed(name) == expected, what
-        n_said += "stored-result-damaged" in answer.said
+        n_said += "damaged" in answer.said
         # What no run needed, such as a scan that nothing reads any more, is found by looking.
         check_store(Store(store))
         assert check_store(Store(store)).damaged == (), what
