@@ -86,15 +86,16 @@ class SourceSamples:
     Attributes:
         away_m: (n, 2) displacements along u and v, in metres, of cells that show no free-standing
             object and are away from true depth steps.
-        step_m: (m, 2) displacements of such cells within 2 cells of a true depth step.
+        step_m: (m, 2) displacements of cells that show no free-standing object and are within 2
+            cells of a true depth step.
         n_traced: number of cells coloured from an oriented photo.
         n_far: number of traced cells whose source pixel shows a point more than 3 cells away, or no
             surface.
         n_ghosts: number of traced cells whose source pixel shows a free-standing object.
-        n_stated: number of coordinates that are away from steps and have a predicted error.
-        n_within_1_sigma: number of these coordinates whose error is at most the predicted error.
-        n_within_2_sigma: number of these coordinates whose error is at most twice the predicted
-            error.
+        n_stated: number of components (along u or v) of the displacements in `away_m`, before
+            thinning, that have a predicted error.
+        n_within_1_sigma: number of these components that are at most the predicted error.
+        n_within_2_sigma: number of these components that are at most twice the predicted error.
         n_seen_by_both: as in `SourceErrors`.
         n_seen_painted: as in `SourceErrors`.
     """

@@ -310,7 +310,7 @@ def _excess_of_overlaps(
 def _views_of(
     wall: Wall, camera: Camera, centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the variances (n,) due to a pose, and the tangents (n, 2) of the viewing angles."""
+    """Return pose variances (n,) of a coordinate, m², and tangents (n, 2) of the view angles."""
     frame = wall.frame
     depths_m = np.nan_to_num(
         wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)

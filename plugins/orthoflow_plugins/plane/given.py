@@ -44,8 +44,8 @@ _SIDES: Final[Mapping[str, SideSource]] = {
 }
 _TOO_FAR: Final = (
     "no point of the cloud is within {buffer:g} m of the plane; the points are between {low:.3f} m "
-    "and {high:.3f} m from it along its normal: check normal and offset_m, points or height_m, or "
-    "raise buffer_m (plane.given)"
+    "and {high:.3f} m from it along its normal: check the definition of the plane "
+    "(`normal` and `offset_m`, `points`, or `height_m`), or increase `buffer_m` (plane.given)"
 )
 STRAY_PARTS: Final = DiagnosticSpec(
     code="points-beside-the-plane",
@@ -159,8 +159,8 @@ class GivenPlane(Method):
         def _one_or_several(self) -> Self:
             if self.planes and self.ways:
                 raise ValueError(
-                    "plane.given needs either one plane or the list planes, got "
-                    f"{self.ways[0]} and planes: move the single plane into the list"
+                    "plane.given accepts either a single plane or the list `planes`, but both "
+                    f"`{self.ways[0]}` and `planes` are set: move the single plane into the list"
                 )
             return self
 

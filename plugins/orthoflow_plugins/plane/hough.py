@@ -85,7 +85,7 @@ class Voters:
         constraint: Constraint,
         accumulator: Accumulator | Literal["raw"],
     ) -> None:
-        """Count the sample in cells.
+        """Count the sample points in each cell.
 
         Args:
             points_m: (s, 3) points of the sample relative to the centre of the box; NaN outside the
@@ -174,7 +174,7 @@ class HoughProposer(Proposer):
         step_rad: float,
         *groups: Group,
     ) -> None:
-        """Count the sample in cells; votes are computed by `propose`.
+        """Count the sample points in each cell; votes are computed by `propose`.
 
         Args:
             search: the search.
@@ -329,7 +329,7 @@ class PlanProposer(HoughProposer):
     first: NDArray[np.int32] | None = None
 
     def __init__(self, search: Search, params: Any) -> None:
-        """Count the sample in cells of the plan and in bins of height."""
+        """Count the sample points in each cell of the plan and in each bin of height."""
         n_turns = round(180.0 / params.angle_step_deg)
         step_rad = math.pi / n_turns
         walls = np.column_stack([step_rad * np.arange(n_turns), np.zeros(n_turns)])
@@ -359,7 +359,7 @@ class SpaceProposer(HoughProposer):
     """Proposes planes of any orientation at maxima of the votes of voxels."""
 
     def __init__(self, search: Search, params: Any) -> None:
-        """Count the sample in voxels."""
+        """Count the sample points in each voxel."""
         coarser = 1.0 if params.search == "full" else 2.0
         n_turns = round(180.0 / (coarser * params.angle_step_deg))
         step_rad = math.pi / n_turns

@@ -72,8 +72,8 @@ class Hough2d(Detector):
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
             description="Score of a line. contrast: its votes minus those of the adjacent "
-            "bins with fewer votes, refined with finer angles and bins; votes: the votes of "
-            "its bin, as in markiewicz2015.",
+            "bins on the side with fewer votes, refined with finer angles and bins; votes: "
+            "the votes of its bin, as in markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
             "cells",

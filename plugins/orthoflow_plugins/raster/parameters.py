@@ -100,9 +100,9 @@ class RasterParams(MethodParams):
     ranks: tuple[Annotated[int, Field(ge=0)], ...] = Field(
         default=(),
         description="Rasterise just these planes, by index in planes.json, where 0 has the most "
-        "points; curved surfaces follow the last plane. Indices change with the scan, the detector "
-        "and its tolerances; near selects walls by position. If empty, planes are selected by "
-        "constraint, min_area_m2, n_walls_max and skip_covered.",
+        "points; curved surfaces are numbered after the last plane. Indices change with the scan, "
+        "the detector and its tolerances; to select walls by position, use `near`. If empty, "
+        "planes are selected by constraint, min_area_m2, n_walls_max and skip_covered.",
     )
     near: tuple[Place, ...] = Field(
         default=(),
