@@ -194,7 +194,7 @@ def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
     )
     published = (*whole.record.published, gone)
     partly = replace(whole, record=replace(whole.record, published=published))
-    with pytest.raises(RecordError, match=f"wall_{WALL + 1}_ortho.tif is missing in"):
+    with pytest.raises(RecordError, match=f"wall_{WALL + 1}_ortho.tif is missing from"):
         room_results(partly)
     (wall,) = room_results(partly, wall=WALL).walls
     assert wall.number == WALL

@@ -11,7 +11,7 @@ from tests.undrawn_charts import blank_charts
 @pytest.fixture(autouse=True)
 def _few_seeds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Measure the noise of clouds at fewer places, which took a third of each detection."""
-    if "noise" not in request.node.name:
+    if "nois" not in request.node.name:
         monkeypatch.setattr(cloud, "NOISE_SEEDS", 200)
 
 
