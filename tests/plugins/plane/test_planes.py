@@ -441,7 +441,7 @@ def test_a_horizontal_plane_lies_below_the_scene_or_at_the_height_given(tmp_path
         ({"normal": (0, 0, 1.0), "offset_m": 0.0, "horizontal": True}, "got normal and horizontal"),
         ({**TRIPLE, "height_m": 2.0}, "points and horizontal"),
         ({"normal": (0, 0, 0.0), "offset_m": 1.0}, "normal must not be"),
-        ({"planes": TWO, "height_m": 2.0}, "got horizontal and planes: move the single"),
+        ({"planes": TWO, "height_m": 2.0}, "are set: move the single"),
         ({"planes": ({"normal": (0, 0, 1.0)},)}, "normal and offset_m together, got only one"),
     ],
 )
