@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import string
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
@@ -24,9 +24,8 @@ __all__ = [
     "DiagnosticGroup",
     "DiagnosticSpec",
     "grouped",
-    "placed",
+    "placement",
     "standing",
-    "step_names",
     "warning_texts",
 ]
 
@@ -216,38 +215,39 @@ def standing(cells: Iterable[Any]) -> tuple[tuple[str, Diagnostic], ...]:
     )
 
 
-def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
-    """Return a function that maps a method or kind to the name of its step, for `placed`.
+def placement(steps: Iterable[tuple[str, str]]) -> Callable[[Diagnostic, str], Diagnostic]:
+    """Return a function that inserts the names of a workflow's steps into a diagnostic.
+
+    Its arguments are the diagnostic and the name of the reporting step. It also omits remedies with
+    methods of the workflow. Workflows share results, but may have different names for steps, so the
+    names are inserted when a result is used.
 
     Args:
         steps: for each cell, the name of its step and the id of its method.
     """
     found: dict[str, set[str]] = {}
+    methods: set[str] = set()
     for step, method in steps:
+        methods.add(method)
         for name in (method, method.partition(".")[0]):
             found.setdefault(name, set()).add(step)
-    # If several steps have this kind or method, the reference is ambiguous and remains unchanged.
-    return lambda name: min(found[name]) if len(found.get(name, ())) == 1 else name
 
+    def step_of(name: str) -> str:
+        # If several steps have this kind or method, the reference is ambiguous.
+        return min(found[name]) if len(found.get(name, ())) == 1 else name
 
-def placed(
-    one: Diagnostic, step: str, step_of: Callable[[str], str], methods: Container[str] = ()
-) -> Diagnostic:
-    """Insert names of steps into text and remedy; omit remedies with methods of the workflow.
+    def placed(one: Diagnostic, step: str) -> Diagnostic:
+        def inserted(text: str) -> str:
+            return _STEP.sub(lambda match: step_of(match[1]) if match[1] else step, text)
 
-    Workflows share results, but may have different names for steps, so the names are inserted when
-    a result is used.
-    """
+        remedy = _UNLESS.sub(lambda match: "" if match[1] in methods else match[2], one.remedy)
+        return replace(one, text=inserted(one.text), remedy=inserted(remedy))
 
-    def name(found: re.Match[str]) -> str:
-        return step_of(found[1]) if found[1] else step
-
-    remedy = _UNLESS.sub(lambda found: "" if found[1] in methods else found[2], one.remedy)
-    return replace(one, text=_STEP.sub(name, one.text), remedy=_STEP.sub(name, remedy))
+    return placed
 
 
 class _Placeholder:
-    """A field that remains in the text until `placed` replaces it."""
+    """A field that remains in the text until the function from `placement` replaces it."""
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -11,9 +11,8 @@ from orthoflow.diagnostics import (
     Diagnostic,
     DiagnosticSpec,
     grouped,
-    placed,
+    placement,
     standing,
-    step_names,
 )
 from orthoflow.errors import ProductError
 from tests.report_runs import cell, given
@@ -91,17 +90,19 @@ def test_codes_are_words_with_dashes(code: str) -> None:
 
 
 def test_settings_are_named_by_the_steps_of_the_workflow() -> None:
-    names = step_names([("wall", "raster.grid"), ("a", "plane.x"), ("b", "plane.y")])
-    assert placed(apart(0, 60), "plane.ransac", names).remedy == (
+    steps = [("wall", "raster.grid"), ("a", "plane.x"), ("b", "plane.y")]
+    placed = placement(steps)
+    assert placed(apart(0, 60), "plane.ransac").remedy == (
         "register them, or set wall.buffer_m=0.1 for plane.ransac"
     )
     again = DiagnosticSpec(code="a", text="", remedy="{unless[match.b]:use match.b, or }ask").of(
         "", {}
     )
-    assert placed(again, "", names).remedy == "use match.b, or ask"
-    assert placed(again, "", names, {"match.b"}).remedy == "ask"
-    # Of two steps of a kind nobody knows which is meant.
-    assert [names(name) for name in ("plane", "plane.x", "ortho")] == ["plane", "a", "ortho"]
+    assert placed(again, "").remedy == "use match.b, or ask"
+    assert placement([*steps, ("ties", "match.b")])(again, "").remedy == "ask"
+    # If two steps have a kind, it is unknown which one is meant.
+    named = DiagnosticSpec(code="a", text="{step[plane]} {step[plane.x]} {step[ortho]}").of("", {})
+    assert placed(named, "").text == "plane a ortho"
 
 
 def test_a_later_step_settles_what_names_its_method_or_code() -> None:

@@ -239,22 +239,20 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records.open import open_run
-    from orthoflow.records.runs import find_record
+    from orthoflow.records.runs import find_record, read_run
     from orthoflow.records.verify import broken_seal
 
     chosen = Choices(**choices)
     check_choices(chosen, target, format_options())
-    opened = open_run(run)
+    # These formats copy the whole record or print its seal, so they need a finished one.
+    hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
+    opened = read_run(find_record(run)) if hands_on else open_run(run)
+    if not opened.is_finished:
+        echo_error(f"note: {run} has not ended; only its results so far are exported")
     chosen = replace(chosen, store=store_of(opened, chosen.store))
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    # These formats copy the whole record or print its seal, so check all of it.
-    hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
-    if not opened.is_finished:
-        if hands_on:
-            find_record(run)  # raises an error that states how to get a finished record
-        echo_error(f"note: {run} has not ended; only its results so far are exported")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
         raise RecordError(f"{finding}; changed records are not exported: use an unchanged copy")

@@ -9,12 +9,11 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Final, Literal
 
-from orthoflow.diagnostics import Diagnostic, DiagnosticSpec, placed, step_names, warning_texts
+from orthoflow.diagnostics import Diagnostic, DiagnosticSpec, placement, warning_texts
 from orthoflow.engine.durability import exclusive_lock, is_locked, remove_tree, writing_to
 from orthoflow.engine.environment import environment, now
 from orthoflow.engine.journal import (
@@ -191,8 +190,7 @@ class _Run:
         self._ready: dict[str, tuple[CellKey, Mapping[str, ProductRef]]] = {}
         self._running: dict[str, Task] = {}
         self._settings = {item.cell.address: item.cell.setting for item in self._plan.cells}
-        used = [(item.cell.step, item.cell.method) for item in self._plan.cells]
-        self._named = partial(placed, step_of=step_names(used), methods={one for _, one in used})
+        self._named = placement((item.cell.step, item.cell.method) for item in self._plan.cells)
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
         while self._waiting or self._running:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Final, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import WallFrame
+
+_GOLDEN: Final = 0.6180339887498949
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +30,18 @@ class Rows:
         """Concatenate items; fields that are not arrays are copied from the first object."""
         columns = {name: [getattr(part, name) for part in parts] for name in _arrays(parts[0])}
         return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
+
+
+def spread_index(n_items: int, count: int) -> NDArray[np.int64]:
+    """Return the index (count,) of one item from each of `count` equal parts of a list.
+
+    The position within each part is computed with the golden ratio, because a fixed stride could
+    coincide with the columns of a scan, and random positions would need a seed.
+    """
+    stretch = n_items / max(count, 1)
+    ordinal = np.arange(count)
+    within = np.modf(ordinal * _GOLDEN)[0] if stretch > 1.0 else np.zeros(count)
+    return np.minimum((ordinal + within) * stretch, n_items - 1).astype(np.int64)
 
 
 class _Raster(Protocol):

@@ -8,7 +8,6 @@ import json
 import shutil
 import tempfile
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +20,7 @@ from orthoflow_provenance.document import (
 )
 from orthoflow_provenance.record import write_record
 
-from orthoflow.diagnostics import placed, step_names
+from orthoflow.diagnostics import placement
 from orthoflow.engine.journal import RECORD_FILE, kept_from_others, readable_lines
 from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import Run, find_record, published_state, read_run
@@ -89,8 +88,7 @@ def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
     found = {address: store.result(line.key) for address, line in ended.items() if line.key}
     results = {address: result for address, result in found.items() if result is not None}
 
-    used = {(cell.step, cell.method) for cell in record.cells}
-    named = partial(placed, step_of=step_names(used), methods={method for _, method in used})
+    named = placement((cell.step, cell.method) for cell in record.cells)
 
     def known(cell: RecordedCell) -> RecordedCell:
         result, line = results.get(cell.address), ended.get(cell.address)

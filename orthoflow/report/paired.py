@@ -188,13 +188,14 @@ class MetricOverDatasets:
             return ""
         best, *others = sorted(known, key=lambda one: badness(one.median, better))
         after = others[0]
-        test = "Wilcoxon's test" if len(self.methods) == 2 else "too few datasets"
         if self.ranks is not None:
             test = "Nemenyi's test"
             is_clear = best.name in self.ranks.leading and after.name not in self.ranks.leading
         else:
             pairs = [one.paired for one in self.methods if one.paired]
-            is_clear = len(self.methods) == 2 and any(pair.p_holm < _SHOWN_P for pair in pairs)
+            is_pair = len(self.methods) == 2
+            test = "Wilcoxon's test" if is_pair else "too few datasets"
+            is_clear = is_pair and any(pair.p_holm < _SHOWN_P for pair in pairs)
         unit = "1" if is_flag(unit) else unit
         values = [f"{one.name} ({number_with_unit(one.median, unit)})" for one in (best, after)]
         level = [one.name for one in others if is_rounding(best.median, one.median)]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import basis_from_up
+from orthoflow.geometry.rows import spread_index
 from orthoflow.geometry.slabs import read_only
 from orthoflow.products import PointCloud
 from orthoflow_plugins.plane.kernels import (
@@ -31,7 +32,6 @@ SAMPLE_POINTS: Final = 200_000
 # Number of points from which the extent of a scene is computed.
 _BOX_POINTS: Final = 20_000
 _TAIL_SHARE: Final = 0.05
-_GOLDEN: Final = 0.6180339887498949
 # Margin of the robust box on each side: this share of the size of the box, plus a constant.
 _MARGIN_SHARE: Final = 0.02
 MARGIN_M: Final = 2.5
@@ -210,17 +210,14 @@ def prepare(
 
 
 def draw_sample(cloud: PointCloud) -> Sample:
-    """Draw one point from each of `SAMPLE_POINTS` equal parts of a cloud; all if there are fewer.
-
-    The position of the point within each part is computed with the golden ratio, because a fixed
-    stride could coincide with the columns of a scan, and random positions would need a seed.
+    """Draw one point from each of `SAMPLE_POINTS` equal parts of a cloud (see `spread_index`).
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
     """
     if len(cloud) < 3:
         cloud.require_points(3)
-    index = _spread_index(len(cloud), min(SAMPLE_POINTS, len(cloud)))
+    index = spread_index(len(cloud), min(SAMPLE_POINTS, len(cloud)))
     offsets_m = np.column_stack([cloud.x[index], cloud.y[index], cloud.z[index]]).astype(np.float64)
     if not np.isfinite(offsets_m).all():
         cloud.require_points(3)
@@ -231,7 +228,7 @@ def thinned(cloud: PointCloud, every: int) -> PointCloud:
     """Return coordinates and scans of every n-th point, at least three, as in `draw_sample`."""
     if every == 1:
         return cloud
-    index = _spread_index(len(cloud), min(len(cloud), max(3, len(cloud) // every)))
+    index = spread_index(len(cloud), min(len(cloud), max(3, len(cloud) // every)))
     return replace(
         cloud,
         x=cloud.x[index],
@@ -243,13 +240,6 @@ def thinned(cloud: PointCloud, every: int) -> PointCloud:
         row=None,
         column=None,
     )
-
-
-def _spread_index(n_points: int, count: int) -> NDArray[np.int64]:
-    stretch = n_points / max(count, 1)
-    ordinal = np.arange(count)
-    within = np.modf(ordinal * _GOLDEN)[0] if stretch > 1.0 else np.zeros(count)
-    return np.minimum((ordinal + within) * stretch, n_points - 1).astype(np.int64)
 
 
 def blocked(offsets_m: NDArray[np.float64]) -> BlockedPoints:

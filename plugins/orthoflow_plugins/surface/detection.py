@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Cone, Cylinder
-from orthoflow.products import PointCloud, Surface
-from orthoflow_plugins.surface.fit import FittedSurface, fit_all, named
+from orthoflow.products import PointCloud, Surface, surface_kind
+from orthoflow_plugins.surface.fit import fit_all
 from orthoflow_plugins.surface.parameters import DetectorParams
 from orthoflow_plugins.surface.search import (
     BLOCK_VOXELS,
@@ -52,7 +52,6 @@ class Detection:
 
     Attributes:
         surfaces: the surfaces, in descending order of their numbers of points.
-        fitted: their fits, in the same order.
         accepted: the surfaces as found among voxels, in the same order.
         labels: (n,) int16 index of the surface of each point; -1 for none.
         plane_tests: tests of the given planes.
@@ -62,7 +61,6 @@ class Detection:
     """
 
     surfaces: tuple[Surface, ...]
-    fitted: tuple[FittedSurface, ...]
     accepted: tuple[Found, ...]
     labels: NDArray[np.int16]
     plane_tests: list[PlaneTest]
@@ -151,14 +149,9 @@ def detect(
     rank[kept] = np.arange(len(kept))
     return Detection(
         surfaces=tuple(
-            named(
-                _with_side(fitted[index], is_oriented=is_oriented),
-                place,
-                cloud.up,
-            )
+            _named(fitted[index].surface, place, cloud.up, is_oriented=is_oriented)
             for place, index in enumerate(kept)
         ),
-        fitted=tuple(fitted[index] for index in kept),
         accepted=tuple(found[index] for index in kept),
         labels=rank[labels] if len(kept) < len(found) or kept != sorted(kept) else labels,
         plane_tests=tests,
@@ -189,11 +182,10 @@ def _levels(
     return levels[::-1], noise_m
 
 
-def _with_side(fitted: FittedSurface, *, is_oriented: bool) -> Surface:
-    """Return the surface; if no stations are known, its side is assumed from its arc."""
-    surface = fitted.surface
-    if is_oriented:
-        return surface
-    start, end = surface.arc_rad
-    shape = replace(surface.shape, is_concave=end - start < _OUTSIDE_RAD)
-    return replace(surface, shape=shape)
+def _named(surface: Surface, index: int, up: NDArray[np.float64], *, is_oriented: bool) -> Surface:
+    """Return a surface with its name; if no stations are known, its side follows from its arc."""
+    shape = surface.shape
+    if not is_oriented:
+        start, end = surface.arc_rad
+        shape = replace(shape, is_concave=end - start < _OUTSIDE_RAD)
+    return replace(surface, shape=shape, name=f"{surface_kind(shape, up)} {index}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -14,7 +14,7 @@ from scipy import ndimage
 from orthoflow.geometry.slabs import Offsets, read_only
 from orthoflow.geometry.surfaces import zero_direction
 from orthoflow.geometry.threads import even_parts, in_threads
-from orthoflow.products import PointCloud, Surface, surface_kind
+from orthoflow.products import PointCloud, Surface
 from orthoflow_plugins.surface.kernels import Cells, sum_cells
 from orthoflow_plugins.surface.rounds import design, robust_solution
 from orthoflow_plugins.surface.search import Found, longest_gap
@@ -265,8 +265,3 @@ def _extent(is_full: NDArray[np.bool_]) -> tuple[tuple[float, float], tuple[int,
     start = int(opens[(int(np.argmax(steps)) + 1) % len(opens)])
     low = start * step - math.pi
     return (low, low + (count - gap) * step), ends
-
-
-def named(fitted: Surface, index: int, up: NDArray[np.float64]) -> Surface:
-    """Return a surface with its name."""
-    return replace(fitted, name=f"{surface_kind(fitted.shape, up)} {index}")

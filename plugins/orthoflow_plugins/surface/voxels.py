@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.rows import Rows
+from orthoflow.geometry.rows import Rows, spread_index
 from orthoflow.products import PointCloud
 from orthoflow_plugins.surface.kernels import (
     MOMENTS,
@@ -21,7 +21,6 @@ from orthoflow_plugins.surface.kernels import (
 
 # Maximum number of points used in the search; the final fit uses all points.
 SAMPLE_POINTS: Final = 250_000
-_GOLDEN: Final = 0.6180339887498949
 # Minimum number of points for a normal, and maximum ratio of the scatter across the surface to that
 # along it.
 _NORMAL_POINTS: Final = 8
@@ -67,12 +66,9 @@ class Voxels(Rows):
 
 
 def draw_sample(cloud: PointCloud, labels: NDArray[np.int16] | None) -> Sample:
-    """Draw one point from each equal section of the cloud, placed by the golden ratio."""
+    """Draw one point from each of `SAMPLE_POINTS` equal parts of a cloud (see `spread_index`)."""
     count = min(SAMPLE_POINTS, len(cloud))
-    stretch = len(cloud) / max(1, count)
-    ordinal = np.arange(count)
-    within = np.modf(ordinal * _GOLDEN)[0] if stretch > 1.0 else np.zeros(count)
-    index = np.minimum((ordinal + within) * stretch, len(cloud) - 1).astype(np.int64)
+    index = spread_index(len(cloud), count)
     offsets = np.column_stack([cloud.x[index], cloud.y[index], cloud.z[index]])
     label = np.full(count, -1, dtype=np.int16) if labels is None else np.asarray(labels[index])
     return Sample(index=index, offsets_m=offsets.astype(np.float64), label=label)
