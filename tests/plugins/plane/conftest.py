@@ -7,12 +7,19 @@ from orthoflow_plugins.plane import cloud
 
 from tests.undrawn_charts import blank_charts
 
+_ALL_PLACES = cloud.NOISE_SEEDS
+
 
 @pytest.fixture(autouse=True)
-def _few_seeds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Measure the noise of clouds at fewer places, which took a third of each detection."""
-    if "nois" not in request.node.name:
-        monkeypatch.setattr(cloud, "NOISE_SEEDS", 200)
+def _few_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure the noise of clouds at few places, because it took a third of each detection."""
+    monkeypatch.setattr(cloud, "NOISE_SEEDS", 200)
+
+
+@pytest.fixture
+def all_places(_few_places: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure the noise of clouds at all places, for tests whose subject is noise."""
+    monkeypatch.setattr(cloud, "NOISE_SEEDS", _ALL_PLACES)
 
 
 @pytest.fixture(autouse=True)

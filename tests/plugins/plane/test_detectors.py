@@ -211,6 +211,7 @@ def test_points_that_fix_no_plane_are_refused(
 
 
 @any_method
+@pytest.mark.usefixtures("all_places")
 def test_a_tolerance_below_the_noise_is_answered_with_one_that_does(
     detector: str, tmp_path: Path
 ) -> None:
@@ -359,6 +360,7 @@ def detected(method: Any, points: NDArray[np.float64], folder: Path) -> Planes:
 
 
 @pytest.mark.parametrize("noise_m", [0.001, 0.02])
+@pytest.mark.usefixtures("all_places")
 def test_the_noise_of_a_flat_wall_is_measured(noise_m: float) -> None:
     found = measure_noise(wall(noise_m, 120_000))
     assert found == pytest.approx((noise_m, noise_m), rel=0.12)
@@ -374,6 +376,7 @@ def test_errors_that_neighbours_share_show_in_large_neighbourhoods() -> None:
     assert shared_m > 0.004
 
 
+@pytest.mark.usefixtures("all_places")
 def test_a_cloud_without_flat_places_has_no_measured_noise_and_a_clean_one_usual_tolerances(
     tmp_path: Path,
 ) -> None:
@@ -384,6 +387,7 @@ def test_a_cloud_without_flat_places_has_no_measured_noise_and_a_clean_one_usual
 
 
 @every_kind
+@pytest.mark.usefixtures("all_places")
 def test_one_noisy_wall_is_found_at_defaults(method: type, tmp_path: Path) -> None:
     planes = detected(method, wall(0.02, 60_000), tmp_path)
     assert len(planes) == 1
@@ -395,6 +399,7 @@ def test_one_noisy_wall_is_found_at_defaults(method: type, tmp_path: Path) -> No
     ("noise_m", "shared_m"), [(0.025, 0.003), *long_only((0.005, 0.003), (0.01, 0.01))]
 )
 @every_kind
+@pytest.mark.usefixtures("all_places")
 def test_walls_of_a_noisy_room_are_found_beside_denser_clutter(
     method: type, noise_m: float, shared_m: float, tmp_path: Path
 ) -> None:

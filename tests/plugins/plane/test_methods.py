@@ -194,6 +194,7 @@ def test_the_plan_model_finds_the_walls_and_lets_them_lean(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("noise_m", [0.001, 0.005])
+@pytest.mark.usefixtures("all_places")
 def test_the_tolerance_found_by_itself_follows_the_noise(noise_m: float, tmp_path: Path) -> None:
     cloud = cloud_of(sampled(noise_m=noise_m), stations=STATION)
     out, ctx = detect(Ransac, cloud, tmp_path, scoring="a-contrario")

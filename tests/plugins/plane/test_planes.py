@@ -309,6 +309,7 @@ def measured(cloud: PointCloud, folder: Path, **params: object) -> tuple[Any, di
 
 
 @pytest.mark.parametrize(("noise_m", "bow_m"), [(0.001, 0.0), (0.001, 0.006), (0.004, 0.006)])
+@pytest.mark.usefixtures("all_places")
 def test_thickness_is_the_noise_and_not_the_bow(
     noise_m: float, bow_m: float, tmp_path: Path
 ) -> None:
@@ -323,6 +324,7 @@ def test_thickness_is_the_noise_and_not_the_bow(
     assert metrics["thickness_scan_steps"] == pytest.approx(1000.0 * noise_m / step_mm, rel=0.05)
 
 
+@pytest.mark.usefixtures("all_places")
 def test_noise_that_grows_with_incidence_and_range_is_given_by_class(tmp_path: Path) -> None:
     range_m = np.linalg.norm(wall(0.0), axis=1)
     noise_m = 0.001 + 0.003 * np.arccos(2.0 / range_m)
