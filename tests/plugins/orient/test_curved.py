@@ -15,8 +15,8 @@ from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Cameras, Intrinsics, Layer, LayerMask, Photo, Photos
-from tests import curved_scenes, ortho_scenes
+from orthoflow.products import Intrinsics, Layer, LayerMask, Photo, Photos
+from tests import curved_scenes
 from tests.curved_scenes import Drum
 from tests.method_runs import run
 from tests.raster_scenes import cloud_of, context
@@ -33,15 +33,19 @@ LOOSE = {
 }
 
 
-def shifts_m(layer: Layer, drum: Drum, frame: WallFrame) -> NDArray[np.float64]:
-    """Displacements (n, 2) along u and v of blocks of a layer, by least squares, in metres."""
+def texture_of(drum: Drum, frame: WallFrame) -> NDArray[np.float64]:
+    """The true grey values of a wall."""
     rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
     places = drum.places(frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()])))
-    true = curved_scenes.texture(places).reshape(frame.shape)
+    return curved_scenes.texture(places).reshape(frame.shape)
+
+
+def shifts_m(layer: Layer, true: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Displacements (n, 2) along u and v of blocks of a layer, by least squares, in metres."""
     down, right = np.gradient(true)
     off, found = layer.rgb[..., 0] / 255.0 - true, []
-    for row in range(0, frame.height - BLOCK_CELLS, BLOCK_CELLS):
-        for column in range(0, frame.width - BLOCK_CELLS, BLOCK_CELLS):
+    for row in range(0, true.shape[0] - BLOCK_CELLS, BLOCK_CELLS):
+        for column in range(0, true.shape[1] - BLOCK_CELLS, BLOCK_CELLS):
             part = slice(row, row + BLOCK_CELLS), slice(column, column + BLOCK_CELLS)
             shown = layer.mask[part] == LayerMask.PAINTED
             if shown.mean() > 0.98:
@@ -93,12 +97,9 @@ def test_an_oriented_vault_is_unrolled_to_a_tenth_of_a_cell(tmp_path: Path) -> N
     for camera, viewer in zip(cameras.cameras, viewers, strict=True):
         assert np.linalg.norm(camera.viewing().centre_world - viewer.centre_world) < 1.5e-3
 
-    def rmse_m(oriented: Cameras) -> NDArray[np.float64]:
-        shown = {**given, "cloud": cloud, "cameras": oriented}
-        layers = run(DsmBackward, context(tmp_path), shown).layers.layers
-        shifts = np.vstack([shifts_m(layer, drum, walls.walls[0].frame) for layer in layers])
-        assert len(shifts) > 100
-        return np.sqrt((shifts**2).mean(axis=0))
-
-    assert (rmse_m(ortho_scenes.cameras(*viewers)) < LIMIT_M).all()
-    assert (rmse_m(cameras) < LIMIT_M).all()
+    shown = {**given, "cloud": cloud, "cameras": cameras}
+    layers = run(DsmBackward, context(tmp_path), shown).layers.layers
+    true = texture_of(drum, walls.walls[0].frame)
+    shifts = np.vstack([shifts_m(layer, true) for layer in layers])
+    assert len(shifts) > 100
+    assert (np.sqrt((shifts**2).mean(axis=0)) < LIMIT_M).all()
