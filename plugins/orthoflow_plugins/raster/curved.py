@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Bend, Cylinder, WallFrame
+from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.slabs import Slab
+from orthoflow.geometry.surfaces import angles_around
 from orthoflow.geometry.unrolling import unrolled
-from orthoflow.products import Planes, PointCloud, Surface, Surfaces
+from orthoflow.products import Planes, PointCloud, Surface, Surfaces, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.extents import Extent, Reach, SampledPoints, extent_of
+from orthoflow_plugins.raster.frames import blank
 from orthoflow_plugins.raster.parameters import RasterParams
 
 # Axes within 45 degrees of the vertical are upright.
@@ -41,6 +44,11 @@ class CurvedWalls:
         self.surfaces: dict[int, Surface] = {}
         self.frames: dict[int, WallFrame] = {}
         self._planes, self._params = planes, params
+        self._vaults = [
+            surface
+            for surface in (surfaces.surfaces if surfaces is not None else ())
+            if isinstance(surface.shape, Cylinder) and surface.shape.is_concave
+        ]
         for k, surface in enumerate(surfaces.surfaces if surfaces is not None else ()):
             index = len(planes) + k
             if not _is_chosen(surface, index, planes.up, params):
@@ -85,6 +93,26 @@ class CurvedWalls:
             found = reach.as_set
         return Extent(front_m=min(found.front_m, front_m), behind_m=min(found.behind_m, behind_m))
 
+    def blank_beyond_groins(self, wall: Wall, index: int) -> None:
+        """Set the cells of a vault to void where another vault that crosses it is open.
+
+        Where two vaults cross, the surface of each ends at the groins, beyond which it would be
+        inside the other. There, the points in the buffer belong to the other vault.
+        """
+        own = self.surfaces[index]
+        bands = list(row_bands(wall.frame.shape))
+        for other in self._vaults if own.shape.is_concave else ():
+            if other is own:
+                continue
+            inside = [_is_inside(other, wall.frame, rows) for rows in bands]
+            depths_m = [wall.depth_m[rows][one] for rows, one in zip(bands, inside, strict=True)]
+            depth_m = np.concatenate(depths_m)
+            depth_m = depth_m[np.isfinite(depth_m)]
+            # A vault that was built inside the other one has a surface there.
+            if len(depth_m) and np.median(depth_m) < -self._planes.tolerance_m:
+                for rows, one in zip(bands, inside, strict=True):
+                    blank(wall, rows, one)
+
     def covers(self, plane: int, buffer_m: tuple[float, float], index: int) -> bool:
         """Return whether a plane is inside the raster and the buffer of a curved wall."""
         frame, corners = self.frames[index], self._planes.corners[plane]
@@ -115,6 +143,23 @@ def flattened(cloud: PointCloud, slab: Slab) -> tuple[PointCloud, Slab]:
         cloud.selected(near.index), origin=near.origin, x=near.x, y=near.y, z=near.z, stations=None
     )
     return flat, replace(slab, frame=slab.frame.flat)
+
+
+def _is_inside(vault: Surface, frame: WallFrame, rows: slice) -> NDArray[np.bool_]:
+    """Return the mask of the cells in some rows whose places on the surface are in a vault.
+
+    A vault is the space between its axis and its arc.
+    """
+    shape = vault.shape
+    grid = np.stack(np.meshgrid(np.arange(frame.width), np.arange(rows.start, rows.stop)), axis=-1)
+    points = frame.world_from_wall(grid.reshape(-1, 2) + 0.5)
+    along = (points - vault.middle_world) @ shape.axis_world
+    inside = np.abs(along) < 0.5 * (vault.along_m[1] - vault.along_m[0])
+    inside &= shape.distances_m(points) > 0.0
+    start = angles_around(points, vault.middle_world, shape.axis_world, vault.zero_world)
+    start = (start - vault.arc_rad[0]) % math.tau
+    inside &= start < vault.arc_rad[1] - vault.arc_rad[0]
+    return inside.reshape(-1, frame.width)
 
 
 def _is_chosen(surface: Surface, index: int, up: NDArray[np.float64], params: RasterParams) -> bool:

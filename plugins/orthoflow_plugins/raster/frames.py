@@ -79,14 +79,18 @@ def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
     # Make the corners relative to the first cell of the cropped grid.
     corners -= np.floor(corners.min(axis=0) + 1e-6).clip(0, None)
     for rows in row_bands(wall.mask.shape):
-        outside = ~filled((corners - [0.0, rows.start],), wall.mask[rows].shape)
-        wall.mask[rows][outside] = SurfaceMask.VOID
-        for values in (wall.depth_m, wall.sigma_m, wall.intensity, wall.percentiles_m):
-            if values is not None:
-                values[rows][outside] = np.nan
-        for numbers in (wall.count, wall.rgb, wall.rgb_mask):
-            if numbers is not None:
-                numbers[rows][outside] = 0
+        blank(wall, rows, ~filled((corners - [0.0, rows.start],), wall.mask[rows].shape))
+
+
+def blank(wall: Wall, rows: slice, cells: NDArray[np.bool_]) -> None:
+    """Set cells, given as a mask of some rows, to void."""
+    wall.mask[rows][cells] = SurfaceMask.VOID
+    for values in (wall.depth_m, wall.sigma_m, wall.intensity, wall.percentiles_m):
+        if values is not None:
+            values[rows][cells] = np.nan
+    for numbers in (wall.count, wall.rgb, wall.rgb_mask):
+        if numbers is not None:
+            numbers[rows][cells] = 0
 
 
 def mapped(

@@ -88,12 +88,12 @@ class RasterGrid(Method):
     position of the points to the centre of the cell.
 
     Cylinders are unrolled: one axis of their rasters is the length of the arc, and depths are
-    distances from the cylinder.
+    distances from the cylinder. Where two vaults cross, each raster ends at the groins.
     """
 
     id: ClassVar[str] = "raster.grid"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
         MetricSpec("omega_deg", label="direction of the first wall's normal (omega)"),
@@ -178,6 +178,8 @@ class RasterGrid(Method):
             wall = replace(wall, frame=slab.frame)
             free_m = math.inf if is_curved else free_before_m(planes, index, cloud.stations)
             empty.append(emptiness_of(wall, slab, sight, free_m=free_m, threads=ctx.cores))
+            if is_curved:
+                curved.blank_beyond_groins(wall, index)
             if params.crop is not None and np.ndim(params.crop) == 2:
                 blank_outside(wall, params.crop)
             walls.append(wall)

@@ -43,6 +43,9 @@ _LARGEST_SHIFT: Final = 1.0
 # A surface is a cylinder if its generatrices are parallel to its axis to within this angle, and
 # otherwise a cone.
 _CYLINDER_SLOPE: Final = math.radians(1.0)
+# Largest standard deviation of a radius, as a share of it. Flat strips between rounded corners have
+# 0.01 to 0.02; a vault of 3 m with an arc of 45 degrees and 1 cm of relief has 0.008.
+_LEAST_PRECISE: Final = 0.01
 _OUTSIDE_RAD: Final = math.radians(200.0)
 
 
@@ -132,6 +135,7 @@ def detect(
             "radius_m": fit.surface.radius_m,
             "shift_mm": 1000.0 * fit.shift_m,
             "half_angle_deg": math.degrees(math.atan(abs(fit.slope))),
+            "sigma_radius_mm": 1000.0 * fit.surface.sigma_radius_m,
         }
         shape = fit.surface.shape
         is_steep = abs(fit.slope) > _CYLINDER_SLOPE
@@ -143,6 +147,8 @@ def detect(
             rejected.append(Rejected(reason="cone" if is_steep else "cylinder", evidence=evidence))
         elif fit.cell_scatter_m > largest_m:
             rejected.append(Rejected(reason="rough", evidence=evidence))
+        elif fit.surface.sigma_radius_m > _LEAST_PRECISE * fit.surface.radius_m:
+            rejected.append(Rejected(reason="uncertain radius", evidence=evidence))
         else:
             kept.append(index)
     rank = np.full(len(found) + 1, -1, dtype=np.int16)

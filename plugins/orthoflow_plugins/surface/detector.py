@@ -64,7 +64,7 @@ class DetectorOut(Ports):
 class Detector(Method):
     """Base class of the detectors of curved surfaces."""
 
-    result_version = 1
+    result_version = 2
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = (
         MetricSpec("n_surfaces", label="curved surfaces found"),
@@ -145,9 +145,13 @@ class Detector(Method):
                 turn_deg=test.turn_deg,
             )
         what = "a cone" if self.is_cone else "a cylinder"
-        for item in found.rejected:
-            if "turning" in item.evidence:
-                ctx.report(REJECTED, subject=what, reason=item.reason, **item.evidence)
+        # For each reason, only the largest hypothesis is reported.
+        tested = [item for item in found.rejected if "turning" in item.evidence]
+        largest = {
+            item.reason: item for item in sorted(tested, key=lambda item: item.evidence["area_m2"])
+        }
+        for item in largest.values():
+            ctx.report(REJECTED, subject=what, reason=item.reason, **item.evidence)
         if found.surfaces and (cloud.stations is None or not len(cloud.stations)):
             ctx.report(SIDE_GUESSED, n=len(found.surfaces))
         if found.surfaces:

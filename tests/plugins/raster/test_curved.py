@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.simulate.curved import SimulateCurved
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.surfaces import angles_around
 from orthoflow.products import SurfaceMask, Wall
+from orthoflow.testing import Trial, run_trial
 from tests import curved_scenes, samples
 from tests.curved_scenes import Drum
 from tests.method_runs import run
@@ -107,3 +110,25 @@ def test_curved_walls_follow_planes_and_cover_their_facets(tmp_path: Path) -> No
     assert names(constraint="horizontal") == (["ceiling 0", "floor 1"], [0, 1])
     with pytest.raises(MethodError, match="ranks contains 3"):
         names(ranks=(3,))
+
+
+def test_crossing_vaults_end_at_their_groins(tmp_path: Path) -> None:
+    params = {"subject": "cross-vault", "scan_step_m": 0.03}
+    trial = Trial(method=SimulateCurved, inputs={}, params=params, seed=3)
+    room = run_trial(trial, tmp_path / "room").outputs
+    surfaces = room["truth"].surfaces
+    inputs = {"cloud": room["cloud"], "planes": curved_scenes.NO_PLANES, "surfaces": surfaces}
+    walls = run(RasterGrid, context(tmp_path), inputs, gsd_m=0.04).walls.walls
+    assert len(walls) == 2
+    for wall, surface in zip(walls, surfaces.surfaces, strict=True):
+        rows, columns = np.mgrid[: wall.frame.height, : wall.frame.width] + 0.5
+        points = wall.frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()]))
+        shape = surface.shape
+        angles = angles_around(points, shape.point_world, shape.axis_world, surface.zero_world)
+        along_m = np.abs((points - shape.point_world) @ shape.axis_world)
+        # The plane of a groin is at 45 degrees to both axes.
+        beyond_m = (shape.radius_m * np.abs(np.sin(angles)) - along_m).reshape(wall.mask.shape)
+        assert not wall.mask[beyond_m > 0.001].any()
+        on = (beyond_m < -0.06) & (along_m.reshape(wall.mask.shape) < surface.along_m[1] - 0.1)
+        assert (wall.mask[on] > 0).mean() > 0.9
+        assert np.abs(np.nanmedian(wall.depth_m[on])) < 0.001
