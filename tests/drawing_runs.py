@@ -7,11 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from click.testing import CliRunner, Result
 from numpy.typing import NDArray
 from orthoflow_provenance.document import PublishedFile, RecordedProduct
 from orthoflow_provenance.record import write_record
 from scipy.spatial.transform import Rotation
 
+from orthoflow.cli.program import program
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of
 from orthoflow.files.publishing import (
@@ -212,6 +214,12 @@ def write_drawing_run(
     made = record(cells, name="box", published=publish_box(folder, image, others), environments=())
     write_record(folder / "run.h5", made, shelf.find)
     return folder
+
+
+def export(run: Path, target: str, folder: Path, *more: object) -> Result:
+    """Export a run in a format into a folder, by the command."""
+    words = ["export", str(run), "--to", target, "-o", str(folder), *map(str, more)]
+    return CliRunner().invoke(program, words)
 
 
 def _recorded(shelf: ProductShelf, payload: Payload) -> RecordedProduct:

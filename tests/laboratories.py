@@ -16,7 +16,6 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.model import Workflow
-from orthoflow.workflow.source import InvalidWorkflowError
 
 LABORATORY = Path(__file__).parent / "laboratory"
 GOOD = """\
@@ -143,14 +142,3 @@ def with_steps(steps: str, head: str = "inputs: {scan: {files: a.e57}}\n") -> st
 def load(text: str, path: Path, catalog: Catalog, *sets: str) -> Workflow:
     path.write_text(text, encoding="utf-8")
     return load_workflow(path, catalog, sets=sets)
-
-
-def problems(text: str, path: Path, catalog: Catalog) -> list[tuple[int, int, str, str]]:
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InvalidWorkflowError) as caught:
-        load_workflow(path, catalog)
-    assert caught.value.exit_code == 2
-    for problem in caught.value.problems:
-        assert str(problem) in str(caught.value)
-        assert text.splitlines()[problem.line - 1] == problem.text
-    return [(item.line, item.column, item.path, item.message) for item in caught.value.problems]

@@ -168,6 +168,13 @@ def record(cells: Sequence[RecordedCell], **more: object) -> RunRecord:
     return RunRecord(**{**wanted, **more})  # type: ignore[arg-type]
 
 
+def run_of(
+    *cells: RecordedCell, products: Mapping[tuple[str, str], Product] | None = None, **more: object
+) -> HeldRun:
+    """A run of some cells, with products that they give and other facts of its record."""
+    return HeldRun(path=Path("run.h5"), record=record(cells, **more), products=products or {})
+
+
 def without_products(run: Run) -> Run:
     """A run whose record holds the digests of its products alone."""
     cells = tuple(

@@ -48,22 +48,6 @@ def flip(path: Path) -> None:
     path.write_bytes(content)
 
 
-def test_a_run_says_what_it_found_damaged(say: Said, tmp_path: Path) -> None:
-    assert say(*RUN, "first")[0] == 0
-    [figure] = (tmp_path / ".orthoflow" / "objects").glob("*/blob")
-    flip(figure)
-    for published in (tmp_path / ".orthoflow" / "objects").glob("*/files/numbers.txt"):
-        flip(published)
-    code, text = say(*RUN, "again")
-    assert code == 0
-    assert "range: warning: the stored result was damaged (" in text
-    assert "1 warning with a code shown above" in next(
-        line for line in text.splitlines() if line.startswith("dots: ok")
-    )
-    code, text = say(*RUN, "third")
-    assert (code, "damaged" in text) == (0, False)
-
-
 def test_the_store_is_listed_verified_and_collected(say: Said, tmp_path: Path) -> None:
     as_stored = "0 results and 0 objects in .orthoflow are unchanged\n"
     assert say("cache", "verify") == (0, as_stored)
@@ -94,14 +78,3 @@ def test_the_store_is_listed_verified_and_collected(say: Said, tmp_path: Path) -
     assert would.startswith("would remove 2 results and 2 objects, ")
     assert say("cache", "gc", "--older-than", "0")[0] == 0
     assert json.loads(say("cache", "list", "--json")[1]) == []
-
-
-@pytest.mark.parametrize("command", [(*RUN, "first"), ("cache", "gc"), ("cache", "verify")])
-def test_a_folder_of_something_else_is_no_store(
-    command: tuple[str, ...], say: Said, tmp_path: Path
-) -> None:
-    before = {path for path in tmp_path.iterdir() if path.name != "site"}
-    code, text = say(*command, "--store", ".")
-    assert code == 2
-    assert f"error: {tmp_path} is not a store of orthoflow: it contains " in text
-    assert {path for path in tmp_path.iterdir() if path.name != "site"} == before

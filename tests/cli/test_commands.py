@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import subprocess
 import sys
@@ -13,7 +12,6 @@ import h5py
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.cli import tables
 from orthoflow.cli.commands import (
     RecordCommand,
     command_again,
@@ -76,22 +74,6 @@ def test_a_failure_on_a_changed_record_is_that_records(tmp_path: Path) -> None:
         raised = failing(kind("no plane"), intact)
         assert isinstance(raised, RecordError)
         assert str(raised) == "a product of this run is invalid: no plane"
-
-
-def test_what_a_terminal_would_obey_is_written_out(capsys: pytest.CaptureFixture[str]) -> None:
-    tables.echo("\x1b[31mred", "plain")
-    tables.echo("told", err=True)
-    tables.echo()
-    said = capsys.readouterr()
-    assert (said.out, said.err) == ("\\x1b[31mred\nplain\n\n", "told\n")
-    tables.echo_json({"name": "w\N{LATIN SMALL LETTER A WITH DIAERESIS}nde\x9b", "n": 1})
-    printed = capsys.readouterr().out
-    assert json.loads(printed) == {
-        "name": "w\N{LATIN SMALL LETTER A WITH DIAERESIS}nde\x9b",
-        "n": 1,
-    }
-    assert "\N{LATIN SMALL LETTER A WITH DIAERESIS}" in printed
-    assert "\x9b" not in printed
 
 
 @pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])

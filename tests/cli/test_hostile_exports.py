@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 import rasterio
 from affine import Affine
-from click.testing import CliRunner, Result
 
-from orthoflow.cli.program import program
 from orthoflow.files.geotiff import RasterParts
 from tests import hostile_records as hostile
-from tests.drawing_runs import WALL, write_drawing_run
+from tests.drawing_runs import WALL, export, write_drawing_run
 
 ORTHO = Path("products", "mosaic", f"wall_{WALL}_ortho.tif")
 DRAWN = ("sheet", "dxf", "geojson")
@@ -32,13 +30,8 @@ def run(drawn: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(drawn, tmp_path / "run"))
 
 
-def export(run: Path, target: str, *more: str) -> Result:
-    words = ["export", str(run), "--to", target, "-o", str(run.parent / target), *more]
-    return CliRunner().invoke(program, words)
-
-
 def check_refused(run: Path, target: str, code: int, *said: str) -> None:
-    done = export(run, target)
+    done = export(run, target, run.parent / target)
     assert done.exit_code == code, (target, done.output)
     for part in said:
         assert part in " ".join(done.output.split()), target
@@ -93,7 +86,7 @@ def test_what_stands_in_the_place_of_a_picture_is_not_read(run: Path, suffix: st
     place.unlink()
     os.mkfifo(place)
     for target in PICTURED:
-        done = export(run, target)
+        done = export(run, target, run.parent / target)
         assert done.exit_code in ((0, 2, 3) if suffix == ".tif" else (2, 3)), (target, done.output)
         assert "itself failed" not in done.output
     made = {path for path in run.parent.rglob("*") if not path.is_relative_to(run)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -12,6 +13,15 @@ from orthoflow_provenance.document import RecordedFile, RecordedInput
 from orthoflow_provenance.record import write_record
 from syrupy.assertion import SnapshotAssertion
 
+from orthoflow.cli.browsing import (
+    RunSummary,
+    differing_facts,
+    key_metrics,
+    run_folders,
+    summaries,
+)
+from orthoflow.diagnostics import DiagnosticSpec
+from orthoflow.errors import ArgumentError
 from tests.hostile_records import reseal
 from tests.report_runs import cell, metrics, record
 from tests.studios import asked, said
@@ -53,30 +63,10 @@ def folders(*arguments: object) -> list[str]:
     return [row["folder"] for row in json.loads(said("runs", *arguments, "--json"))]
 
 
-def test_the_table_says_when_how_good_and_in_what_runs_differ(runs: Path) -> None:
-    lines = said("runs").splitlines()
-    rows = [line.split(maxsplit=8) for line in lines[1:6]]
-    shown = ["check.rmse_u_mm", "check.rms_mm", "plane.rms_mm"]
-    assert lines[0].split() == ["folder", "started", "workflow", "status", *shown, "differs", "in"]
-    assert [row[0] for row in rows] == [
-        "runs/other", "runs/b", "runs/a", "deep/er/c", "runs/going",
-    ]  # fmt: skip
-    assert rows[1] == [
-        "runs/b",
-        "2026-01-02",
-        "08:04",
-        "hall",
-        "ok",
-        "2.5",
-        "2",
-        "9",
-        "plane.cell_m=0.05",
-    ]
-    # Of the other workflow there is one run: nothing that it differs from.
-    assert rows[0] == ["runs/other", "2026-01-02", "07:04", "court", "ok", "4", "2", "9"]
-    assert rows[4] == ["runs/going", "2026-01-02", "11:00", "hall", "unfinished"]
-    assert lines[6].startswith("runs/going unfinished: resume with the same command and -o ")
-    assert lines[-1] == "5 runs"
+@pytest.mark.usefixtures("runs")
+def test_the_table_says_when_how_good_and_in_what_runs_differ(snapshot: SnapshotAssertion) -> None:
+    assert said("runs") == snapshot
+    assert json.loads(said("runs", "deep", "--json")) == snapshot(name="of one, as JSON")
 
 
 def test_runs_are_chosen_and_ordered(runs: Path) -> None:
@@ -97,17 +87,6 @@ def test_runs_are_chosen_and_ordered(runs: Path) -> None:
         ("rmse_u_mm = -1.5", []),
     ):
         assert folders("--where", condition) == found
-
-
-def test_json_has_every_number(runs: Path) -> None:
-    (row,) = json.loads(said("runs", "deep", "--json"))
-    # A later step has the plain name.
-    assert row["metrics"]["rms_mm"] == row["metrics"]["check.rms_mm"] == 2.0
-    assert row["metrics"]["plane.rms_mm"] == 9.0
-    assert row["facts"]["plane.tries"] == 3
-    assert row["facts"]["input scan"] == ["hall.laz aaaaaaaa"]
-    assert (row["status"], row["started"]) == ("ok", "2026-01-02T10:04:05Z")
-    assert row["differs"] == {}
 
 
 def test_a_folder_of_runs_is_shown_as_their_table(runs: Path) -> None:
@@ -184,3 +163,171 @@ def test_a_comparison_groups_equal_differences_and_counts_rounding(
         (tmp_path / name).mkdir()
         write_record(tmp_path / name / "run.h5", record(cells, run_id=name), lambda _digest: None)
     assert said("compare", "a", "b") == snapshot
+
+
+# Which runs there are, and what sums one up -------------------------------------------------------
+
+
+UPSIDE_DOWN = DiagnosticSpec(code="upside-down", severity="error", text="{subject} is upside down")
+
+
+def a_run(folder: Path, name: str = "journal.jsonl") -> Path:
+    folder.mkdir(parents=True)
+    (folder / name).touch()
+    return folder
+
+
+def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path) -> None:
+    for place in ("b", "a/x", "1/2/3/4/5/6", "a/x/deep", "1/2/3/4/5/6b/7"):
+        a_run(tmp_path / place, "run.h5" if place == "b" else "journal.jsonl")
+    for place in (".hidden/c", "products/d", "logs/e", "node_modules/f", "pages/g"):
+        a_run(tmp_path / place)
+    found = [path.relative_to(tmp_path).as_posix() for path in run_folders([tmp_path])]
+    assert found == ["1/2/3/4/5/6", "a/x", "b"]
+    # Each once, in the order of the folders that are given; a run may be one of them.
+    twice = run_folders([tmp_path / "b", tmp_path / "a", tmp_path])
+    assert [path.relative_to(tmp_path).as_posix() for path in twice] == ["b", "a/x", "1/2/3/4/5/6"]
+    # A run that is itself the folder may have others beside its record, but for parts of it.
+    for place in ("b/again", "b/datasets/one", "b/export/ro-crate"):
+        a_run(tmp_path / place)
+    assert run_folders([tmp_path / "b"]) == [tmp_path / "b", tmp_path / "b/again"]
+    (tmp_path / "elsewhere").symlink_to(tmp_path / "a", target_is_directory=True)
+    assert run_folders([tmp_path]) == [tmp_path / name for name in found]
+    with pytest.raises(
+        ArgumentError, match=r"b/run\.h5 is not a folder: pass folders that contain runs"
+    ):
+        run_folders([tmp_path, tmp_path / "b" / "run.h5"])
+
+
+def test_the_headlines_that_most_runs_have_come_first() -> None:
+    runs = [
+        RunSummary(folder=Path(), status="ok", headlines=tuple(names))
+        for names in ("ab", "bc", "b", "ca")
+    ]
+    assert key_metrics(runs, most=4) == ["a", "b", "c"]
+    # Of equals the first; shown in the order of all.
+    assert key_metrics(runs, most=2) == ["a", "b"]
+
+
+def written(folder: Path, *cells: object, **more: object) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_record(folder / "run.h5", record(cells, **more), lambda _digest: None)  # type: ignore[arg-type]
+    return folder
+
+
+def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
+    scan = RecordedFile(name="hall.laz", size_bytes=3, sha256="0123456789" + "a" * 54)
+    folder = written(
+        tmp_path / "run",
+        cell(
+            "plane",
+            params={"cell_m": 0.1},
+            metrics=metrics(rms_mm=3.0, omega_deg=4.0),
+            diagnostics=(UPSIDE_DOWN.of("", {}), UPSIDE_DOWN.of("photo 2", {})),
+        ),
+        cell("check", params={"tries": 2}, metrics=metrics(rms_mm=1.0)),
+        cell("lost", status="skipped", params={"none": 1}),
+        cell("bad", status="failed", error_message="no plane"),
+        cell("worse", status="failed", error_message="no wall"),
+        cell("plane#1", params={"cell_m": 7.0}, metrics=metrics(rms_mm=9.0)),
+        name="hall",
+        status="failed",
+        inputs=(RecordedInput(name="scan", files=(scan, replace(scan, name="b.laz"))),),
+    )
+    (recorded,) = summaries([folder])
+    assert (recorded.folder, recorded.status) == (folder, "failed")
+    assert (recorded.reason, recorded.n_errors) == ("bad: no plane", 1)
+    assert (recorded.workflow, recorded.run_id, recorded.started) == (
+        "hall",
+        "r1",
+        "2026-01-02T03:04:05Z",
+    )
+    # Repeats are averaged, and a later step has the plain name.
+    wanted = {"plane.rms_mm": 6.0, "check.rms_mm": 1.0, "rms_mm": 1.0, "omega_deg": 4.0}
+    assert {name: recorded.metrics[name] for name in wanted} == wanted
+    assert recorded.n_datasets == 0
+    assert recorded.all_facts == {
+        "seed": 1,
+        "orthoflow": "orthoflow 0.1.0",
+        "input scan": ["hall.laz 01234567", "b.laz 01234567"],
+        "plane.cell_m": 0.1,
+        "plane.use": "plane.toy",
+        "check.tries": 2,
+        "check.use": "inspect.toy",
+        "bad.use": "bad.toy",
+        "worse.use": "worse.toy",
+    }
+
+
+def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
+    cells = [
+        cell(
+            f"check@data={name}",
+            metrics=metrics(rms_mm=value, plane_offset_mm=(-1) ** k * value, omega_deg=-value),
+            params={"tries": k},
+        )
+        for k, (name, value) in enumerate({"hall": 1.0, "stairs": 2.0, "court": 5.0}.items())
+    ]
+    rooms = {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs", "court")}
+    recorded = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
+    write_record(tmp_path / "run.h5", recorded, lambda _digest: None)
+    (summary,) = summaries([tmp_path])
+    assert (summary.metrics["rms_mm"], summary.metrics["check.rms_mm"]) == (2.0, 2.0)
+    # Of errors with signs their sizes, of angles themselves; of one dataset as it was measured.
+    assert (summary.metrics["plane_offset_mm"], summary.metrics["omega_deg"]) == (2.0, -2.0)
+    alone = record(cells[1:2], workflow_resolved=json.dumps({"datasets": {"stairs": {}}}))
+    write_record(tmp_path / "run.h5", alone, lambda _digest: None)
+    (of_one,) = summaries([tmp_path])
+    assert of_one.metrics["plane_offset_mm"] == -2.0
+    assert summary.n_datasets == 3
+    assert summary.all_facts["check.tries"] == "0|1|2"
+
+
+def test_runs_differ_in_the_values_of_parameters_each_of_which_is_stated_once(
+    tmp_path: Path,
+) -> None:
+    def swept(name: str, *tries: tuple[int, ...]) -> RunSummary:
+        cells = [
+            cell(f"check@check=tries-{value},data=room{room}", params={"tries": value})
+            for room, values in enumerate(tries)
+            for value in values
+        ]
+        folder = written(
+            tmp_path / name,
+            *cells,
+            workflow_resolved=json.dumps({"datasets": {f"room{k}": {} for k in range(len(tries))}}),
+        )
+        (found,) = summaries([folder])
+        return found
+
+    several, one = swept("a", (1, 2, 3), (1, 2, 3)), swept("b", (4,), (4,))
+    assert list(differing_facts([several, one]).values()) == [
+        {"check.tries": "1|2|3"},
+        {"check.tries": 4},
+    ]
+    # `--where` takes all values.
+    assert several.values("check.tries") == (1, 2, 3)
+    assert (one.values("seed"), one.values("rms_mm")) == ((1,), ())
+    # A fact that some lack differs only where two others disagree on it.
+    more = swept("c", (4,), (4,), (4,))
+    assert differing_facts([one, more])[more.folder] == {"datasets": 3}
+    bare = replace(one, folder=tmp_path / "d", parameters={})
+    assert differing_facts([one, bare])[one.folder] == {}
+
+
+def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "going")
+    began = {"event": "run", "time": "2026-01-02T11:00:00Z", "run_id": "x", "workflow": "hall"}
+    (folder / "journal.jsonl").write_text(json.dumps(began) + "\n" + "broken")
+    (recorded,) = summaries([folder])
+    assert recorded == RunSummary(
+        folder=folder,
+        status="unfinished",
+        reason=f"resume with the same command and -o {folder}",
+        workflow="hall",
+        run_id="x",
+        started="2026-01-02T11:00:00Z",
+    )
+    (folder / "journal.jsonl").write_text("[1]\n")
+    (odd,) = summaries([folder])
+    assert (odd.status, odd.workflow) == ("unfinished", "")

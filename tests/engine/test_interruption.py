@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import time
 from collections.abc import Callable
@@ -56,26 +55,6 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Digests of an undisturbed run."""
     with toy_world(tmp_path_factory.mktemp("quiet")) as world:
         return digests(world.run(STEPS, executor="inline"))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("attempt", range(4))
-def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
-    world: World, quiet: dict[str, str], attempt: int
-) -> None:
-    rng = random.Random(attempt)
-    for _ in range(2):
-        process = start_coordinator(world, STEPS, "run")
-        time.sleep(rng.uniform(0.1, 4.0))
-        process.kill()
-        process.join()
-    outcome = world.run(STEPS)
-    assert digests(outcome) == quiet
-    assert [event["event"] for event in events(world)].count("run") == 1
-    assert set(outcome.cached) == set()
-    assert list(world.store.scratch.iterdir()) == []
-    collect_garbage(world.store)
-    assert len(world.run(STEPS, into="after").cached) == 4
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from syrupy.assertion import SnapshotAssertion
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
+from orthoflow.files.drawings.sheet_contents import read_title_block
 from orthoflow.files.metashape import read_metashape_xml
 from orthoflow.files.polygons import read_polygons
 from orthoflow.files.sidecars import read_sidecar
@@ -79,6 +80,11 @@ FILES: Mapping[str, tuple[Callable[[Path], object], str, Sequence[Content]]] = {
             {"type": "Feature", "properties": {}, "geometry": None},
         )),
         features(feature([SQUARE])).replace("4.0", "1" + 400 * "0"),
+    )),
+    "title block": (read_title_block, "block.yaml", (
+        *("projct: a\n", "title: [1]\n", f"note: {'a' * 301}\n", "layout: middle\n", "a" * 100_001),
+        "revisions: [{mark: A, texts: b}]\n",
+        *("logo: none.png\n", "logo: block.yaml\n"),
     )),
     "metashape": (read_metashape_xml, "cameras.xml", (
         *(BOMB, BOMB.encode("utf-16"), "<document><chunk>", "<document/>"),

@@ -60,9 +60,9 @@ from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 from tests import photo_files, samples, scan_files
 from tests.files import test_metashape as agisoft
 from tests.files.test_e57_images import pinhole, spherical, written
-from tests.files.test_exif import INNER, MAIN
 from tests.files.test_given_cameras import HEAD as REALITYCAPTURE
 from tests.files.test_given_cameras import oriented
+from tests.files.test_photo_files import INNER, MAIN
 from tests.files.test_vector_files import HOLE, SQUARE, feature, features
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import (

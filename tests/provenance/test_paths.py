@@ -58,6 +58,7 @@ def test_names_that_lead_elsewhere_or_are_no_names_everywhere_are_refused(proble
         ("/".join(["ö" * 120] * 16 + ["a" * 240]), "is longer than 4095 bytes"),
         ("/".join(["ö" * 120] * 16 + ["a" * 239]), ""),
         ("products/" + "ö" * 128, "has a part that is longer than 255 bytes"),
+        *((name, "") for name in TAKEN),
     ],
 )
 def test_paths_that_lead_elsewhere_or_are_too_long_are_refused(path: str, problem: str) -> None:

@@ -29,7 +29,6 @@ from tests.report_runs import cell, given
 from tests.report_runs import record as a_record
 
 PNG = b"\x89PNG\r\n\x1a\n picture"
-CLOUD_DIGEST = "sha256:" + "c" * 64
 
 
 def one_plane() -> Planes:

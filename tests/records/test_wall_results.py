@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,7 @@ from orthoflow_provenance.document import Metric, PublishedFile, RecordedCell
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import CheckPoints, Finding, Inspection, Product
 from orthoflow.records import walls as module
-from tests.report_runs import HeldRun, cell, given, record
-
-
-def held(*cells: RecordedCell, products: dict[tuple[str, str], Product] | None = None) -> HeldRun:
-    return HeldRun(path=Path("run.h5"), record=record(cells), products=products or {})
+from tests.report_runs import cell, given, run_of
 
 
 def inspection(*findings: tuple[str, float, int]) -> Inspection:
@@ -85,15 +82,15 @@ def test_given_check_points_are_not_asked_for_again(
     # Those of the simulated room were given by nobody.
     room = cell("room", method="simulate.room", outputs=points)
     survey = cell("survey", method="read.checkpoints", outputs=points)
-    products = {("survey", "points"): checkpoints(count)}
-    found = module.uncounted_points(held(room, survey, check, products=products))
+    products: dict[tuple[str, str], Product] = {("survey", "points"): checkpoints(count)}
+    found = module.uncounted_points(run_of(room, survey, check, products=products))
     assert found is not None
     assert (found.sentence, found.phrase.text("de")) == (
         said,
         f"Genauigkeit nicht geprüft; {drawn}",
     )
     for others in ((), (survey, looking())):
-        assert module.uncounted_points(held(room, *others, products=products)) is None
+        assert module.uncounted_points(run_of(room, *others, products=products)) is None
 
 
 @pytest.mark.parametrize(
@@ -115,11 +112,11 @@ def test_what_was_done_to_colours_is_said(
     behind = {"layers": given("ortho.layers", "l", "layers")}
     mosaic = cell("mosaic", method="mosaic.seams", inputs=behind, params=params, metrics=metrics)
     ortho = cell("ortho", inputs={"photos": given("shots.photos", "p", "photos")})
-    assert module.colours_phrase(held(ortho, mosaic), "mosaic").text() == said
+    assert module.colours_phrase(run_of(ortho, mosaic), "mosaic").text() == said
     for least, more in ((0, ""), (10, ", without points darker than 10 of 255")):
         cloud = {"cloud": given("cloud.cloud", "c", "cloud")}
         ortho = cell("ortho", inputs=cloud, params={"skip_below_grey": least})
-        found = module.colours_phrase(held(ortho, mosaic), "mosaic")
+        found = module.colours_phrase(run_of(ortho, mosaic), "mosaic")
         assert found.text() == f"colours as scanned{more}"
 
 
@@ -129,14 +126,14 @@ def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
 
     a, d, e = giving("a", "walls"), giving("d", "walls"), giving("e", "cloud")
     plane = cell("plane", status="failed", error_message="no plane")
-    run = held(a, giving("b", "orthoimages"), giving("c", "orthoimages"), d, e)
+    run = run_of(a, giving("b", "orthoimages"), giving("c", "orthoimages"), d, e)
     assert module.pictured_cell(run, None) == "c"
     assert module.pictured_cell(run, "a") == "a"
-    assert module.pictured_cell(held(a, d), None) == "d"
+    assert module.pictured_cell(run_of(a, d), None) == "d"
     with pytest.raises(ArgumentError, match=r"r1 has no orthoimages and no walls.*plane.*no plane"):
-        module.pictured_cell(held(e, plane), None)
+        module.pictured_cell(run_of(e, plane), None)
     with pytest.raises(ArgumentError, match=r"e has no orthoimages or walls; .*: none"):
-        module.pictured_cell(held(e), "e")
+        module.pictured_cell(run_of(e), "e")
     with pytest.raises(ArgumentError, match="steps of this run that have them: b, c, a, d"):
         module.pictured_cell(run, "e")
 
@@ -154,7 +151,7 @@ PUBLISHED = (
 
 def test_an_orthoimage_that_is_gone_is_asked_for(tmp_path: Path) -> None:
     files = tuple(PublishedFile(path=path, size_bytes=0, sha256="") for path in PUBLISHED)
-    run = HeldRun(path=tmp_path / "run.h5", record=record([cell("mosaic")], published=files))
+    run = replace(run_of(cell("mosaic"), published=files), path=tmp_path / "run.h5")
     module.require_orthoimages(run, "mosaic", 10)
     for wall in (None, 2):
         with pytest.raises(RecordError, match=r"wall_2_ortho.tif is missing from .* copy it back"):

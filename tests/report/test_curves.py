@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
+from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.curves import Curve, curve_files, curves, sweeps
 from orthoflow.report.rankings import Mark
-from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
+from tests.report_runs import HeldRun, cell, compared_resolved, metrics, run_of
 
 
-def swept(*values: float, repeats: int = 1, other: object = 1, failed: int = -1) -> list[object]:
+def swept(*values: float, other: object = 1) -> list[RecordedCell]:
     """Cells of `plane` with values of a tolerance, whose error is a tenth of it."""
     return [
         cell(
-            f"plane@plane=tolerance_m-{value:g}" + (f"#{repeat}" if repeat else ""),
+            f"plane@plane=tolerance_m-{value:g}",
             params={"tolerance_m": value, "seed": other},
-            metrics=metrics(rms_mm=0.1 * value + 0.001 * repeat),
-            status="failed" if index == failed else "ok",
+            metrics=metrics(rms_mm=0.1 * value),
         )
-        for index, value in enumerate(values)
-        for repeat in range(repeats)
+        for value in values
     ]
 
 
@@ -39,19 +38,15 @@ def bars(curve: Curve) -> list[float]:
     return [spread for spread in found if math.isfinite(spread)]
 
 
-def held(folder: Path, cells: list[object]) -> HeldRun:
-    return HeldRun(path=folder / "run.h5", record=record(cells))  # type: ignore[arg-type]
-
-
-def test_one_value_other_differences_and_words_are_none(tmp_path: Path) -> None:
+def test_one_value_other_differences_and_words_are_none() -> None:
     mixed = [*swept(0.02), *swept(0.1, other=2)]
-    assert list(sweeps(held(tmp_path, mixed).record.cells)) == []
+    assert list(sweeps(run_of(*mixed).record.cells)) == []
     words = [cell(f"plane@plane={word}", params={"mode": word}) for word in "abc"]
-    assert list(sweeps(held(tmp_path, words).record.cells)) == []
+    assert list(sweeps(run_of(*words).record.cells)) == []
 
 
-def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path) -> None:
-    cells: list[object] = [cell("plane", metrics=metrics(rms_mm=11.5))]
+def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn() -> None:
+    cells = [cell("plane", metrics=metrics(rms_mm=11.5))]
     cells += [
         cell(
             f"wall@wall=v{value}",
@@ -63,7 +58,7 @@ def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path)
         )
         for value in (0.005, 0.01, 0.02)
     ]
-    run = held(tmp_path, cells)
+    run = run_of(*cells)
     names = [curve.name for curve in curves([run])]
     assert names == ["wall.empty_share_over_wall.gsd_m", "wall.sigma_median_mm_over_wall.gsd_m"]
     table = comparison_table([run])
@@ -73,46 +68,39 @@ def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path)
     # Where quality differs, the rest is not shown.
     judged = [*cells, cell("check@wall=v0.005", metrics=metrics(rmse_u_mm=1.0))]
     judged += [cell("check@wall=v0.01", metrics=metrics(rmse_u_mm=2.0))]
-    assert [curve.name for curve in curves([held(tmp_path, judged)])] == [
+    assert [curve.name for curve in curves([run_of(*judged)])] == [
         "check.rmse_u_mm_over_wall.gsd_m"
     ]
 
 
-def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: Path) -> None:
+def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not() -> None:
     cells = [
         *(
             replace(one, metrics=metrics(rms_mm=1.0, n_planes=9.0))
             for one in swept(0.02, 0.05, 0.1)
-        ),  # type: ignore[type-var]
+        ),
         cell("apart", metrics=metrics(rms_mm=2.0)),
     ]
-    plain = held(tmp_path, cells)
-    asked = replace(
-        plain,
-        record=replace(plain.record, workflow_resolved=compared_resolved("*.rms_mm", "*.n_planes")),
-    )
-    titles = [
-        [one.title.partition(" against ")[0] for one in curves([run])] for run in (plain, asked)
-    ]
+    asked = compared_resolved("*.rms_mm", "*.n_planes")
+    runs = run_of(*cells), run_of(*cells, workflow_resolved=asked)
+    titles = [[one.title.partition(" against ")[0] for one in curves([run])] for run in runs]
     error = "points to the first plane, RMS / mm (plane)"
     assert titles == [[], [error, "planes found (plane)"]]
 
 
-def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
-    recorded = record(
-        swept(0.02, 0.05, 0.1),  # type: ignore[arg-type]
-        workflow_resolved=json.dumps({"compare": {"baseline": {"plane": "tolerance_m-0.05"}}}),
-    )
-    (curve,) = curves([HeldRun(path=tmp_path / "run.h5", record=recorded)])
+def test_the_baseline_of_a_sweep_is_the_filled_point() -> None:
+    resolved = json.dumps({"compare": {"baseline": {"plane": "tolerance_m-0.05"}}})
+    (curve,) = curves([run_of(*swept(0.02, 0.05, 0.1), workflow_resolved=resolved)])
     assert [point.x for point in curve.lines[""] if point.is_filled] == [0.05]
-    (plain,) = curves([held(tmp_path, swept(0.02, 0.05, 0.1))])
+    (plain,) = curves([run_of(*swept(0.02, 0.05, 0.1))])
     assert not any(point.is_filled for point in plain.lines[""])
 
 
-def over_rooms(
-    folder: Path, values: dict[str, dict[float, tuple[float | None, ...]]], metric: str
-) -> dict[str, HeldRun]:
-    """Rooms with a value per tolerance and repeat, None where the repeat has none."""
+# Of rooms a value per tolerance and repeat, None where the repeat has none.
+_Rooms = Mapping[str, Mapping[float, tuple[float | None, ...]]]
+
+
+def curve_over(values: _Rooms, metric: str) -> Curve:
     cells = {
         room: [
             cell(
@@ -126,20 +114,18 @@ def over_rooms(
         for room, by_x in values.items()
     }
     asked = compared_resolved(f"*.{metric}")
-    return {
-        room: HeldRun(path=folder / "run.h5", record=record(own, workflow_resolved=asked))
-        for room, own in cells.items()
-    }
+    (curve,) = curves([run_of(*own, workflow_resolved=asked) for own in cells.values()])
+    return curve
 
 
-def test_a_line_is_over_the_rooms_that_all_its_points_have(tmp_path: Path) -> None:
-    values: dict[str, dict[float, tuple[float | None, ...]]] = {
+def test_a_line_is_over_the_rooms_that_all_its_points_have() -> None:
+    values = {
         "calm": {1.0: (1.0, 2.0), 2.0: (2.0, 2.0)},
         # Where the hard room fails, the rest looks better.
         "dark": {1.0: (9.0, 9.0), 2.0: (None, None)},
         "wide": {1.0: (3.0, 4.0), 2.0: (4.0, 4.0)},
     }
-    (curve,) = curves([*over_rooms(tmp_path, values, "rms_mm").values()])
+    curve = curve_over(values, "rms_mm")
     assert points(curve) == [(1.0, 2.5), (2.0, 3.0)]
     assert curve.caption.startswith(
         "Points are medians of 2 of 3 datasets. Absolute values of errors are used. "
@@ -147,35 +133,33 @@ def test_a_line_is_over_the_rooms_that_all_its_points_have(tmp_path: Path) -> No
     )
     # Repeats of one room are no spread of rooms.
     alone = {"calm": values["calm"], "dark": {1.0: (None,), 2.0: (None,)}}
-    (curve,) = curves([*over_rooms(tmp_path, alone, "rms_mm").values()])
+    curve = curve_over(alone, "rms_mm")
     assert "Points are medians of 1 of 2 datasets. " in curve.caption
     assert "Bars" not in curve.caption
     assert bars(curve) == []
 
 
-def test_of_what_is_found_or_not_a_curve_has_the_share_of_rooms(tmp_path: Path) -> None:
-    found: dict[str, dict[float, tuple[float | None, ...]]] = {
+def test_of_what_is_found_or_not_a_curve_has_the_share_of_rooms() -> None:
+    found = {
         "calm": {0.02: (1.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0,) * 4},
         "dark": {0.02: (0.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0,) * 4},
         "wide": {0.02: (1.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0, 0.0, 0.0, 0.0)},
     }
-    (curve,) = curves([*over_rooms(tmp_path, found, "main_found").values()])
+    curve = curve_over(found, "main_found")
     assert points(curve) == [(0.02, pytest.approx(2 / 3)), (0.05, 1.0), (0.1, 0.75)]
     assert curve.bounds == (0.0, 1.0)
     assert bars(curve) == []
     assert "share of yes over 3 of 3 datasets" in curve.caption
 
 
-def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path) -> None:
-    signed: dict[str, dict[float, tuple[float | None, ...]]] = {
-        room: {x: (sign * x,) for x in (0.02, 0.05, 0.1)}
-        for room, sign in (("hall", 1.0), ("tower", -1.0))
-    }
-    (curve,) = curves([*over_rooms(tmp_path, signed, "plane_offset_mm").values()])
+def test_signed_errors_over_datasets_do_not_make_each_other_small() -> None:
+    signs = {"hall": 1.0, "tower": -1.0}
+    signed = {room: {x: (s * x,) for x in (0.02, 0.05, 0.1)} for room, s in signs.items()}
+    curve = curve_over(signed, "plane_offset_mm")
     assert [y for _, y in points(curve)] == [0.02, 0.05, 0.1]
 
 
-def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
+def test_a_page_has_twelve_curves_of_six_lines() -> None:
     def many(n_metrics: int, n_lines: int) -> HeldRun:
         names = [f"rmse_{k}_mm" for k in range(n_metrics)]
         cells = [
@@ -188,7 +172,7 @@ def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
             for index in range(3)
         ]
         asked = compared_resolved("plane.rmse_*")
-        return HeldRun(path=tmp_path / "run.h5", record=record(cells, workflow_resolved=asked))
+        return run_of(*cells, workflow_resolved=asked)
 
     assert len(curves([many(13, 1)])) == 12
     for n_lines, n_drawn in ((6, 6), (7, 6)):
@@ -196,14 +180,14 @@ def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
         assert list(curve.lines) == [f"mode=m{k}" for k in range(n_drawn)]
 
 
-def test_a_drawing_stands_alone_as_a_file(tmp_path: Path) -> None:
-    cells = [replace(one, step="a/b") for one in swept(0.02, 0.05)]  # type: ignore[type-var]
+def test_a_drawing_stands_alone_as_a_file() -> None:
+    cells = [replace(one, step="a/b") for one in swept(0.02, 0.05)]
     cells = [replace(one, assignment={"a/b": one.assignment["plane"]}) for one in cells]
-    [(name, data)] = curve_files(held(tmp_path, cells)).items()
+    [(name, data)] = curve_files(run_of(*cells)).items()
     assert name == "01_a_b.rms_mm_over_a_b.tolerance_m.svg"
     assert ET.fromstring(data).tag.endswith("}svg")
     # The same numbers give the same bytes, in every format.
-    assert curve_files(held(tmp_path, cells)) == {name: data}
+    assert curve_files(run_of(*cells)) == {name: data}
     for suffix, begin in (("pdf", b"%PDF"), ("png", b"\x89PNG")):
-        [(name, data)] = curve_files(held(tmp_path, cells), suffix).items()
+        [(name, data)] = curve_files(run_of(*cells), suffix).items()
         assert (name.rpartition(".")[2], data[:4]) == (suffix, begin)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from orthoflow_plugins.orient.report import residual_rows
-from orthoflow_provenance.document import RecordedCell, RecordedFigure
+from orthoflow_provenance.document import RecordedFigure
 
 from orthoflow.files.images import decode_image, encode_png, encode_webp
 from orthoflow.products import Camera, Cameras
 from orthoflow.report.figures import figure_groups, write_figures
 from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import wall_pictures
-from tests.report_runs import HeldRun, cell, compared_resolved, compared_run, record
+from tests.report_runs import HeldRun, cell, compared_run, run_of
 
 PNG, SVG, WEBP = "image/png", "image/svg+xml", "image/webp"
 
@@ -27,39 +26,19 @@ def figure(name: str, data: bytes, media_type: str = PNG) -> RecordedFigure:
     return RecordedFigure(name=name, caption=f"about {name}", media_type=media_type, data=data)
 
 
-def run(cells: Sequence[RecordedCell]) -> HeldRun:
-    recorded = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
-    return HeldRun(path=Path("run") / "run.h5", record=recorded)
-
-
-def shown(of: HeldRun, **more: object) -> list[tuple[str, str, int]]:
-    """Cell, title and bytes of every figure on the page."""
-    return [
-        (group.cell, picture.title, len(base64.b64decode(picture.uri.partition(",")[2])))
-        for group in figure_groups(of, **more)  # type: ignore[arg-type]
-        for picture in group.pictures
-    ]
-
-
-def noise(seed: int, side: int = 300) -> bytes:
-    """A picture that packs badly: some 3 bytes a pixel as PNG."""
-    return encode_png(
-        np.random.default_rng(seed).integers(0, 256, (side, side, 3)).astype(np.uint8)
-    )
-
-
-# --- sharing the bytes of a page ---
-
-
 def test_all_figures_of_a_page_take_less_than_four_megabytes() -> None:
-    large = [figure(f"f{k}", noise(k, 700)) for k in range(5)]
-    n_bytes = len(large[0].data)
-    assert 2 * n_bytes < 3_900_000 < 3 * n_bytes
-    for n_figures, is_whole in ((2, True), (3, False)):
-        cells = [cell("plane@plane=fine", figures=tuple(large[:n_figures]))]
-        sizes = [size for *_, size in shown(run(cells))]
-        assert (sizes == [len(one.data) for one in large[:n_figures]]) is is_whole
-        assert sum(sizes) <= 3_900_000
+    # Pictures that pack badly: some 3 bytes a pixel as PNG.
+    rng = np.random.default_rng(0)
+    large = tuple(
+        figure(f"f{k}", encode_png(rng.integers(0, 256, (700, 700, 3)).astype(np.uint8)))
+        for k in range(3)
+    )
+    assert 2 * len(large[0].data) < 3_900_000 < 3 * len(large[0].data)
+    for figures, is_whole in ((large[:2], True), (large, False)):
+        (group,) = figure_groups(run_of(cell("plane@plane=fine", figures=figures)))
+        shown = [base64.b64decode(one.uri.partition(",")[2]) for one in group.pictures]
+        assert (shown == [one.data for one in figures]) is is_whole
+        assert sum(map(len, shown)) <= 3_900_000
 
 
 # --- files ---
@@ -68,20 +47,14 @@ def test_all_figures_of_a_page_take_less_than_four_megabytes() -> None:
 def test_figures_are_written_as_programs_take_them(tmp_path: Path) -> None:
     picture = np.full((20, 30, 3), 77, np.uint8)
     bad = b'<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>'
-    of = run(
-        [
-            cell(
-                "check",
-                figures=(
-                    figure("photo", encode_webp(picture), WEBP),
-                    figure("chart", encode_png(picture)),
-                    figure("script", bad, SVG),
-                    figure("damaged", b"RIFF....WEBP", WEBP),
-                ),
-            ),
-            cell("other", figures=(figure("not_asked", encode_png(picture)),)),
-        ]
+    figures = (
+        figure("photo", encode_webp(picture), WEBP),
+        figure("chart", encode_png(picture)),
+        figure("script", bad, SVG),
+        figure("damaged", b"RIFF....WEBP", WEBP),
     )
+    other = cell("other", figures=(figure("not_asked", encode_png(picture)),))
+    of = run_of(cell("check", figures=figures), other)
     assert write_figures(of, tmp_path / "out", ["check"]) == 2
     found = sorted(
         path.relative_to(tmp_path / "out").as_posix()

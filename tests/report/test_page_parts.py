@@ -7,23 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.records import RecordedEnvironment
 from orthoflow.report import combinations as module
 from orthoflow.report.combinations import group_environments, improved_on, ways
 from orthoflow.report.figures import graph_file, run_graph
-from tests.report_runs import HeldRun, cell, compared_run, environment, given, record
+from tests.report_runs import cell, compared_run, environment, given, run_of
 
 CLOUD = given("scan.cloud", "1", "cloud")
 
 
-def run(*cells: RecordedCell) -> HeldRun:
-    return HeldRun(path=Path("run.h5"), record=record(cells))
-
-
 def test_boxes_are_below_all_that_they_depend_on() -> None:
-    held = run(
+    held = run_of(
         cell("scan", wall_s=125.0),
         cell("plane", inputs={"cloud": CLOUD}, cached_from="r0"),
         cell("failing", inputs={"cloud": CLOUD}, status="failed"),
@@ -48,7 +43,7 @@ def test_boxes_are_below_all_that_they_depend_on() -> None:
 def test_wide_levels_continue_below_and_what_was_skipped_alone_is_last() -> None:
     skipped = [cell(f"read{index}", status="skipped") for index in range(7)]
     planes = [cell(f"plane{index}", inputs={"cloud": CLOUD}) for index in range(6)]
-    graph = run_graph(run(cell("scan"), *skipped, *planes))
+    graph = run_graph(run_of(cell("scan"), *skipped, *planes))
     rows = [row for _, row in graph.nodes(data="row")]
     assert [rows.count(row) for row in range(5)] == [1, 5, 1, 5, 2]
     assert rows[0] == 0
@@ -57,12 +52,12 @@ def test_wide_levels_continue_below_and_what_was_skipped_alone_is_last() -> None
 
 def test_cells_of_a_step_are_one_box() -> None:
     cells = [cell(f"plane@plane=v{k}", status="failed" if k < 3 else "ok") for k in range(25)]
-    (about,) = (about for _, about in run_graph(run(*cells)).nodes(data=True))
+    (about,) = (about for _, about in run_graph(run_of(*cells)).nodes(data=True))
     assert about["state"] == "failed"
     assert about["about"] == "run 25 times, 22.0 s, 3 failed"
     for froms, state in ((("r0",), "cached"), (("r0", ""), "ok")):
         cells = [cell(f"p@p=v{k}", cached_from=froms[k % len(froms)]) for k in range(4)]
-        assert run_graph(run(*cells)).nodes["p"]["state"] == state
+        assert run_graph(run_of(*cells)).nodes["p"]["state"] == state
 
 
 FIRST = environment()
@@ -73,8 +68,8 @@ def packages(name: str, **versions: str) -> RecordedEnvironment:
 
 
 def first_alike(*others: RecordedEnvironment) -> list[str]:
-    recorded = record([cell("a")], environments=(FIRST, *others))
-    return [*group_environments([HeldRun(path=Path("r.h5"), record=recorded)]).first.values()]
+    run = run_of(cell("a"), environments=(FIRST, *others))
+    return [*group_environments([run]).first.values()]
 
 
 @pytest.mark.parametrize(
@@ -108,24 +103,24 @@ def test_every_cell_stands_in_one_place(tmp_path: Path) -> None:
     assert (coarse.anchor, broken.cells) == ("r1-way-2", ("plane@plane=broken",))
 
 
-def test_what_combinations_share_stands_with_the_first(tmp_path: Path) -> None:
+def test_what_combinations_share_stands_with_the_first() -> None:
     cells = [
         cell("plane@plane=a"),
         cell("plane@plane=b"),
         *(cell(f"orient@plane={p},orient={o}") for p in "ab" for o in "xy"),
     ]
-    run = HeldRun(path=tmp_path / "run.h5", record=record(cells))
+    run = run_of(*cells)
     found = {way.name: way for way in ways(run, "")}
     assert found["plane=b, orient=x"].cells == ("plane@plane=b", "orient@plane=b,orient=x")
     assert found["plane=b, orient=y"].cells == ("orient@plane=b,orient=y",)
 
 
-def test_a_first_orientation_is_improved_on_by_the_second(tmp_path: Path) -> None:
+def test_a_first_orientation_is_improved_on_by_the_second() -> None:
     cells = [
         cell("first", method="orient.pnp"),
         cell("reties", method="match.guided", inputs={"c": given("first.cameras", "1", "cameras")}),
         cell("orient", method="orient.dlt", inputs={"t": given("reties.ties", "2", "ties")}),
     ]
-    run = HeldRun(path=tmp_path / "run.h5", record=record(cells))
+    run = run_of(*cells)
     assert improved_on(run, [one.address for one in cells]) == {"first"}
     assert improved_on(run, ["first", "reties"]) == frozenset()

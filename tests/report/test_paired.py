@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_provenance.document import Metric
+from orthoflow_provenance.document import Metric, RecordedCell
 from scipy.stats import wilcoxon
 
 from orthoflow.records.runs import parts_of
@@ -22,10 +21,17 @@ from orthoflow.report.paired import (
     paired_differences,
     who_leads,
 )
-from tests.report_runs import HeldRun, cell, environment, record
+from tests.report_runs import cell, environment, run_of
 
 # Of one method in each room, with repeats a list; None where it failed.
 _Values = Sequence[float | list[float | None] | None]
+
+
+def over_parts(
+    cells: Sequence[RecordedCell], resolved: Mapping[str, object], **more: object
+) -> Sequence[MetricOverDatasets]:
+    """Compare the methods of a run over its datasets."""
+    return over_datasets(parts_of(run_of(*cells, workflow_resolved=json.dumps(resolved), **more)))
 
 
 def over(
@@ -75,13 +81,9 @@ def over(
         "datasets": {f"r{room}": {"inputs": {}, "set": {}} for room in range(n_rooms)},
         "compare": {"baseline": {"plane": next(iter(methods))}},
     }
-    held = record(
-        cells,
-        workflow_resolved=json.dumps(resolved),
-        environments=(environment(), environment("e2", threads=4)),
-    )
-    (found_over,) = over_datasets(parts_of(HeldRun(path=Path("run.h5"), record=held)))
-    return found_over
+    environments = (environment(), environment("e2", threads=4))
+    (found,) = over_parts(cells, resolved, environments=environments)
+    return found
 
 
 def pairs(better: str, *values: tuple[float, float]) -> Paired:
@@ -186,8 +188,7 @@ def test_a_step_has_a_row_per_variant_on_which_it_depends() -> None:
         for step, corner in (("plane", ""), ("check", ",corner=x"), ("check", ",corner=y"))
     ]
     resolved = {"datasets": {f"r{room}": {} for room in range(2)}}
-    held = record(cells, workflow_resolved=json.dumps(resolved))
-    found = over_datasets(parts_of(HeldRun(path=Path("run.h5"), record=held)))
+    found = over_parts(cells, resolved)
     assert {one.column.step: [method.name for method in one.methods] for one in found} == {
         "check": [f"plane={plane}, corner={corner}" for plane in "ab" for corner in "xy"],
     } | ({"plane": ["plane=a", "plane=b"]} if len(found) > 1 else {})
@@ -209,8 +210,7 @@ def test_methods_are_compared_at_equal_values_of_a_sweep() -> None:
         "datasets": {f"r{room}": {} for room in range(2)},
         "compare": {"baseline": {"plane": "hough-0.02"}},
     }
-    held = record(cells, workflow_resolved=json.dumps(resolved))
-    (found,) = over_datasets(parts_of(HeldRun(path=Path("run.h5"), record=held)))
+    (found,) = over_parts(cells, resolved)
     assert {one.name: one.compared_with for one in found.methods} == {
         "plane=hough-0.02": "",
         "plane=hough-0.1": "plane=hough-0.02",

@@ -25,7 +25,7 @@ from tests.report_runs import (
     compared_run,
     given,
     metrics,
-    record,
+    run_of,
     warned,
 )
 
@@ -34,10 +34,6 @@ from tests.report_runs import (
 def compared(tmp_path: Path) -> HeldRun:
     """Three variants of one step, one of them failed."""
     return compared_run(tmp_path)
-
-
-def run(*cells: object, **more: object) -> Run:
-    return Run(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
 
 
 def test_the_page_needs_no_network_and_escapes_what_methods_say(
@@ -96,7 +92,7 @@ def test_what_was_skipped_asks_for_no_citation() -> None:
         cell("photo", status="skipped", citations=("Photos, 2017",)),
     ]
     planes = ("plane.toy", "wall.toy: 4, Table 2")
-    assert citations(run(*cells)) == {"Planes, 2015": planes, "Walls, 2016": ("wall.toy",)}
+    assert citations(run_of(*cells)) == {"Planes, 2015": planes, "Walls, 2016": ("wall.toy",)}
 
 
 def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
@@ -145,7 +141,7 @@ def test_combinations_that_show_different_walls_are_a_limit(
     walls: list[tuple[float, float]], said: str
 ) -> None:
     cells = [rastered(*wall, f"plane={index}") for index, wall in enumerate(walls)]
-    found = limits(run(*cells))
+    found = limits(run_of(*cells))
     if not said:
         assert found == ()
         return
@@ -163,17 +159,17 @@ def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended(tmp_path:
         inputs={"t": given("reties.ties", "2", "t")},
         **warned("photo b: few ties"),
     )
-    assert [limit.cells for limit in limits(run(first, reties, orient))] == [("orient",)]
-    silent = run(first, reties, replace(orient, **warned()))
+    assert [limit.cells for limit in limits(run_of(first, reties, orient))] == [("orient",)]
+    silent = run_of(first, reties, replace(orient, **warned()))
     write_report([silent], tmp_path / "report.html")
     assert "No unresolved warnings." in (tmp_path / "report.html").read_text()
     failed = replace(orient, status="failed", error_message="no disk", **warned())
-    limiting = [limit.cells for limit in limits(run(first, reties, failed))]
+    limiting = [limit.cells for limit in limits(run_of(first, reties, failed))]
     assert limiting == [("orient",), ("first",)]
 
 
 def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
-    whole_run = run(
+    whole_run = run_of(
         cell("wall"),
         cell("paint", status="failed", error_message="no disk"),
         cell("check", status="skipped", error_message="needs paint, which failed"),
@@ -200,11 +196,11 @@ def test_a_third_party_method_declares_its_headlines() -> None:
         cell("plane", method="plane.toy", metrics=(plane,)),
         cell("dent", method="dent.simple", metrics=(dent, other)),
     ]
-    assert [(one.what, one.value, one.cell) for one in answers(run(*cells))] == [
+    assert [(one.what, one.value, one.cell) for one in answers(run_of(*cells))] == [
         ("share of dents", "0.25", "dent"),
         ("points to the first plane, RMS", "1.6 mm", "plane"),
     ]
-    columns = comparison_columns(combinations_of(run(*cells)))
+    columns = comparison_columns(combinations_of(run_of(*cells)))
     assert [one.metric for one in columns if one.headline] == ["dent_share", "rms_mm"]
 
 
@@ -217,8 +213,8 @@ def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
         PublishedFile(path=f"products/shade/{name}", size_bytes=2, sha256="0" * 64)
         for name in ("shades 1.json", "metrics.csv", "gone.json")
     )
-    made = record([cell("shade"), cell("plain")], published=published)
-    write_page(HeldRun(path=tmp_path / "run.h5", record=made), tmp_path / "report.html")
+    made = run_of(cell("shade"), cell("plain"), published=published)
+    write_page(replace(made, path=tmp_path / "run.h5"), tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert re.findall(r'href="(products/[^"]*)"', page) == ["products/shade/shades%201.json"]
     assert "0 metrics, 1 file</span>" in page
@@ -233,7 +229,7 @@ def test_costs_are_summed_over_the_steps_of_a_combination() -> None:
         cell("plane@plane=region", cpu_s=0.996, peak_rss_mib=50.0),
         cell("wall@plane=region", cpu_s=0.0),
     ]
-    table = comparison_table([run(*cells)])
+    table = comparison_table([run_of(*cells)])
     assert table is not None
     found = [tuple(cost.text for cost in one.values[-2:]) for one in table.rows]
     assert found == [("1.5", "1235"), ("", ""), ("1.00", "50")]
@@ -265,7 +261,9 @@ def test_a_value_states_what_it_is_the_mean_of(
         )
         for index, value in enumerate(values)
     ]
-    table = comparison_table([run(*repeats, cell("plane@plane=two", metrics=metrics(rms_mm=3.0)))])
+    table = comparison_table(
+        [run_of(*repeats, cell("plane@plane=two", metrics=metrics(rms_mm=3.0)))]
+    )
     assert table is not None
     value = table.rows[0].values[0]
     assert (value.text, value.note) == (text, note)
@@ -300,7 +298,7 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
 def test_runs_of_one_workflow_are_told_apart_by_their_options() -> None:
     cells = cell("plane", metrics=metrics(rms_mm=1.0))
     runs = [
-        run(cells, run_id=f"r{walls}", overrides=("--set all=0", f"--set wall.n={walls}"))
+        run_of(cells, run_id=f"r{walls}", overrides=("--set all=0", f"--set wall.n={walls}"))
         for walls in (1, 4)
     ]
     table = comparison_table(runs)
@@ -319,7 +317,7 @@ def test_a_glance_states_which_lead_and_names_three_at_most(compared: Run) -> No
     assert table.best_in(first).startswith("plane: points to the first plane")
     n_exact = table.n_ranked
     cells = [replace(one, determinism="seeded") for one in compared.record.cells]
-    seeded = comparison_table([run(*cells, workflow_resolved=compared.record.workflow_resolved)])
+    seeded = comparison_table([run_of(*cells, workflow_resolved=compared.record.workflow_resolved)])
     assert seeded is not None
     assert (n_exact, seeded.n_ranked, seeded.best_in(seeded.glance[0])) == (3, 0, "")
     assert (last.name, last.shortfall, last.count(Mark.BEST)) == ("plane=broken", "failed", 0)

@@ -7,7 +7,6 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from orthoflow.products import Planes, ScanRow, Spread, Thickness
 from orthoflow.report.paper_tables import bibtex, paper_files
 from orthoflow.report.rankings import Value, badness, rank
 from orthoflow.report.tables import PlaneTables, plane_tables
-from tests.report_runs import HeldRun, cell, compared_run, given, record
+from tests.report_runs import cell, compared_run, given, run_of
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +81,7 @@ def test_one_paper_is_one_entry_and_signs_of_latex_mean_nothing() -> None:
     assert "title = {no year at all}" in found
 
 
-def test_of_a_run_without_datasets_there_is_no_table_over_them(
-    files: dict[str, str], tmp_path: Path
-) -> None:
+def test_of_a_run_without_datasets_there_is_no_table_over_them(files: dict[str, str]) -> None:
     assert sorted(files) == ["citations.bib", "results.csv", "results.md", "results.tex"]
 
 
@@ -112,8 +109,7 @@ def wall_and_floor() -> Planes:
 def tables(*made: tuple[RecordedCell, Planes]) -> list[PlaneTables]:
     """The tables of cells that give planes."""
     products = {(cell.address, "planes"): planes for cell, planes in made}
-    recorded = record([cell for cell, _ in made])
-    return list(plane_tables(HeldRun(path=Path("run.h5"), record=recorded, products=products)))
+    return list(plane_tables(run_of(*(cell for cell, _ in made), products=products)))
 
 
 def giving(address: str, digest: str, **more: Any) -> RecordedCell:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -31,35 +30,30 @@ from orthoflow.report.summaries import answers
 from tests.compared_runs import compared
 from tests.compared_runs import number as metric
 from tests.report_runs import (
-    HeldRun,
     cell,
     compared_resolved,
     distance,
     metrics,
     record,
+    run_of,
 )
-
-
-def run(*cells: object, **more: object) -> HeldRun:
-    return HeldRun(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
-
 
 # --- combinations ---
 
 
 def test_the_baseline_is_what_the_workflow_says() -> None:
     cells = [cell("plane@plane=fine"), cell("plane@plane=coarse"), cell("plane@plane=fine#1")]
-    named = run(*cells, workflow_resolved=compared_resolved("*.wall_s", "a.b"))
+    named = run_of(*cells, workflow_resolved=compared_resolved("*.wall_s", "a.b"))
     assert baseline_of(named) == {"plane": "fine"}
     assert wanted_metrics(named) == ("*.wall_s", "a.b")
     assert [one.is_baseline for one in combinations_of(named)] == [True, False]
     assert [item.address for item in baseline_cells(named)] == ["plane@plane=fine"]
     for resolved in ("{}", "no JSON", "[]", '{"compare": 3}', '{"compare": {"metrics": 1}}'):
-        silent = run(*reversed(cells), workflow_resolved=resolved)
+        silent = run_of(*reversed(cells), workflow_resolved=resolved)
         assert (baseline_of(silent), wanted_metrics(silent)) == ({}, ())
         assert [one.is_baseline for one in combinations_of(silent)] == [False, False]
         assert [item.address for item in baseline_cells(silent)] == ["plane@plane=fine"]
-    assert baseline_cells(run()) == ()
+    assert baseline_cells(run_of()) == ()
 
 
 # --- differences ---
@@ -128,7 +122,7 @@ def test_products_that_differ_stand_first_with_their_distances() -> None:
 
 
 def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:
-    whole_run = run(
+    whole_run = run_of(
         cell("plane", metrics=metrics(rms_mm=1.25)),
         cell("plane#1", metrics=metrics(rms_mm=1.75)),
         cell("first", metrics=metrics(check_rmse_mm_worst=2.0, n_oriented=9.0)),

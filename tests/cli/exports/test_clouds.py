@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +28,7 @@ from orthoflow.products import (
     Product,
 )
 from tests import samples
-from tests.report_runs import cameras_product
+from tests.report_runs import HeldRun, cameras_product, cell, given, run_of
 
 N_SIDE = 12
 
@@ -55,39 +56,28 @@ def labels(n_points: int = N_SIDE**2) -> PointLabels:
     return PointLabels(plane_index=np.zeros(n_points, np.int16))
 
 
-class ToyRun(SimpleNamespace):
-    """Cells of products that lie in its record: address -> inputs by port, and what it made."""
-
-    def __init__(self, cells: dict[str, tuple[dict[str, str], dict[str, Product]]]) -> None:
-        super().__init__(record=SimpleNamespace(run_id="r1"), cells={}, made={})
-        for address, (taken, made) in cells.items():
-            self.made[address] = made
-            outputs = {
-                port: SimpleNamespace(
-                    digest=f"{address}.{port}", type_name=product.type_name, embedded=True
-                )
-                for port, product in made.items()
-            }
-            inputs = {
-                port: self.cells[source].outputs[port.rstrip("2")] for port, source in taken.items()
-            }
-            self.cells[address] = SimpleNamespace(
-                outputs=outputs, inputs=inputs, assignment={}, repeat=0
-            )
-
-    def cell(self, address: str) -> Any:
-        return self.cells[address]
-
-    def payload(self, address: str, port: str) -> Any:
-        return self.made[address][port].to_payload()
+def toy_run(**cells: tuple[Mapping[str, str], Mapping[str, Product]]) -> HeldRun:
+    """A run of steps: which step gives each input, and the products that each gives, by port."""
+    held = {(step, port): one for step, (_, made) in cells.items() for port, one in made.items()}
+    outputs = {
+        place: given("", chr(97 + number), one.type_name)
+        for number, (place, one) in enumerate(held.items())
+    }
+    recorded = [
+        cell(
+            step,
+            inputs={port: outputs[source, port.rstrip("2")] for port, source in taken.items()},
+            outputs={port: outputs[step, port] for port in made},
+        )
+        for step, (taken, made) in cells.items()
+    ]
+    return run_of(*recorded, products=held)
 
 
-def labelled(of: PointCloud | None = None, marks: PointLabels | None = None) -> Any:
-    return ToyRun(
-        {
-            "scan": ({}, {"cloud": of or cloud()}),
-            "plane": ({"cloud": "scan"}, {"planes": planes(), "labels": marks or labels()}),
-        }
+def labelled(of: PointCloud | None = None, marks: PointLabels | None = None) -> HeldRun:
+    return toy_run(
+        scan=({}, {"cloud": of or cloud()}),
+        plane=({"cloud": "scan"}, {"planes": planes(), "labels": marks or labels()}),
     )
 
 
@@ -142,30 +132,26 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     bare = replace(cloud(), intensity=None)
     made: dict[str, Product] = {"planes": planes(), "labels": labels()}
-    turned = ToyRun(
-        {
-            "scan": ({}, {"cloud": bare}),
-            "plane": ({"cloud": "scan"}, made),
-            "orient": ({}, {"cameras": cameras_product()}),
-        }
+    turned = toy_run(
+        scan=({}, {"cloud": bare}),
+        plane=({"cloud": "scan"}, made),
+        orient=({}, {"cameras": cameras_product()}),
     )
     # Photos that the run oriented are named, though they were not read.
     with pytest.raises(ArgumentError, match=r"available: photos, plane, deviation$"):
         exported(folder, turned, colour="intensity")
-    grey = ToyRun({"scan": ({}, {"cloud": bare})})
+    grey = toy_run(scan=({}, {"cloud": bare}))
     with pytest.raises(ArgumentError, match="of scan has no colours, intensities or planes"):
         exported(folder, grey)
     none = np.zeros(0, np.float32)
     empty = PointCloud(origin=np.zeros(3), x=none, y=none, z=none, up=np.array([0.0, 0.0, 1.0]))
     with pytest.raises(ArgumentError, match="the cloud of scan has no points"):
-        exported(folder, ToyRun({"scan": ({}, {"cloud": empty})}))
+        exported(folder, toy_run(scan=({}, {"cloud": empty})))
     with pytest.raises(ArgumentError, match=r"^the labels have 9 points, but the cloud has 144$"):
         exported(folder, labelled(marks=labels(9)))
-    two = ToyRun(
-        {
-            "scan": ({}, {"cloud": cloud()}),
-            "plane": ({"cloud": "scan", "cloud2": "scan"}, {"labels": labels()}),
-        }
+    two = toy_run(
+        scan=({}, {"cloud": cloud()}),
+        plane=({"cloud": "scan", "cloud2": "scan"}, {"labels": labels()}),
     )
     with pytest.raises(
         ArgumentError,
@@ -217,7 +203,7 @@ def test_photos_colour_what_they_see_and_the_rest_stays_grey(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.json", "cloud.toy"]
 
 
-def photographed(*names: str, takes: bool = True) -> Any:
+def photographed(*names: str, takes: bool = True) -> HeldRun:
     """A run that oriented two photos, and could not orient a third; twice."""
     one = cameras_product().cameras[0]
     refused = Camera(photo="c.jpg", status="too few ties")
@@ -225,12 +211,10 @@ def photographed(*names: str, takes: bool = True) -> Any:
     last = Cameras(cameras=(replace(one, photo="b.jpg"), replace(one, photo="a.jpg"), refused))
     photos = [Photo(name=name, encoded=b"", width=4, height=3) for name in names]
     taken = {"photos": "shots"} if takes else {}
-    return ToyRun(
-        {
-            "shots": ({}, {"photos": Photos(photos=tuple(photos))}),
-            "orient": (taken, {"cameras": first}),
-            "bundle": (taken, {"cameras": last}),
-        }
+    return toy_run(
+        shots=({}, {"photos": Photos(photos=tuple(photos))}),
+        orient=(taken, {"cameras": first}),
+        bundle=(taken, {"cameras": last}),
     )
 
 

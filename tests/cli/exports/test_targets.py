@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 import pytest
 import trimesh
-from click.testing import CliRunner, Result
 
 from orthoflow.cli.export import format_options
 from orthoflow.cli.exports import results as module
@@ -25,13 +24,13 @@ from orthoflow.cli.exports.products import (
     output_of,
     product_of,
 )
-from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.products import PointLabels
 from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
 from tests.drawing_runs import WALL, box_image, write_drawing_run
-from tests.report_runs import HeldRun, cell, compared_run, given, record
+from tests.drawing_runs import export as export_run
+from tests.report_runs import HeldRun, cell, compared_run, given, run_of
 
 OPTIONS: Final = format_options()
 
@@ -81,30 +80,30 @@ def test_what_contradicts_itself_is_refused(chosen: Choices, target: str | None,
     assert bool(refused(chosen, target)) == bool(said)
 
 
-def run_of(*addresses: str, type_name: str = "labels") -> HeldRun:
+def giving(*addresses: str) -> HeldRun:
     """Cells that give a product each, whose digests are the letters of the alphabet."""
     cells = [
-        cell(address, outputs={"out": given("", chr(97 + place), type_name)})
+        cell(address, outputs={"out": given("", chr(97 + place), "labels")})
         for place, address in enumerate(addresses)
     ]
-    return HeldRun(path=Path("run.h5"), record=record([cell("scan"), *cells]))
+    return run_of(cell("scan"), *cells)
 
 
 def test_the_last_cell_is_taken_and_the_first_five_others_are_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert output_of(run_of("plane"), "labels", None) == ("plane", "out")
+    assert output_of(giving("plane"), "labels", None) == ("plane", "out")
     seven = [f"plane@plane=v{k}" for k in range(7)]
-    assert output_of(run_of(*seven), "labels", seven[2]) == (seven[2], "out")
+    assert output_of(giving(*seven), "labels", seven[2]) == (seven[2], "out")
     assert capsys.readouterr().err == ""
-    assert output_of(run_of(*seven), "labels", None) == (seven[-1], "out")
+    assert output_of(giving(*seven), "labels", None) == (seven[-1], "out")
     said = capsys.readouterr().err
     assert f"note: using the labels of points of {seven[-1]}; --step selects others: " in said
     assert f"{', '.join(seven[:5])} and 1 more" in said
 
 
 def test_a_cell_that_gives_nothing_of_the_kind_is_refused() -> None:
-    run = run_of("a", "b")
+    run = giving("a", "b")
     with pytest.raises(ArgumentError) as caught:
         output_of(run, "labels", "scan")
     assert str(caught.value) == (
@@ -117,10 +116,9 @@ def test_a_cell_that_gives_nothing_of_the_kind_is_refused() -> None:
 
 
 def test_the_last_of_some_cells_gives_a_product(tmp_path: Path) -> None:
-    run = run_of("a", "b")
+    run = giving("a", "b")
     first, second = (PointLabels(plane_index=np.full(3, k, np.int16)) for k in (1, 2))
-    payloads = {"a": first.to_payload(), "b": second.to_payload()}
-    held: Any = SimpleNamespace(cells=run.cells, payload=lambda address, _port: payloads[address])
+    held = replace(run, products={("a", "out"): first, ("b", "out"): second})
     found = last_product(held, run.cells, PointLabels, tmp_path)
     assert found is not None
     assert found.plane_index.tolist() == [2, 2, 2]
@@ -237,14 +235,9 @@ def model(tmp_path: Path) -> Path:
     return write_drawing_run(tmp_path / "run")
 
 
-def export_model(model: Path, *more: str) -> Result:
-    words = ["export", str(model), "--to", "gltf", "-o", str(model.parent / "model"), *more]
-    return CliRunner().invoke(program, words)
-
-
 @pytest.mark.parametrize("more", [(), ("--relief",)])
 def test_a_model_has_the_depths_of_the_wall_only_on_request(model: Path, more: tuple[str]) -> None:
-    done = export_model(model, *more)
+    done = export_run(model, "gltf", model.parent / "model", *more)
     assert done.exit_code == 0, done.output
     (mesh,) = trimesh.load(model.parent / "model" / "room.glb").geometry.values()
     span_m = np.ptp(mesh.vertices[:, 2])
@@ -254,7 +247,7 @@ def test_a_model_has_the_depths_of_the_wall_only_on_request(model: Path, more: t
 
 def test_a_run_without_depths_says_so(model: Path) -> None:
     shutil.rmtree(model / "products" / "wall")
-    done = export_model(model, "--relief")
+    done = export_run(model, "gltf", model.parent / "model", "--relief")
     assert done.exit_code == 2
     assert f"--relief: the run has no depth raster of wall {WALL}" in " ".join(done.output.split())
     assert not (model.parent / "model").exists()

@@ -11,10 +11,8 @@ import numpy as np
 import pdfplumber
 import pytest
 import rasterio
-from click.testing import CliRunner
 from PIL import Image
 
-from orthoflow.cli.program import program
 from orthoflow.files.drawings.printed_pictures import (
     NOTHING,
     ElevationWall,
@@ -31,23 +29,18 @@ from orthoflow.files.sidecars import placed_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.records.open import open_run
 from orthoflow.records.walls import delivered_walls, room_results, write_walls_json
-from tests.drawing_runs import GSD_M, SIZE_M, WALL, box_image, box_planes, write_drawing_run
+from tests.drawing_runs import (
+    GSD_M,
+    SIZE_M,
+    WALL,
+    box_image,
+    box_planes,
+    export,
+    write_drawing_run,
+)
 from tests.optional import skip
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_drawing_run(tmp_path_factory.mktemp("deliverables") / "run")
-
-
-def export(run: Path, target: str, folder: Path, *more: str) -> str:
-    done = CliRunner().invoke(
-        program, ["export", str(run), "--to", target, "-o", str(folder), *more]
-    )
-    assert done.exit_code == 0, done.output
-    return done.output
 
 
 @pytest.mark.parametrize("slope", [-0.6, 0.0, 0.3])
@@ -107,7 +100,7 @@ def test_equal_depths_before_and_behind_the_plane_have_equally_strong_colours(
 
 
 def test_relief_lies_where_the_depths_do(run: Path, tmp_path: Path) -> None:
-    export(run, "relief", tmp_path / "out", "--light", "90,20")
+    assert export(run, "relief", tmp_path / "out", "--light", "90,20").exit_code == 0
     depth = next((run / "products").rglob(f"wall_{WALL}_depth.tif"))
     with (
         rasterio.open(depth) as given,
@@ -119,10 +112,7 @@ def test_relief_lies_where_the_depths_do(run: Path, tmp_path: Path) -> None:
     assert lines["type"] == "FeatureCollection"
     with Image.open(tmp_path / "out" / f"wall_{WALL}_relief.png") as figure:
         assert figure.width > 600
-    refused = CliRunner().invoke(
-        program, ["export", str(run), "--to", "relief", "--light", "90", "-o", str(tmp_path / "no")]
-    )
-    assert refused.exit_code == 2
+    assert export(run, "relief", tmp_path / "no", "--light", "90").exit_code == 2
 
 
 def test_walls_unfold_in_the_order_of_a_viewer_who_turns_right() -> None:
@@ -152,7 +142,10 @@ def test_walls_unfold_in_the_order_of_a_viewer_who_turns_right() -> None:
 
 
 def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> None:
-    export(run, "elevation", tmp_path / "out", "--scale", "25", "--language", "fr")
+    assert (
+        export(run, "elevation", tmp_path / "out", "--scale", "25", "--language", "fr").exit_code
+        == 0
+    )
     with pdfplumber.open(tmp_path / "out" / "elevation_1.pdf") as pdf:
         (page,) = pdf.pages
         (image,) = page.images
@@ -167,7 +160,7 @@ def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> Non
 
 
 def test_a_qgis_project_shifts_x_alone(run: Path, tmp_path: Path) -> None:
-    export(run, "qgis", tmp_path / "out")
+    assert export(run, "qgis", tmp_path / "out").exit_code == 0
     project = (tmp_path / "out" / "walls.qgs").read_text()
     virtual = sorted((tmp_path / "out").glob("*_ortho.vrt"))
     assert virtual
@@ -200,7 +193,7 @@ def test_every_export_states_the_same_of_a_wall(tmp_path: Path) -> None:
         ("iiif", "manifest.json"),
         ("stac", f"products/mosaic/wall_{WALL}_ortho.item.json"),
     ):
-        export(run, target, tmp_path / target)
+        assert export(run, target, tmp_path / target).exit_code == 0
         assert wall.about.sentence in (tmp_path / target / file).read_text(), target
     item = json.loads((tmp_path / "stac" / file).read_text())
     assert item["properties"]["orthoflow:expected_mm_median"] == pytest.approx(2.0)
@@ -220,7 +213,7 @@ def test_an_iiif_manifest_has_a_scale_and_its_tiles_are_the_picture(
     run: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "out"
-    export(run, "iiif", folder, "--base-url", "https://example.org/room/")
+    assert export(run, "iiif", folder, "--base-url", "https://example.org/room/").exit_code == 0
     text = (folder / "manifest.json").read_text()
     manifest = json.loads(text)
     (canvas,) = manifest["items"]

@@ -13,12 +13,10 @@ import numpy as np
 import pdfplumber
 import pytest
 from click import BadParameter
-from click.testing import CliRunner, Result
 from orthoflow_provenance.document import PublishedFile
 from PIL import Image
 
 from orthoflow.cli.export import export as command
-from orthoflow.cli.program import program
 from orthoflow.errors import RecordError
 from orthoflow.records.open import open_run
 from orthoflow.records.walls import room_results
@@ -31,6 +29,7 @@ from tests.drawing_runs import (
     box_openings,
     box_planes,
     box_points,
+    export,
     wall_frame,
     write_drawing_run,
 )
@@ -40,16 +39,6 @@ from tests.report_runs import cell, given, metrics
 TOP_M = 102.4
 MM = 25.4 / 72.0
 WIDE_M, HIGH_M = SIZE_M[0] - 2 * GAP_M, SIZE_M[2] - 2 * GAP_M
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_drawing_run(tmp_path_factory.mktemp("drawn") / "run")
-
-
-def export(run: Path, target: str, folder: Path, *more: object) -> Result:
-    words = ["export", str(run), "--to", target, "-o", str(folder), *map(str, more)]
-    return CliRunner().invoke(program, words)
 
 
 @pytest.fixture(scope="module")

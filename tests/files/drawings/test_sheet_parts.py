@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from orthoflow.errors import InputError
 from orthoflow.files.drawings.key_plans import key_plan
 from orthoflow.files.drawings.printed_pictures import label_place
-from orthoflow.files.drawings.sheet_contents import TitleBlock, read_title_block
 from orthoflow.geometry.frames import frame_over
 from tests import samples
 from tests.drawing_runs import GAP_M, SIZE_M, box_planes, wall_frame
@@ -111,35 +108,3 @@ def test_arrows_are_as_long_at_walls_that_lean(tilt_deg: float) -> None:
     assert np.linalg.norm(along) == pytest.approx(0.25 * 4.0 * 0.9)
     before = plan.arrow[0] - plan.marked.mean(axis=0)
     np.testing.assert_allclose(before, -along / 0.9, atol=1e-9)
-
-
-def read(folder: Path, text: str) -> TitleBlock:
-    path = folder / "block.yaml"
-    path.write_text(text, encoding="utf-8")
-    return read_title_block(path)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("projct: a\n", "block.yaml:1:1: projct: unknown key projct (did you mean project?)"),
-        ("title: [1]\n", "block.yaml:1:8: title: input should be text, got a list"),
-        (f"note: {'a' * 301}\n", "note: has 301 characters; at most 300 fit on a sheet"),
-        ("layout: middle\n", "block.yaml:1:9: layout: input should be 'column' or 'strip', got"),
-        (
-            "revisions: [{mark: A, texts: b}]\n",
-            "block.yaml:1:23: revisions[0].texts: unknown key texts (did you mean text?)",
-        ),
-        ("logo: none.png\n", "cannot read none.png: No such file"),
-        ("logo: block.yaml\n", "block.yaml is not a JPEG, PNG, TIFF"),
-        (
-            "a" * 100_001,
-            "block.yaml has 100001 bytes, but a title block (YAML) may have at most 100000",
-        ),
-    ],
-)
-def test_what_is_wrong_is_said_in_one_sentence(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
-    assert said in str(caught.value)
-    assert "\n" not in str(caught.value)

@@ -14,13 +14,11 @@ import cv2
 import numpy as np
 import pdfplumber
 import pytest
-from click.testing import CliRunner, Result
 from fontTools.fontBuilder import FontBuilder
 from fontTools.pens.t2CharStringPen import T2CharStringPen
 from PIL import Image
 
 from orthoflow.cli.exports.sheets import usual_scale
-from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.printed_pictures import encode_part
@@ -44,7 +42,7 @@ from orthoflow.geometry.frames import frame_over
 from orthoflow.products import OrthoMask
 from orthoflow.records.open import open_run
 from tests import samples
-from tests.drawing_runs import WALL, box_image, write_drawing_run
+from tests.drawing_runs import WALL, box_image, export, write_drawing_run
 from tests.long_loops import long_only
 
 MM = 25.4 / 72.0
@@ -68,16 +66,6 @@ revisions:
   - {mark: A, date: 2026-03-14, text: first issue, by: KN}
   - {mark: B, date: 2026-03-20, text: openings added, by: AM}
 """
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_drawing_run(tmp_path_factory.mktemp("drawn") / "run")
-
-
-def export(run: Path, folder: Path, *more: object) -> Result:
-    words = ["export", str(run), "--to", "sheet", "-o", str(folder), *map(str, more)]
-    return CliRunner().invoke(program, words)
 
 
 @contextmanager
@@ -152,7 +140,7 @@ def test_text_and_lines_have_the_sizes_of_the_standards_and_nothing_overlaps(
     # The whole title block has no room on A4.
     if layout is not None and "A4" not in more:
         given = ("--title-block", office(tmp_path, layout=layout))
-    done = export(run, tmp_path / "out", *more, *given)
+    done = export(run, "sheet", tmp_path / "out", *more, *given)
     assert done.exit_code == 0, done.output
     for path in (tmp_path / "out").iterdir():
         with page_of(path) as page:
@@ -180,7 +168,7 @@ def test_a_title_block_has_what_the_office_and_its_client_want(
 ) -> None:
     block = office(tmp_path, layout=layout)
     more = ("--scale", 50, "--title-block", block, "--paper", "A2")
-    done = export(run, tmp_path / "out", *more)
+    done = export(run, "sheet", tmp_path / "out", *more)
     assert done.exit_code == 0, done.output
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
         text = words_of(page)
@@ -210,7 +198,7 @@ def test_a_title_block_has_what_the_office_and_its_client_want(
 
 def test_what_a_title_block_has_too_much_of_is_refused(run: Path, tmp_path: Path) -> None:
     more = ("--scale", 50, "--paper", "160x160", "--title-block", office(tmp_path))
-    done = export(run, tmp_path / "out", *more)
+    done = export(run, "sheet", tmp_path / "out", *more)
     assert done.exit_code == 2
     assert "--paper 160x160 is too small for the title block" in done.output
     assert not (tmp_path / "out").exists()
@@ -219,7 +207,7 @@ def test_what_a_title_block_has_too_much_of_is_refused(run: Path, tmp_path: Path
 def test_the_seal_is_read_by_a_phone_and_heights_are_those_of_the_wall(
     run: Path, tmp_path: Path
 ) -> None:
-    done = export(run, tmp_path / "out", "--scale", 20)
+    done = export(run, "sheet", tmp_path / "out", "--scale", 20)
     # Cells of 10 mm have 150 to the inch from 1:59.06 on.
     assert "but sufficient at 1:100" in done.output
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
@@ -243,7 +231,7 @@ def test_the_seal_is_read_by_a_phone_and_heights_are_those_of_the_wall(
 
 
 def test_feet_are_written_and_measured(run: Path, tmp_path: Path) -> None:
-    assert export(run, tmp_path / "out", "--units", "ft", "--scale", 24).exit_code == 0
+    assert export(run, "sheet", tmp_path / "out", "--units", "ft", "--scale", 24).exit_code == 0
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
         text = words_of(page)
         assert "1:24" in text
@@ -272,7 +260,7 @@ def test_letters_of_no_font_are_refused_and_nothing_is_written(
     pens.installed_letters.cache_clear()
     block = tmp_path / "block.yaml"
     block.write_text("project: 松本城\n", encoding="utf-8")
-    done = export(run, tmp_path / "out", "--title-block", block)
+    done = export(run, "sheet", tmp_path / "out", "--title-block", block)
     pens.installed_letters.cache_clear()
     assert done.exit_code == 2
     assert "no installed font contains the character 松 (U+677E), which is used" in done.output
@@ -290,7 +278,7 @@ def test_letters_are_taken_from_an_installed_font(
     pens.fallback_font.cache_clear()
     block = tmp_path / "block.yaml"
     block.write_text("project: A 城\n", encoding="utf-8")
-    done = export(run, tmp_path / "out", "--title-block", block)
+    done = export(run, "sheet", tmp_path / "out", "--title-block", block)
     pens.installed_letters.cache_clear()
     assert done.exit_code == 0, done.output
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
@@ -402,7 +390,7 @@ def test_too_many_sheets_are_refused() -> None:
 
 
 def test_match_lines_name_the_sheet_on_which_the_wall_goes_on(run: Path, tmp_path: Path) -> None:
-    done = export(run, tmp_path / "out", "--scale", 10, "--paper", "A3")
+    done = export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A3")
     assert done.exit_code == 0, done.output
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     n_sheets = len(names)
@@ -477,7 +465,7 @@ def test_numbers_have_the_separators_of_the_language(
     errors_m = np.full(box_image().frame.shape, 0.002, np.float32)
     image = replace(box_image(), error_m=errors_m, n_check_points=1288)
     run = write_drawing_run(tmp_path / "run", gains="global", differ=True, image=image)
-    done = export(run, tmp_path / "out", "--scale", 25, "--language", language)
+    done = export(run, "sheet", tmp_path / "out", "--scale", 25, "--language", language)
     assert (done.exit_code, done.stderr) == (0, "")
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
         text, letters = words_of(page), "".join(char["text"] for char in page.chars)
@@ -516,7 +504,7 @@ def test_a_wall_with_an_empty_image_has_a_sheet_only_where_it_is_asked_for(tmp_p
     )
     run = write_drawing_run(tmp_path / "run", others=(empty,))
     for options, number in ((), WALL), (("--wall", 1), 1):
-        done = export(run, tmp_path / str(number), "--scale", 25, *options)
+        done = export(run, "sheet", tmp_path / str(number), "--scale", 25, *options)
         assert done.exit_code == 0, done.output
         assert ("; left out as empty: wall 1" in done.output) == (not options)
         names = [path.name for path in (tmp_path / str(number)).iterdir()]
@@ -545,7 +533,7 @@ def test_a_wall_that_is_not_recommended_says_so_on_its_sheet(
         image, mask=mask, rgb=rgb, source=source, error_m=errors_m, n_check_points=12 * has_ties
     )
     run = write_drawing_run(tmp_path / "run", image=image)
-    done = export(run, tmp_path / "out", "--scale", 25, "--language", "de")
+    done = export(run, "sheet", tmp_path / "out", "--scale", 25, "--language", "de")
     assert done.exit_code == 0, done.output
     assert (f"warning: not recommended for delivery: wall {WALL} (" in done.stderr) == bool(said)
     assert said in done.stderr
