@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.images import encode_jpeg, encode_png
-from orthoflow.files.sidecars import OrthoFile, numbers, write_bytes
+from orthoflow.files.sidecars import OrthoFile, chart_json, numbers, write_bytes
 from orthoflow.geometry import Bend, WallFrame
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import JsonValue
@@ -145,7 +145,7 @@ class _Document:
                     "product_digest": ortho.digest,
                     "surface": "depths of the wall"
                     if depth is not None
-                    else ("plane" if frame.bend is None else "cylinder"),
+                    else str(chart_json(frame)["chart"]),
                 },
             }
         )
@@ -257,7 +257,7 @@ class WallMesh:
 
 
 def flat_mesh(frame: WallFrame) -> WallMesh:
-    """Return the rectangle of a wall, or strips along the arc of a cylinder."""
+    """Return the rectangle of a wall, or strips along the arcs of a curved one."""
     if frame.bend is not None:
         return _strips(frame, frame.bend)
     places = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], dtype=np.float32)
@@ -269,17 +269,15 @@ def flat_mesh(frame: WallFrame) -> WallMesh:
 
 
 def _strips(frame: WallFrame, bend: Bend) -> WallMesh:
-    n_cells = frame.width if bend.along == "u" else frame.height
-    turn = n_cells * frame.gsd_m / abs(bend.radius_m)
-    shares = np.linspace(0.0, 1.0, max(2, math.ceil(turn / _STRIP_RAD)) + 1)
-    first, last = (np.column_stack([shares, np.full(shares.size, side)]) for side in (0.0, 1.0))
-    places = np.vstack([first, last])
-    top, bottom = np.arange(shares.size - 1), np.arange(shares.size - 1) + shares.size
-    corners = [top, bottom, bottom + 1, top + 1]
-    if bend.along == "v":
-        places, corners = places[:, ::-1], corners[::-1]
+    size_m = frame.gsd_m * np.array([frame.width, frame.height])
+    count = max(2, math.ceil(bend.turn_rad(size_m) / _STRIP_RAD)) + 1
+    ribs = bend.ribs_m(size_m, count) / size_m
+    start, end = np.arange(len(ribs) - 1), np.arange(len(ribs) - 1) + len(ribs)
+    corners = [start, end, end + 1, start + 1]
+    if np.linalg.det([bend.revolution.along, bend.revolution.aside]) > 0.0:
+        corners.reverse()
     triangles = np.concatenate([np.stack([corners[k] for k in (0, i, i + 1)], 1) for i in (1, 2)])
-    places = np.ascontiguousarray(places, dtype=np.float32)
+    places = np.ascontiguousarray(np.vstack([ribs[:, 0], ribs[:, 1]]), dtype=np.float32)
     return WallMesh(
         vertices=_lifted(frame, places, np.zeros(len(places))),
         places=places,

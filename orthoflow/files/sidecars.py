@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.geotiff import GridPlace, RasterParts, local_crs_name
 from orthoflow.files.wall_descriptions import ORTHO_FILE, WallDescription, described
-from orthoflow.geometry import Bend, WallFrame
+from orthoflow.geometry import Bend, ConeBend, CylinderBend, WallFrame
 from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
@@ -70,6 +70,12 @@ _FROM_CYLINDER: Final = (
     "(r - depth_m) * cos(angle)) * normal_world with r = {sign}radius_m and angle = gsd_m * {bent} "
     "/ r"
 )
+_FROM_CONE: Final = (
+    "apex + (s * sin(h) + d * cos(h)) * (cos(t) * zero_direction + sin(t) * quarter_direction) + "
+    "(s * cos(h) - d * sin(h)) * axis with (x, y) = gsd_m * (column, row) - apex_in_raster_m, "
+    "s = sqrt(x^2 + y^2), t = (atan2(y, x) - zero_in_raster) / sin(h), with the difference between "
+    "-180 and 180 deg, h = half_angle and d = {sign}depth_m"
+)
 
 
 def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
@@ -108,13 +114,30 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
 
 
 def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
-    """Return the shape of a raster's surface; for a cylinder, also its axis and radius.
+    """Return the shape of a raster's surface; if it is curved, also its axis and dimensions.
 
     The zero direction points from the axis to the edge of the raster, left or top, where the arc
-    begins. The frame's vectors u, v and normal are those at its top-left corner.
+    begins, and on a cone to the middle of the arc. The frame's vectors u, v and normal are those at
+    its top-left corner.
     """
     if (bend := frame.bend) is None:
         return {"chart": "plane"}
+    if isinstance(bend, ConeBend):
+        own, local = bend.revolution, np.array([frame.u_world, frame.v_world, frame.normal_world])
+        zero, quarter, axis = own.axes @ local
+        return {
+            "chart": "cone",
+            "axis": numbers(axis),
+            "apex": numbers(frame.origin_world + own.start @ local),
+            "half_angle_deg": math.degrees(bend.half_angle_rad),
+            "zero_direction": numbers(zero),
+            "quarter_direction": numbers(quarter),
+            "concave": bend.is_inside,
+            "apex_in_raster_m": list(bend.apex_m),
+            "zero_in_raster_deg": math.degrees(bend.toward_rad),
+            "slants_m": list(bend.slants_m),
+            "sector_deg": math.degrees(2.0 * bend.half_sector_rad),
+        }
     along_u, zero = bend.along == "u", frame.normal_world * math.copysign(1.0, -bend.radius_m)
     return {
         "chart": "cylinder",
@@ -130,6 +153,8 @@ def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
 def _world_from_raster(bend: Bend | None) -> str:
     if bend is None:
         return _FROM_PLANE
+    if not isinstance(bend, CylinderBend):
+        return _FROM_CONE.format(sign="-" if bend.is_concave else "")
     bent, straight = ("column", "row") if bend.along == "u" else ("row", "column")
     tangent, axis = ("u_world", "v_world") if bend.along == "u" else ("v_world", "u_world")
     return _FROM_CYLINDER.format(
@@ -141,24 +166,41 @@ def _world_from_raster(bend: Bend | None) -> str:
     )
 
 
-def _bend_of(content: Mapping[str, object], name: str) -> Bend | None:
+def _bend_of(content: Mapping[str, object], name: str) -> CylinderBend | ConeBend | None:
     """Return the curvature given in a sidecar; None for a plane.
 
     Raises:
         InputError: the shape of the surface is unknown or incomplete.
+        GeometryError: the dimensions of a cone are impossible.
     """
     chart = content.get("chart", "plane")
     if chart == "plane":
         return None
+    if chart == "cone":
+        apex_m, slants_m = (_vector(content.get(key)) for key in ("apex_in_raster_m", "slants_m"))
+        if apex_m.shape != (2,) or slants_m.shape != (2,):
+            raise InputError(f"{name}: a cone needs apex_in_raster_m and slants_m, 2 numbers each")
+        half_rad, toward_rad, sector_rad = (
+            math.radians(_number(content.get(f"{key}_deg")))
+            for key in ("half_angle", "zero_in_raster", "sector")
+        )
+        return ConeBend(
+            apex_m=(float(apex_m[0]), float(apex_m[1])),
+            toward_rad=toward_rad,
+            half_angle_rad=half_rad,
+            is_inside=content.get("concave") is True,
+            slants_m=(float(slants_m[0]), float(slants_m[1])),
+            half_sector_rad=0.5 * sector_rad,
+        )
     if chart != "cylinder":
-        raise InputError(f"{name}: chart must be plane or cylinder, got {shown_value(chart)}")
+        raise InputError(f"{name}: chart must be plane, cylinder or cone, got {shown_value(chart)}")
     along, radius_m = content.get("arc_along"), _number(content.get("radius_m"))
     if along not in ("u", "v") or not radius_m > 0.0:
         raise InputError(
             f"{name}: a cylinder needs arc_along (u or v) and a positive radius_m, got "
             f"{shown_value(along)} and {shown_value(content.get('radius_m'))}"
         )
-    return Bend(
+    return CylinderBend(
         along="u" if along == "u" else "v",
         radius_m=radius_m if content.get("concave") is True else -radius_m,
     )

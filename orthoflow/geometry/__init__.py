@@ -1,7 +1,7 @@
 """Geometry of planes, cameras, rasters and simulated scenes: pure array arithmetic."""
 
+from orthoflow.geometry.bends import Bend, ConeBend, CylinderBend
 from orthoflow.geometry.frames import (
-    Bend,
     Plane,
     UpDirection,
     WallFrame,
@@ -19,7 +19,9 @@ from orthoflow.geometry.surfaces import Cone, Cylinder
 __all__ = [
     "Bend",
     "Cone",
+    "ConeBend",
     "Cylinder",
+    "CylinderBend",
     "Plane",
     "UpDirection",
     "WallFrame",

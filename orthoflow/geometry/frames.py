@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
+from orthoflow.geometry.bends import ConeBend, CylinderBend
 
 UpDirection = Literal["z", "x", "-x", "y", "-y", "-z"]
 
@@ -182,38 +183,16 @@ RasterAxes = Literal["map", "wall", "level", "plane"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bend:
-    """The curvature of a raster that unrolls a part of a circular cylinder.
-
-    Attributes:
-        along: `u` if rows of the raster follow the arc and columns are parallel to the axis of the
-            cylinder (towers, columns and apses); `v` if columns follow the arc (barrel vaults).
-        radius_m: radius in metres; positive if the surface is seen from inside, so that the axis is
-            on the viewer's side, and negative if it is seen from outside.
-    """
-
-    along: Literal["u", "v"]
-    radius_m: float
-
-    def __post_init__(self) -> None:
-        if self.along not in ("u", "v") or not 0.0 < abs(self.radius_m) < math.inf:
-            raise GeometryError(
-                "a curved raster needs an arc along u or v and a finite radius "
-                f"other than 0, got {self.along!r} and {self.radius_m} m"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
 class WallFrame:
-    """A raster on a plane or cylinder: u to the right of the viewer, v down, n towards the viewer.
+    """A raster on a plane, cylinder or cone: u to the right of the viewer, v down, n towards him.
 
     On a plane, the world coordinates of a position (column, row) at a given depth are
     `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`. The centre
     of cell (row, column) is at (column + 0.5, row + 0.5); `u x v = -n`.
 
-    On a cylinder, the axes depend on the position (see `axes_at`), and `u_world`, `v_world` and
-    `normal_world` are those at the top-left corner. One coordinate is the arc length on the
-    cylinder, and the depth is the distance from the cylinder along the local normal.
+    On a curved surface, the axes depend on the position (see `axes_at`), and `u_world`, `v_world`
+    and `normal_world` are those at the top-left corner. The surface is unrolled (see `bends`), and
+    the depth is the distance from it along the local normal.
 
     Attributes:
         origin_world: (3,) float64 metres, outer corner of the top-left cell, on the surface.
@@ -229,7 +208,7 @@ class WallFrame:
         name: name of the wall, used in the name of the raster's coordinate system.
         left_m: distance along the wall from its left edge to the left edge of this raster, if the
             raster shows only part of the wall.
-        bend: curvature of a raster on a cylinder; None for a raster on a plane.
+        bend: curvature of a raster on a cylinder or cone; None for a raster on a plane.
     """
 
     origin_world: NDArray[np.float64]
@@ -243,7 +222,7 @@ class WallFrame:
     up: tuple[float, float, float] | None = None
     name: str = ""
     left_m: float = 0.0
-    bend: Bend | None = None
+    bend: CylinderBend | ConeBend | None = None
 
     def __post_init__(self) -> None:
         if not (self.gsd_m > 0.0 and self.width > 0 and self.height > 0):
@@ -258,7 +237,7 @@ class WallFrame:
             )
         if not np.allclose(np.cross(self.u_world, self.v_world), -self.normal_world, atol=1e-9):
             raise GeometryError("a wall frame needs u x v = -n, but these axes mirror the image")
-        if self.bend is not None:
+        if isinstance(self.bend, CylinderBend):
             # A raster of whole blocks of cells may exceed a full turn by a part of a block.
             n_cells = self.width if self.bend.along == "u" else self.height
             if (n_cells - 1) * self.gsd_m > math.tau * abs(self.bend.radius_m):
@@ -266,8 +245,8 @@ class WallFrame:
                     f"a curved wall frame must not exceed one turn, got {n_cells} cells of "
                     f"{self.gsd_m} m at a radius of {abs(self.bend.radius_m)} m"
                 )
-            if self.map_crs is not None:
-                raise GeometryError("a curved wall frame cannot be a map")
+        if self.bend is not None and self.map_crs is not None:
+            raise GeometryError("a curved wall frame cannot be a map")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -283,15 +262,16 @@ class WallFrame:
         increases with the row number, so that the ceiling can be superimposed on the floor. For
         sloping planes, and if up is unknown, X and Y are distances from the top-left corner.
         Cylinders with a vertical axis are treated as walls, with the heights of the axis; other
-        cylinders are treated as sloping planes.
+        cylinders are treated as sloping planes. On cones, X and Y are distances from the apex.
         """
         if self.map_crs is not None:
             return "map"
-        if self.up is None or (self.bend is not None and self.bend.along == "v"):
+        bend = self.bend
+        if self.up is None or isinstance(bend, ConeBend) or (bend and bend.along == "v"):
             return "plane"
         if -float(self.v_world @ self.up) >= _LEAST_COSINE:
             return "wall"
-        if self.bend is not None:
+        if bend is not None:
             return "plane"
         first = basis_from_up(np.array(self.up))[0]
         is_level = abs(float(self.normal_world @ self.up)) >= _LEAST_COSINE
@@ -303,11 +283,13 @@ class WallFrame:
         axes = self.raster_axes
         if axes == "map":
             return float(self.origin_world[0]), float(self.origin_world[1])
+        if isinstance(self.bend, ConeBend):
+            return -self.bend.apex_m[0], self.bend.apex_m[1]
         if axes == "plane" or self.up is None:
             return 0.0, 0.0
         # If a tower leans, the height varies along a row of cells; the height of the axis does not.
         beside = self.origin_world
-        if self.bend is not None:
+        if isinstance(self.bend, CylinderBend):
             beside = beside + self.bend.radius_m * self.normal_world
         first, second, height = (basis_from_up(np.array(self.up)) @ beside).tolist()
         return (self.left_m, height) if axes == "wall" else (first, second)
@@ -329,18 +311,24 @@ class WallFrame:
         """
         if self.map_crs is not None:
             return self.map_crs
-        at = self.wall_from_raster(np.zeros((1, 2)))
+        start_m = np.zeros((1, 2))
+        if isinstance(self.bend, ConeBend):
+            # At the apex itself, there are no axes.
+            start_m[0] = math.cos(self.bend.toward_rad), -math.sin(self.bend.toward_rad)
+        at = self.wall_from_raster(start_m)
         zero, axes = self.world_from_wall(at)[0], self.axes_at(at)[0, :2]
         # The position is rounded to millimetres, the axes to 1e-6.
         place = [*np.round(1e3 * zero), *np.round(1e6 * axes.ravel())]
-        if self.bend is not None:
+        if isinstance(self.bend, CylinderBend):
             place.append(np.round(1e3 * self.bend.radius_m))
+        elif self.bend is not None:
+            place.append(np.round(1e6 * self.bend.half_angle_rad))
         digest = hashlib.sha256(",".join(f"{value:.0f}" for value in place).encode()).hexdigest()
         return f"{self.name or 'plane'} {digest[:8]}"
 
     @property
     def plane(self) -> Plane:
-        """Plane that contains the raster; for a cylinder, the tangent plane at its middle."""
+        """Plane that contains the raster; for a curved surface, the tangent plane at its middle."""
         if self.bend is not None:
             normal = self.facing_world
             return Plane(normal=normal, offset_m=float(normal @ self.middle_world))
@@ -362,7 +350,7 @@ class WallFrame:
 
     @property
     def flat(self) -> WallFrame:
-        """The same raster on a plane; a cylinder is unrolled onto the plane at the origin."""
+        """The same raster on a plane; a curved one is unrolled onto the plane at its corner."""
         return self if self.bend is None else replace(self, bend=None)
 
     def of_rows(self, rows: slice) -> WallFrame:
@@ -389,13 +377,14 @@ class WallFrame:
         if self.bend is None:
             return placed
         u, v, normal = self.axes_at(at)[0]
-        return replace(placed, u_world=u, v_world=v, normal_world=normal)
+        bend = self.bend.moved(self.gsd_m * at[0])
+        return replace(placed, u_world=u, v_world=v, normal_world=normal, bend=bend)
 
     def has_cells_of(self, other: WallFrame) -> bool:
         """Return whether both frames have the same cells, to within 0.001 cells at the corners."""
         if self.shape != other.shape or (self.bend is None) != (other.bend is None):
             return False
-        # Rasters on cylinders with different radii or sides may have the same corners, but not the
+        # Rasters on surfaces with different radii or sides may have the same corners, but not the
         # same middle.
         apart = max(
             np.abs(self.corners_world() - other.corners_world()).max(),
@@ -410,7 +399,8 @@ class WallFrame:
         # In notebooks, users may pass a single position as a list of two numbers.
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         if self.bend is not None:
-            return self._on_cylinder(self.bend, pixels, depths_m)
+            local = self.bend.points(self.gsd_m * pixels, depths_m)
+            return np.asarray(self.origin_world + local @ self._axes)
         in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
         lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels)), self.normal_world)
         points: NDArray[np.float64] = self.origin_world + in_plane + lifted
@@ -420,7 +410,10 @@ class WallFrame:
         """Return wall positions (n, 3) = (column, row, depth in metres) of world points (n, 3)."""
         relative = points_world - self.origin_world
         if self.bend is not None:
-            return self._from_cylinder(self.bend, relative)
+            size_m = self.gsd_m * self._size[0]
+            on_wall = self.bend.places(relative @ self._axes.T, size_m)
+            on_wall[:, :2] /= self.gsd_m
+            return on_wall
         return np.column_stack(
             [
                 relative @ self.u_world / self.gsd_m,
@@ -432,27 +425,32 @@ class WallFrame:
     def axes_at(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the axes u, v and n, as rows (n, 3, 3), at positions (n, 2) = (column, row)."""
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
-        axes = np.array([self.u_world, self.v_world, self.normal_world])
         if self.bend is None:
-            return np.broadcast_to(axes, (len(pixels), 3, 3))
-        bent = 0 if self.bend.along == "u" else 1
-        angles = pixels[:, bent] * self.gsd_m / self.bend.radius_m
-        cosines, sines = np.cos(angles)[:, None], np.sin(angles)[:, None]
-        turned = np.repeat(axes[None], len(pixels), axis=0)
-        turned[:, bent] = cosines * axes[bent] + sines * axes[2]
-        turned[:, 2] = cosines * axes[2] - sines * axes[bent]
-        return turned
+            return np.broadcast_to(self._axes, (len(pixels), 3, 3))
+        return np.asarray(self.bend.axes_at(self.gsd_m * pixels) @ self._axes)
 
     def outline_world(self, n_sides: int = 64) -> NDArray[np.float64]:
-        """Return the closed outline (n, 3) of the raster, with points along the arcs."""
-        corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]) * self._size
+        """Return the closed outline (n, 3) of the surface, with points along its arcs."""
         if self.bend is None:
-            return self.world_from_wall(corners[[0, 1, 2, 3, 0]])
-        shares = np.arange(n_sides)[:, None] / n_sides
-        sides = [
-            corner + shares * (corners[(k + 1) % 4] - corner) for k, corner in enumerate(corners)
-        ]
-        return self.world_from_wall(np.vstack([*sides, corners[:1]]))
+            return self.corners_world()[[0, 1, 2, 3, 0]]
+        ribs = self.bend.ribs_m(self.gsd_m * self._size[0], n_sides) / self.gsd_m
+        shares = np.linspace(0.0, 1.0, n_sides)[:, None]
+        first, last = (rib[0] + shares * (rib[1] - rib[0]) for rib in (ribs[0], ribs[-1]))
+        return self.world_from_wall(np.vstack([first, ribs[:, 1], last[::-1], ribs[::-1, 0]]))
+
+    def shows(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether positions (n, 2) = (column, row) are in the raster and on its surface."""
+        inside = ((pixels_wall >= 0.0) & (pixels_wall <= self._size)).all(axis=1)
+        if self.bend is not None:
+            inside &= self.bend.contains(self.gsd_m * pixels_wall)
+        return np.asarray(inside)
+
+    def shown_cells(self, rows: slice) -> NDArray[np.bool_]:
+        """Return which cells (k, width) of k rows have their centres on the surface."""
+        places = np.stack(
+            np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height)[rows] + 0.5), axis=-1
+        )
+        return self.shows(places.reshape(-1, 2)).reshape(places.shape[:2])
 
     def met_by(
         self, start_world: NDArray[np.float64], rays: NDArray[np.float64]
@@ -470,7 +468,7 @@ class WallFrame:
         met = start_world + lengths[ahead, None] * rays[ahead]
         on_wall = self.wall_from_world(met)[:, :2]
         facing = np.einsum("ij,ij->i", rays[ahead], self.axes_at(on_wall)[:, 2]) < 0.0
-        inside = ((on_wall >= 0.0) & (on_wall <= self._size)).all(axis=1) & facing
+        inside = self.shows(on_wall) & facing
         points[ahead[inside]] = met[inside]
         return points
 
@@ -481,25 +479,23 @@ class WallFrame:
         to_origin = self.origin_world - start_world
         if self.bend is None:
             return np.asarray((to_origin @ self.normal_world) / (rays @ self.normal_world))
-        axis = self.v_world if self.bend.along == "u" else self.u_world
-        from_axis = -to_origin - self.bend.radius_m * self.normal_world
-        across, beside = from_axis - (from_axis @ axis) * axis, rays - np.outer(rays @ axis, axis)
-        a, b = (beside**2).sum(axis=1), beside @ across
-        root = np.sqrt(b * b - a * (across @ across - self.bend.radius_m**2))
-        # Rays meet the front of a cylinder where they leave it if it is seen from inside, and where
-        # they enter it if it is seen from outside.
-        return np.asarray((-b + math.copysign(1.0, self.bend.radius_m) * root) / a)
+        return self.bend.met_lengths(-self._axes @ to_origin, rays @ self._axes.T)
 
-    def metres_per_cell(self, depths_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sizes (n, 2) of cells along u and v at depths (n,), in metres.
+    def metres_per_cell(
+        self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the sizes (n, 2) of cells along u and v, in metres.
 
-        In front of a cylinder seen from inside, cells are shorter along the arc; in front of one
-        seen from outside, they are longer.
+        In front of a surface seen from inside, arcs are shorter; in front of one seen from outside,
+        they are longer.
+
+        Args:
+            pixels_wall: (n, 2) = (column, row).
+            depths_m: (n,) depths.
         """
-        sizes = np.full((len(depths_m), 2), self.gsd_m)
-        if self.bend is not None:
-            sizes[:, 0 if self.bend.along == "u" else 1] *= 1.0 - depths_m / self.bend.radius_m
-        return sizes
+        if self.bend is None:
+            return np.full((len(depths_m), 2), self.gsd_m)
+        return self.gsd_m * self.bend.scales(self.gsd_m * pixels_wall, depths_m)
 
     def require_plane(self, what: str) -> None:
         """Refuse a curved raster where only planes can be processed.
@@ -508,7 +504,7 @@ class WallFrame:
             what: name, for the message, of the method or operation.
 
         Raises:
-            GeometryError: the raster is on a cylinder.
+            GeometryError: the raster is on a curved surface.
         """
         if self.bend is not None:
             raise GeometryError(f"{what} does not take curved walls, but {self.name} is one")
@@ -517,37 +513,9 @@ class WallFrame:
     def _size(self) -> NDArray[np.float64]:
         return np.array([[self.width, self.height]], dtype=np.float64)
 
-    def _on_cylinder(
-        self, bend: Bend, pixels: NDArray[np.float64], depths_m: NDArray[np.float64] | float
-    ) -> NDArray[np.float64]:
-        bent, straight = (0, 1) if bend.along == "u" else (1, 0)
-        axes = (self.u_world, self.v_world)
-        angles = self.gsd_m * pixels[:, bent] / bend.radius_m
-        from_axis = bend.radius_m - np.broadcast_to(depths_m, len(pixels))
-        points: NDArray[np.float64] = (
-            self.origin_world
-            + np.multiply.outer(self.gsd_m * pixels[:, straight], axes[straight])
-            + np.multiply.outer(from_axis * np.sin(angles), axes[bent])
-            + np.multiply.outer(bend.radius_m - from_axis * np.cos(angles), self.normal_world)
-        )
-        return points
-
-    def _from_cylinder(self, bend: Bend, relative: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return wall positions (n, 3); the cylinder is cut opposite the middle of the raster."""
-        bent, straight = (0, 1) if bend.along == "u" else (1, 0)
-        axes, side = (self.u_world, self.v_world), math.copysign(1.0, bend.radius_m)
-        aside = side * (relative @ axes[bent])
-        away = side * (bend.radius_m - relative @ self.normal_world)
-        middle = 0.5 * self.gsd_m * float(self._size[0, bent]) / bend.radius_m
-        # Measure angles from the middle of the raster, because they jump by a full turn at the
-        # opposite side.
-        cosine, sine = math.cos(middle), math.sin(middle)
-        angles = middle + np.arctan2(cosine * aside - sine * away, cosine * away + sine * aside)
-        on_wall = np.empty((len(relative), 3))
-        on_wall[:, bent] = angles * bend.radius_m / self.gsd_m
-        on_wall[:, straight] = relative @ axes[straight] / self.gsd_m
-        on_wall[:, 2] = bend.radius_m - side * np.hypot(aside, away)
-        return on_wall
+    @property
+    def _axes(self) -> NDArray[np.float64]:
+        return np.array([self.u_world, self.v_world, self.normal_world])
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert (n, 2) = (column, row) to (n, 2) = (X, Y), in metres as in files."""

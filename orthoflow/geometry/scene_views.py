@@ -239,6 +239,10 @@ class _Renderer:
         """Set depths and rectangles of cells (n,); return the points (3, n) at their centres."""
         starts, ways = self._starts(cells, 0.5, 0.5)
         hits = self._rays.cast(starts, ways, within=self._reach_m)
+        if self._frame.bend is not None:
+            rows, columns = np.divmod(cells, self._width)
+            places = np.column_stack([columns + 0.5, rows + 0.5])
+            hits.rectangle[~self._frame.shows(places)] = -1
         hit = hits.rectangle >= 0
         self._rectangle[cells] = hits.rectangle
         self._depth_m[cells[hit]] = self._front_m - hits.t[hit]

@@ -1,4 +1,4 @@
-"""Unrolling of points near a cylinder onto a plane, so that they can be rasterised like a wall."""
+"""Unrolling of points near a curved surface onto a plane, to rasterise them like a wall."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.bends import NARROWEST
 from orthoflow.geometry.slabs import OffsetPoints, Slab
 
 _CHUNK: Final = 1 << 20
@@ -45,7 +46,7 @@ def unrolled(points: OffsetPoints, slab: Slab) -> UnrolledPoints:
 
     Args:
         points: points of the cloud.
-        slab: slab around a cylinder, whose depths must not reach the axis.
+        slab: slab around a curved surface. Points near its axis are left out.
     """
     frame, flat = slab.frame, slab.frame.flat
     low, high = box_around(slab)
@@ -62,9 +63,12 @@ def unrolled(points: OffsetPoints, slab: Slab) -> UnrolledPoints:
         on_wall = frame.wall_from_world(
             np.column_stack([axis[near] for axis in axes]) + points.origin
         )
-        is_inside = (on_wall[:, :2] >= 0.0).all(axis=1)
+        is_inside = frame.shows(on_wall[:, :2])
         is_inside &= (on_wall[:, :2] < [frame.width, frame.height]).all(axis=1)
         is_inside &= (on_wall[:, 2] >= -slab.behind_m) & (on_wall[:, 2] <= slab.front_m)
+        if frame.bend is not None:
+            widths = frame.bend.widths(frame.gsd_m * on_wall[:, :2], on_wall[:, 2])
+            is_inside &= widths >= NARROWEST
         on_wall = on_wall[is_inside]
         moved = flat.world_from_wall(on_wall[:, :2], on_wall[:, 2]) - flat.origin_world
         indices.append(first + near[is_inside])
@@ -89,6 +93,6 @@ def box_around(slab: Slab) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # its radius.
     bend = frame.bend
     slack_m = 1e-3 + (
-        0.0 if bend is None else 2e-3 * (abs(bend.radius_m) + max(slab.behind_m, slab.front_m))
+        0.0 if bend is None else 2e-3 * (bend.deepest_m + max(slab.behind_m, slab.front_m))
     )
     return places.min(axis=0) - slack_m, places.max(axis=0) + slack_m

@@ -411,10 +411,10 @@ def cursor_places(
 
 
 def _bend_of(frame: WallFrame) -> dict[str, object]:
-    """Return the arc of a curved wall for the scripts of pages."""
+    """Return the surface of a curved wall for the scripts of pages."""
     if frame.bend is None:
         return {}
-    return {"bend": {"along": frame.bend.along, "radius": frame.bend.radius_m}}
+    return {"bend": frame.bend.revolution.numbers}
 
 
 def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:

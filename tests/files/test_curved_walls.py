@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from orthoflow.files.gltf import write_room
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.files.sidecars import OrthoFile, ortho_files
 from orthoflow.files.tiles.pyramid import PAGE, write_viewer
-from orthoflow.geometry import Bend, WallFrame
+from orthoflow.geometry import ConeBend, CylinderBend, WallFrame
 from orthoflow.products import Orthoimages
 from orthoflow.report.pictures import Picture, cursor_places
 from tests import drawing_runs, samples
@@ -32,9 +33,21 @@ FLAT = replace(
 )
 # A whole turn has 251 cells.
 WALLS = {
-    "tower": replace(FLAT, bend=Bend(along="u", radius_m=-RADIUS_M)),
-    "column": replace(FLAT, width=251, bend=Bend(along="u", radius_m=-RADIUS_M)),
-    "vault": replace(FLAT, height=80, bend=Bend(along="v", radius_m=RADIUS_M)),
+    "tower": replace(FLAT, bend=CylinderBend(along="u", radius_m=-RADIUS_M)),
+    "column": replace(FLAT, width=251, bend=CylinderBend(along="u", radius_m=-RADIUS_M)),
+    "vault": replace(FLAT, height=80, bend=CylinderBend(along="v", radius_m=RADIUS_M)),
+    "spire": replace(
+        FLAT,
+        height=84,
+        bend=ConeBend(
+            apex_m=(2.525, 0.025),
+            toward_rad=0.5 * math.pi,
+            half_angle_rad=0.2,
+            is_inside=False,
+            slants_m=(2.0, 4.0),
+            half_sector_rad=math.pi * math.sin(0.2),
+        ),
+    ),
 }
 
 
@@ -58,7 +71,9 @@ def test_models_bend_walls(name: str, depth_m: float | None, tmp_path: Path) -> 
     depths = None
     if depth_m is not None:
         depths = {ortho.wall: tmp_path / "depth.tif"}
-        raster = np.full(frame.shape, depth_m, dtype=np.float32)
+        rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
+        is_shown = frame.shows(np.column_stack([columns.ravel(), rows.ravel()]))
+        raster = np.where(is_shown.reshape(frame.shape), depth_m, np.nan).astype(np.float32)
         write_raster(depths[ortho.wall], raster, place=GridPlace(gsd_m=frame.gsd_m), tags={})
     write_room(tmp_path / "room.glb", (ortho,), UP, depths)
     scene = trimesh.load(tmp_path / "room.glb")
@@ -99,7 +114,8 @@ def test_drawings_unroll_and_place_walls(name: str, tmp_path: Path) -> None:
     assert any(
         len(ring) > 100 and np.abs(frame.wall_from_world(ring)[:, 2]).max() < 1e-6 for ring in rings
     )
-    assert axes_of(frame).phrase.text().startswith("unrolled cylinder of radius 2.000 m")
+    unrolled = ("unrolled cylinder of radius 2.000 m", "unrolled cone with a half angle of 11.46°")
+    assert axes_of(frame).phrase.text().startswith(unrolled[name == "spire"])
     assert north_of(frame) is None
     assert key_plan(lines.planes, frame).arrow is None
     write_wall_geojson(tmp_path / "wall.geojson", wall, lines)
@@ -110,13 +126,15 @@ def test_drawings_unroll_and_place_walls(name: str, tmp_path: Path) -> None:
 
 def test_pages_know_the_arc_of_a_wall(tmp_path: Path) -> None:
     frame = WALLS["vault"]
+    assert frame.bend is not None
+    bend = frame.bend.revolution.numbers
     ortho = published(frame, tmp_path / "files")
     write_viewer(tmp_path, {"vault": ortho})
-    assert '"along": "v", "radius": 2.0' in (tmp_path / PAGE).read_text()
+    assert f'"bend": {json.dumps(bend)}' in (tmp_path / PAGE).read_text()
     pictures = [
         Picture(uri="", title="", caption="", frame=one, id=str(k))
         for k, one in enumerate((frame, frame.flat))
     ]
     curved, flat = cursor_places(pictures, [])
-    assert curved["bend"] == {"along": "v", "radius": 2.0}
+    assert curved["bend"] == bend
     assert "bend" not in flat

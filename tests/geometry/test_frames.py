@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -15,10 +15,16 @@ from scipy.spatial.transform import Rotation
 from orthoflow.errors import GeometryError
 from orthoflow.files.geotiff import GridPlace
 from orthoflow.files.sidecars import frame_json, frame_of_raster
-from orthoflow.geometry import basis_from_up, up_vector
+from orthoflow.geometry import (
+    Cone,
+    ConeBend,
+    Cylinder,
+    CylinderBend,
+    basis_from_up,
+    up_vector,
+)
 from orthoflow.geometry.frames import (
     UP_VECTORS,
-    Bend,
     Plane,
     UpDirection,
     WallFrame,
@@ -74,52 +80,82 @@ def test_places_on_a_wall_are_metres_to_the_right_down_and_before_it() -> None:
         np.testing.assert_allclose(frame.plane.distances_m(points), placed[:, 2], atol=1e-12)
 
 
-CURVED = [
-    replace(turned(), gsd_m=0.1, width=60, height=50, bend=Bend(along=along, radius_m=radius_m))
-    for along, radius_m in (("u", 3.0), ("u", -1.0), ("v", 3.0), ("v", -2.0))
+CONE = {"apex_m": (2.0, -1.0), "slants_m": (0.9, 8.0), "half_sector_rad": 1.5}
+BENDS: list[Any] = [
+    CylinderBend(along="u", radius_m=3.0),
+    CylinderBend(along="u", radius_m=-1.0),
+    CylinderBend(along="v", radius_m=3.0),
+    CylinderBend(along="v", radius_m=-2.0),
+    ConeBend(toward_rad=1.6, half_angle_rad=0.5, is_inside=False, **CONE),
+    ConeBend(toward_rad=1.5, half_angle_rad=1.1, is_inside=True, **CONE),
 ]
+CURVED = [replace(turned(), gsd_m=0.1, width=60, height=50, bend=bend) for bend in BENDS]
 
 
-@pytest.mark.parametrize("frame", CURVED, ids=lambda frame: str(frame.bend))
-def test_places_on_a_cylinder_are_arcs_and_distances_from_it(frame: WallFrame) -> None:
-    bend = frame.bend
-    assert bend is not None
-    bent, straight = (0, 1) if bend.along == "u" else (1, 0)
-    axes = np.array([frame.u_world, frame.v_world])
+def shape_of(frame: WallFrame) -> Cylinder | Cone:
+    """The surface of a frame, as its sidecar describes it."""
+    chart: Any = frame_json(frame)
+    axis, is_concave = np.array(chart["axis"]), chart["concave"]
+    axis /= np.linalg.norm(axis)
+    if chart["chart"] == "cone":
+        half = math.radians(chart["half_angle_deg"])
+        apex = np.array(chart["apex"])
+        return Cone(apex_world=apex, axis_world=axis, half_angle_rad=half, is_concave=is_concave)
+    point = np.array(chart["point"])
+    return Cylinder(
+        point_world=point, axis_world=axis, radius_m=chart["radius_m"], is_concave=is_concave
+    )
+
+
+@pytest.mark.parametrize(
+    "frame", CURVED, ids=("inside", "outside", "vault", "above", "spire", "funnel")
+)
+def test_curved_surfaces_are_unrolled_without_stretching(frame: WallFrame) -> None:
     random = np.random.default_rng(7)
     cells = random.uniform([0.0, 0.0], [frame.width, frame.height], (200, 2))
-    depths_m = random.uniform(-0.4, 0.4, 200)
-    points = frame.world_from_wall(cells, depths_m)
+    depths_m = random.uniform(-0.15, 0.15, 200)
+    points, shape = frame.world_from_wall(cells, depths_m), shape_of(frame)
+    assert frame.shows(cells).all()
     np.testing.assert_allclose(
         frame.wall_from_world(points), np.column_stack([cells, depths_m]), atol=1e-9
     )
-    # The distance from the axis, and the angle about it, by plain geometry.
-    from_axis = points - (frame.origin_world + bend.radius_m * frame.normal_world)
-    across = from_axis - np.outer(from_axis @ axes[straight], axes[straight])
-    radii_m = np.linalg.norm(across, axis=1)
-    side = math.copysign(1.0, bend.radius_m)
-    np.testing.assert_allclose(radii_m, abs(bend.radius_m) - side * depths_m)
-    np.testing.assert_allclose(from_axis @ axes[straight], 0.1 * cells[:, straight], atol=1e-12)
-    arcs_rad = 0.1 * cells[:, bent] / abs(bend.radius_m)
-    np.testing.assert_allclose(
-        across @ -frame.normal_world * side / radii_m, np.cos(arcs_rad), atol=1e-12
-    )
+    np.testing.assert_allclose(shape.distances_m(points), depths_m, atol=1e-8)
     # Axes are the derivatives: scaled by the depth along the arc, right-handed as on a plane.
     local = frame.axes_at(cells)
     np.testing.assert_allclose(np.cross(local[:, 0], local[:, 1]), -local[:, 2], atol=1e-12)
-    np.testing.assert_allclose(local[:, 2], -side * across / radii_m[:, None], atol=1e-12)
-    sizes_m = frame.metres_per_cell(depths_m)
-    for axis in range(2):
-        step = 1e-5 * np.eye(2)[axis]
-        moved = frame.world_from_wall(cells + step, depths_m)
-        moved -= frame.world_from_wall(cells - step, depths_m)
-        wanted = 2e-5 * sizes_m[:, axis, None] * local[:, axis]
-        np.testing.assert_allclose(moved, wanted, atol=1e-11)
-    np.testing.assert_allclose(sizes_m[:, bent], 0.1 * radii_m / abs(bend.radius_m))
+    np.testing.assert_allclose(local[:, 2], shape.normals(points), atol=1e-8)
+    jacobians = np.stack(
+        [
+            (
+                frame.world_from_wall(cells + step, depths_m)
+                - frame.world_from_wall(cells - step, depths_m)
+            )
+            / 2e-6
+            for step in 1e-6 * np.eye(2)
+        ],
+        axis=1,
+    )
+    lengths_m = np.linalg.norm(jacobians, axis=2)
+    np.testing.assert_allclose(lengths_m, frame.metres_per_cell(cells, depths_m), atol=1e-9)
+    # Between near positions on the surface, distances and angles are those on the raster.
+    ends = cells[:, None] + 0.01 * np.array([[0.0, 0.0], [1.0, 0.0], [0.6, 0.8]])
+    at = frame.world_from_wall(ends.reshape(-1, 2)).reshape(-1, 3, 3)
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        apart_m = np.linalg.norm(at[:, first] - at[:, second], axis=1)
+        on_raster = 0.1 * np.linalg.norm(ends[0, first] - ends[0, second])
+        np.testing.assert_allclose(apart_m, on_raster, rtol=1e-6)
+    # Rays from the viewer's side meet the positions on the surface that face them.
+    start, places = points[0] + 0.3 * local[0, 2], frame.world_from_wall(cells)
+    faces = np.einsum("ij,ij->i", start - places, local[:, 2]) > 0.05
+    assert faces.sum() > 20
+    met = frame.met_by(start, places[faces] - start)
+    np.testing.assert_allclose(met, places[faces], atol=1e-8)
 
 
-@pytest.mark.parametrize("frame", CURVED, ids=lambda frame: str(frame.bend))
-def test_parts_of_a_cylinder_have_its_cells(frame: WallFrame) -> None:
+@pytest.mark.parametrize(
+    "frame", CURVED, ids=("inside", "outside", "vault", "above", "spire", "funnel")
+)
+def test_parts_of_a_curved_surface_have_its_cells(frame: WallFrame) -> None:
     part = frame.part((4.0, 7.0), width=11, height=20)
     cells = np.array([[0.0, 0.0], [3.0, 4.0], [11.0, 20.0]])
     expected = frame.world_from_wall(cells + np.array([4.0, 7.0]), 0.1)
@@ -130,22 +166,24 @@ def test_parts_of_a_cylinder_have_its_cells(frame: WallFrame) -> None:
     np.testing.assert_allclose(rows.plane.normal, rows.facing_world)
     np.testing.assert_allclose(rows.distances_m(rows.middle_world[None]), [0.0], atol=1e-9)
     content = json.loads(json.dumps(frame_json(part)))
-    place = GridPlace(gsd_m=0.1, corner_m=(0.3, -0.4))
+    left_m, top_m = part.raster_corner_m
+    place = GridPlace(gsd_m=0.1, corner_m=(left_m + 0.3, top_m - 0.4))
     read = frame_of_raster(content, raster=place, shape=(5, 6), name="wall_3.json")
     assert read.has_cells_of(frame.part((7.0, 11.0), width=6, height=5))
-    from_axis = expected - np.array(content["point"])
-    away_m = np.linalg.norm(np.cross(from_axis, np.array(content["axis"])), axis=1)
-    np.testing.assert_allclose(away_m, content["radius_m"] + (-0.1 if content["concave"] else 0.1))
+    assert isinstance(part.bend, CylinderBend) or part.crs == frame.crs == read.crs
+    ring = frame.outline_world()
+    assert np.linalg.norm(np.diff(ring, axis=0), axis=1).max() < 0.8
+    np.testing.assert_allclose(shape_of(part).distances_m(ring), 0.0, atol=1e-8)
     payload = Unrolled(frame=part).to_payload()
-    assert Unrolled.from_payload(payload).frame.bend == frame.bend
+    assert Unrolled.from_payload(payload).frame.bend == part.bend
     assert "bend" not in str(Unrolled(frame=part.flat).to_payload().metadata)
 
 
 def test_towers_are_walls_and_vaults_have_axes_of_their_own() -> None:
     up = {"up": (0.0, 0.0, 1.0)}
-    tower = replace(FRAME, **up, bend=Bend(along="u", radius_m=-2.0))  # type: ignore[arg-type]
+    tower = replace(FRAME, **up, bend=CylinderBend(along="u", radius_m=-2.0))  # type: ignore[arg-type]
     assert (tower.raster_axes, tower.raster_corner_m) == ("wall", (0.0, 3.0))
-    vault = replace(FRAME, **up, bend=Bend(along="v", radius_m=2.0))  # type: ignore[arg-type]
+    vault = replace(FRAME, **up, bend=CylinderBend(along="v", radius_m=2.0))  # type: ignore[arg-type]
     assert (vault.raster_axes, vault.raster_corner_m) == ("plane", (0.0, 0.0))
     assert len({frame.crs for frame in (tower, vault, FRAME)}) == 3
 
@@ -204,8 +242,8 @@ def test_frames_have_the_same_cells_to_a_thousandth_of_one() -> None:
         ({"gsd_m": math.nan}, "needs a positive cell size"),
         ({"u_world": np.zeros(2)}, "an origin and three axes, each with 3 coordinates"),
         ({"v_world": -FRAME.v_world}, "these axes mirror the image"),
-        ({"bend": Bend(along="u", radius_m=0.05)}, "must not exceed one turn, got 5 cells"),
-        ({"bend": Bend(along="u", radius_m=1.0), "map_crs": "site"}, "cannot be a map"),
+        ({"bend": CylinderBend(along="u", radius_m=0.05)}, "must not exceed one turn, got 5 cells"),
+        ({"bend": CylinderBend(along="u", radius_m=1.0), "map_crs": "site"}, "cannot be a map"),
     ],
 )
 def test_what_is_no_frame_is_refused(change: dict[str, object], sentence: str) -> None:

@@ -21,7 +21,7 @@ from orthoflow.files.drawings.key_plans import KeyPlan, axis_words
 from orthoflow.files.drawings.pens import POINTS_PER_MM
 from orthoflow.files.drawings.words import Language, Phrase
 from orthoflow.files.images import decode_image
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import CylinderBend, WallFrame
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.untrusted_text import open_file, reading, text_of_file
 
@@ -509,9 +509,12 @@ def axes_of(frame: WallFrame) -> Axes:
         top_m += frame.height * frame.gsd_m
     values = {"crs": frame.map_crs, "up": up_words(np.array(frame.up))}
     phrase = Phrase(key=f"axes_{frame.raster_axes}", values=values)
-    if frame.bend is not None:
+    if isinstance(frame.bend, CylinderBend):
         radius = f"{abs(frame.bend.radius_m):.3f}"
         phrase = Phrase(key="axes_unrolled", values={"radius": radius})
+    elif frame.bend is not None:
+        angle = f"{math.degrees(frame.bend.half_angle_rad):.2f}"
+        phrase = Phrase(key="axes_unrolled_cone", values={"angle": angle})
     return Axes(across=(left_m, 1.0), down=(top_m, -1.0), phrase=phrase)
 
 

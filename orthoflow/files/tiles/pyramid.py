@@ -13,7 +13,7 @@ import json
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -100,10 +100,9 @@ def write_viewer(folder: Path, images: Mapping[str, OrthoFile]) -> None:
 
 def _image(name: str, ortho: OrthoFile) -> JsonValue:
     frame = ortho.frame
-    arc: dict[str, JsonValue] = {}
+    curved: dict[str, Any] = {}
     if frame.bend is not None:
-        arc = {"n": numbers(frame.normal_world), "along": frame.bend.along}
-        arc["radius"] = frame.bend.radius_m
+        curved = {"n": numbers(frame.normal_world), "bend": frame.bend.revolution.numbers}
     return {
         "file": name,
         "title": ortho.name,
@@ -116,7 +115,7 @@ def _image(name: str, ortho: OrthoFile) -> JsonValue:
         "origin": numbers(frame.origin_world),
         "u": numbers(frame.u_world),
         "v": numbers(frame.v_world),
-        **arc,
+        **curved,
         # X and Y of the corner, as in the GeoTIFF.
         "corner": list(frame.raster_corner_m),
         "down": frame.raster_down,

@@ -295,11 +295,15 @@
       const depth = known === null ? NaN : known / 1000;
       let [right, below, before] = [place.gsd * u, place.gsd * v, known === null ? 0 : depth];
       if (place.bend) {
-        // A cylinder: the arc begins at the left or upper edge.
-        const { along, radius } = place.bend, angle = (along === "u" ? right : below) / radius;
-        const bent = (radius - before) * Math.sin(angle);
-        before = radius - (radius - before) * Math.cos(angle);
-        if (along === "u") right = bent; else below = bent;
+        // A cylinder or cone: the distance along a generatrix and the angle about the axis.
+        const { start, axes, place_m, along, aside, radius_m, sine, cosine, side } = place.bend;
+        const [p, q] = [right - place_m[0], below - place_m[1]];
+        const [straight, across] = [along, aside].map((way) => p * way[0] + q * way[1]);
+        const distance = sine ? Math.hypot(straight, across) : straight;
+        const angle = sine ? Math.atan2(across, straight) / sine : across / radius_m;
+        const radius = radius_m + sine * distance + side * cosine * before;
+        const about = [radius * Math.cos(angle), radius * Math.sin(angle), cosine * distance - side * sine * before];
+        [right, below, before] = start.map((value, axis) => about.reduce((sum, part, k) => sum + part * axes[k][axis], value));
       }
       const world = [0, 1, 2].map((axis) => place.origin[axis]
         + right * place.u[axis] + below * place.v[axis] + before * place.n[axis]);

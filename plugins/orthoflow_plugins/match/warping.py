@@ -203,7 +203,7 @@ def _highest_m(
 ) -> NDArray[np.float64]:
     """Return the largest depths (n,) on the rays from points (n, 3) of a curved wall to a camera.
 
-    A ray from the inside of a cylinder rises up to its middle and then falls again.
+    A ray from the inside of a curved surface rises first and then falls again.
 
     Args:
         frame: the raster of the wall.
@@ -212,13 +212,10 @@ def _highest_m(
         shares: (n,) parts of the rays, from the start.
     """
     rays = centre - points
-    if frame.bend is not None and frame.bend.radius_m > 0.0:
-        axis = frame.v_world if frame.bend.along == "u" else frame.u_world
-        from_axis = points - (frame.origin_world + frame.bend.radius_m * frame.normal_world)
-        across = from_axis - np.outer(from_axis @ axis, axis)
-        beside = rays - np.outer(rays @ axis, axis)
-        middle = -(across * beside).sum(axis=1) / np.maximum((beside**2).sum(axis=1), 1e-12)
-        shares = np.minimum(shares, np.maximum(middle, 0.0)).astype(np.float32)
+    if frame.bend is not None and frame.bend.is_concave:
+        axes = np.array([frame.u_world, frame.v_world, frame.normal_world]).T
+        highest = frame.bend.highest_shares((points - frame.origin_world) @ axes, rays @ axes)
+        shares = np.minimum(shares, np.maximum(highest, 0.0)).astype(np.float32)
     return frame.wall_from_world(points + shares[:, None] * rays)[:, 2]
 
 

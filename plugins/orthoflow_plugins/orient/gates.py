@@ -189,18 +189,23 @@ def _before_m(centre: NDArray[np.float64], wall: KnownWall) -> float:
     if wall.frame is None:
         return float((centre - wall.corners_world.mean(axis=0)) @ wall.normal)
     points = _grid(wall, (_GRID_SIDE, _GRID_SIDE))
-    return float(np.einsum("ij,ij->i", centre - points, wall.axes_at(points)[:, 2]).max())
+    lifts_m = np.einsum("ij,ij->i", centre - points, wall.axes_at(points)[:, 2])
+    return float(np.nanmax(lifts_m))
 
 
 def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the cell centres (rows * cols, 3) of a grid over the rectangle of a wall."""
+    """Return the cell centres (rows * cols, 3) of a grid over the rectangle of a wall.
+
+    Those beside the sector of a cone are NaN.
+    """
     top_left, bottom_left, _, top_right = wall.corners_world
     down, along = (
         axis.ravel()
         for axis in np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij")
     )
     if (frame := wall.frame) is not None:
-        return frame.world_from_wall(np.column_stack([along * frame.width, down * frame.height]))
+        cells = np.column_stack([along * frame.width, down * frame.height])
+        return np.where(frame.shows(cells)[:, None], frame.world_from_wall(cells), np.nan)
     points: NDArray[np.float64] = (
         top_left
         + along[:, None] * (top_right - top_left)

@@ -1,8 +1,8 @@
-"""Compiled function that finds the cells of an unrolled cylinder that a photo sees.
+"""Compiled function that finds the cells of an unrolled cylinder or cone that a photo sees.
 
-The axis of the cylinder is parallel to the straight direction of the raster. In a plane normal to
-the axis, rays are straight lines, and depths are distances from the cylinder. A ray is followed
-over the relief in steps of at most one cell; the lengths of the steps change along the ray.
+In the axes of the surface, rays are straight lines, and depths are distances from the surface. A
+ray is followed over the relief in steps of at most one cell; the lengths of the steps change along
+the ray.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     OCCLUDED,
     OUTSIDE,
     PAINTED,
+    AxisView,
     Relief,
     TileVisibility,
     WallView,
@@ -32,23 +33,23 @@ _ROUNDS: Final = 2
 
 
 class Ray(NamedTuple):
-    """A ray from a cell to the camera, relative to the axis of the cylinder.
+    """A ray from a cell to the camera, in the axes of the surface.
 
     Attributes:
-        across: coordinate along the tangent at the first edge of the raster, in metres.
-        lift: coordinate along the normal there, in metres.
-        along: coordinate along the axis from the first edge of the raster, in metres.
-        to_across: component of the vector to the camera along the tangent.
-        to_lift: component of this vector along the normal.
-        to_along: component of this vector along the axis.
+        first: coordinate towards angle 0, in metres.
+        second: coordinate towards an angle of 90 degrees.
+        axial: coordinate along the axis.
+        to_first: component of the vector to the camera towards angle 0.
+        to_second: component of this vector towards an angle of 90 degrees.
+        to_axial: component of this vector along the axis.
     """
 
-    across: float
-    lift: float
-    along: float
-    to_across: float
-    to_lift: float
-    to_along: float
+    first: float
+    second: float
+    axial: float
+    to_first: float
+    to_second: float
+    to_axial: float
 
 
 @compiled
@@ -63,7 +64,8 @@ def look_at_curved_cells(
     """Project the cells of a tile into a photo and find those that the photo sees.
 
     Args:
-        view: the camera in the axes at the top-left corner of a curved wall.
+        view: the camera in the axes at the top-left corner of a curved wall, and in those of the
+            surface.
         relief: the surface of the whole wall.
         buffer: depth buffer of objects in front of the wall.
         visible: output, in the shape of the tile.
@@ -71,16 +73,13 @@ def look_at_curved_cells(
         first_column: first column of the tile on the wall.
     """
     n_rows, n_columns = visible.mask.shape
-    radius_m, gsd_m = view.radius_m, view.gsd_m
-    n_bent = n_columns if view.is_along_u else n_rows
-    first_bent = first_column if view.is_along_u else first_row
-    cosines, sines = np.empty(n_bent), np.empty(n_bent)
-    for k in range(n_bent):
-        angle = (first_bent + k + 0.5) * gsd_m / radius_m
-        cosines[k], sines[k] = math.cos(angle), math.sin(angle)
-    eye_along = view.row if view.is_along_u else view.column
-    eye_across = view.column if view.is_along_u else view.row
+    about, gsd_m = view.about, view.gsd_m
     area = view.camera[12] * view.camera[13] * gsd_m * gsd_m
+    # On a cylinder, the angle is the same in all cells of a row or column.
+    is_along_u = about.aside_x != 0.0
+    n_bent = n_columns if is_along_u else n_rows
+    first_bent = first_column if is_along_u else first_row
+    directions = _directions(about, gsd_m, first_bent, n_bent)
     for i in range(n_rows):
         for j in range(n_columns):
             depth = float(relief.depth[first_row + i, first_column + j])
@@ -88,112 +87,187 @@ def look_at_curved_cells(
             if math.isnan(depth):
                 visible.mask[i, j] = NO_SURFACE
                 continue
-            k = j if view.is_along_u else i
-            straight = first_row + i if view.is_along_u else first_column + j
-            from_axis = radius_m - depth
-            across, lift = from_axis * sines[k], -from_axis * cosines[k]
-            along = (straight + 0.5) * gsd_m
-            x, y = (across, along) if view.is_along_u else (along, across)
-            u, v, distance = project_point(view.camera, x, y, lift + radius_m)
+            x = (first_column + j + 0.5) * gsd_m - about.place_x
+            y = (first_row + i + 0.5) * gsd_m - about.place_y
+            along, aside = x * about.along_x + y * about.along_y, 0.0
+            if about.sine == 0.0:
+                k = j if is_along_u else i
+                towards_first, towards_second = directions[0, k], directions[1, k]
+            else:
+                aside = x * about.aside_x + y * about.aside_y
+                angle = math.atan2(aside, along) / about.sine
+                along = math.sqrt(along * along + aside * aside)
+                towards_first, towards_second = math.cos(angle), math.sin(angle)
+            radius = about.radius_m + about.sine * along
+            from_axis = radius + about.side * about.cosine * depth
+            first, second = from_axis * towards_first, from_axis * towards_second
+            axial = about.cosine * along - about.side * about.sine * depth
+            u, v, distance = project_point(about.camera, first, second, axial)
             visible.mask[i, j] = OUTSIDE
             if not (0.0 <= u < view.camera[21] and 0.0 <= v < view.camera[22]):
                 continue
             ray = Ray(
-                across,
-                lift,
-                along,
-                (eye_across + 0.5) * gsd_m - across,
-                view.height_m - radius_m - lift,
-                (eye_along + 0.5) * gsd_m - along,
+                first,
+                second,
+                axial,
+                about.first - first,
+                about.second - second,
+                about.axial - axial,
             )
-            length = math.sqrt(ray.to_across**2 + ray.to_lift**2 + ray.to_along**2)
-            cosine = (cosines[k] * ray.to_lift - sines[k] * ray.to_across) / length
+            length = math.sqrt(ray.to_first**2 + ray.to_second**2 + ray.to_axial**2)
+            outwards = towards_first * ray.to_first + towards_second * ray.to_second
+            cosine = about.side * (about.cosine * outwards - about.sine * ray.to_axial) / length
             at_row = min(int(v / buffer.reduction), buffer.nearest.shape[0] - 1)
             at_column = min(int(u / buffer.reduction), buffer.nearest.shape[1] - 1)
-            leaves = _reaches(ray, radius_m, view.front_m)
+            leaves = _reaches(ray, about, view.front_m)
             leaves_m = (1.0 - leaves) * distance - view.tolerance_m
-            is_hidden = cosine <= view.cosine_least
-            is_hidden = is_hidden or buffer.nearest[at_row, at_column] < leaves_m
+            is_hidden = buffer.nearest[at_row, at_column] < leaves_m
             visible.mask[i, j] = OCCLUDED
-            if is_hidden or _is_covered(view, relief, ray, depth):
+            if cosine <= view.cosine_least or is_hidden or _is_covered(view, relief, ray, depth):
                 continue
             width, height = view.camera[21], view.camera[22]
             inside = min(width - u, u, height - v, v) / view.border_px
-            area_here = area * (1.0 - depth / radius_m) / (distance * distance)
+            area_here = area * from_axis / (radius * distance * distance)
             visible.mask[i, j] = PAINTED
             visible.u[i, j], visible.v[i, j] = u, v
             visible.quality[i, j] = cosine * area_here * min(1.0, inside)
 
 
+@kernel_part
+def _directions(about: AxisView, gsd_m: float, first: int, n_cells: int) -> NDArray[np.float64]:
+    """Return the cosines and sines (2, n) of the angles of rows or columns about a cylinder."""
+    directions = np.zeros((2, n_cells))
+    if about.sine == 0.0:
+        for k in range(n_cells):
+            angle = (first + k + 0.5) * gsd_m / about.radius_m
+            directions[0, k], directions[1, k] = math.cos(angle), math.sin(angle)
+    return directions
+
+
 @inlined
-def _depth_at(ray, share, radius_m):  # type: ignore[no-untyped-def]  # numba infers the types
+def _depth_at(ray, share, about):  # type: ignore[no-untyped-def]  # numba infers the types
     """Return the depth of the ray at a share of its length."""
-    across, lift = ray.across + share * ray.to_across, ray.lift + share * ray.to_lift
-    away = math.sqrt(across * across + lift * lift)
-    return radius_m - (away if radius_m > 0.0 else -away)
+    first, second = ray.first + share * ray.to_first, ray.second + share * ray.to_second
+    outwards = math.sqrt(first * first + second * second) - about.radius_m
+    axial = ray.axial + share * ray.to_axial
+    return about.side * (about.cosine * outwards - about.sine * axial)
 
 
 @kernel_part
-def _place_at(ray: Ray, share: float, view: WallView, relief: Relief) -> tuple[float, float]:
-    """Return the row and column of a ray at a share of its length; (0, 0) is the first centre."""
-    across, lift = ray.across + share * ray.to_across, ray.lift + share * ray.to_lift
-    n_bent = relief.depth.shape[1] if view.is_along_u else relief.depth.shape[0]
-    side, middle = math.copysign(1.0, view.radius_m), 0.5 * n_bent * view.gsd_m / view.radius_m
-    angle = math.atan2(side * across, -side * lift) - middle
-    angle = middle + angle - math.tau * round(angle / math.tau)
-    bent = angle * view.radius_m / view.gsd_m - 0.5
-    straight = (ray.along + share * ray.to_along) / view.gsd_m - 0.5
-    return (straight, bent) if view.is_along_u else (bent, straight)
+def _position_at(ray: Ray, share: float, about: AxisView) -> tuple[float, float]:
+    """Return the distance along a generatrix and the angle about the axis at a share of a ray."""
+    first, second = ray.first + share * ray.to_first, ray.second + share * ray.to_second
+    angle = math.atan2(second, first) - about.middle_rad
+    angle = about.middle_rad + angle - math.tau * round(angle / math.tau)
+    outwards = math.sqrt(first * first + second * second) - about.radius_m
+    axial = ray.axial + share * ray.to_axial
+    return about.sine * outwards + about.cosine * axial, angle
 
 
 @kernel_part
-def _reaches(ray: Ray, radius_m: float, depth_m: float) -> float:
-    """Return the share of a ray at which it first reaches a depth; 1 if it does not."""
-    a = ray.to_across**2 + ray.to_lift**2
-    b = ray.across * ray.to_across + ray.lift * ray.to_lift
-    c = ray.across**2 + ray.lift**2 - (radius_m - depth_m) ** 2
+def _cell_at(distance: float, angle: float, view: WallView) -> tuple[float, float]:
+    """Return the row and column of a position on the surface; (0, 0) is the first centre."""
+    about = view.about
+    if about.sine == 0.0:
+        along, aside = distance, about.radius_m * angle
+    else:
+        turn = about.sine * angle
+        along, aside = distance * math.cos(turn), distance * math.sin(turn)
+    x = about.place_x + along * about.along_x + aside * about.aside_x
+    y = about.place_y + along * about.along_y + aside * about.aside_y
+    return y / view.gsd_m - 0.5, x / view.gsd_m - 0.5
+
+
+@kernel_part
+def _reaches(ray: Ray, about: AxisView, depth_m: float) -> float:
+    """Return the share of a ray at which it first reaches a depth; 1 if it does not.
+
+    Positions of the same depth are on a cylinder or cone with the same axis and half angle.
+    """
+    share, c, least = _crossing(ray, about, depth_m, about.side)
+    if share > 0.0:
+        return min(1.0, share)
+    return 0.0 if about.side * c >= 0.0 and least > 0.0 else 1.0
+
+
+@kernel_part
+def _crossing(
+    ray: Ray, about: AxisView, depth_m: float, leaves: float
+) -> tuple[float, float, float]:
+    """Return the share of a ray where it crosses a depth, and the values at its start.
+
+    Args:
+        ray: the ray.
+        about: the surface.
+        depth_m: the depth. Its radius is `least` / cosine at the start of the ray.
+        leaves: 1 for the crossing away from the axis, and -1 for the one towards the axis.
+
+    Returns:
+        The share, which is infinite if there is no crossing; a number that is positive if the start
+        is farther from the axis than the depth, and negative if it is nearer; and `least`.
+    """
+    least = about.cosine * about.radius_m + about.side * depth_m + about.sine * ray.axial
+    to_least, square = about.sine * ray.to_axial, about.cosine**2
+    a = square * (ray.to_first**2 + ray.to_second**2) - to_least**2
+    b = square * (ray.first * ray.to_first + ray.second * ray.to_second) - least * to_least
+    c = square * (ray.first**2 + ray.second**2) - least**2
     root = b * b - a * c
     if root < 0.0 or a == 0.0:
-        return 1.0
-    share = (-b - math.sqrt(root) if radius_m > 0.0 else -b + math.sqrt(root)) / a
-    return min(1.0, share) if share > 0.0 else (0.0 if c * radius_m <= 0.0 else 1.0)
+        return math.inf, c, least
+    share = (-b + leaves * math.sqrt(root)) / a
+    # The equation also holds on the mirror image of a cone.
+    return share if least + share * to_least > 0.0 else math.inf, c, least
 
 
 @kernel_part
 def _is_covered(view: WallView, relief: Relief, ray: Ray, depth: float) -> bool:
     """Return whether the relief of the wall, or its opposite side, hides a cell from the camera."""
+    about = view.about
     if relief.occluding.size == 0:
         return False
-    if view.radius_m > 0.0 and _is_behind_the_wall(view, relief, ray):
+    if about.side < 0.0 and _is_behind_the_wall(view, relief, ray):
         return True
     top = _highest_in_the_way(view, relief, ray, depth)
-    end = _reaches(ray, view.radius_m, top) if depth + view.tolerance_m < top else 0.0
+    end = _reaches(ray, about, top) if depth + view.tolerance_m < top else 0.0
     share = 0.0
     while True:
-        across, lift = ray.across + share * ray.to_across, ray.lift + share * ray.to_lift
-        turning = abs(across * ray.to_lift - lift * ray.to_across) / (across**2 + lift**2)
-        per_share = max(turning * abs(view.radius_m), abs(ray.to_along)) / view.gsd_m
-        share += 1.0 / max(per_share, 1e-6)
+        share += 1.0 / max(_cells_per_share(ray, share, view), 1e-6)
         if share >= end:
             return False
-        row, column = _place_at(ray, share, view, relief)
+        row, column = _cell_at(*_position_at(ray, share, about), view)
         if not _is_on_wall(relief, row, column):
             return False
-        level = _depth_at(ray, share, view.radius_m) + view.tolerance_m
+        level = _depth_at(ray, share, about) + view.tolerance_m
         if _surface_at(relief.occluding, row, column) > level:
             return True
 
 
 @kernel_part
+def _cells_per_share(ray: Ray, share: float, view: WallView) -> float:
+    """Return the number of cells that a ray crosses per unit of its share."""
+    about = view.about
+    first, second = ray.first + share * ray.to_first, ray.second + share * ray.to_second
+    square = first * first + second * second
+    turning = abs(first * ray.to_second - second * ray.to_first) / square
+    if about.sine == 0.0:
+        return max(turning * about.radius_m, abs(ray.to_axial)) / view.gsd_m
+    away = math.sqrt(square)
+    distance = about.sine * away + about.cosine * (ray.axial + share * ray.to_axial)
+    lifting = (first * ray.to_first + second * ray.to_second) / away
+    lengthening = about.sine * lifting + about.cosine * ray.to_axial
+    return math.hypot(about.sine * distance * turning, lengthening) / view.gsd_m
+
+
+@kernel_part
 def _is_behind_the_wall(view: WallView, relief: Relief, ray: Ray) -> bool:
-    """Return whether a ray leaves a cylinder, seen from inside, through its opposite side."""
-    a = ray.to_across**2 + ray.to_lift**2
-    b = ray.across * ray.to_across + ray.lift * ray.to_lift
-    root = b * b - a * (ray.across**2 + ray.lift**2 - view.radius_m**2)
-    share = (-b + math.sqrt(root)) / a if root > 0.0 and b < 0.0 else 2.0
-    if share >= 1.0:
+    """Return whether a ray leaves a surface, seen from inside, through its opposite side."""
+    about = view.about
+    share, _, least = _crossing(ray, about, 0.0, 1.0)
+    inwards = about.cosine**2 * (ray.first * ray.to_first + ray.second * ray.to_second)
+    inwards -= about.sine * least * ray.to_axial
+    if not (0.0 < share < 1.0 and inwards < 0.0):
         return False
-    row, column = _place_at(ray, share, view, relief)
+    row, column = _cell_at(*_position_at(ray, share, about), view)
     return _is_on_wall(relief, row, column) and (
         _surface_at(relief.occluding, row, column) > -math.inf
     )
@@ -203,20 +277,55 @@ def _is_behind_the_wall(view: WallView, relief: Relief, ray: Ray) -> bool:
 def _highest_in_the_way(view: WallView, relief: Relief, ray: Ray, depth: float) -> float:
     """Return an upper bound of the surface along the part of a ray that it may interrupt."""
     top, n_rows, n_columns = relief.highest_m, relief.depth.shape[0], relief.depth.shape[1]
-    row, column = _place_at(ray, 0.0, view, relief)
     for _ in range(_ROUNDS):
         if not depth + view.tolerance_m < top:
             return top
-        end_row, end_column = _place_at(ray, _reaches(ray, view.radius_m, top), view, relief)
-        first_row = max(0, int(min(row, end_row) - 1.0)) // BLOCK_CELLS
-        last_row = max(0, min(n_rows - 1, int(max(row, end_row) + 2.0))) // BLOCK_CELLS
-        first = max(0, int(min(column, end_column) - 1.0)) // BLOCK_CELLS
-        last = max(0, min(n_columns - 1, int(max(column, end_column) + 2.0))) // BLOCK_CELLS
+        low_row, high_row, low_column, high_column = _cells_along(
+            view, ray, _reaches(ray, view.about, top)
+        )
+        first_row = max(0, int(low_row - 1.0)) // BLOCK_CELLS
+        last_row = max(0, min(n_rows - 1, int(high_row + 2.0))) // BLOCK_CELLS
+        first = max(0, int(low_column - 1.0)) // BLOCK_CELLS
+        last = max(0, min(n_columns - 1, int(high_column + 2.0))) // BLOCK_CELLS
         top = -math.inf
         for i in range(first_row, last_row + 1):
             for j in range(first, last + 1):
                 top = max(top, float(relief.tops[i, j]))
     return top
+
+
+@kernel_part
+def _cells_along(view: WallView, ray: Ray, end: float) -> tuple[float, float, float, float]:
+    """Return bounds of the rows and columns of a ray up to a share: two rows, two columns."""
+    about = view.about
+    (near, start), (far, stop) = _position_at(ray, 0.0, about), _position_at(ray, end, about)
+    if about.sine == 0.0:
+        row, column = _cell_at(near, start, view)
+        end_row, end_column = _cell_at(far, stop, view)
+        return (
+            min(row, end_row),
+            max(row, end_row),
+            min(column, end_column),
+            max(column, end_column),
+        )
+    # The distance from the apex is a convex function of the share, so it is largest at an end. A
+    # lower bound follows from the smallest distance from the axis and the lowest position along it.
+    across = ray.to_first * ray.to_first + ray.to_second * ray.to_second
+    middle = -(ray.first * ray.to_first + ray.second * ray.to_second) / max(across, 1e-12)
+    middle = min(max(middle, 0.0), end)
+    first, second = ray.first + middle * ray.to_first, ray.second + middle * ray.to_second
+    nearest = math.sqrt(first * first + second * second)
+    axial = min(ray.axial, ray.axial + end * ray.to_axial)
+    least, most = about.sine * nearest + about.cosine * axial, max(near, far)
+    low_row = low_column = math.inf
+    high_row = high_column = -math.inf
+    for distance, angle in ((least, start), (most, start), (least, stop), (most, stop)):
+        row, column = _cell_at(distance, angle, view)
+        low_row, high_row = min(low_row, row), max(high_row, row)
+        low_column, high_column = min(low_column, column), max(high_column, column)
+    # An arc exceeds the box of its ends by its height at most.
+    beyond = most * (1.0 - math.cos(0.5 * about.sine * (stop - start))) / view.gsd_m
+    return low_row - beyond, high_row + beyond, low_column - beyond, high_column + beyond
 
 
 @inlined

@@ -263,7 +263,7 @@ def footprint_of(
 def _aside_and_lift(
     view: WallView, surface: Surface, places: list[tuple[float, ...]], depth: float
 ) -> tuple[float, float]:
-    """Return distances of the camera along a cylinder and above it, from the first of places."""
+    """Return distances of the camera along a curved wall and above it, from the first of places."""
     here, across, down = np.array(places)
     eye = (view.column + 0.5) * view.gsd_m, (view.row + 0.5) * view.gsd_m, view.height_m
     normal = np.cross(across - here, down - here)

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import Bend, WallFrame
 from orthoflow.geometry.bands import Allocate, bands_with_reach, in_memory
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
@@ -22,6 +22,7 @@ from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.visibility_kernels import (
     BLOCK_CELLS,
     FINE_CELLS,
+    AxisView,
     Relief,
     TileVisibility,
     WallView,
@@ -117,8 +118,35 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
         tolerance_m=float(surface.tolerance_m),
         cosine_least=math.cos(math.radians(params.incidence_max_deg)),
         border_px=max(1.0, _BORDER_SHARE * min(camera.width, camera.height)),
-        radius_m=0.0 if frame.bend is None else frame.bend.radius_m,
-        is_along_u=frame.bend is not None and frame.bend.along == "u",
+        **({} if frame.bend is None else {"about": _about_axis(near, frame, frame.bend)}),
+    )
+
+
+def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> AxisView:
+    """Return a camera, relative to the corner of a raster, in the axes of its curved surface."""
+    own, axes = bend.revolution, np.array([frame.u_world, frame.v_world, frame.normal_world])
+    from_axis = own.axes @ axes
+    shifted = near.shifted(own.start @ axes)
+    flat = shifted.flat.copy()
+    flat[:9] = (shifted.rotation @ from_axis.T).ravel()
+    size_m = frame.gsd_m * np.array([frame.width, frame.height])
+    first, second, axial = (from_axis @ shifted.centre_world).tolist()
+    return AxisView(
+        camera=flat,
+        first=first,
+        second=second,
+        axial=axial,
+        radius_m=own.radius_m,
+        sine=own.sine,
+        cosine=own.cosine,
+        side=own.side,
+        middle_rad=bend.middle_rad(size_m),
+        place_x=float(own.place_m[0]),
+        place_y=float(own.place_m[1]),
+        along_x=float(own.along[0]),
+        along_y=float(own.along[1]),
+        aside_x=float(own.aside[0]),
+        aside_y=float(own.aside[1]),
     )
 
 
@@ -129,15 +157,15 @@ def cells_seen(
     size = (rows.stop - rows.start, columns.stop - columns.start)
     u, v, quality = np.empty((3, *size), dtype=np.float32)
     visible = TileVisibility(u=u, v=v, mask=np.empty(size, dtype=np.uint8), quality=quality)
-    look = look_at_cells if view.radius_m == 0.0 else look_at_curved_cells
+    look = look_at_cells if view.about.side == 0.0 else look_at_curved_cells
     look(view, relief, buffer, visible, rows.start, columns.start)
     return visible
 
 
 def is_before(view: WallView, surface: Surface) -> bool:
     """Return whether a camera is in front of any part of a wall."""
-    # The cells of a cylinder face different directions.
-    return view.radius_m != 0.0 or view.height_m > float(surface.relief.bottoms.min())
+    # The cells of a curved wall face different directions.
+    return view.about.side != 0.0 or view.height_m > float(surface.relief.bottoms.min())
 
 
 def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory) -> Relief:

@@ -28,6 +28,47 @@ OCCLUDED: Final = 2
 NO_SURFACE: Final = 3
 
 
+class AxisView(NamedTuple):
+    """A camera in the axes of a cylinder or cone (see `bends.Revolution`).
+
+    Attributes:
+        camera: (25,) flat camera for points in these axes from `start`.
+        first: coordinate of the projection centre towards angle 0.
+        second: its coordinate towards an angle of 90 degrees.
+        axial: its coordinate along the axis.
+        radius_m: radius of a cylinder; 0 for a cone.
+        sine: sine of the half angle of a cone; 0 for a cylinder.
+        cosine: cosine of the half angle.
+        side: 1 if the surface is seen from outside, and -1 from inside; 0 for a plane.
+        middle_rad: angle opposite of which the surface is cut.
+        place_x: position of distance 0 and angle 0 on the raster, to the right, in metres.
+        place_y: its position downwards.
+        along_x: direction of the generatrix of angle 0 on the raster.
+        along_y: see `along_x`.
+        aside_x: direction of increasing angles on the raster, perpendicular to it.
+        aside_y: see `aside_x`.
+    """
+
+    camera: NDArray[np.float64]
+    first: float
+    second: float
+    axial: float
+    radius_m: float
+    sine: float
+    cosine: float
+    side: float
+    middle_rad: float
+    place_x: float
+    place_y: float
+    along_x: float
+    along_y: float
+    aside_x: float
+    aside_y: float
+
+
+_PLANE: Final = AxisView(np.zeros(25), *(14 * (0.0,)))
+
+
 class WallView(NamedTuple):
     """A camera in the axes of a wall.
 
@@ -42,9 +83,8 @@ class WallView(NamedTuple):
         tolerance_m: minimum height above a ray at which the surface blocks that ray.
         cosine_least: smallest cosine of the angle of incidence of visible cells.
         border_px: width of the strip along the image border in which quality decreases to 0.
-        radius_m: radius of a cylinder, as in `Bend`; 0 for a plane. The axes are then those at the
-            top-left corner of its raster.
-        is_along_u: whether rows of a cylinder's raster follow the arc.
+        about: the camera in the axes of a curved surface. The axes of the wall are then those at
+            the top-left corner of its raster.
     """
 
     camera: NDArray[np.float64]
@@ -56,8 +96,7 @@ class WallView(NamedTuple):
     tolerance_m: float
     cosine_least: float
     border_px: float
-    radius_m: float = 0.0
-    is_along_u: bool = False
+    about: AxisView = _PLANE
 
 
 class Relief(NamedTuple):

@@ -1,4 +1,4 @@
-"""Walls on cylinders: their grids and extents, and their points, unrolled onto a plane."""
+"""Walls on cylinders and cones: their grids and extents, and their points, unrolled."""
 
 from __future__ import annotations
 
@@ -9,38 +9,29 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Bend, Cylinder, WallFrame
+from orthoflow.geometry import Cone, ConeBend, Cylinder, CylinderBend, WallFrame
 from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.bends import NARROWEST
 from orthoflow.geometry.slabs import Slab
 from orthoflow.geometry.surfaces import angles_around
 from orthoflow.geometry.unrolling import unrolled
 from orthoflow.products import Planes, PointCloud, Surface, Surfaces, Wall
-from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.extents import Extent, Reach, SampledPoints, extent_of
 from orthoflow_plugins.raster.frames import blank
 from orthoflow_plugins.raster.parameters import RasterParams
 
 # Axes within 45 degrees of the vertical are upright.
 _UPRIGHT_COSINE: Final = math.sqrt(0.5)
-# Maximum depth towards the axis, as a share of the radius; at the axis, cells have no width.
-_RADIUS_SHARE: Final = 0.8
 # A plane belongs to the relief of a cylinder if at least this share of the plane is in the
 # cylinder's buffer.
 _COVERED_SHARE: Final = 0.8
 _PLACES: Final = 9
-CONE: Final = DiagnosticSpec(
-    code="cone-not-unrolled",
-    severity="warning",
-    text="{subject} is a cone; cones are not unrolled, so no wall is made from it",
-)
 
 
 class CurvedWalls:
     """The curved surfaces that become walls; they are numbered after all planes."""
 
-    def __init__(
-        self, surfaces: Surfaces | None, planes: Planes, params: RasterParams, ctx: StepContext
-    ) -> None:
+    def __init__(self, surfaces: Surfaces | None, planes: Planes, params: RasterParams) -> None:
         self.surfaces: dict[int, Surface] = {}
         self.frames: dict[int, WallFrame] = {}
         self._planes, self._params = planes, params
@@ -53,11 +44,9 @@ class CurvedWalls:
             index = len(planes) + k
             if not _is_chosen(surface, index, planes.up, params):
                 continue
-            if not isinstance(surface.shape, Cylinder):
-                ctx.report(CONE, subject=surface.name)
-            elif params.ranks or params.near or len(self.frames) < params.n_walls_max:
+            if params.ranks or params.near or len(self.frames) < params.n_walls_max:
                 self.surfaces[index] = surface
-                self.frames[index] = _frame_of(surface, surface.shape, planes.up, index, params)
+                self.frames[index] = _frame_of(surface, planes.up, index, params)
 
     def extent(self, index: int, points: SampledPoints, reach: Reach, *, threads: int) -> Extent:
         """Determine the buffer of a wall from its relief, unrolled onto a plane."""
@@ -119,8 +108,7 @@ class CurvedWalls:
         shares = np.stack(np.meshgrid(*2 * [np.linspace(0.0, 1.0, _PLACES)]), axis=-1)
         places = corners[0] + shares.reshape(-1, 2) @ (corners[[3, 1]] - corners[0])
         on_wall = frame.wall_from_world(places)
-        inside = (on_wall[:, :2] >= 0.0).all(axis=1)
-        inside &= (on_wall[:, :2] <= [frame.width, frame.height]).all(axis=1)
+        inside = frame.shows(on_wall[:, :2])
         inside &= (on_wall[:, 2] <= buffer_m[0]) & (on_wall[:, 2] >= -buffer_m[1])
         facing = frame.axes_at(on_wall[:, :2])[:, 2] @ self._planes.normal[plane] > 0.0
         return float((inside & facing).mean()) >= _COVERED_SHARE
@@ -130,8 +118,15 @@ def limits_m(frame: WallFrame) -> tuple[float, float]:
     """Return the maximum depths behind and in front of a wall, limited towards its axis."""
     if frame.bend is None:
         return math.inf, math.inf
-    most_m = _RADIUS_SHARE * abs(frame.bend.radius_m)
-    return (math.inf, most_m) if frame.bend.radius_m > 0.0 else (most_m, math.inf)
+    most_m = (1.0 - NARROWEST) * frame.bend.deepest_m
+    return (math.inf, most_m) if frame.bend.is_concave else (most_m, math.inf)
+
+
+def blank_beside(wall: Wall) -> None:
+    """Set the cells beside the sector of an unrolled cone to void; a cylinder fills its raster."""
+    if isinstance(wall.frame.bend, ConeBend):
+        for rows in row_bands(wall.mask.shape):
+            blank(wall, rows, ~wall.frame.shown_cells(rows))
 
 
 def flattened(cloud: PointCloud, slab: Slab) -> tuple[PointCloud, Slab]:
@@ -168,15 +163,28 @@ def _is_chosen(surface: Surface, index: int, up: NDArray[np.float64], params: Ra
     is_upright = abs(float(surface.shape.axis_world @ up)) >= _UPRIGHT_COSINE
     if params.constraint == "horizontal" or (params.constraint == "vertical" and not is_upright):
         return False
-    if params.near or not isinstance(surface.shape, Cylinder):
-        return True
     start_rad, end_rad = surface.arc_rad
     length_m = surface.along_m[1] - surface.along_m[0]
-    return (end_rad - start_rad) * surface.shape.radius_m * length_m >= params.min_area_m2
+    if isinstance(surface.shape, Cone):
+        length_m /= math.cos(surface.shape.half_angle_rad)
+    area_m2 = (end_rad - start_rad) * surface.radius_m * length_m
+    return bool(params.near) or area_m2 >= params.min_area_m2
 
 
 def _frame_of(
-    surface: Surface, shape: Cylinder, up: NDArray[np.float64], index: int, params: RasterParams
+    surface: Surface, up: NDArray[np.float64], index: int, params: RasterParams
+) -> WallFrame:
+    east, north, top = up.tolist()
+    shape, name = surface.shape, f"{surface.name.rsplit(' ', 1)[0]} {index}"
+    if isinstance(shape, Cone):
+        frame = _over_cone(surface, shape, up, params)
+    else:
+        frame = _over_cylinder(surface, shape, up, params)
+    return replace(frame, up=(east, north, top), name=name)
+
+
+def _over_cylinder(
+    surface: Surface, shape: Cylinder, up: NDArray[np.float64], params: RasterParams
 ) -> WallFrame:
     """Return the grid over a cylinder's points, widened on all sides.
 
@@ -207,7 +215,6 @@ def _frame_of(
     # The cells must not exceed a full turn.
     n_arc = min(math.ceil(arc_m / gsd_m - 1e-6), math.floor(math.tau * radius_m / gsd_m + 1e-6))
     n_along = math.ceil(length_m / gsd_m - 1e-6)
-    east, north, top = up.tolist()
     return WallFrame(
         origin_world=shape.point_world + first_m * axis + radius_m * outwards,
         u_world=u,
@@ -216,10 +223,65 @@ def _frame_of(
         gsd_m=gsd_m,
         width=max(1, n_arc if is_upright else n_along),
         height=max(1, n_along if is_upright else n_arc),
-        up=(east, north, top),
-        name=f"{surface.name.rsplit(' ', 1)[0]} {index}",
-        bend=Bend(
+        bend=CylinderBend(
             along="u" if is_upright else "v",
             radius_m=radius_m if shape.is_concave else -radius_m,
         ),
+    )
+
+
+def _over_cone(
+    surface: Surface, shape: Cone, up: NDArray[np.float64], params: RasterParams
+) -> WallFrame:
+    """Return the grid over the sector of a cone's points, widened on all sides.
+
+    The middle generatrix of an upright cone is vertical in the image, so that the apex of a spire
+    is at the top. The axis of another cone points to the right, as that of a vault.
+    """
+    axis, gsd_m = shape.axis_world, params.gsd_m
+    sine, cosine = math.sin(shape.half_angle_rad), math.cos(shape.half_angle_rad)
+    start_rad, end_rad = surface.arc_rad
+    least_m = max(0.0, surface.along_m[0] / cosine - params.margin_m)
+    most_m = surface.along_m[1] / cosine + params.margin_m
+    half_rad = min(0.5 * (end_rad - start_rad) * sine + params.margin_m / most_m, math.pi * sine)
+    # The middle generatrix and the normal there.
+    middle_rad = 0.5 * (start_rad + end_rad)
+    beside = np.cross(axis, surface.zero_world)
+    outwards = math.cos(middle_rad) * surface.zero_world + math.sin(middle_rad) * beside
+    generatrix = sine * outwards + cosine * axis
+    normal = (-1.0 if shape.is_concave else 1.0) * (cosine * outwards - sine * axis)
+    is_upright = abs(float(axis @ up)) >= _UPRIGHT_COSINE
+    toward = np.array([1.0, 0.0])
+    if is_upright:
+        toward = np.array([0.0, 1.0 if float(axis @ up) < 0.0 else -1.0])
+    u = np.cross(normal, toward[1] * generatrix) if is_upright else generatrix
+    # The apex is at the centre of a cell, because a corner of a raster must not be at the apex.
+    lowest_m = min(least_m * math.cos(half_rad), most_m * math.cos(half_rad))
+    first = math.floor(lowest_m / gsd_m + 0.5 + 1e-6)
+    last = math.ceil(most_m / gsd_m - 0.5 - 1e-6)
+    n_aside = math.ceil(most_m * math.sin(min(half_rad, 0.5 * math.pi)) / gsd_m - 0.5 - 1e-6)
+    before = np.where(toward > 0.0, first, np.where(toward < 0.0, -last, -n_aside)) - 0.5
+    bend = ConeBend(
+        apex_m=(-most_m * toward[0], -most_m * toward[1]),
+        toward_rad=math.atan2(toward[1], toward[0]),
+        half_angle_rad=shape.half_angle_rad,
+        is_inside=shape.is_concave,
+        slants_m=(least_m, most_m),
+        half_sector_rad=half_rad,
+    )
+    at_edge = WallFrame(
+        origin_world=shape.apex_world + most_m * generatrix,
+        u_world=u,
+        v_world=np.cross(u, normal),
+        normal_world=normal,
+        gsd_m=gsd_m,
+        width=1,
+        height=1,
+        bend=bend,
+    )
+    n_along, n_across = last - first + 1, 2 * n_aside + 1
+    return at_edge.part(
+        before - most_m / gsd_m * toward,
+        width=n_across if is_upright else n_along,
+        height=n_along if is_upright else n_across,
     )

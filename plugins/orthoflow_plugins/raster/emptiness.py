@@ -158,8 +158,11 @@ def _tiles(wall: Wall, points: SampledPoints) -> _Tiles:
     measured: list[NDArray[np.int64]] = []
     for first in range(0, rows, side):
         band = slice(first, first + side)
+        is_void = wall.mask[band] == SurfaceMask.VOID
+        if frame.bend is not None:
+            is_void &= frame.shown_cells(band)
         for cells, sums in (
-            (wall.mask[band] == SurfaceMask.VOID, void),
+            (is_void, void),
             (wall.count[band] > 0, measured),
         ):
             sums.append(np.add.reduceat(cells.sum(axis=0, dtype=np.int64), starts))

@@ -18,7 +18,7 @@ from orthoflow.products import IntensitySource, Planes, PointCloud, Surfaces, Wa
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
-from orthoflow_plugins.raster.curved import CurvedWalls, flattened
+from orthoflow_plugins.raster.curved import CurvedWalls, blank_beside, flattened
 from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
 from orthoflow_plugins.raster.extents import (
     Extent,
@@ -87,8 +87,9 @@ class RasterGrid(Method):
     16 points, mean intensities and colours are extrapolated along their gradients from the mean
     position of the points to the centre of the cell.
 
-    Cylinders are unrolled: one axis of their rasters is the length of the arc, and depths are
-    distances from the cylinder. Where two vaults cross, each raster ends at the groins.
+    Cylinders and cones are unrolled, and depths are distances from the surface. One axis of a
+    cylinder's raster is the length of the arc. A cone becomes a sector of an annulus around its
+    apex, beside which cells are void. Where two vaults cross, each raster ends at the groins.
     """
 
     id: ClassVar[str] = "raster.grid"
@@ -144,7 +145,7 @@ class RasterGrid(Method):
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
         points = sampled(cloud)
-        curved = CurvedWalls(inputs.surfaces, planes, params, ctx)
+        curved = CurvedWalls(inputs.surfaces, planes, params)
         extent_of = _extents(points, planes, curved, cloud.stations, params, ctx)
         frames, covered = _frames(planes, curved, params, extent_of, ctx)
         slabs = {
@@ -176,6 +177,8 @@ class RasterGrid(Method):
                 threads=ctx.cores,
             )
             wall = replace(wall, frame=slab.frame)
+            if is_curved:
+                blank_beside(wall)
             free_m = math.inf if is_curved else free_before_m(planes, index, cloud.stations)
             empty.append(emptiness_of(wall, slab, sight, free_m=free_m, threads=ctx.cores))
             if is_curved:
