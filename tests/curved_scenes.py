@@ -171,8 +171,10 @@ def vault(*, half_deg: float = 75.0, length_m: float = 3.0, **band: object) -> D
     )
 
 
-def tower(*, radius_m: float = 1.0, is_concave: bool = False, **band: object) -> Drum:
-    """300 degrees of a round tower that leans by half a degree, or of an apse."""
+def tower(
+    *, radius_m: float = 1.0, half_deg: float = 150.0, is_concave: bool = False, **band: object
+) -> Drum:
+    """300 degrees of a round tower that leans by half a degree, or of an apse or column."""
     axis = np.array([0.006, -0.006, 1.0])
     cylinder = Cylinder(
         point_world=np.array([10.0, 20.0, 1.0]),
@@ -182,7 +184,7 @@ def tower(*, radius_m: float = 1.0, is_concave: bool = False, **band: object) ->
     )
     return Drum(
         cylinder=cylinder,
-        arc_rad=(-math.radians(150.0), math.radians(150.0)),
+        arc_rad=(-math.radians(half_deg), math.radians(half_deg)),
         along_m=(-1.0, 1.0),
         **band,  # type: ignore[arg-type]
     )

@@ -212,9 +212,8 @@ def _over_cylinder(
     normal = -outwards if shape.is_concave else outwards
     u = np.cross(normal, straight) if is_upright else straight
     arc_m, length_m = (end_rad - start_rad) * radius_m, high_m - low_m
-    # The cells must not exceed a full turn.
-    n_arc = min(math.ceil(arc_m / gsd_m - 1e-6), math.floor(math.tau * radius_m / gsd_m + 1e-6))
-    n_along = math.ceil(length_m / gsd_m - 1e-6)
+    # The last cell of a full turn may overlap the first one.
+    n_arc, n_along = (math.ceil(each_m / gsd_m - 1e-6) for each_m in (arc_m, length_m))
     return WallFrame(
         origin_world=shape.point_world + first_m * axis + radius_m * outwards,
         u_world=u,

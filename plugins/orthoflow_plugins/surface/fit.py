@@ -186,7 +186,7 @@ def _fitted(
     is_on = np.zeros((around, along), dtype=np.bool_)
     largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
     is_on[i, j] = np.abs(rest) < largest_m
-    arc, ends = _extent(is_on)
+    arc, ends = _extent(is_on, counts)
     # Positions along the axis of a cone are measured from its apex.
     start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
     surface = Surface(
@@ -246,8 +246,13 @@ def _covariance(
     return np.asarray(best if best.any() else inverse)
 
 
-def _extent(is_full: NDArray[np.bool_]) -> tuple[tuple[float, float], tuple[int, int]]:
-    """Return the ranges of angles and of cells along the axis (end exclusive) with points."""
+def _extent(
+    is_full: NDArray[np.bool_], counts: NDArray[np.int64]
+) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Return the ranges of angles and of cells along the axis (end exclusive) with points.
+
+    The range of a closed surface begins in the middle of the 10 degrees with the fewest points.
+    """
     length = float(np.quantile(is_full.sum(axis=1), 0.95))
     is_open = is_full.sum(axis=1) >= max(1.0, _OPEN_SHARE * length)
     # Isolated columns are clutter.
@@ -259,7 +264,11 @@ def _extent(is_full: NDArray[np.bool_]) -> tuple[tuple[float, float], tuple[int,
     gap = longest_gap(is_open)
     step = 2.0 * math.pi / count
     if gap <= max(2, count // 60):
-        return (-math.pi, math.pi), ends
+        near = ndimage.uniform_filter1d(
+            counts.sum(axis=1, dtype=np.float64), max(1, count // 36), mode="wrap"
+        )
+        low = (int(np.argmin(near)) + 0.5) * step - math.pi
+        return (low, low + 2.0 * math.pi), ends
     opens = np.flatnonzero(is_open)
     steps = np.diff(np.append(opens, opens[0] + count))
     start = int(opens[(int(np.argmax(steps)) + 1) % len(opens)])

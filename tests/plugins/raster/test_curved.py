@@ -25,6 +25,8 @@ DRUMS = {
     "vault": curved_scenes.vault(**BAND),
     "tower": curved_scenes.tower(**BAND),
     "apse": curved_scenes.tower(is_concave=True, **BAND),
+    # A whole turn is 188.5 cells wide.
+    "column": curved_scenes.tower(radius_m=0.6, half_deg=180.0, **BAND),
 }
 
 

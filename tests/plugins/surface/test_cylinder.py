@@ -159,13 +159,15 @@ def test_what_is_no_cylinder_is_rejected_with_the_reason(
     assert reason is None or reason in reasons
 
 
-@pytest.mark.parametrize("noise_m", [0.005, 0.02])
+@pytest.mark.parametrize(("noise_m", "half_rad"), [(0.005, 2.6), (0.02, 2.6), (0.005, math.pi)])
 def test_a_leaning_cylinder_without_stations_is_found_despite_noise(
-    noise_m: float, tmp_path: Path
+    noise_m: float, half_rad: float, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(2)
     axis = np.array([0.6, 0.0, 0.8])
-    angles, along = rng.uniform(-2.6, 2.6, 200_000), rng.uniform(0.0, 4.0, 200_000)
+    angles, along = rng.uniform(-half_rad, half_rad, 200_000), rng.uniform(0.0, 4.0, 200_000)
+    # Few points are on a sector of 23 degrees.
+    angles[:190_000][np.abs(angles[:190_000] - 1.0) < 0.2] = 0.0
     radial = np.array([0.8, 0.0, -0.6]) * np.cos(angles)[:, None]
     radial += np.array([0.0, 1.0, 0.0]) * np.sin(angles)[:, None]
     distances = 1.2 + rng.normal(scale=noise_m, size=len(angles))
@@ -180,6 +182,13 @@ def test_a_leaning_cylinder_without_stations_is_found_despite_noise(
     turn = np.linalg.norm(np.cross(found.shape.axis_world, axis))
     assert math.degrees(turn) < 6.0 * found.sigma_axis_deg
     assert not found.shape.is_concave
+    assert found.is_closed == (half_rad == math.pi)
+    if found.is_closed:
+        # A closed surface is cut where it has the fewest points.
+        beside = np.cross(found.shape.axis_world, found.zero_world)
+        start = math.cos(found.arc_rad[0]) * found.zero_world
+        start += math.sin(found.arc_rad[0]) * beside
+        assert abs(math.atan2(start[1], start @ [0.8, 0.0, -0.6]) - 1.0) < 0.2
 
 
 @pytest.mark.parametrize("half_angle_deg", [3.0, 10.0, 25.0])
