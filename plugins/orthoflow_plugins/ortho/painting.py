@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Lock
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import Allocate
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled, inlined, interpreted
@@ -232,11 +233,11 @@ def footprint_of(
         cv2.reduce(painted, axis, cv2.REDUCE_SUM, dtype=cv2.CV_32S).ravel() for axis in range(2)
     )
     n_cells = int(in_rows.sum())
-    row, column = (float(n @ np.arange(n.size)) / n_cells for n in (in_rows, in_columns))
+    row = _middle(in_rows, first_row, surface.frame, "v")
+    column = _middle(in_columns, first_column, surface.frame, "u")
     around = surface.relief.depth[first_row:, first_column:]
     around = around[: len(painted), : painted.shape[1]]
     depth = cv2.sumElems(cv2.copyTo(around, painted))[0] / n_cells
-    row, column = row + first_row, column + first_column
     base = _BASE_CELLS
     steps = ((0.0, 0.0), (base, 0.0), (0.0, base))
     places = surface.local([(column + a + 0.5, row + b + 0.5) for a, b in steps], depth)
@@ -258,6 +259,21 @@ def footprint_of(
         obliquity_deg=math.degrees(math.atan2(aside, lift)),
         n_cells=n_cells,
     )
+
+
+def _middle(
+    counts: NDArray[np.int32], first: int, frame: WallFrame, axis: Literal["u", "v"]
+) -> float:
+    """Return the mean row or column of cells, given the number in each from the first one on."""
+    if frame.bend is not None and frame.bend.along == axis:
+        n_cells = frame.width if axis == "u" else frame.height
+        radius_cells = abs(frame.bend.radius_m) / frame.gsd_m
+        if n_cells > math.pi * radius_cells:
+            # A photo may show both ends of a surface that is nearly closed.
+            angles = (first + np.arange(counts.size)) / radius_cells
+            angle = math.atan2(float(counts @ np.sin(angles)), float(counts @ np.cos(angles)))
+            return angle % math.tau * radius_cells
+    return float(counts @ np.arange(counts.size)) / float(counts.sum()) + first
 
 
 def _aside_and_lift(

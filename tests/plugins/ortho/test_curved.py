@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from orthoflow_plugins.colour.photos import ColourPhotos
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.dsm_forward import DsmForward
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
@@ -26,6 +28,11 @@ SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
     "vault": (curved_scenes.vault(length_m=2.0, **BAND), [(0.0, -0.6, 2.5), (30.0, 0.7, 2.4)]),
     "tower": (curved_scenes.tower(**BAND), [(0.0, -0.6, 2.5), (60.0, 0.5, 1.6)]),
     "apse": (curved_scenes.tower(is_concave=True, **BAND), [(100.0, 0.3, 1.5)]),
+    # The second camera faces the cut of the closed surface.
+    "column": (
+        curved_scenes.tower(radius_m=0.6, half_deg=180.0, **BAND),
+        [(0.0, -0.6, 2.0), (175.0, 0.3, 1.5)],
+    ),
 }
 
 
@@ -90,6 +97,31 @@ def test_points_colour_a_cylinder(tmp_path: Path) -> None:
     rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
     places = drum.places(frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()])))
     errors = layer.rgb.reshape(-1, 3)[:, 0] / 255.0 - curved_scenes.texture(places)
+    assert np.sqrt((errors**2).mean()) < 0.13
+
+
+@pytest.mark.parametrize("name", ["vault", "column"])
+def test_points_get_the_colours_of_photos(name: str, tmp_path: Path) -> None:
+    drum, poses = SCENES[name]
+    # The cloud has no points on the sides of the band, through which the back would be seen.
+    drum = replace(drum, height_m=0.0)
+    cameras = [curved_scenes.camera(drum, *pose, width=800) for pose in poses]
+    inputs = {
+        "cloud": drum.cloud(GSD_M),
+        "photos": ortho_scenes.photos(*map(drum.rendered, cameras)),
+        "cameras": ortho_scenes.cameras(*cameras),
+    }
+    cloud = run(ColourPhotos, context(tmp_path), inputs).cloud
+    points = cloud.points_world()
+    is_seen = np.zeros(len(points), dtype=np.bool_)
+    for camera in cameras:
+        rays = points - camera.centre_world
+        met = drum.met(np.broadcast_to(camera.centre_world, rays.shape), rays)
+        is_seen |= (met > 1.0 - 0.05 / np.linalg.norm(rays, axis=1)) & camera.sees(
+            camera.project(points)[:, :2]
+        )
+    assert is_seen.mean() > 0.99
+    errors = cloud.rgb[:, 0] / 255.0 - curved_scenes.texture(drum.places(points))
     assert np.sqrt((errors**2).mean()) < 0.13
 
 
