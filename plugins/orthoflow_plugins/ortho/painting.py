@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import Allocate
+from orthoflow.geometry.bends import CylinderBend
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled, inlined, interpreted
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
@@ -265,7 +266,7 @@ def _middle(
     counts: NDArray[np.int32], first: int, frame: WallFrame, axis: Literal["u", "v"]
 ) -> float:
     """Return the mean row or column of cells, given the number in each from the first one on."""
-    if frame.bend is not None and frame.bend.along == axis:
+    if isinstance(frame.bend, CylinderBend) and frame.bend.along == axis:
         n_cells = frame.width if axis == "u" else frame.height
         radius_cells = abs(frame.bend.radius_m) / frame.gsd_m
         if n_cells > math.pi * radius_cells:
