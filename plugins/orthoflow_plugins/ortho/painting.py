@@ -263,7 +263,7 @@ def footprint_of(
 
 
 def _middle(
-    counts: NDArray[np.int32], first: int, frame: WallFrame, axis: Literal["u", "v"]
+    counts: NDArray[np.number], first: int, frame: WallFrame, axis: Literal["u", "v"]
 ) -> float:
     """Return the mean row or column of cells, given the number in each from the first one on."""
     if isinstance(frame.bend, CylinderBend) and frame.bend.along == axis:
