@@ -175,7 +175,7 @@ class SegmentOpenings(Method):
         ]
         if not chosen:
             raise MethodError(
-                f"none of the {len(walls.walls)} walls is vertical; set level: true to search "
+                f"none of the {len(walls.walls)} walls is a vertical plane; set level: true to search "
                 "floors and ceilings, too (segment.openings)"
             )
         if inputs.cloud is not None:

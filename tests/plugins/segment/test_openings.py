@@ -158,7 +158,9 @@ def leaning(rise_deg: float) -> Walls:
 def test_floors_and_slopes_alone_are_refused_unless_asked_for_and_a_wall_may_lean(
     tmp_path: Path, rise_deg: float
 ) -> None:
-    with pytest.raises(MethodError, match="none of the 1 walls is vertical; set level: true"):
+    with pytest.raises(
+        MethodError, match="none of the 1 walls is a vertical plane; set level: true"
+    ):
         found(tmp_path, walls=leaning(rise_deg))
     if rise_deg == 90.0:
         assert found(tmp_path, walls=leaning(rise_deg), level=True)[0].openings
