@@ -175,8 +175,8 @@ class SegmentOpenings(Method):
         ]
         if not chosen:
             raise MethodError(
-                f"none of the {len(walls.walls)} walls is a vertical plane; set level: true to search "
-                "floors and ceilings, too (segment.openings)"
+                f"none of the {len(walls.walls)} walls is a vertical plane; set level: true to "
+                "search floors and ceilings, too (segment.openings)"
             )
         if inputs.cloud is not None:
             inputs.cloud.require_points(2)
