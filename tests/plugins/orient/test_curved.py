@@ -57,13 +57,13 @@ def shifts_m(layer: Layer, true: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def test_an_oriented_vault_is_unrolled_to_a_tenth_of_a_cell(tmp_path: Path) -> None:
-    drum = curved_scenes.vault(length_m=1.2, band_m=(0.2, 0.35), height_m=0.08)
+    drum = curved_scenes.vault(half_deg=45.0, length_m=1.2, band_m=(0.2, 0.35), height_m=0.08)
     random = np.random.default_rng(11)
     points = drum.cloud(0.7 * GSD_M)
     world = points.points_world()
     world += random.normal(0.0, 1e-3, len(world))[:, None] * drum.cylinder.normals(world)
     cloud = replace(cloud_of(world, intensity=points.intensity), rgb=points.rgb)
-    poses = [(-50.0, -0.2, 2.4), (-18.0, 0.2, 2.5), (15.0, -0.2, 2.4), (50.0, 0.2, 2.4)]
+    poses = [(-30.0, -0.2, 2.4), (0.0, 0.2, 2.5), (30.0, -0.2, 2.4)]
     viewers = [curved_scenes.camera(drum, *pose, width=1000) for pose in poses]
     pictures = [drum.rendered(viewer) for viewer in viewers]
     noisy = [
@@ -93,7 +93,7 @@ def test_an_oriented_vault_is_unrolled_to_a_tenth_of_a_cell(tmp_path: Path) -> N
     again = run(MatchGuided, context(tmp_path), more).ties
     inputs = {"ties": again, "photos": photos}
     cameras = run(OrientColmapBundle, context(tmp_path), inputs).cameras
-    assert [camera.status for camera in cameras.cameras] == ["ok"] * 4
+    assert [camera.status for camera in cameras.cameras] == ["ok"] * 3
     for camera, viewer in zip(cameras.cameras, viewers, strict=True):
         assert np.linalg.norm(camera.viewing().centre_world - viewer.centre_world) < 1.5e-3
 
