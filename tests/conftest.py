@@ -7,7 +7,8 @@ import multiprocessing.util
 import os
 import sys
 from collections.abc import Callable, Generator, Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -187,13 +188,32 @@ def pytest_runtest_makereport(
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Generator[None, object, object]:
+def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
     """Look for no garbage while tests are loaded: there is hardly any."""
     gc.disable()
     try:
+        if session.config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+            _load_tests()
         return (yield)
     finally:
         gc.enable()
+
+
+def _load_tests() -> None:
+    """Load test modules from a different one on in each process that tests are spread over.
+
+    All load all of them. Where nothing is compiled yet, each thus finds compiled what the others
+    have begun with, instead of compiling the same modules at the same time.
+    """
+    process = os.environ.get("PYTEST_XDIST_WORKER")
+    if process is not None:
+        modules = sorted((_ROOT / "tests").rglob("test_*.py"))
+        n_processes = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        start = int(process.removeprefix("gw")) * len(modules) // n_processes
+        for path in modules[start:] + modules[:start]:
+            name = ".".join(path.relative_to(_ROOT).with_suffix("").parts)
+            with suppress(Exception):  # pytest reports it
+                import_module(name)
 
 
 def pytest_collection_finish() -> None:
