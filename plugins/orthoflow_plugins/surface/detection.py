@@ -177,7 +177,7 @@ def _levels(
     first = in_voxels(sample.take(slice(None, None, every)), _FIRST_VOXEL_M)
     noise_m = noise_of(first.voxels(cloud, BLOCK_VOXELS))
     # On a surface, the points of a voxel cover an area of about the square of its size.
-    per_voxel = max(1.0, every * len(first.index) / first.count)
+    per_voxel = max(1.0, every * float(first.moments[:, 0].mean()))
     spacing_m = _FIRST_VOXEL_M / math.sqrt(per_voxel)
     grid = in_voxels(sample, max(_VOXEL_M, _VOXEL_NOISES * noise_m, _VOXEL_SPACINGS * spacing_m))
     levels: list[tuple[float, Voxels]] = []

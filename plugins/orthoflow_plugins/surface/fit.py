@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.slabs import Offsets, read_only
 from orthoflow.geometry.surfaces import zero_direction
 from orthoflow.geometry.threads import even_parts, in_threads
@@ -21,6 +22,7 @@ from orthoflow_plugins.surface.search import Found, longest_gap
 
 # Minimum size and maximum number of the cells of a surface.
 _CELL_M: Final = 0.03
+_CELL_RAD: Final = 0.05
 _MOST_CELLS: Final = 30_000
 _LEAST_CELLS: Final = 8
 # Number of parts of the sums; it is fixed, so that the sums do not depend on the number of threads.
@@ -28,8 +30,17 @@ _PARTS: Final = 4
 # Maximum distance, in standard deviations, of the points that are summed.
 _SUM_SIGMAS: Final = 5.0
 _LEAST_SUM_M: Final = 0.012
-# Sizes, in cells, of the tiles from whose scatter the covariance is estimated.
-_TILES: Final = (1, 4, 16)
+# Cells are merged until they contain this many points on average; cells and tiles become no larger
+# than this share of a circle, because their curvature would be lost.
+_LEAST_MEAN_POINTS: Final = 6.0
+_LEAST_AROUND: Final = 32
+# Size, in cells, of the tiles to whose means the surface is fitted. Tukey's weights detect smaller
+# deviations of tiles, such as those of tangential walls, than of cells.
+_TILE: Final = 4
+# Sizes, in tiles, of the clusters from whose scatter the covariance is estimated.
+_CLUSTERS: Final = (1, 4)
+# Numbers of cells around surfaces are multiples of this number.
+_MULTIPLE: Final = 16
 _OPEN_SHARE: Final = 0.15
 # Cells adjacent to cells without weight are ignored if more than this share of all cells remains.
 _LEAST_USED: Final = 0.4
@@ -47,9 +58,6 @@ class FittedSurface:
         surface: the surface, without a name.
         cell_scatter_m: scatter of the means of cells beyond the noise of points.
         noise_m: standard deviation of the points within cells.
-        counts: (around, along) number of points in each cell.
-        means_m: (around, along) mean distance of each cell from the surface, positive towards the
-            viewer; NaN for empty cells.
         shift_m: maximum displacement from the surface found among voxels.
         slope: change of the radius per metre along the axis if a cone is fitted to a cylinder's
             cells; 0 for cones.
@@ -58,10 +66,47 @@ class FittedSurface:
     surface: Surface
     cell_scatter_m: float
     noise_m: float
-    counts: NDArray[np.int64]
-    means_m: NDArray[np.float64]
     shift_m: float
     slope: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Means(Rows):
+    """Means of the distances of the points in the cells of a grid.
+
+    Attributes:
+        i: (m,) index of each cell around the axis.
+        j: (m,) index of each cell along the axis.
+        n: (m,) number of points.
+        means: (m,) mean distance.
+        matrix: (m, 6) mean of the rows of `design` with the slope.
+        n_around: number of cells around the axis.
+    """
+
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
+    n: NDArray[np.float64]
+    means: NDArray[np.float64]
+    matrix: NDArray[np.float64]
+    n_around: int
+
+    def merged(self, side: int) -> _Means:
+        """Return the means of squares of `side` by `side` cells."""
+        key = (self.i // side) * (self.j.max() + 1) + self.j // side
+        n = np.bincount(key, self.n).astype(np.float64)
+        own = np.flatnonzero(n)
+
+        def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(np.bincount(key, self.n * values)[own] / n[own])
+
+        return _Means(
+            i=own // (self.j.max() + 1),
+            j=own % (self.j.max() + 1),
+            n=n[own],
+            means=mean(self.means),
+            matrix=np.column_stack([mean(column) for column in self.matrix.T]),
+            n_around=self.n_around // side,
+        )
 
 
 def fit_all(
@@ -123,16 +168,14 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
         low_m, high_m = item.along_m
         radius_m = item.round.radius_m
         area_m2 = 2.0 * math.pi * radius_m * (high_m - low_m) * float(item.is_open.mean())
-        size_m = max(_CELL_M, math.sqrt(area_m2 / _MOST_CELLS))
-        # Each part of the circle that may be open contains a whole number of cells.
-        n_open = len(item.is_open)
-        around = n_open * max(1, round(2.0 * math.pi * radius_m / size_m / n_open))
+        size_m = max(min(_CELL_M, _CELL_RAD * radius_m), math.sqrt(area_m2 / _MOST_CELLS))
+        around = _MULTIPLE * max(2, round(2.0 * math.pi * radius_m / size_m / _MULTIPLE))
         along = max(_LEAST_CELLS, round((high_m - low_m) / size_m))
         rounds.append(item.round.row(item.zero))
         within_m = min(tolerance_m, max(_LEAST_SUM_M, _SUM_SIGMAS * noise_m))
         bounds.append((low_m, high_m, tolerance_m, within_m))
         sizes.append((first, around, along, first_open))
-        opens.append(np.repeat(item.is_open, around // n_open))
+        opens.append(item.is_open[np.arange(around) * len(item.is_open) // around])
         first += around * along
         first_open += around
     return Cells(np.array(rounds), np.array(bounds), np.array(sizes), np.concatenate(opens))
@@ -153,40 +196,45 @@ def _fitted(
     n, total, square = sums[i, j].T
     angles = ((i + 0.5) / around - 0.5) * 2.0 * math.pi
     places = bounds[0] + (j + 0.5) * size_m
-    means = total / n
-    many = n >= 4.0
-    within = np.maximum(square - n * means**2, 0.0)
+    within = np.maximum(square - total**2 / n, 0.0)
+    many = n >= 2.0
     noise_m = math.sqrt(float(within[many].sum() / max(1.0, (n[many] - 1.0).sum())))
-    matrix = design(angles, places, found.round.steepness, is_cone=is_cone)
-    variances = max(noise_m, 1e-5) ** 2 / n
-    _, weights, _ = robust_solution(matrix, means, variances)
-    # Cells adjacent to those without weight also contain a few points of mouldings and edges.
-    is_out = np.zeros((around, along), dtype=np.bool_)
-    is_out[i, j] = weights == 0.0
-    is_in = ~ndimage.binary_dilation(is_out, np.ones((3, 3), dtype=np.bool_))[i, j]
-    used = is_in if is_in.mean() > _LEAST_USED else weights > 0.0
-    change, weights, extra_m = robust_solution(matrix[used], means[used], variances[used])
-    rest = means - matrix @ change
+    matrix = design(angles, places, found.round.steepness, is_cone=True)
+    n_own = 6 if is_cone else 5
+    cells = _Means(i=i, j=j, n=n, means=total / n, matrix=matrix, n_around=around)
+    while cells.n.mean() < _LEAST_MEAN_POINTS and cells.n_around >= 2 * _LEAST_AROUND:
+        cells = cells.merged(2)
+    variance = max(noise_m, 1e-5) ** 2
+    _, weights, extra_m = robust_solution(cells.matrix[:, :n_own], cells.means, variance / cells.n)
+    # Cells at edges also contain points of mouldings and of adjoining walls. Only at the sides of a
+    # surface seen from outside, there are none.
+    is_good = np.zeros((cells.n_around + 2, cells.j.max() + 1), dtype=np.bool_)
+    is_good[cells.i + 1, cells.j] = weights > 0.0
+    is_open = np.full_like(is_good, found.side < 0.0)
+    is_open[cells.i + 1, cells.j] = weights > 0.0
+    is_open[[0, -1]] = is_open[[-2, 1]]
+    is_in = ndimage.binary_erosion(is_open, np.ones((3, 3), dtype=np.bool_), border_value=1)
+    is_in &= ndimage.binary_erosion(is_good, np.ones((1, 3), dtype=np.bool_))
+    is_in = is_in[cells.i + 1, cells.j]
+    tiles = cells.take(is_in if is_in.mean() > _LEAST_USED else weights > 0.0)
+    tiles = tiles.merged(max(1, min(_TILE, tiles.n_around // _LEAST_AROUND)))
+    variances = variance / tiles.n
+    change, weights, _ = robust_solution(tiles.matrix[:, :n_own], tiles.means, variances)
     slope = 0.0
     if not is_cone:
-        wider = design(angles[used], places[used], 1.0, is_cone=True)
-        slope = float(robust_solution(wider, means[used], variances[used])[0][5])
-    own = _covariance(matrix[used], rest[used], weights, (i[used], j[used]))
+        slope = float(robust_solution(tiles.matrix, tiles.means, variances)[0][5])
+    own = _covariance(tiles, tiles.matrix[:, :n_own], change, weights)
+    rest = total / n - matrix[:, :n_own] @ change
     best = found.round.corrected(found.zero, change)
     zero = zero_direction(best.axis, cloud.up)
     middle_m = float(n @ places / n.sum())
     best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
-    counts = np.zeros((around, along), dtype=np.int64)
-    counts[i, j] = n
-    sign = -1.0 if found.side > 0.0 else 1.0
-    means_m = np.full((around, along), np.nan)
-    means_m[i, j] = sign * rest
     near = np.abs(rest) < bounds[3]
     rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[near].sum() / n[near].sum())))
     is_on = np.zeros((around, along), dtype=np.bool_)
     largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
     is_on[i, j] = np.abs(rest) < largest_m
-    arc, ends = _extent(is_on, counts)
+    arc, ends = _extent(is_on, sums[:, :, 0])
     # Positions along the axis of a cone are measured from its apex.
     start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
     surface = Surface(
@@ -203,9 +251,7 @@ def _fitted(
         surface=surface,
         cell_scatter_m=extra_m,
         noise_m=noise_m,
-        counts=counts,
-        means_m=means_m,
-        shift_m=float(np.abs(matrix @ change).max()),
+        shift_m=float(np.abs(matrix[:, :n_own] @ change).max()),
         slope=slope,
     )
 
@@ -220,34 +266,35 @@ def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.fl
 
 
 def _covariance(
+    tiles: _Means,
     matrix: NDArray[np.float64],
-    rest: NDArray[np.float64],
+    change: NDArray[np.float64],
     weights: NDArray[np.float64],
-    cell: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> NDArray[np.float64]:
     """Estimate the covariance of the parameters from the scatter between tiles.
 
-    Neighbouring cells have common errors, so tiles of several sizes are used, and the largest
+    Neighbouring tiles have common errors, so clusters of several sizes are used, and the largest
     covariance is returned (White's estimator with clusters).
     """
+    rest = tiles.means - matrix @ change
     inverse = np.linalg.pinv(matrix.T @ (matrix * weights[:, None]), hermitian=True)
+    leverage = weights * np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
+    scores = matrix * (weights * rest / (1.0 - np.minimum(leverage, 0.9)))[:, None]
     best = np.zeros_like(inverse)
-    for side in _TILES:
-        tile = (cell[0] // side) * 100_003 + cell[1] // side
-        _, own = np.unique(tile, return_inverse=True)
-        n_tiles = int(own.max()) + 1
-        if n_tiles <= 3 * len(inverse):
+    for side in _CLUSTERS:
+        cluster = (tiles.i // side) * (tiles.j.max() + 1) + tiles.j // side
+        n_clusters = len(np.unique(cluster[weights > 0.0]))
+        if n_clusters <= 3 * len(inverse):
             break
-        scores = np.zeros((n_tiles, len(inverse)))
-        np.add.at(scores, own, matrix * (weights * rest)[:, None])
-        factor = n_tiles / (n_tiles - len(inverse))
-        found = factor * inverse @ (scores.T @ scores) @ inverse
+        sums = np.column_stack([np.bincount(cluster, column) for column in scores.T])
+        factor = n_clusters / (n_clusters - len(inverse))
+        found = factor * inverse @ (sums.T @ sums) @ inverse
         best = found if np.trace(found) > np.trace(best) else best
     return np.asarray(best if best.any() else inverse)
 
 
 def _extent(
-    is_full: NDArray[np.bool_], counts: NDArray[np.int64]
+    is_full: NDArray[np.bool_], counts: NDArray[np.float64]
 ) -> tuple[tuple[float, float], tuple[int, int]]:
     """Return the ranges of angles and of cells along the axis (end exclusive) with points.
 
@@ -264,9 +311,7 @@ def _extent(
     gap = longest_gap(is_open)
     step = 2.0 * math.pi / count
     if gap <= max(2, count // 60):
-        near = ndimage.uniform_filter1d(
-            counts.sum(axis=1, dtype=np.float64), max(1, count // 36), mode="wrap"
-        )
+        near = ndimage.uniform_filter1d(counts.sum(axis=1), max(1, count // 36), mode="wrap")
         low = (int(np.argmin(near)) + 0.5) * step - math.pi
         return (low, low + 2.0 * math.pi), ends
     opens = np.flatnonzero(is_open)

@@ -17,66 +17,53 @@ from orthoflow.geometry.slabs import Offsets
 
 # Number of entries of a row of moments: n, sums of x, y, z, and of xx, xy, xz, yy, yz, zz.
 MOMENTS: Final = 10
-_KEY_BITS: Final = 20
-
-
-class VoxelTable(NamedTuple):
-    """Occupied voxels, found by hashing (open addressing).
-
-    Attributes:
-        keys: (2^k,) int64 keys, -1 for empty entries.
-        slots: (2^k,) int32 index of the voxel of each entry.
-        places: (v, 3) int32 position of each voxel in the grid.
-        moments: (v, 10) float64 sums over the points of each voxel.
-        first: (v,) int32 index of the first point of each voxel.
-    """
-
-    keys: NDArray[np.int64]
-    slots: NDArray[np.int32]
-    places: NDArray[np.int32]
-    moments: NDArray[np.float64]
-    first: NDArray[np.int32]
-
-
-@kernel_part
-def _find(keys: NDArray[np.int64], i: int, j: int, k: int) -> np.int64:
-    """Return the entry of a voxel, or the empty entry where it belongs."""
-    key = (i << (2 * _KEY_BITS)) | (j << _KEY_BITS) | k
-    mask = np.int64(keys.shape[0] - 1)
-    bits = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    entry = np.int64(bits >> np.uint64(32)) & mask
-    while keys[entry] != -1 and keys[entry] != key:
-        entry = (entry + np.int64(1)) & mask
-    return entry
-
-
-@kernel_part
-def _voxel_at(table: VoxelTable, count: int, i: int, j: int, k: int) -> np.int64:
-    """Return the index of a voxel; a new voxel is added with the index `count`."""
-    entry = _find(table.keys, i, j, k)
-    if table.keys[entry] == -1:
-        table.keys[entry] = (i << (2 * _KEY_BITS)) | (j << _KEY_BITS) | k
-        table.slots[entry] = count
-        table.places[count, 0] = i
-        table.places[count, 1] = j
-        table.places[count, 2] = k
-    return np.int64(table.slots[entry])
+# Maximum number of iterations of a robust solution. It ends when the solution changes by less than
+# _SETTLED (metres or radians). The scatter is estimated from about _SCATTER_SAMPLE observations.
+_ROUNDS: Final = 12
+_SETTLED: Final = 1e-8
+_SCATTER_SAMPLE: Final = 4_000
+# Number of points of a block of `sum_cells`, and of points compared at a time to find its bounds.
+_BLOCK: Final = 128
+_LANES: Final = 16
+# A voxel at (i, j, k) has the key i << 40 | j << 20 | k.
+KEY_BITS: Final = 20
 
 
 @compiled
 def fill_voxels(
-    points: NDArray[np.float64], low: NDArray[np.float64], voxel_m: float, table: VoxelTable
+    points: NDArray[np.float64],
+    low: NDArray[np.float64],
+    voxel_m: float,
+    table: NDArray[np.int32],
+    keys: NDArray[np.int64],
+    moments: NDArray[np.float64],
+    first: NDArray[np.int64],
 ) -> int:
-    """Sort points (m, 3) into voxels that begin at `low`; return the number of voxels."""
+    """Sort points (m, 3) into voxels that begin at `low`; return the number of voxels.
+
+    Args:
+        points: the points.
+        low: corner of the voxels at (1, 1, 1).
+        voxel_m: size of a voxel.
+        table: (2^k,) indices of voxels, -1 for empty entries (open addressing).
+        keys: (m,) output, key of each voxel.
+        moments: (m, 10) output, sums over the points of each voxel.
+        first: (m,) output, index of the first point of each voxel.
+    """
     count = 0
+    mask = np.int64(table.shape[0] - 1)
     for p in range(points.shape[0]):
         x, y, z = points[p, 0] - low[0], points[p, 1] - low[1], points[p, 2] - low[2]
-        i, j, k = int(x / voxel_m) + 2, int(y / voxel_m) + 2, int(z / voxel_m) + 2
-        v = _voxel_at(table, count, i, j, k)
-        if v == count:
-            table.first[v] = p
+        i, j, k = int(x / voxel_m) + 1, int(y / voxel_m) + 1, int(z / voxel_m) + 1
+        key = (i << (2 * KEY_BITS)) | (j << KEY_BITS) | k
+        bits = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+        entry = np.int64(bits >> np.uint64(32)) & mask
+        while table[entry] != -1 and keys[table[entry]] != key:
+            entry = (entry + np.int64(1)) & mask
+        if table[entry] == -1:
+            table[entry], keys[count], first[count] = count, key, p
             count += 1
-        own = table.moments[v]
+        own = moments[table[entry]]
         own[0] += 1.0
         own[1] += x
         own[2] += y
@@ -91,45 +78,35 @@ def fill_voxels(
 
 
 @compiled
-def merge_voxels(fine: VoxelTable, n_fine: int, coarse: VoxelTable) -> int:
-    """Merge voxels into voxels of twice the size, and return the number of these."""
-    count = 0
-    for f in range(n_fine):
-        i, j, k = fine.places[f, 0], fine.places[f, 1], fine.places[f, 2]
-        v = _voxel_at(coarse, count, i // 2 + 1, j // 2 + 1, k // 2 + 1)
-        if v == count:
-            coarse.first[v] = fine.first[f]
-            count += 1
-        for m in range(MOMENTS):
-            coarse.moments[v, m] += fine.moments[f, m]
-    return count
-
-
-@compiled
 def find_normals(
-    table: VoxelTable, n_voxels: int, normals: NDArray[np.float64], spreads: NDArray[np.float64]
+    keys: NDArray[np.int64],
+    moments: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    spreads: NDArray[np.float64],
 ) -> None:
     """Compute the normal of each voxel from the points of the voxel and its 26 neighbours.
 
     Args:
-        table: the voxels.
-        n_voxels: their number.
+        keys: (v,) keys of the voxels, ascending. The neighbours of a voxel are then in nine runs
+            of the list, which all move forwards from one voxel to the next.
+        moments: (v, 10) sums over the points of each voxel.
         normals: output (v, 3), unit vectors.
         spreads: output (v, 4): standard deviations along the normal and along the two principal
             directions of the surface, ascending, and the number of points.
     """
-    total = np.empty(MOMENTS)
-    for v in range(n_voxels):
+    total, starts = np.empty(MOMENTS), np.zeros(9, dtype=np.int64)
+    for v in range(keys.shape[0]):
         total[:] = 0.0
-        i, j, k = table.places[v, 0], table.places[v, 1], table.places[v, 2]
-        for di in range(-1, 2):
-            for dj in range(-1, 2):
-                for dk in range(-1, 2):
-                    entry = _find(table.keys, i + di, j + dj, k + dk)
-                    if table.keys[entry] != -1:
-                        other = table.slots[entry]
-                        for m in range(MOMENTS):
-                            total[m] += table.moments[other, m]
+        for run in range(9):
+            aside = ((run // 3 - 1) << (2 * KEY_BITS)) + ((run % 3 - 1) << KEY_BITS)
+            other = starts[run]
+            while other < keys.shape[0] and keys[other] < keys[v] + aside - 1:
+                other += 1
+            starts[run] = other
+            while other < keys.shape[0] and keys[other] <= keys[v] + aside + 1:
+                for m in range(MOMENTS):
+                    total[m] += moments[other, m]
+                other += 1
         _principal(total, normals[v], spreads[v])
         spreads[v, 3] = total[0]
 
@@ -214,6 +191,140 @@ def count_votes(
                 votes[j] += 1
 
 
+@compiled
+def near_voxels(
+    row: NDArray[np.float64],
+    side: float,
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    near: NDArray[np.int64],
+) -> int:
+    """Find the voxels near a surface whose normals agree with it; return their number.
+
+    Args:
+        row: (12,) the surface.
+        side: 1 if normals point to the axis, -1 if they point away from it, 0 for both.
+        points: (v, 3) the voxels.
+        normals: (v, 3) their normals.
+        limits: maximum distance, and minimum cosine of the angle between the normals.
+        near: (v,) output, indices of the voxels.
+    """
+    count = 0
+    for v in range(points.shape[0]):
+        dx, dy, dz = points[v, 0] - row[0], points[v, 1] - row[1], points[v, 2] - row[2]
+        along = dx * row[3] + dy * row[4] + dz * row[5]
+        radius = math.sqrt(max(1e-24, dx * dx + dy * dy + dz * dz - along * along))
+        if abs(radius - row[9] - row[10] * along) * row[11] >= limits[0]:
+            continue
+        tilt = normals[v, 0] * row[3] + normals[v, 1] * row[4] + normals[v, 2] * row[5]
+        cosine = dx * normals[v, 0] + dy * normals[v, 1] + dz * normals[v, 2] - along * tilt
+        cosine = row[11] * (cosine / radius - row[10] * tilt)
+        if (-side * cosine if side != 0.0 else abs(cosine)) > limits[1]:
+            near[count] = v
+            count += 1
+    return count
+
+
+@compiled
+def solve_robustly(
+    matrix: NDArray[np.float64],
+    distances: NDArray[np.float64],
+    variances: NDArray[np.float64],
+    tukey: float,
+    solution: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> float:
+    """Solve by least squares with Tukey's weights (see `robust_solution`).
+
+    Args:
+        matrix: (n, k) design.
+        distances: (n,) observations.
+        variances: (n,) their variances.
+        tukey: Tukey's constant, in standard deviations.
+        solution: (k,) output.
+        weights: (n,) output.
+
+    Returns:
+        The standard deviation of the additional scatter.
+    """
+    n, k = matrix.shape
+    normal, right, extra = np.empty((k, k)), np.empty(k), 0.0
+    squares = np.empty(n)
+    step = max(1, n // _SCATTER_SAMPLE)
+    beyond = np.empty((n + step - 1) // step)
+    for p in range(n):
+        weights[p] = 1.0 / variances[p]
+    for _ in range(_ROUNDS):
+        _set_normal_equations(matrix, distances, weights, normal, right)
+        change = _solve(normal, right, solution)
+        for p in range(n):
+            rest = distances[p]
+            for a in range(k):
+                rest -= matrix[p, a] * solution[a]
+            squares[p] = rest * rest
+        # The median of squared residuals without measurement noise is 0.455 times the variance.
+        for p in range(beyond.shape[0]):
+            beyond[p] = squares[p * step] / 0.455 - variances[p * step]
+        extra = max(0.0, np.median(beyond))
+        count = 0
+        for p in range(n):
+            spread = variances[p] + extra
+            share = max(0.0, 1.0 - squares[p] / (tukey * tukey * spread))
+            weights[p] = share * share / spread
+            count += share > 0.0
+        if change < _SETTLED or count < 2 * k:
+            break
+    return math.sqrt(extra)
+
+
+@kernel_part
+def _set_normal_equations(
+    matrix: NDArray[np.float64],
+    distances: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Set the lower triangle of the normal matrix (k, k), and the right side (k,)."""
+    k = matrix.shape[1]
+    normal[:], right[:] = 0.0, 0.0
+    for p in range(matrix.shape[0]):
+        for a in range(k):
+            product = weights[p] * matrix[p, a]
+            right[a] += product * distances[p]
+            for b in range(a + 1):
+                normal[a, b] += product * matrix[p, b]
+
+
+@kernel_part
+def _solve(
+    normal: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
+) -> float:
+    """Solve by Cholesky's factorisation; return the largest change of the solution."""
+    k, trace = normal.shape[0], 0.0
+    for a in range(k):
+        trace += normal[a, a]
+    for a in range(k):
+        normal[a, a] += 1e-12 * trace
+        for b in range(a + 1):
+            value = normal[a, b]
+            for c in range(b):
+                value -= normal[a, c] * normal[b, c]
+            normal[a, b] = math.sqrt(max(value, 1e-300)) if a == b else value / normal[b, b]
+        for c in range(a):
+            right[a] -= normal[a, c] * right[c]
+        right[a] /= normal[a, a]
+    change = 0.0
+    for a in range(k - 1, -1, -1):
+        for c in range(a + 1, k):
+            right[a] -= normal[c, a] * right[c]
+        right[a] /= normal[a, a]
+        change = max(change, abs(right[a] - solution[a]))
+        solution[a] = right[a]
+    return change
+
+
 class Cells(NamedTuple):
     """The grids of cells on the surfaces.
 
@@ -235,47 +346,14 @@ class Cells(NamedTuple):
 @kernel_part
 def _quick_angle(sine: float, cosine: float) -> float:
     """Return atan2 with an error of at most 1e-4 rad (a polynomial of degree 7), for cells."""
-    high, low = max(abs(sine), abs(cosine)), min(abs(sine), abs(cosine))
-    ratio = low / max(high, 1e-300)
+    # Without branches, loops over arrays are vectorised.
+    a, b = abs(sine), abs(cosine)
+    ratio = min(a, b) / (max(a, b) + 1e-300)
     square = ratio * ratio
     angle = ((-0.0464964749 * square + 0.15931422) * square - 0.327622764) * square
     angle = angle * ratio + ratio
-    if abs(sine) > abs(cosine):
-        angle = 0.5 * math.pi - angle
-    if cosine < 0.0:
-        angle = math.pi - angle
-    return angle if sine >= 0.0 else -angle
-
-
-@kernel_part
-def _cell_at(cells: Cells, s: int, x: float, y: float, z: float, along: float) -> int:
-    """Return the cell of a position relative to the surface's point; -1 if it is excluded."""
-    # Arrays of rows would be reference-counted at each use.
-    r = cells.rounds
-    cosine = x * r[s, 6] + y * r[s, 7] + z * r[s, 8]
-    sine = (
-        x * (r[s, 4] * r[s, 8] - r[s, 5] * r[s, 7])
-        + y * (r[s, 5] * r[s, 6] - r[s, 3] * r[s, 8])
-        + z * (r[s, 3] * r[s, 7] - r[s, 4] * r[s, 6])
-    )
-    around, rows = cells.sizes[s, 1], cells.sizes[s, 2]
-    i = min(int((_quick_angle(sine, cosine) / (2.0 * math.pi) + 0.5) * around), around - 1)
-    if not cells.is_open[cells.sizes[s, 3] + i]:
-        return -1
-    share = (along - cells.bounds[s, 0]) / (cells.bounds[s, 1] - cells.bounds[s, 0])
-    return int(cells.sizes[s, 0] + i * rows + min(int(share * rows), rows - 1))
-
-
-@kernel_part
-def _distance_of_plane(
-    index: int, planes: NDArray[np.float64], x: float, y: float, z: float
-) -> float:
-    """Return the distance of a point from its plane; inf if it has none or the plane is curved."""
-    if index < 0:
-        return math.inf
-    distance = planes[index, 0] * x + planes[index, 1] * y + planes[index, 2] * z
-    distance -= planes[index, 3]
-    return math.inf if math.isnan(distance) else distance
+    angle = 0.5 * math.pi - angle if a > b else angle
+    return math.copysign(math.pi - angle if cosine < 0.0 else angle, sine)
 
 
 @compiled
@@ -290,6 +368,9 @@ def sum_cells(
 ) -> None:
     """Label each point with the nearest surface, and sum the distances of the points in each cell.
 
+    Blocks of points that are far from a surface are skipped. Points near two surfaces are labelled
+    but not summed: those that are nearer to one of them have a biased mean distance from it.
+
     Args:
         offsets: the points.
         plane: (n,) index of the plane of each point, -1 for none; empty without planes.
@@ -301,34 +382,145 @@ def sum_cells(
         labels: (n,) output, -1 for points on no surface.
         counts: (s,) output, number of points of each surface.
     """
-    r, bounds = cells.rounds, cells.bounds
-    count = r.shape[0]
-    for p in range(offsets.x.shape[0]):
-        labels[p] = -1
-        x, y, z = float(offsets.x[p]), float(offsets.y[p]), float(offsets.z[p])
-        index = plane[p] if plane.shape[0] > 0 else -1
-        nearest, best, cell = _distance_of_plane(index, planes, x, y, z), -1, 0
-        for s in range(count):
-            dx, dy, dz = x - r[s, 0], y - r[s, 1], z - r[s, 2]
-            along = dx * r[s, 3] + dy * r[s, 4] + dz * r[s, 5]
-            if along < bounds[s, 0] or along > bounds[s, 1]:
+    lanes, middle = np.empty((2, _LANES), dtype=np.float32), np.empty(3)
+    work, index = np.empty((7, _BLOCK)), np.empty((3, _BLOCK), dtype=np.int64)
+    nearest, second, best, cell = work[0], work[1], index[0], index[1]
+    for first in range(0, offsets.x.shape[0], _BLOCK):
+        end = min(first + _BLOCK, offsets.x.shape[0])
+        block = Offsets(offsets.x[first:end], offsets.y[first:end], offsets.z[first:end])
+        own = labels[first:end]
+        for p in range(end - first):
+            own[p] = -1
+        half = _reach(block.x, 0, lanes, middle) + _reach(block.y, 1, lanes, middle)
+        half = math.sqrt(half + _reach(block.z, 2, lanes, middle))
+        is_empty = True
+        for s in range(cells.rounds.shape[0]):
+            if _may_have_points(cells, s, middle, half):
+                if is_empty:
+                    is_empty = False
+                    _compare_planes(block, plane[first:end], planes, work, index)
+                _compare(block, cells, s, work, index)
+        if is_empty:
+            continue
+        for p in range(end - first):
+            s, distance = best[p], nearest[p]
+            if s < 0:
                 continue
-            radius = r[s, 9] + r[s, 10] * along
-            square = dx * dx + dy * dy + dz * dz - along * along
-            reach = bounds[s, 2] / r[s, 11]
-            inner = max(0.0, radius - reach)
-            if square < inner * inner or square > (radius + reach) * (radius + reach):
-                continue
-            distance = (math.sqrt(square) - radius) * r[s, 11]
-            if abs(distance) >= abs(nearest):
-                continue
-            at = _cell_at(cells, s, dx, dy, dz, along)
-            if at >= 0:
-                nearest, best, cell = distance, s, at
-        if best >= 0:
-            labels[p] = best
-            counts[best] += 1
-            if abs(nearest) < bounds[best, 3]:
-                sums[cell, 0] += 1.0
-                sums[cell, 1] += nearest
-                sums[cell, 2] += nearest * nearest
+            own[p] = s
+            counts[s] += 1
+            if abs(distance) < cells.bounds[s, 3] <= second[p]:
+                sums[cell[p], 0] += 1.0
+                sums[cell[p], 1] += distance
+                sums[cell[p], 2] += distance * distance
+
+
+@kernel_part
+def _reach(
+    values: NDArray[np.float32],
+    axis: int,
+    lanes: NDArray[np.float32],
+    middle: NDArray[np.float64],
+) -> float:
+    """Set the middle of a block along an axis; return the square of half its length."""
+    low, high = lanes[0], lanes[1]
+    n_lanes = min(_LANES, values.shape[0])
+    for lane in range(n_lanes):
+        low[lane] = values[lane]
+        high[lane] = values[lane]
+    for start in range(n_lanes, values.shape[0], _LANES):
+        # The last part overlaps the one before it.
+        begin = min(start, values.shape[0] - _LANES)
+        part = values[begin : begin + _LANES]
+        # Without branches, loops are vectorised.
+        for lane in range(_LANES):
+            low[lane] = min(low[lane], part[lane])
+            high[lane] = max(high[lane], part[lane])
+    least, most = low[0], high[0]
+    for lane in range(1, n_lanes):
+        least, most = min(least, low[lane]), max(most, high[lane])
+    middle[axis] = 0.5 * (float(least) + float(most))
+    half = 0.5 * (float(most) - float(least))
+    return half * half
+
+
+@kernel_part
+def _may_have_points(cells: Cells, s: int, middle: NDArray[np.float64], half: float) -> bool:
+    """Return whether a sphere with radius `half` reaches a surface and its tolerance."""
+    r = cells.rounds
+    dx, dy, dz = middle[0] - r[s, 0], middle[1] - r[s, 1], middle[2] - r[s, 2]
+    along = dx * r[s, 3] + dy * r[s, 4] + dz * r[s, 5]
+    across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - along * along))
+    distance = (across - r[s, 9] - r[s, 10] * along) * r[s, 11]
+    is_beside = along < cells.bounds[s, 0] - half or along > cells.bounds[s, 1] + half
+    return not is_beside and abs(distance) <= cells.bounds[s, 2] + half
+
+
+@kernel_part
+def _compare_planes(
+    block: Offsets,
+    plane: NDArray[np.int16],
+    planes: NDArray[np.float64],
+    work: NDArray[np.float64],
+    index: NDArray[np.int64],
+) -> None:
+    """Set the distances of a block's points from their planes; inf for points without one."""
+    for p in range(block.x.shape[0]):
+        # Distances from the nearest plane or surface, and from the second nearest surface, and the
+        # index of the nearest surface.
+        work[0, p], work[1, p], index[0, p] = math.inf, math.inf, -1
+        if plane.shape[0] > 0 and plane[p] >= 0:
+            own = plane[p]
+            distance = planes[own, 0] * block.x[p] + planes[own, 1] * block.y[p]
+            distance += planes[own, 2] * block.z[p] - planes[own, 3]
+            if not math.isnan(distance):
+                work[0, p] = distance
+
+
+@kernel_part
+def _compare(
+    block: Offsets,
+    cells: Cells,
+    s: int,
+    work: NDArray[np.float64],
+    index: NDArray[np.int64],
+) -> None:
+    """Compare the distances of a block's points from a surface with those from the others."""
+    x, y, z = block.x, block.y, block.z
+    nearest, second, along, off = work[0], work[1], work[2], work[3]
+    sine, cosine, angle = work[4], work[5], work[6]
+    best, cell, chosen = index[0], index[1], index[2]
+    r, bounds, sizes = cells.rounds, cells.bounds, cells.sizes
+    px, py, pz, ax, ay, az = r[s, 0], r[s, 1], r[s, 2], r[s, 3], r[s, 4], r[s, 5]
+    radius, slope, steepness = r[s, 9], r[s, 10], r[s, 11]
+    least, most, reach = bounds[s, 0], bounds[s, 1], bounds[s, 2]
+    for p in range(x.shape[0]):
+        dx, dy, dz = float(x[p]) - px, float(y[p]) - py, float(z[p]) - pz
+        at = dx * ax + dy * ay + dz * az
+        across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - at * at))
+        along[p], off[p] = at, (across - radius - slope * at) * steepness
+    count = 0
+    for p in range(x.shape[0]):
+        chosen[count] = p
+        count += (abs(off[p]) <= reach) & (along[p] >= least) & (along[p] <= most)
+    zx, zy, zz = r[s, 6], r[s, 7], r[s, 8]
+    sx, sy, sz = ay * zz - az * zy, az * zx - ax * zz, ax * zy - ay * zx
+    for q in range(count):
+        p = chosen[q]
+        dx, dy, dz = float(x[p]) - px, float(y[p]) - py, float(z[p]) - pz
+        sine[q], cosine[q] = dx * sx + dy * sy + dz * sz, dx * zx + dy * zy + dz * zz
+    for q in range(count):
+        angle[q] = _quick_angle(sine[q], cosine[q])
+    around, rows = sizes[s, 1], sizes[s, 2]
+    columns_per_rad, rows_per_m = around / (2.0 * math.pi), rows / (most - least)
+    for q in range(count):
+        p = chosen[q]
+        i = min(int((angle[q] + math.pi) * columns_per_rad), around - 1)
+        if not cells.is_open[sizes[s, 3] + i]:
+            continue
+        if abs(off[p]) < abs(nearest[p]):
+            second[p] = abs(nearest[p]) if best[p] >= 0 else math.inf
+            nearest[p], best[p] = off[p], s
+            j = min(int((along[p] - least) * rows_per_m), rows - 1)
+            cell[p] = sizes[s, 0] + i * rows + j
+        elif best[p] >= 0:
+            second[p] = min(second[p], abs(off[p]))

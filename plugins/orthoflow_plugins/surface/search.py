@@ -20,9 +20,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from orthoflow.geometry.surfaces import zero_direction
-from orthoflow_plugins.surface.kernels import count_votes
-from orthoflow_plugins.surface.rounds import Round, fitted
-from orthoflow_plugins.surface.voxels import Voxels
+from orthoflow_plugins.surface.kernels import count_votes, near_voxels
+from orthoflow_plugins.surface.rounds import Round, cross, fitted
+from orthoflow_plugins.surface.voxels import Voxels, keys_of
 
 # Size of a block, in voxels. The two voxels of a pair are in the same block or in adjacent ones.
 BLOCK_VOXELS: Final = 6
@@ -211,16 +211,18 @@ def _is_fringe(new: Found, old: Found) -> bool:
 
 def claimed(found: Found, voxels: Voxels, limits: Limits) -> NDArray[np.bool_]:
     """Return a mask (v,) of the voxels on a surface."""
-    distances, _ = found.round.outwards(voxels.points)
-    angles, along = found.round.places(voxels.points, found.zero)
+    near = np.empty(len(voxels), dtype=np.int64)
+    within = np.array([1.5 * limits.tolerance_at(found.round.radius_m), -1.0])
+    row = found.round.row(found.zero)
+    near = near[: near_voxels(row, 0.0, voxels.points, voxels.normals, within, near)]
+    angles, along = found.round.places(voxels.points[near], found.zero)
     n_around = len(found.is_open)
     column = np.minimum(((angles / (2.0 * math.pi) + 0.5) * n_around).astype(int), n_around - 1)
-    near = np.abs(distances) < 1.5 * limits.tolerance_at(found.round.radius_m)
-    margin = 0.1 * (found.along_m[1] - found.along_m[0])
     low, high = found.along_m
-    return np.asarray(
-        near & found.is_open[column] & (along > low - margin) & (along < high + margin)
-    )
+    margin = 0.1 * (high - low)
+    is_on = np.zeros(len(voxels), dtype=np.bool_)
+    is_on[near] = found.is_open[column] & (along > low - margin) & (along < high + margin)
+    return is_on
 
 
 def _hypotheses(
@@ -267,8 +269,15 @@ def _hypotheses(
     along = np.einsum("ij,ij->i", (q - p)[kept], axis[kept])
     places = centre[kept] + radius[kept, None] * middles + 0.5 * along[:, None] * axis[kept]
     largest = _MIDDLE_SHARE * sagittas + _MIDDLE_SLACK * voxel_m
-    sure = np.flatnonzero(_have_middles(guesses, places, middles, largest, voxels, voxel_m))
-    sure = sure[:_HYPOTHESES]
+    tree = cKDTree(voxels.points, balanced_tree=False, compact_nodes=False)
+    parts: list[NDArray[np.int64]] = []
+    for start in range(0, len(kept), _HYPOTHESES):
+        if sum(map(len, parts)) >= _HYPOTHESES:
+            break
+        part = slice(start, start + _HYPOTHESES)
+        own = guesses[part], places[part], middles[part], largest[part]
+        parts.append(start + np.flatnonzero(_have_middles(*own, tree, voxels, voxel_m)))
+    sure = np.concatenate([np.zeros(0, dtype=np.int64), *parts])[:_HYPOTHESES]
     ends = np.column_stack([first, second])[kept]
     return np.ascontiguousarray(guesses[sure]), ends[sure]
 
@@ -278,6 +287,7 @@ def _have_middles(
     places: NDArray[np.float64],
     outwards: NDArray[np.float64],
     largest: NDArray[np.float64],
+    tree: cKDTree,
     voxels: Voxels,
     voxel_m: float,
 ) -> NDArray[np.bool_]:
@@ -290,12 +300,11 @@ def _have_middles(
         places: (h, 3) middles of the arcs.
         outwards: (h, 3) directions of the radii there.
         largest: (h,) largest distance of the voxel from the circle.
+        tree: tree of the points of all voxels.
         voxels: all voxels.
         voxel_m: their size.
     """
-    apart, nearest = cKDTree(voxels.points).query(
-        places, distance_upper_bound=_MIDDLE_VOXELS * voxel_m
-    )
+    apart, nearest = tree.query(places, distance_upper_bound=_MIDDLE_VOXELS * voxel_m)
     is_near = np.isfinite(apart)
     nearest = np.where(is_near, nearest, 0)
     relative = voxels.points[nearest] - guesses[:, :3]
@@ -310,15 +319,14 @@ def _pairs(
     voxels: Voxels, free: NDArray[np.int64], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Draw pairs of voxels in the same block or in adjacent ones."""
-    blocks = voxels.block[free] + 1
-    keys = (blocks[:, 0] << 40) + (blocks[:, 1] << 20) + blocks[:, 2]
+    keys = keys_of(voxels.block[free] + 1)
     order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
+    blocks, starts = np.unique(keys[order], return_index=True)
+    starts = np.append(starts, len(keys))
     seeds = rng.integers(0, max(1, len(free)), min(_PAIRS, _PAIRS_PER_VOXEL * len(free)))
-    steps = rng.integers(-1, 2, (len(seeds), 3))
-    wanted = keys[seeds] + (steps[:, 0] << 40) + (steps[:, 1] << 20) + steps[:, 2]
-    start = np.searchsorted(ordered, wanted, side="left")
-    end = np.searchsorted(ordered, wanted, side="right")
+    wanted = keys[seeds] + keys_of(rng.integers(-1, 2, (len(seeds), 3)))
+    block = np.minimum(np.searchsorted(blocks, wanted), len(blocks) - 1)
+    start, end = starts[block], np.where(blocks[block] == wanted, starts[block + 1], 0)
     place = start + (rng.random(len(seeds)) * (end - start)).astype(np.int64)
     keep = (end > start) & (order[np.minimum(place, len(order) - 1)] != seeds)
     return free[seeds[keep]], free[order[place[keep]]]
@@ -362,12 +370,15 @@ def _tested(
     last_m = limits.tolerance_at(found.radius_m)
     first_m = max(2.0 * last_m, 0.15 * found.radius_m)
     evidence: dict[str, float] = {"radius_m": found.radius_m}
+    near = np.empty(len(voxels), dtype=np.int64)
     for step in range(_ITERATIONS + 1):
         share = min(1.0, step / (_ITERATIONS - 1))
         within_m = first_m ** (1.0 - share) * last_m**share
         angle_deg = _NORMAL_DEG[0] + share * (_NORMAL_DEG[1] - _NORMAL_DEG[0])
         zero = zero_direction(found.axis, up)
-        on = _members(found, side, voxels, within_m, angle_deg)
+        limits_on = np.array([within_m, math.cos(math.radians(angle_deg))])
+        count = near_voxels(found.row(zero), side, voxels.points, voxels.normals, limits_on, near)
+        on = near[:count]
         if len(on) >= _LEAST_VOXELS:
             on = on[_connected(*found.places(voxels.points[on], zero), found, voxel_m)]
             is_flat = _turning(found, zero, voxels.take(on), voxel_m)[1]
@@ -386,17 +397,6 @@ def _tested(
     found = found.moved(float(np.mean((voxels.points[on] - found.point) @ found.axis)))
     zero = zero_direction(found.axis, up)
     return _judged(found, zero, side, voxels.take(on), voxel_m, limits)
-
-
-def _members(
-    found: Round, side: float, voxels: Voxels, within_m: float, angle_deg: float
-) -> NDArray[np.int64]:
-    distances, outwards = found.outwards(voxels.points)
-    cosine = np.einsum("ij,ij->i", outwards, voxels.normals)
-    cosine = -side * cosine if side else np.abs(cosine)
-    return np.flatnonzero(
-        (np.abs(distances) < within_m) & (cosine > math.cos(math.radians(angle_deg)))
-    )
 
 
 def _grid(
@@ -506,7 +506,7 @@ def _turning(
     """
     angles, _ = found.places(voxels.points, zero)
     _, outwards = found.outwards(voxels.points)
-    aside = np.cross(found.axis, zero)
+    aside = cross(found.axis, zero)
     signs = np.sign(np.einsum("ij,ij->i", voxels.normals, outwards))
     normals = voxels.normals * signs[:, None]
     turned = np.arctan2(normals @ aside, normals @ zero) - angles

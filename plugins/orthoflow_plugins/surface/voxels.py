@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.rows import Rows, spread_index
 from orthoflow.products import PointCloud
-from orthoflow_plugins.surface.kernels import (
-    MOMENTS,
-    VoxelTable,
-    fill_voxels,
-    find_normals,
-    merge_voxels,
-)
+from orthoflow_plugins.surface.kernels import KEY_BITS, MOMENTS, fill_voxels, find_normals
 
 # Maximum number of points used in the search; the final fit uses all points.
 SAMPLE_POINTS: Final = 250_000
@@ -76,27 +70,35 @@ def draw_sample(cloud: PointCloud, labels: NDArray[np.int16] | None) -> Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelGrid:
-    """Occupied voxels of one size.
+    """Occupied voxels of one size, ordered by their positions.
 
     Attributes:
-        table: the voxels.
-        count: their number.
+        places: (v, 3) int64 position of each voxel in the grid.
+        moments: (v, 10) float64 sums over the points of each voxel (see `kernels`).
+        first: (v,) int64 index in the cloud of a point of each voxel.
         size_m: size of a voxel.
-        low: (3,) corner of the grid, metres from the cloud's origin.
-        index: (m,) indices in the cloud of the points to which `table.first` refers.
+        low: (3,) point from which the moments are computed, metres from the cloud's origin.
     """
 
-    table: VoxelTable
-    count: int
+    places: NDArray[np.int64]
+    moments: NDArray[np.float64]
+    first: NDArray[np.int64]
     size_m: float
     low: NDArray[np.float64]
-    index: NDArray[np.int64]
 
     def coarser(self) -> VoxelGrid:
         """Return voxels of twice the size."""
-        table = _empty_table(self.count)
-        count = merge_voxels(self.table, self.count, table)
-        return replace(self, table=table, count=count, size_m=2.0 * self.size_m)
+        places = (self.places + 1) >> 1
+        keys = keys_of(places)
+        order = np.argsort(keys, kind="stable")
+        starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+        return VoxelGrid(
+            places=places[order[starts]],
+            moments=np.add.reduceat(self.moments[order], starts),
+            first=self.first[order[starts]],
+            size_m=2.0 * self.size_m,
+            low=self.low,
+        )
 
     def voxels(self, cloud: PointCloud, block_voxels: int, noise_m: float | None = None) -> Voxels:
         """Return the voxels that have a normal, i.e. enough points close to a plane.
@@ -107,18 +109,17 @@ class VoxelGrid:
             noise_m: standard deviation of the points normal to surfaces, if known; voxels with much
                 more scatter are at edges and are omitted.
         """
-        table, count = self.table, self.count
-        normals, spreads = np.zeros((count, 3)), np.zeros((count, 4))
-        find_normals(table, count, normals, spreads)
+        normals, spreads = np.zeros((len(self.first), 3)), np.zeros((len(self.first), 4))
+        find_normals(keys_of(self.places), self.moments, normals, spreads)
         is_flat = (spreads[:, 3] >= _NORMAL_POINTS) & (spreads[:, 0] < _FLATNESS * spreads[:, 1])
         if noise_m is not None:
             is_flat &= spreads[:, 0] < _THICKEST_NOISES * noise_m + _THICKEST_VOXELS * self.size_m
         chosen = np.flatnonzero(is_flat)
-        moments = table.moments[chosen]
+        moments = self.moments[chosen]
         means = moments[:, 1:4] / moments[:, :1] + self.low
         normals = normals[chosen]
         if cloud.stations is not None and len(cloud.stations):
-            own = self.index[table.first[chosen]]
+            own = self.first[chosen]
             scan = np.zeros(len(own), dtype=np.int64) if cloud.scan is None else cloud.scan[own]
             stations = cloud.stations[np.minimum(scan, len(cloud.stations) - 1)] - cloud.origin
             facing = np.einsum("ij,ij->i", stations - means, normals)
@@ -127,7 +128,7 @@ class VoxelGrid:
             points=means,
             normals=normals,
             spread_m=spreads[chosen, 0],
-            block=table.places[chosen].astype(np.int64) // block_voxels,
+            block=self.places[chosen] // block_voxels,
         )
 
 
@@ -141,20 +142,26 @@ def in_voxels(sample: Sample, voxel_m: float) -> VoxelGrid:
     if ((high - low) >= voxel_m * _MOST_VOXELS).any():
         near = ((points - low) < voxel_m * _MOST_VOXELS).all(axis=1)
         points, index = points[near], index[near]
-    table = _empty_table(len(points))
-    count = fill_voxels(points, low, voxel_m, table)
-    return VoxelGrid(table=table, count=count, size_m=voxel_m, low=low, index=index)
-
-
-def _empty_table(most: int) -> VoxelTable:
-    size = 1 << max(4, math.ceil(math.log2(1.5 * most + 1)))
-    return VoxelTable(
-        keys=np.full(size, -1, dtype=np.int64),
-        slots=np.empty(size, dtype=np.int32),
-        places=np.empty((most, 3), dtype=np.int32),
-        moments=np.zeros((most, MOMENTS)),
-        first=np.empty(most, dtype=np.int32),
+    table = np.full(1 << max(4, math.ceil(math.log2(1.5 * len(points) + 1))), -1, dtype=np.int32)
+    keys = np.empty(len(points), dtype=np.int64)
+    moments = np.zeros((len(points), MOMENTS))
+    first = np.empty(len(points), dtype=np.int64)
+    count = fill_voxels(points, low, voxel_m, table, keys, moments, first)
+    order = np.argsort(keys[:count])
+    keys = keys[order]
+    mask = (1 << KEY_BITS) - 1
+    return VoxelGrid(
+        places=np.column_stack([keys >> 2 * KEY_BITS, (keys >> KEY_BITS) & mask, keys & mask]),
+        moments=moments[order],
+        first=index[first[order]],
+        size_m=voxel_m,
+        low=low,
     )
+
+
+def keys_of(places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the keys (v,) of positions (v, 3); they are in the order of the positions."""
+    return np.asarray(((places[:, 0] << KEY_BITS) + places[:, 1] << KEY_BITS) + places[:, 2])
 
 
 def noise_of(voxels: Voxels) -> float:
