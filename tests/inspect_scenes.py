@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, shift
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.scene_views import TrueOrthoimage, render
-from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from orthoflow.geometry.scenes import Scene, SurfaceRole
 from orthoflow.products import (
     CheckPoints,
     Inspection,
@@ -29,13 +29,13 @@ from orthoflow.products import (
     Planes,
     PointLabels,
     Product,
-    SurfaceMask,
     Truth,
     Walls,
 )
 from orthoflow.sdk import Method, StepContext
 from tests import samples
 from tests.raster_scenes import UP, numbers
+from tests.scene_rays import a_scene
 
 GSD_M = 0.004
 SHAPE = (280, 360)
@@ -85,7 +85,6 @@ def walls(*, source: IntensitySource = "laser", where: WallFrame | None = None) 
         depth_m=np.where(known, 0.0, np.nan).astype(np.float32),
         sigma_m=np.full(SHAPE, np.nan, dtype=np.float32),
         count=known.astype(np.uint32),
-        mask=np.where(known, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
         intensity=None if source == "none" else intensity,
     )
     return samples.walls(wall, up=UP, intensity_source=source, buffer_m=BUFFER_M)
@@ -153,24 +152,16 @@ TRUE_FRAME = samples.facing_south(0.008, 150, 100, (0.0, -0.003, 0.8))
 
 def truth_scene() -> Scene:
     """Wall, board and chair, each with stains of another seed."""
-    count = 3
-    return Scene(
-        origin=np.zeros(3),
-        centre=np.array([[0.6, 0.0, 0.4], [0.28, -0.06, 0.4], [0.88, -0.4, 0.16]]),
-        axis_a=np.tile([1.0, 0.0, 0.0], (count, 1)),
-        axis_b=np.tile([0.0, 0.0, 1.0], (count, 1)),
-        extent=np.array(
-            [[-0.6, 0.6, -0.4, 0.4], [-0.12, 0.12, -0.16, 0.16], [-0.08, 0.08, -0.16, 0.16]]
-        ),
-        plane_index=np.array([0, 1, -1], dtype=np.int16),
-        role=np.array([SurfaceRole.WALL, SurfaceRole.RELIEF, SurfaceRole.OBJECT], dtype=np.uint8),
-        texture=np.full(count, TextureKind.PLAIN, dtype=np.int32),
-        texture_params=np.array(
-            [[150.0, 120.0, 90.0, 0.6, 0.8, 0.25, seed, 0.0] for seed in (11.0, 12.0, 13.0)[:count]]
-        ),
-        hole_rectangle=np.zeros(0, dtype=np.int32),
-        hole_extent=np.zeros((0, 4)),
-    )
+    rows: list[dict[str, object]] = [
+        {"centre": (0.6, 0.0, 0.4), "extent": (-0.6, 0.6, -0.4, 0.4)},
+        {"centre": (0.28, -0.06, 0.4), "extent": (-0.12, 0.12, -0.16, 0.16)},
+        {"centre": (0.88, -0.4, 0.16), "extent": (-0.08, 0.08, -0.16, 0.16)},
+    ]
+    roles = (SurfaceRole.WALL, SurfaceRole.RELIEF, SurfaceRole.OBJECT)
+    for row, role, seed in zip(rows, roles, (11.0, 12.0, 13.0), strict=True):
+        params = (150.0, 120.0, 90.0, 0.6, 0.8, 0.25, seed, 0.0)
+        row |= {"a": samples.EAST, "b": UP, "role": role, "params": params}
+    return replace(a_scene(rows), plane_index=np.array([0, 1, -1], dtype=np.int16))
 
 
 def true_planes(*, lift_m: float = 0.0) -> Planes:
@@ -228,7 +219,6 @@ def truth_inputs() -> Mapping[str, Product]:
         depth_m=depth,
         sigma_m=np.where(known, 2.0**-9, np.nan).astype(np.float32),
         count=known.astype(np.uint32),
-        mask=np.where(known, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
     )
     labels = np.repeat([0, 1, -1], [600, 200, 200]).astype(np.int16)
     found = np.where(labels < 0, -1, 1 - labels)

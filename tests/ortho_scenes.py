@@ -244,3 +244,12 @@ def places_off(layer: Layer) -> NDArray[np.float64]:
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
     shown = layer.rgb[..., :2].astype(np.float64) + 0.5
     return ((shown - 4.0 * np.dstack([columns, rows]) + 128.0) % 256.0 - 128.0) / 4.0
+
+
+def seen_at(viewer: ViewingCamera) -> NDArray[np.float64]:
+    """Return photo positions (rows, cols, 2) of the cells of the wall."""
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
+    places = np.column_stack([columns.ravel(), rows.ravel()])
+    depths = depth_m().ravel().astype(np.float64)
+    points = frame().world_from_wall(places, depths)
+    return viewer.project(points)[:, :2].reshape(*SHAPE, 2)

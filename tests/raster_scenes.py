@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -105,13 +108,6 @@ def cloud_of(
     )
 
 
-def part_of(cloud: PointCloud, index: NDArray[np.intp]) -> PointCloud:
-    """Some points of a cloud with their colours and intensities."""
-    names = ("x", "y", "z", "rgb", "intensity")
-    columns = {name: getattr(cloud, name) for name in names}
-    return replace(cloud, **{k: None if v is None else v[index] for k, v in columns.items()})
-
-
 def cell_centres(shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Columns and rows of all cell centres, flat, row by row."""
     rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
@@ -180,3 +176,13 @@ def points_apart(
     )
     places = places[((places > 0.0) & (places < shape[::-1])).all(axis=1)]
     return rng.permutation(places)
+
+
+@contextmanager
+def peak_bytes() -> Iterator[Callable[[], int]]:
+    """Measure the peak memory of arrays, without memory-mapped files."""
+    tracemalloc.start()
+    try:
+        yield lambda: tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()

@@ -12,7 +12,7 @@ from orthoflow_plugins.read.reporting import report_quality, warn_of_up
 
 from orthoflow.geometry import cloud_quality
 from orthoflow.geometry.cloud_quality import CloudQuality, judge_quality, scan_step_m
-from orthoflow.sdk import StepContext
+from tests.raster_scenes import context
 
 ASKEW = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
 Offsets = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
@@ -37,10 +37,6 @@ def judged(points: NDArray[np.float64], scan: NDArray[np.uint16] | None = None) 
     quality = judge_quality(offsets(points), scan)
     assert quality is not None
     return quality
-
-
-def context(folder: Path) -> StepContext:
-    return StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
 
 
 @pytest.mark.parametrize(("step_m", "noise_m"), [(0.004, 0.0005), (0.008, 0.002), (0.004, 0.006)])

@@ -10,23 +10,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import AdjustedPoints, honest_covariance
 from orthoflow.geometry.resection import adjust, predicted_covariances
 from tests import samples
 from tests.long_loops import long_only
 
-VIEW: Final = ViewingCamera(
-    width=3000,
-    height=2000,
-    fx=2700.0,
-    fy=2700.0,
-    cx=1500.0,
-    cy=1000.0,
-    distortion=np.zeros(5),
-    rotation=np.eye(3),
-    translation=np.array([0.0, 0.0, 8.0]),
-)
+LENS: Final = {
+    "width": 3000,
+    "height": 2000,
+    "fx": 2700.0,
+    "fy": 2700.0,
+    "cx": 1500.0,
+    "cy": 1000.0,
+}
+VIEW: Final = samples.camera(np.eye(3), np.array([0.0, 0.0, -8.0]), **LENS)
 
 
 Draw = Callable[[NDArray[np.float64], np.random.Generator], NDArray[np.float64]]

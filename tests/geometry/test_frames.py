@@ -188,26 +188,15 @@ def test_towers_are_walls_and_vaults_have_axes_of_their_own() -> None:
     assert len({frame.crs for frame in (tower, vault, FRAME)}) == 3
 
 
-@pytest.mark.parametrize(
-    ("place", "away_m"),
-    [
-        ((2.0, 1.0, 0.0), 0.0),
-        ((0.0, 3.0, 0.0), 0.0),
-        ((2.0, 1.0, -0.4), 0.4),
-        ((-3.0, 1.0, 0.0), 0.3),
-        ((8.0, 1.0, 0.4), 0.5),
-        ((2.0, -3.0, 0.4), 0.5),
-        ((2.0, 7.0, 0.0), 0.4),
-        ((-3.0, 7.0, 1.2), 1.3),
-    ],
-)
-def test_points_are_as_far_from_a_raster_as_from_its_rectangle(
-    place: tuple[float, float, float], away_m: float
-) -> None:
-    for frame in (FRAME, turned()):
-        point = frame.world_from_wall(np.array([place[:2]]), np.array([place[2]]))
-        both = frame.distances_m(np.vstack([point, point]))
-        np.testing.assert_allclose(both, [away_m, away_m], atol=1e-9)
+@pytest.mark.parametrize("frame", [FRAME, turned()], ids=["upright", "turned"])
+def test_points_are_as_far_from_a_raster_as_from_its_rectangle(frame: WallFrame) -> None:
+    # Above, beside, in front of and inside a rectangle of 5 x 3 cells of 0.1 m.
+    places = np.random.default_rng(2).uniform([-5, -5, -0.5], [10, 8, 0.5], (200, 3))
+    cells, depths_m = places[:, :2], places[:, 2]
+    beyond = np.maximum(0.0, np.maximum(-cells, cells - [5, 3]))
+    expected = np.hypot(0.1 * np.hypot(*beyond.T), depths_m)
+    found = frame.distances_m(frame.world_from_wall(cells, depths_m))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize(("crs", "corner"), [(None, (0.0, 0.0)), ("EPSG:32632", (1.0, 2.0))])

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from orthoflow.geometry.key_points import (
-    Matches,
     Window,
     best_matches,
     find_features,
@@ -90,36 +89,14 @@ def test_of_one_only_there_is_no_second() -> None:
     assert np.isinf(found.next_best).all()
 
 
-def paired(matches: Matches) -> list[tuple[int, int]]:
-    return sorted(zip(matches.first.tolist(), matches.second.tolist(), strict=True))
-
-
-def test_pairs_are_each_other_s_nearest_and_distinct() -> None:
-    second = descriptors(50, 6)
-    first = second[[4, 4, 9, 30]].copy()
-    first[1, :4] += 40.0  # further from 4 than the first is
-    first[3] = np.rint(0.5 * (second[30] + second[31]))  # as near to 31 as to 30
-    found = mutual_matches(first, second, ratio=0.8)
-    assert paired(found) == [(0, 4), (2, 9)]
-    assert found.ratio.tolist() == [0.0, 0.0]
-    # In one direction alone the second of the two is paired, too.
-    assert paired(best_matches(first, second, ratio=0.8)) == [(0, 4), (1, 4), (2, 9)]
-    assert len(best_matches(first, second, ratio=1.0)) == 4
-    assert len(mutual_matches(first[:0], second, ratio=0.8)) == 0
-
-
-def test_of_two_that_are_the_same_none_is_distinct() -> None:
-    second = descriptors(50, 8)
-    second[7] = second[31]
-    first = second[[7, 12]].copy()
-    assert paired(mutual_matches(first, second, ratio=0.9)) == [(1, 12)]
-    assert paired(best_matches(first, second, ratio=0.9)) == [(1, 12)]
-
-
-def test_neighbours_within_a_window_are_those_of_brute_force() -> None:
+@pytest.mark.parametrize("in_window", [True, False])
+def test_matches_are_those_of_brute_force(*, in_window: bool) -> None:
     rng = np.random.default_rng(0)
     first = rng.integers(0, 80, (600, 128)).astype(np.float32)
     second = (first[:500] + rng.integers(-9, 10, (500, 128))).astype(np.float32)
+    # Of two that are the same, neither is distinct; of two with the same nearest, one is mutual.
+    second[7] = second[31] = first[31]
+    first[599] = first[99] + 1.0
     places = [rng.uniform(0.0, 100.0, (n, 2)).astype(np.float32) for n in (600, 500)]
     sizes = [rng.normal(size=n).astype(np.float32) for n in (600, 500)]
     angles = [rng.uniform(0.0, 360.0, n).astype(np.float32) for n in (600, 500)]
@@ -134,25 +111,33 @@ def test_neighbours_within_a_window_are_those_of_brute_force() -> None:
         max_log_size=0.7,
         max_angle_deg=90.0,
     )
-    found = mutual_matches_within(first, second, window, ratio=0.95)
     distance = cdist(first.astype(np.float64), second.astype(np.float64))
     turn = np.abs(angles[0][:, None] - angles[1]) % 360.0
-    distance[
-        (np.abs(places[0][:, None] - places[1]).max(axis=2) > 30.0)
-        | (np.abs(sizes[0][:, None] - sizes[1]) > 0.7)
-        | (np.minimum(turn, 360.0 - turn) > 90.0)
-    ] = np.inf
+    is_outside = np.abs(places[0][:, None] - places[1]).max(axis=2) > 30.0
+    is_outside |= np.abs(sizes[0][:, None] - sizes[1]) > 0.7
+    is_outside |= np.minimum(turn, 360.0 - turn) > 90.0
+    if in_window:
+        found = mutual_matches_within(first, second, window, ratio=0.95)
+        distance[is_outside] = np.inf
+    else:
+        found = mutual_matches(first, second, ratio=0.95)
     ordered = np.sort(distance, axis=1)
     nearest = distance.argmin(axis=1)
     mutual = distance.argmin(axis=0)[nearest] == np.arange(len(first))
     # One that has no rival is distinct from nothing.
     ratio = np.full(len(first), np.inf)
-    rivals = np.isfinite(ordered[:, 1])
+    rivals = np.isfinite(ordered[:, 1]) & (ordered[:, 1] > 0.0)
     ratio[rivals] = ordered[rivals, 0] / ordered[rivals, 1]
     expected = np.flatnonzero(mutual & (ratio <= 0.95))
     assert len(expected) > 10
     np.testing.assert_array_equal(found.first, expected)
     np.testing.assert_array_equal(found.second, nearest[expected])
+    np.testing.assert_allclose(found.ratio, ratio[expected], atol=1e-5)
+    if not in_window:
+        one_way = best_matches(first, second, ratio=0.95)
+        np.testing.assert_array_equal(one_way.first, np.flatnonzero(ratio <= 0.95))
+        assert len(one_way) > len(expected)
+        assert len(mutual_matches(first[:0], second, ratio=0.8)) == 0
 
 
 @pytest.mark.parametrize("as_opencv", [False, True], ids=["precise", "as OpenCV sets it"])
@@ -172,7 +157,7 @@ def test_key_points_lie_where_they_are(*, as_opencv: bool) -> None:
 def test_the_key_points_that_are_kept_are_described_as_if_all_were() -> None:
     rgb = walls_of(textured_wall(1)).walls[0].rgb
     assert rgb is not None
-    grey = np.tile(rgb[..., 0], (1, 5))
+    grey = np.tile(rgb[:200, :, 0], (1, 5))
     every, few = (find_features(grey, n) for n in (10**6, 100))
     assert len(few) == 100 < len(every) / 10
     # Some lie in the second tile.

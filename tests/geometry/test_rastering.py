@@ -82,7 +82,7 @@ def test_points_that_are_left_out_win_nothing(threads: int) -> None:
     is_left_out = np.random.default_rng(2).random(len(cloud)) < 0.4
     winners = topmost_points(cloud, slab, threads=threads, is_left_out=is_left_out)
     kept = np.flatnonzero(~is_left_out)
-    expected = topmost_points(scenes.part_of(cloud, kept), slab, threads=1)
+    expected = topmost_points(cloud.selected(kept), slab, threads=1)
     has_point = expected["point"] != NO_POINT
     np.testing.assert_array_equal(winners["point"] != NO_POINT, has_point)
     np.testing.assert_array_equal(winners["point"][has_point], kept[expected["point"][has_point]])
@@ -107,7 +107,7 @@ def test_depths_are_in_order_on_both_sides_of_the_plane() -> None:
     depths_m = np.array([-1e-3, -1e-6, 0.0, 0.0, 1e-6, -1e-6])
     points = scenes.cloud_of(wall.world(np.full(6, 3.5), np.full(6, 4.5), depths_m))
     for n_points, winner in ((1, 0), (2, 1), (3, 2), (4, 2), (5, 4), (6, 4)):
-        some = scenes.part_of(points, np.arange(n_points))
+        some = points.selected(np.arange(n_points))
         assert topmost_points(some, slab_of(wall), threads=1)["point"][4 * 40 + 3] == winner
 
 
@@ -134,7 +134,7 @@ def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
     wall = scenes.leaning_wall(shape=(60, 80))
     some = random_cloud(wall, n_points=1_100_000, seed=2)
     # As a scanner goes: along the wall, and then along what lies beside it.
-    cloud = scenes.part_of(some, np.argsort(some.x, kind="stable"))
+    cloud = some.selected(np.argsort(some.x, kind="stable"))
     frame = slab_of(wall).frame
     part = Slab(frame=replace(frame, width=8), front_m=0.15, behind_m=0.15)
     read = {}
@@ -157,7 +157,7 @@ def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
 def test_only_what_may_lie_in_some_rows_is_read() -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     some = random_cloud(wall, n_points=1_100_000, seed=2)
-    cloud = scenes.part_of(some, np.argsort(some.z, kind="stable"))
+    cloud = some.selected(np.argsort(some.z, kind="stable"))
     slab, rows = slab_of(wall), slice(20, 30)
     counts = []
     for asked in (None, rows):

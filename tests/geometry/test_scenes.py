@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry import WallFrame, frame_over, scene_rays
+from orthoflow.geometry import WallFrame, scene_rays
 from orthoflow.geometry.scene_views import TrueOrthoimage, render
 from orthoflow.geometry.scenes import (
     Scene,
@@ -22,7 +22,7 @@ from orthoflow.geometry.scenes import (
     normals,
     uniforms,
 )
-from tests import scenes
+from tests import samples, scenes
 from tests.long_loops import seeds
 from tests.scene_rays import a_scene, cast, colours_at
 
@@ -62,8 +62,7 @@ def wall_with_screen() -> Scene:
 
 
 def wall_frame(gsd_m: float = 0.05) -> WallFrame:
-    corners = np.array([[-2.0, 0, 1], [-2, 0, -1], [2, 0, -1], [2, 0, 1]])
-    return frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=gsd_m)
+    return samples.facing_south(gsd_m, round(4 / gsd_m), round(2 / gsd_m), (-2.0, 0.0, 1.0))
 
 
 def rendered(

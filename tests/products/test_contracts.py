@@ -14,6 +14,7 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from orthoflow.products import Camera, Cameras, PointLabels, Product, product
 from tests import samples
+from tests.inspect_scenes import points_at
 from tests.raster_scenes import cloud_of
 
 TYPES = {
@@ -47,19 +48,12 @@ def test_types_are_stored_and_compared_as_ever(snapshot: SnapshotAssertion) -> N
 
 
 def test_large_products_are_mapped_whatever_their_type(monkeypatch: pytest.MonkeyPatch) -> None:
-    labels = products.PointLabels(plane_index=np.zeros(4, np.int16))
-    points = products.CheckPoints(
-        names=("a",),
-        points_world=np.zeros((1, 3)),
-        classes=("",),
-        wall=np.zeros(1, np.int32),
-        pixels_wall=np.zeros((1, 2)),
-    )
+    points = points_at(np.zeros((1, 3)))
     n_bytes = sum(array.nbytes for array in points.to_payload().arrays.values())
     for limit, is_mapped in ((n_bytes, False), (n_bytes - 1, True)):
         monkeypatch.setattr(product, "LARGE_BYTES", limit)
         assert points.to_payload().mapped == is_mapped
-        assert labels.to_payload().mapped
+        assert labels(0, 0, 0, 0).to_payload().mapped
 
 
 CLOUD = cloud_of(np.zeros((4, 3)))

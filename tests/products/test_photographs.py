@@ -2,45 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from orthoflow.errors import ProductError
-from orthoflow.products import (
-    Camera,
-    Intrinsics,
-    TieRole,
-    Ties,
-    TieWall,
-)
+from orthoflow.products import Camera, Intrinsics, Ties, TieWall
 from orthoflow.testing.photographed import camera_before, oriented
 from tests import samples
 
-CORNERS = [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 0.0, 2.0]]
-WALL = TieWall(
-    name="wall 0",
-    corners_world=tuple(map(tuple, CORNERS)),
-    normal_world=(0.0, -1.0, 0.0),
-    gsd_m=0.01,
-)
+WALL = samples.tie_wall(samples.facing_south(0.01, 300, 200).corners_world(), 0.01)
 
 
 def ties(**more: object) -> Ties:
-    return Ties(
-        photo_names=("a.jpg", "b.jpg"),
-        photo=np.array([0, 1], np.int32),
-        wall=np.zeros(2, np.int32),
-        pixels_photo=np.array([[1.5, 2.5], [3.5, 4.5]]),
-        points_world=np.array([[0.5, 0.0, 0.5], [1.5, 0.0, 1.0]]),
-        sigma_px=np.full(2, 0.5),
-        sigma_m=np.full(2, 0.001),
-        role=np.full(2, TieRole.CONTROL, np.uint8),
-        residual_px=np.full((2, 2), np.nan),
-        **more,  # type: ignore[arg-type]
-    )
+    known = {"points_world": np.ones((2, 3)), "sigma_px": np.ones(2), "sigma_m": np.ones(2)}
+    return samples.ties(np.ones((2, 2)), photo_names=("a.jpg", "b.jpg"), **known, **more)
 
 
 def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:
@@ -61,20 +38,9 @@ def test_walls_and_radii_of_another_shape_are_refused() -> None:
         ties(search_radius_px=(22.0,))
 
 
-@pytest.mark.parametrize(("skew", "kept"), [(0.0, None), (0.75, 0.75)])
-def test_a_lens_has_a_skew_where_its_axes_are_not_square(skew: float, kept: float | None) -> None:
-    camera = samples.camera(
-        np.eye(3), np.zeros(3), fx=800.0, fy=820.0, cx=500.0, cy=400.0, width=1000, height=800
-    )
-    lens = Intrinsics.of(dataclasses.replace(camera, skew=skew), source="survey")
-    assert (lens.skew, lens.source, lens.width, lens.height) == (kept, "survey", 1000, 800)
-    assert lens.posed().skew == skew
-    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (800.0, 820.0, 500.0, 400.0)
-
-
 @pytest.mark.parametrize(("wall", "number"), [(0, 7), (1, 1), (2, 2), (-1, -1)])
 def test_people_know_a_wall_of_ties_by_its_plane_where_that_is_said(wall: int, number: int) -> None:
-    said = ties(walls=(dataclasses.replace(WALL, plane_index=7), WALL))
+    said = ties(walls=(replace(WALL, plane_index=7), WALL))
     assert said.number(wall) == number
 
 
@@ -93,6 +59,10 @@ def test_a_lens_comes_back_from_its_camera() -> None:
     points = np.array([[1.2, 0.1, 1.0], [1.9, 0.0, 0.4], [0.9, -0.1, 1.6]])
     np.testing.assert_array_equal(again.project(points), TRUE.project(points))
     assert Intrinsics.of(again, source="exif") == lens
+    # A lens has a skew where its axes are not perpendicular.
+    assert lens.skew is None
+    skewed = Intrinsics.of(replace(TRUE, skew=0.75))
+    assert skewed.skew == skewed.posed().skew == 0.75
 
 
 def test_without_a_pose_a_lens_looks_along_its_own_axis() -> None:

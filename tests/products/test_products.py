@@ -29,7 +29,6 @@ from orthoflow.products import (
     ScanRow,
     Spread,
     Thickness,
-    TieWall,
     Walls,
 )
 from orthoflow.testing.photographed import PHOTOGRAPHED
@@ -40,8 +39,8 @@ from tests.drawing_runs import box_planes, box_products
 
 def cameras() -> Cameras:
     """Cameras with the ties that they kept, and a table of residuals."""
-    corners = ((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (3.0, 0.0, 2.0))
-    wall = TieWall(name="w", corners_world=corners, normal_world=(0.0, -1.0, 0.0), gsd_m=0.01)
+    corners = samples.facing_south(0.01, 300, 200).corners_world()
+    wall = dataclasses.replace(samples.tie_wall(corners, 0.01), name="w")
     names = ("mean", "sd", "median", "nmad", "rmse", "p95", "max", "beyond_own", "beyond_any")
     numbers: dict[str, Any] = dict.fromkeys(names, 0.25)
     row = ResidualRow(photo="a.jpg", role="check", axis="u", unit="px", n=3, **numbers)

@@ -23,9 +23,7 @@ def wall_at(x_m: float, name: str) -> Wall:
 
 
 def walls(*given: Wall) -> Walls:
-    return Walls(
-        walls=given, up=UP, intensity_source="none", buffer_front_m=0.3, buffer_behind_m=0.1
-    )
+    return samples.walls(*given, buffer_front_m=0.3, buffer_behind_m=0.1)
 
 
 def test_walls_share_a_reach_or_have_their_own() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +36,8 @@ from orthoflow.sdk import StepContext
 from tests import inspect_scenes, samples
 from tests.inspect_scenes import BUFFER_M, GSD_M, points_at
 from tests.long_loops import long_only
-from tests.raster_scenes import context, rastered
+from tests.method_runs import run
+from tests.raster_scenes import context, peak_bytes, rastered
 
 
 def inspect(
@@ -171,9 +171,8 @@ def test_targets_of_a_real_scan_are_found_and_carried_back_into_space(
 def _intensity_of(path: Path, scratch: Path) -> Walls:
     """Return the intensity of a patch on its plane, scanned from the origin."""
     files = InputFiles(name="scan", paths=(path,))
-    params = ReadScan.Params(view_from=(0.0, 0.0, 0.0))
     ctx = context(scratch)
-    cloud = ReadScan().run(ReadScan.In(files=files), params, ctx).cloud
+    cloud = run(ReadScan, ctx, {"files": files}, view_from=(0.0, 0.0, 0.0)).cloud
     points = cloud.points_world()
     near = np.ones(len(points), dtype=np.bool_)
     for _ in range(10):
@@ -182,10 +181,8 @@ def _intensity_of(path: Path, scratch: Path) -> Walls:
         off = (points - middle) @ normal
         near = np.abs(off) < max(4.0 * float(np.median(np.abs(off[near]))), 0.001)
     normal = -normal * np.sign(normal @ middle)
-    given = GivenPlane.Params(
-        normal=tuple(float(value) for value in normal), offset_m=float(normal @ middle)
-    )
-    planes = GivenPlane().run(GivenPlane.In(cloud=cloud), given, ctx).planes
+    given = {"normal": tuple(normal.tolist()), "offset_m": float(normal @ middle)}
+    planes = run(GivenPlane, ctx, {"cloud": cloud}, **given).planes
     # The cell size is the point spacing.
     return rastered(cloud, planes, scratch, gsd_m=0.0013)[0]
 
@@ -210,12 +207,9 @@ def test_points_are_measured_without_memory_per_cell(
     place = np.array([[1000.5, 800.5]])
     points = points_at(where.world_from_wall(place), pixels=place + 0.25)
     inspect(tmp_path, points, inspect_scenes.walls(), inspect_scenes.displaced(0, 0))  # loaded
-    tracemalloc.start()
-    try:
+    with peak_bytes() as peak:
         metrics, _, _ = inspect(tmp_path, points, samples.walls(wall), image)
-        assert tracemalloc.get_traced_memory()[1] < 4.0 * n_cells
-    finally:
-        tracemalloc.stop()
+        assert peak() < 4.0 * n_cells
     assert metrics["mean_x_mm"] == pytest.approx(0.25e3 * GSD_M)
 
 

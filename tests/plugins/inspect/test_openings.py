@@ -12,8 +12,13 @@ from orthoflow_plugins.inspect.openings import InspectOpenings
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Inspection, Opening, Openings
+from tests.method_runs import run
 from tests.raster_scenes import context
+from tests.raster_scenes import numbers as numbers_of
 from tests.recess_scenes import GSD_M, RECESS, opening, scene
+
+# Size of the recess, 0.8 m by 1.22 m.
+WIDTH_M, HEIGHT_M = RECESS[1] - RECESS[0], RECESS[3] - RECESS[2]
 
 
 def judged(
@@ -21,22 +26,10 @@ def judged(
 ) -> tuple[dict[str, float], Inspection]:
     truth, walls = scene()
     ctx = context(folder)
-    inputs = InspectOpenings.In(
-        truth=truth, walls=walls, openings=Openings(openings=openings, walls=(3,))
-    )
-    outputs = InspectOpenings().run(inputs, InspectOpenings.Params.model_validate(params), ctx)
-    return {metric.name: metric.value for metric in ctx.metrics}, outputs.inspection
-
-
-def test_the_true_outline_has_no_error(tmp_path: Path) -> None:
-    numbers, inspection = judged(tmp_path, opening(scene()[1]))
-    assert (numbers["n_true_openings"], numbers["n_found_openings"]) == (1, 1)
-    assert (numbers["n_false_openings"], numbers["n_stray_sides"]) == (0, 0)
-    assert numbers["opening_iou_mean"] == pytest.approx(1.0, abs=1e-9)
-    # Rays are a sixteenth of a cell of 20 mm apart.
-    assert numbers["side_max_mm"] <= 0.7
-    assert numbers["opening_depth_error_max_mm"] == pytest.approx(3.0, abs=0.01)
-    assert len(inspection.points_world) == 4
+    found = Openings(openings=openings, walls=(3,))
+    inputs = {"truth": truth, "walls": walls, "openings": found}
+    inspection = run(InspectOpenings, ctx, inputs, **params).inspection
+    return numbers_of(ctx), inspection
 
 
 # The wall has 15,000 cells; if fewer are allowed, 2 x 2 cells are joined.
@@ -56,32 +49,33 @@ def test_large_walls_are_judged_in_coarser_cells_but_sides_as_exactly(
     assert coarse == pytest.approx(whole, abs=1e-9)
 
 
-@pytest.mark.parametrize("outwards_m", [0.03, -0.05])
+@pytest.mark.parametrize("outwards_m", [0.0, 0.03, -0.05])
 def test_an_outline_that_is_too_large_or_small_is_so_in_every_side(
     tmp_path: Path, outwards_m: float
 ) -> None:
-    numbers, _ = judged(tmp_path, opening(scene()[1], outwards_m=outwards_m))
+    numbers, inspection = judged(tmp_path, opening(scene()[1], outwards_m=outwards_m))
+    assert (numbers["n_true_openings"], numbers["n_found_openings"]) == (1, 1)
+    assert (numbers["n_false_openings"], numbers["n_stray_sides"]) == (0, 0)
+    assert numbers["opening_depth_error_max_mm"] == pytest.approx(3.0, abs=0.01)
+    assert len(inspection.points_world) == 4
+    # Rays are a sixteenth of a cell of 20 mm apart.
+    assert numbers["side_max_mm"] == pytest.approx(1e3 * abs(outwards_m), abs=0.7)
     assert numbers["side_mean_mm"] == pytest.approx(1e3 * outwards_m, abs=0.7)
     assert numbers["side_rmse_mm"] == pytest.approx(1e3 * abs(outwards_m), abs=0.7)
     assert numbers["side_rmse_cells"] == pytest.approx(abs(outwards_m) / GSD_M, abs=0.04)
     assert numbers["side_error_over_sigma"] == pytest.approx(1e3 * abs(outwards_m), abs=0.7)
-    assert 0.8 < numbers["opening_iou_min"] < 0.95
+    ratio = (WIDTH_M + 2 * outwards_m) * (HEIGHT_M + 2 * outwards_m) / (WIDTH_M * HEIGHT_M)
+    assert numbers["opening_iou_min"] == pytest.approx(min(ratio, 1.0 / ratio), abs=0.02)
 
 
 def test_openings_of_other_walls_are_refused(tmp_path: Path) -> None:
     truth, walls = scene()
-    inputs = InspectOpenings.In(
-        truth=truth, walls=walls, openings=Openings(openings=(), walls=(7,))
-    )
+    inputs = {"truth": truth, "walls": walls, "openings": Openings(openings=(), walls=(7,))}
     with pytest.raises(
         MethodError,
         match=r"there are openings on wall 7, which is not among the connected walls \(3\)",
     ):
-        InspectOpenings().run(inputs, InspectOpenings.Params(), context(tmp_path))
-
-
-# Size of the recess, 0.8 m by 1.22 m.
-WIDTH_M, HEIGHT_M = RECESS[1] - RECESS[0], RECESS[3] - RECESS[2]
+        run(InspectOpenings, context(tmp_path), inputs)
 
 
 @pytest.mark.parametrize(("right_m", "is_found"), [(0.24, True), (0.29, False), (-0.24, True)])

@@ -14,7 +14,7 @@ from orthoflow_plugins.inspect.image_quality import OrthoimageGrey
 from orthoflow_plugins.inspect.key_pairs import find_key_pairs
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts
 from orthoflow_plugins.inspect.surf import InspectSurf
-from scipy.ndimage import gaussian_filter, shift
+from scipy.ndimage import shift
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Inspection, Orthoimage, Orthoimages, Walls
@@ -159,11 +159,6 @@ def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-6)
 
 
-def texture() -> NDArray[np.float64]:
-    smooth = gaussian_filter(np.random.default_rng(1).normal(size=(130, 130)), 1.5)
-    return np.asarray(128.0 + 30.0 * smooth / smooth.std())
-
-
 def image(grey: NDArray[np.float64]) -> GreyImage:
     everywhere = np.ones(grey.shape, dtype=np.bool_)
     return GreyImage(grey=grey, valid=everywhere, region=everywhere)
@@ -175,7 +170,7 @@ def moved(grey: NDArray[np.float64], right: float, down: float) -> NDArray[np.fl
 
 @pytest.mark.parametrize("apart", [(0.0, 0.0), (1.3, -2.6), (-3.0, 3.75), (5.0, -5.0), (-5.0, 5.0)])
 def test_a_displacement_is_measured_in_every_whole_patch(apart: tuple[float, float]) -> None:
-    true = texture()
+    true = inspect_scenes.texture()[:130, :130]
     found = patches.measure_shifts(image(moved(true, *apart)), image(true), reach_cells=5)
     # 130 cells contain 4 x 4 patches of 32 cells; two cells remain.
     centres = [[32 * c + 16.0, 32 * r + 16.0] for r in range(4) for c in range(4)]
@@ -187,7 +182,7 @@ def test_a_displacement_is_measured_in_every_whole_patch(apart: tuple[float, flo
 
 
 def test_what_strays_by_two_cells_from_its_start_is_left_out() -> None:
-    true = texture()
+    true = inspect_scenes.texture()[:130, :130]
     start = patches.unrefined(
         np.array([[40.0, 40.0], [80.0, 40.0]]), np.array([[1.0, 0.0], [6.0, 0.0]])
     )

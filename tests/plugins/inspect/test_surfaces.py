@@ -12,7 +12,8 @@ from orthoflow_plugins.inspect.surfaces import InspectSurfaces
 from orthoflow.geometry import Cylinder
 from orthoflow.products import Surface
 from tests import samples
-from tests.raster_scenes import context
+from tests.method_runs import run
+from tests.raster_scenes import context, numbers
 from tests.recess_scenes import scene
 
 
@@ -20,10 +21,8 @@ def inspected(folder: Path, *found: Surface) -> dict[str, float]:
     true = samples.surfaces()
     truth = replace(scene()[0], surfaces=replace(true, surfaces=true.surfaces[:1]))
     ctx = context(folder)
-    surfaces = replace(true, surfaces=found)
-    inputs = InspectSurfaces.In(truth=truth, surfaces=surfaces)
-    InspectSurfaces().run(inputs, InspectSurfaces.Params(), ctx)
-    return {metric.name: metric.value for metric in ctx.metrics}
+    run(InspectSurfaces, ctx, {"truth": truth, "surfaces": replace(true, surfaces=found)})
+    return numbers(ctx)
 
 
 def test_a_vault_has_the_errors_by_which_it_was_changed(tmp_path: Path) -> None:
@@ -39,12 +38,12 @@ def test_a_vault_has_the_errors_by_which_it_was_changed(tmp_path: Path) -> None:
     )
     changed = replace(vault, shape=shape, along_m=(0.0, 2.0))
     far = replace(vault, name="vault 1", shape=replace(vault.shape, radius_m=3.2))
-    numbers = inspected(tmp_path, changed, far)
-    assert numbers["n_true_surfaces"] == numbers["n_found_surfaces"] == 1
-    assert numbers["n_false_surfaces"] == 1
-    assert numbers["axis_error_max_deg"] == pytest.approx(np.degrees(0.01))
-    assert numbers["axis_offset_max_mm"] == pytest.approx(5.0)
-    assert numbers["radius_error_max_mm"] == pytest.approx(2.0)
+    found = inspected(tmp_path, changed, far)
+    assert found["n_true_surfaces"] == found["n_found_surfaces"] == 1
+    assert found["n_false_surfaces"] == 1
+    assert found["axis_error_max_deg"] == pytest.approx(np.degrees(0.01))
+    assert found["axis_offset_max_mm"] == pytest.approx(5.0)
+    assert found["radius_error_max_mm"] == pytest.approx(2.0)
     # The standard deviation of the radius is 0.1 mm.
-    assert numbers["radius_error_over_sigma"] == pytest.approx(20.0)
+    assert found["radius_error_over_sigma"] == pytest.approx(20.0)
     assert inspected(tmp_path)["n_found_surfaces"] == 0

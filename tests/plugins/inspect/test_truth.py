@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,9 +31,10 @@ from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import inspect_scenes, samples, scenes
 from tests.inspect_scenes import BUFFER_M, inspected
-from tests.raster_scenes import context
+from tests.method_runs import run
+from tests.raster_scenes import context, peak_bytes
 
-GSD_M = 0.014
+GSD_M = 0.017
 
 # True orthoimages, rendered once for all tests, by displacement.
 _RENDERED: dict[tuple[float, float], TrueOrthoimage] = {}
@@ -43,8 +43,8 @@ _RENDERED: dict[tuple[float, float], TrueOrthoimage] = {}
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     ctx = context(tmp_path_factory.mktemp("room"))
-    params = SimulateRoom.Params(scan_step_m=0.05, panorama_step_m=0.15)
-    return SimulateRoom().run(SimulateRoom.In(), params, ctx).truth
+    made = run(SimulateRoom, ctx, {}, scan_step_m=0.05, panorama_step_m=0.15)
+    return made.truth  # type: ignore[no-any-return]
 
 
 def rendered(truth: Truth, shift_cells: tuple[float, float] = (0.0, 0.0)) -> TrueOrthoimage:
@@ -264,7 +264,7 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
 def test_a_large_wall_takes_the_memory_of_a_band(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    inputs = finer(6)
+    inputs = finer(4)
     n_cells = inputs["orthoimages"].images[0].mask.size
     for name, value in (
         ("truth.SUPERSAMPLE", 1),
@@ -274,13 +274,10 @@ def test_a_large_wall_takes_the_memory_of_a_band(
         ("image_quality.TILE_CELLS", 128),
     ):
         monkeypatch.setattr(f"orthoflow_plugins.inspect.{name}", value)
-    tracemalloc.start()
-    try:
+    with peak_bytes() as peak:
         metrics, _, _ = inspected(InspectTruth, tmp_path, **inputs)
         # A band with its margin has half of the cells; the whole wall needed 174 bytes per cell.
-        assert tracemalloc.get_traced_memory()[1] < 110 * n_cells
-    finally:
-        tracemalloc.stop()
+        assert peak() < 110 * n_cells
     assert metrics["depth_median_mm"] == pytest.approx(1e3 * 2.0**-9, rel=1e-6)
 
 

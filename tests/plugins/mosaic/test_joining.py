@@ -127,16 +127,6 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
     np.testing.assert_array_equal(joining.without_islands(rank, owner, layers, cells_min), expected)
 
 
-def test_without_a_small_patch_nothing_changes() -> None:
-    layers = [layer(20 + k, painted=1.0, has_filled=False) for k in range(2)]
-    source = np.zeros(SHAPE, dtype=np.int16)
-    source[:3, :3] = 1
-    rank = np.full(SHAPE, ORDER.index(OrthoMask.PAINTED), dtype=np.uint8)
-    # Nine cells are not fewer than nine.
-    assert joining.without_islands(rank, source, layers, 9) is source
-    assert (joining.without_islands(rank, source, layers, 10) == 0).all()
-
-
 @pytest.mark.parametrize("cells_min", [1, 7])
 def test_bands_decide_islands_as_the_whole_does(
     monkeypatch: pytest.MonkeyPatch, cells_min: int

@@ -74,24 +74,6 @@ def random_layer(seed: int, *, wall: int = 0) -> Layer:
     )
 
 
-def test_a_single_layer_passes_through(tmp_path: Path) -> None:
-    layer = random_layer(1)
-    image = image_of(tmp_path, layer, names=("west wall",))
-    np.testing.assert_array_equal(image.rgb, layer.rgb)
-    states = {
-        LayerMask.OUTSIDE: OrthoMask.NONE,
-        LayerMask.PAINTED: OrthoMask.PAINTED,
-        LayerMask.OCCLUDED: OrthoMask.OCCLUDED,
-        LayerMask.NO_SURFACE: OrthoMask.NO_SURFACE,
-    }
-    expected = np.array([states[LayerMask(state)] for state in range(4)])[layer.mask]
-    assert layer.filled is not None
-    expected[layer.filled > 0] = OrthoMask.FILLED
-    np.testing.assert_array_equal(image.mask, expected)
-    np.testing.assert_array_equal(image.source, np.where(layer.mask == LayerMask.PAINTED, 0, -1))
-    assert (image.name, image.sources) == ("west wall", ("photo 1",))
-
-
 def test_every_wall_of_the_layers_gets_an_orthoimage(tmp_path: Path) -> None:
     layers = (random_layer(1, wall=0), random_layer(2, wall=2), random_layer(3, wall=0))
     images = joined(tmp_path, *layers, names=("a", "b", "c"))[0].images

@@ -99,18 +99,14 @@ def test_erosion_takes_the_cells_beside_hidden_patches(
 
 
 def test_cells_without_a_surface_and_outside_the_photo_say_so(tmp_path: Path) -> None:
-    where, depths = scenes.frame(), scenes.depth_m()
+    depths = scenes.depth_m()
     depths[200:220, 20:60] = np.nan
-    viewer = scenes.camera(where)
+    viewer = scenes.camera(scenes.frame())
     photos = scenes.photos(scenes.rendered()[:, :500])
     given = of_depths(depths, viewers=[replace(viewer, width=500)], photos=photos)
     layer = layer_of(tmp_path, given)
     assert (layer.mask[200:220, 20:60] == VOID).all()
-    rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
-    points = where.world_from_wall(
-        np.column_stack([columns.ravel(), rows.ravel()]), scenes.depth_m().ravel().astype(float)
-    )
-    u = viewer.project(points)[:, 0].reshape(scenes.SHAPE)
+    u = scenes.seen_at(viewer)[..., 0]
     has_surface = ~np.isnan(depths)
     np.testing.assert_array_equal((layer.mask == OUTSIDE)[has_surface], (u >= 500)[has_surface])
 

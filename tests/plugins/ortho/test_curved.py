@@ -15,6 +15,7 @@ from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.errors import OrthoflowError
+from orthoflow.geometry.bends import CylinderBend
 from orthoflow.products import LayerMask
 from tests import curved_scenes, ortho_scenes
 from tests.curved_scenes import Drum
@@ -126,5 +127,7 @@ def test_points_get_the_colours_of_photos(name: str, tmp_path: Path) -> None:
 
 
 def test_pixels_are_not_thrown_onto_a_cylinder(tmp_path: Path) -> None:
+    curved = replace(ortho_scenes.frame(), bend=CylinderBend(along="u", radius_m=3.0))
+    given = ortho_scenes.inputs(walls=ortho_scenes.walls(curved))
     with pytest.raises(OrthoflowError, match="dsm-forward does not take curved walls"):
-        projected("apse", tmp_path, DsmForward)
+        ortho_scenes.laid(DsmForward, tmp_path, given)

@@ -15,7 +15,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from orthoflow_plugins.ortho.filling import fillable_gaps
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
-from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.errors import MethodError
@@ -25,27 +24,21 @@ from orthoflow.products import Layer, LayerMask, PointCloud, Walls
 from orthoflow.sdk import StepContext
 from tests import raster_scenes as scenes
 from tests import samples
+from tests.method_runs import run
 from tests.raster_scenes import context
 
 
-def bare_walls(known: scenes.KnownWall, *, buffer_m: float = 0.15) -> Walls:
+def bare_walls(known: scenes.KnownWall) -> Walls:
     frame = frame_over(known.planes().corners[0], known.normal, gsd_m=known.gsd_m)
-    wall = samples.wall(
-        frame,
-        depth_m=np.full(frame.shape, np.nan, dtype=np.float32),
-        sigma_m=np.full(frame.shape, np.nan, dtype=np.float32),
-        count=np.zeros(frame.shape, dtype=np.uint32),
-        mask=np.zeros(frame.shape, dtype=np.uint8),
-    )
-    return samples.walls(wall, buffer_m=buffer_m)
+    wall = samples.wall(frame, depth_m=np.full(frame.shape, np.nan, dtype=np.float32))
+    return samples.walls(wall)
 
 
 def laid(
     cloud: PointCloud, walls: Walls, ctx: StepContext, **params: object
 ) -> tuple[Layer, dict[str, Mapping[str, Any]]]:
     """Return the layer of the wall, and the values of diagnostics by code."""
-    chosen = PointcloudDirect.Params.model_validate(params)
-    layers = PointcloudDirect().run(PointcloudDirect.In(walls=walls, cloud=cloud), chosen, ctx)
+    layers = run(PointcloudDirect, ctx, {"walls": walls, "cloud": cloud}, **params)
     assert layers.layers.names == (walls.walls[0].name,)
     return layers.layers.layers[0], {one.code: one.values for one in ctx.diagnostics}
 
@@ -348,11 +341,9 @@ CAST = np.array([1.3, 1.0, 0.7])
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[PointCloud, Walls]:
     """Return a simulated room, scanned in colour from two stations, and its largest wall."""
     ctx = context(tmp_path_factory.mktemp("room"))
-    params = SimulateRoom.Params(scan_step_m=0.018, panorama_step_m=0.012)
-    simulated = SimulateRoom().run(SimulateRoom.In(), params, ctx)
-    inputs = RasterGrid.In(cloud=simulated.cloud, planes=simulated.truth.planes)
-    chosen = RasterGrid.Params(gsd_m=0.02, n_walls_max=1)
-    return simulated.cloud, RasterGrid().run(inputs, chosen, ctx).walls
+    made = run(SimulateRoom, ctx, {}, scan_step_m=0.018, panorama_step_m=0.012)
+    params = {"gsd_m": 0.02, "n_walls_max": 1}
+    return made.cloud, scenes.rastered(made.cloud, made.truth.planes, ctx.scratch, **params)[0]
 
 
 def light_painted(

@@ -17,7 +17,7 @@ from orthoflow_plugins.read.photos import ReadPhotos
 
 from orthoflow.files.images import encode_png
 from orthoflow.files.publishing import publish_layers, publish_orthoimages
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.cameras import looking_at
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.levels import sixteen_bits
 from orthoflow.products import InputFiles, Layer, LayerMask, Layers, Orthoimages, OrthoMask, Photos
@@ -49,15 +49,6 @@ def joined(folder: Path, layers: tuple[Layer, ...], **params: object) -> Orthoim
     return images
 
 
-def seen_at(viewer: ViewingCamera) -> NDArray[np.float64]:
-    """Return photo positions (rows, cols, 2) of the cells of the wall."""
-    rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
-    places = np.column_stack([columns.ravel(), rows.ravel()])
-    depths = scenes.depth_m().ravel().astype(np.float64)
-    points = scenes.frame().world_from_wall(places, depths)
-    return viewer.project(points)[:, :2].reshape(*scenes.SHAPE, 2)
-
-
 def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> None:
     viewer = scenes.camera(scenes.frame())
     deep = scenes.inputs(photos=deep_photos(ramp()))
@@ -67,7 +58,7 @@ def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> Non
     publish_layers(Layers(layers=layers), tmp_path, "sha256:0")
     (image,) = images.images
     shown = image.mask == OrthoMask.PAINTED
-    u, v = np.floor(seen_at(viewer)[shown]).astype(int).T
+    u, v = np.floor(scenes.seen_at(viewer)[shown]).astype(int).T
     for name in ("wall_0_ortho", "wall_0_layer_0_0"):
         with rasterio.open(tmp_path / f"{name}.tif") as file:
             assert file.dtypes == ("uint16",) * 3

@@ -71,11 +71,16 @@ def seen_of(
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 1.4])
-@pytest.mark.parametrize("hides", [False, True])
-def test_places_and_quality_are_those_of_the_camera(aside_m: float, hides: bool) -> None:
-    where = scenes.frame()
+@pytest.mark.parametrize(("hides", "at_survey"), [(False, True), (True, False)])
+def test_places_and_quality_are_those_of_the_camera(
+    aside_m: float, hides: bool, at_survey: bool
+) -> None:
+    where = scenes.frame(at_survey=at_survey)
     camera = replace(scenes.camera(where, aside_m=aside_m), skew=20.0)
-    visible = seen_of(surface_of(noisy_depths(), hides=hides), camera)
+    surface = surface_of(noisy_depths(), hides=hides, where=where)
+    visible = seen_of(surface, camera)
+    cosine_least = surfaces.view_of(camera, surface, PARAMS).cosine_least
+    assert cosine_least == pytest.approx(math.cos(math.radians(80.0)))
     painted = visible.mask == PAINTED
     rows, columns = np.nonzero(painted)
     depths = noisy_depths()[painted].astype(np.float64)
@@ -272,28 +277,6 @@ def test_bounds_of_blocks_are_those_of_their_cells(
     # Bands of a large wall do not affect the result.
     monkeypatch.setattr(surfaces, "BAND_CELLS", 20 * shape[1])
     np.testing.assert_array_equal(surfaces.relief_of(wall_of(depths)).occluding, relief.occluding)
-
-
-def test_a_camera_is_the_same_in_the_axes_of_a_wall() -> None:
-    where = scenes.frame(at_survey=True)
-    camera = replace(scenes.camera(where, aside_m=0.4), skew=2.0)
-    surface = surface_of(np.zeros(scenes.SHAPE), hides=False, where=where)
-    view = surfaces.view_of(camera, surface, PARAMS)
-    (foot,) = where.wall_from_world(camera.centre_world[None])
-    # The centre of the first cell is 0.
-    assert (view.column, view.row) == pytest.approx((foot[0] - 0.5, foot[1] - 0.5), abs=1e-6)
-    assert view.height_m == pytest.approx(foot[2], abs=1e-9)
-    assert (view.gsd_m, view.front_m, view.tolerance_m) == (where.gsd_m, scenes.BUFFER_M, 0.008)
-    assert view.cosine_least == pytest.approx(math.cos(math.radians(80.0)))
-    assert view.border_px == 0.05 * min(camera.width, camera.height)
-    # Points in metres right, down and in front have the same pixels as with the camera.
-    at = np.random.default_rng(2).uniform([0.0, 0.0, -0.1], [1.2, 0.9, 0.1], (20, 3))
-    world = where.world_from_wall(at[:, :2] / where.gsd_m, at[:, 2])
-    flat = view.camera
-    local = flat[:9].reshape(3, 3) @ at.T + flat[9:12, None]
-    expected = camera.rotation @ world.T + camera.translation[:, None]
-    np.testing.assert_allclose(local, expected, atol=1e-6)
-    np.testing.assert_array_equal(flat[12:], camera.flat[12:])
 
 
 @pytest.mark.parametrize(("least_m", "is_seen"), [(0.1, True), (1.99, True), (2.01, False)])

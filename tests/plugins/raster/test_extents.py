@@ -175,20 +175,6 @@ def test_a_facade_without_anything_about_it_keeps_the_rectangle_of_its_points() 
     assert (found.front_m, found.behind_m) == (0.15, 0.15)
 
 
-def test_the_buffer_follows_a_door_that_stands_back() -> None:
-    # A jamb is visible on one side, and a room 3 m behind a window.
-    whole = wall()
-    in_door = (abs(whole[:, 0] - 1.0) < 0.4) & (whole[:, 2] < 2.0)
-    in_window = (abs(whole[:, 0] - 3.0) < 0.4) & (abs(whole[:, 2] - 1.5) < 0.4)
-    jamb = patch((0.6, 0.6), (-0.36, 0.0), (0.0, 2.0))
-    leaf = patch((0.6, 1.4), (-0.36, -0.36), (0.0, 2.0))
-    outside = patch((2.6, 3.4), (-3.0, -3.0), (1.1, 1.9))
-    cloud = scanned(whole[~in_door & ~in_window], jamb, leaf, outside)
-    found = extent(cloud, planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)))
-    # The buffers include a depth step and the margin beyond the relief.
-    assert (found.front_m, found.behind_m) == (0.15, pytest.approx(0.36, abs=0.06))
-
-
 def test_the_cornice_of_an_adjoining_wall_is_no_relief_of_this_one() -> None:
     # Two steps of a cornice run along the left wall towards the viewer, and a cupboard deeper than
     # any relief is next to the right wall.
@@ -244,27 +230,27 @@ def test_a_wall_grows_by_a_metre_at_most_where_a_fifth_of_a_line_of_cells_is_cov
 
 
 @pytest.mark.parametrize(
-    ("depths_m", "front_m"),
+    ("depths_m", "front_m", "behind_m"),
     [
-        ((0.12,), 0.14),
+        ((0.12,), 0.14, 0.14),
         # Five steps of 2.5 cm are bridged, six are not.
-        ((0.16,), 0.1),
-        ((0.1, 0.2, 0.3, 0.4), 0.42),
-        # A column that extends beyond the limit is not relief.
-        ((0.1, 0.2, 0.3, 0.4, 0.5, 0.58), 0.1),
-        ((0.1, 0.3), 0.12),
+        ((0.16,), 0.1, 0.1),
+        ((0.1, 0.2, 0.3, 0.4), 0.42, 0.42),
+        # A column that extends beyond the limit, 0.5 m in front and 1 m behind, is not relief.
+        ((0.1, 0.2, 0.3, 0.4, 0.5, 0.58), 0.1, 0.6),
+        ((0.1, 0.3), 0.12, 0.12),
     ],
     ids=str,
 )
 def test_relief_hangs_together_over_steps_of_a_tenth_of_a_metre(
-    depths_m: tuple[float, ...], front_m: float
+    depths_m: tuple[float, ...], front_m: float, behind_m: float
 ) -> None:
-    steps = [part((1.0, 2.0), depth, (1.0, 2.0)) for depth in depths_m]
-    found = quiet(wall(), *steps, least_m=0.1)
-    # The buffer includes a depth step of 2.5 cm, and extends 2 cm beyond the relief.
-    assert found.front_m == pytest.approx(front_m, abs=0.03)
-    assert found.front_m == round(found.front_m, 3)
-    assert found.behind_m == 0.1
+    for side, expected_m in ((1.0, (front_m, 0.1)), (-1.0, (0.1, behind_m))):
+        steps = [part((1.0, 2.0), side * depth, (1.0, 2.0)) for depth in depths_m]
+        found = quiet(wall(), *steps, least_m=0.1)
+        # The buffer includes a depth step of 2.5 cm, and extends 2 cm beyond the relief.
+        assert (found.front_m, found.behind_m) == pytest.approx(expected_m, abs=0.03)
+        assert found.front_m == round(found.front_m, 3)
 
 
 def test_what_is_set_is_not_looked_for() -> None:

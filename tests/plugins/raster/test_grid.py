@@ -282,9 +282,7 @@ def test_a_coarse_scan_is_recovered_linear_between_its_points(tmp_path: Path) ->
     assert np.isnan(wall.sigma_m[recovered]).all()
 
 
-def test_single_missing_points_are_recovered_on_the_slope_they_lie_on(
-    tmp_path: Path,
-) -> None:
+def test_single_missing_points_are_recovered_on_the_slope_they_lie_on(tmp_path: Path) -> None:
     missing = np.random.default_rng(4).random(SCANNED_WALL.shape) < 0.08
     errors_m = []
     for steps in (2, 0):
@@ -345,10 +343,7 @@ WHOLE = scenes.upright_wall()
 
 
 def cropped(folder: Path, **params: object) -> tuple[Wall, StepContext]:
-    columns, rows = scenes.cell_centres(WHOLE.shape)
-    points = WHOLE.world(columns, rows, scenes.relief_m(columns))
-    intensity = np.linspace(0.1, 0.9, columns.size, dtype=np.float32)
-    cloud = scenes.cloud_of(points, rgb=scenes.checker(columns, rows), intensity=intensity)
+    cloud, _ = one_point_per_cell(WHOLE)
     walls, ctx = scenes.rastered(cloud, WHOLE.planes(), folder, gsd_m=WHOLE.gsd_m, **params)
     return walls.walls[0], ctx
 
@@ -385,12 +380,23 @@ def test_a_crop_holds_the_cells_of_the_whole_wall(
 
 def test_cells_beyond_a_polygon_are_void(tmp_path: Path) -> None:
     whole, _ = cropped(tmp_path)
-    # The crop is the triangle to the right of the line from (1, 3) to (3, 1), below v = 1.
-    wall, _ = cropped(tmp_path, crop=[[1.0, 3.0], [3.0, 1.0], [3.0, 3.0]])
+    # The crop is the triangle to the right of the line from (1, 3) to (3, 1), below v = 1, with a
+    # notch at its lower edge.
+    notched = [
+        [1.0, 3.0],
+        [3.0, 1.0],
+        [3.0, 3.0],
+        [2.75, 3.0],
+        [2.75, 2.0],
+        [2.25, 2.0],
+        [2.25, 3.0],
+    ]
+    wall, _ = cropped(tmp_path, crop=notched)
     assert wall.frame.shape == (16, 16)
     rows, columns = np.mgrid[8:24, 8:24] + 0.5
     # Cells with their centres on the diagonal may be on either side.
     inside, on = columns + rows > 32.0, columns + rows == 32.0
+    inside[8:, 10:14] = False
     kept = wall.mask == SurfaceMask.MEASURED
     np.testing.assert_array_equal(kept[~on], inside[~on])
     assert_same(wall, whole, np.s_[8:24, 8:24], kept)
@@ -398,14 +404,6 @@ def test_cells_beyond_a_polygon_are_void(tmp_path: Path) -> None:
     assert np.isnan(wall.intensity[~kept]).all()
     assert not wall.count[~kept].any()
     assert not wall.rgb[~kept].any()
-
-
-def test_a_notch_of_a_polygon_is_outside(tmp_path: Path) -> None:
-    notched = [[0, 0], [4, 0], [4, 3], [2.5, 3], [2.5, 1], [1.5, 1], [1.5, 3], [0, 3]]
-    wall, _ = cropped(tmp_path, crop=notched)
-    expected = np.ones((24, 32), dtype=bool)
-    expected[8:, 12:20] = False
-    np.testing.assert_array_equal(wall.mask == SurfaceMask.MEASURED, expected)
 
 
 def test_a_crop_without_an_area_or_beside_the_wall_is_refused(tmp_path: Path) -> None:

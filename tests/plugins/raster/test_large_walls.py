@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import mmap
-import tracemalloc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,7 +23,7 @@ from orthoflow.geometry.rows import raster_rows
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Walls
 from tests import inspect_scenes, ortho_scenes, raster_scenes, samples
 from tests.plugins.ortho.test_direct import bare_walls
-from tests.raster_scenes import context
+from tests.raster_scenes import context, peak_bytes
 
 BAND_CELLS = 1 << 17
 
@@ -43,16 +40,6 @@ def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct.BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.walls.BAND_CELLS", 2 * BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting.CELLS_ASKED", BAND_CELLS)
-
-
-@contextmanager
-def peak_bytes() -> Iterator[Callable[[], int]]:
-    """Measure the peak memory of arrays, without memory-mapped files."""
-    tracemalloc.start()
-    try:
-        yield lambda: tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
 
 
 def mapped(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -83,9 +70,7 @@ def large_inputs(folder: Path, n: int = 5) -> DsmBackward.In:
 
 
 @pytest.mark.usefixtures("small_bands")
-def test_layers_are_painted_and_reported_without_memory_per_cell(
-    tmp_path: Path,
-) -> None:
+def test_layers_are_painted_and_reported_without_memory_per_cell(tmp_path: Path) -> None:
     (tmp_path / "small").mkdir()
     small, inputs = large_inputs(tmp_path / "small", 2), large_inputs(tmp_path)
     method, n_cells = DsmBackward, inputs.walls.walls[0].mask.size
@@ -158,9 +143,7 @@ def large_layers(folder: Path) -> tuple[Layer, ...]:
 
 
 @pytest.mark.usefixtures("small_bands")
-def test_mosaics_are_joined_and_reported_without_memory_per_cell(
-    tmp_path: Path,
-) -> None:
+def test_mosaics_are_joined_and_reported_without_memory_per_cell(tmp_path: Path) -> None:
     layers = large_layers(tmp_path)
     params = MosaicSeams.Params(seams="graph-cut", island_cells_min=4)
     few = Layers(layers=tuple(raster_rows(layer, slice(0, 100)) for layer in layers))

@@ -59,9 +59,7 @@ def test_whole_cells_reach_beyond_the_rectangle_alike_on_all_sides(tmp_path: Pat
     np.testing.assert_allclose(np.abs(off_m), np.tile([0.035, 0.045, 0.0], (4, 1)), atol=1e-9)
 
 
-def test_only_level_planes_seen_from_above_are_maps(
-    tmp_path: Path,
-) -> None:
+def test_only_level_planes_seen_from_above_are_maps(tmp_path: Path) -> None:
     assert placed(level(0.01), tmp_path)[0].map_crs == "site"
     frame, warnings = placed(level(0.1), tmp_path)
     assert frame.map_crs is None

@@ -89,21 +89,6 @@ def test_nearest_takes_the_nearest_point_wherever_it_lies(tmp_path: Path) -> Non
     assert wall.count.sum() == len(places)
 
 
-def test_cells_of_single_outliers_are_recovered_and_thin_bars_stay(tmp_path: Path) -> None:
-    known = scenes.leaning_wall(shape=(60, 80))
-    columns, rows = scenes.cell_centres(known.shape)
-    true_m = np.zeros(known.shape)
-    true_m[30, 20:40] = 0.05  # a bar one cell wide
-    wrong = np.zeros(known.shape, dtype=bool)
-    wrong[[5, 12, 50], [7, 60, 33]] = True
-    depths_m = np.where(wrong, 0.12, true_m).ravel()
-    cloud = scenes.cloud_of(known.world(columns, rows, depths_m))
-    for surface in ("median", "denoised"):
-        wall = rastered(cloud, known, tmp_path, surface=surface).walls[0]
-        np.testing.assert_allclose(wall.depth_m, true_m, atol=1e-5)
-        np.testing.assert_array_equal(wall.mask == SurfaceMask.RECOVERED, wrong)
-
-
 def test_denoising_takes_the_noise_and_leaves_the_steps(tmp_path: Path) -> None:
     known = scenes.leaning_wall(shape=(120, 160))
     cloud, _, _ = scattered(known, per_cell=2.25, noise_m=NOISE_M)
@@ -122,39 +107,11 @@ def test_denoising_takes_the_noise_and_leaves_the_steps(tmp_path: Path) -> None:
     assert rms_mm["denoised"] < 0.45 * rms_mm["median"]
 
 
-def test_a_net_of_triangles_closes_windows(tmp_path: Path) -> None:
-    known = scenes.leaning_wall(shape=(40, 60))
-    cloud, places, _ = scattered(known, per_cell=3.0)
-    in_window = (np.abs(places - [25.0, 20.0]) < 8.0).all(axis=1)
-    holed = scenes.part_of(cloud, np.flatnonzero(~in_window))
-    grid, net = (
-        rastered(holed, known, tmp_path, surface=name).walls[0] for name in ("median", "tin")
-    )
-    assert (grid.mask[16:24, 21:29] == SurfaceMask.VOID).all()
-    assert (net.mask[16:24, 21:29] == SurfaceMask.RECOVERED).all()
-    np.testing.assert_array_equal(net.count, grid.count)
-    assert (net.rgb[net.mask > 0] == 120).all()
-
-
-def test_percentiles_are_numpys(tmp_path: Path) -> None:
-    known = scenes.upright_wall()
-    rng = np.random.default_rng(9)
-    depths_m = rng.normal(0.0, 0.03, 57)
-    points = known.world(rng.uniform(3, 4, 57), rng.uniform(4, 5, 57), depths_m)
-    walls = rastered(scenes.cloud_of(points), known, tmp_path, percentiles=[0, 10, 50, 99])
-    wall = walls.walls[0]
-    np.testing.assert_allclose(
-        wall.percentiles_m[4, 3], np.percentile(depths_m, [0, 10, 50, 99]), atol=1e-6
-    )
-    assert np.isnan(wall.percentiles_m[4, 4]).all()
-    assert walls.percentiles == (0, 10, 50, 99)
-
-
-def test_depths_sorted_a_few_at_a_time_give_the_same_medians_and_percentiles(
+def test_percentiles_are_numpys_and_do_not_depend_on_how_many_depths_are_sorted_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = scenes.leaning_wall(shape=(40, 60))
-    cloud, *_ = scattered(known, per_cell=5.0, noise_m=NOISE_M)
+    cloud, places, depths_m = scattered(known, per_cell=5.0, noise_m=NOISE_M)
     found = []
     for n_points, n_cells in ((1 << 26, 1 << 20), (700, 50)):
         monkeypatch.setattr("orthoflow_plugins.raster.surfaces.POINTS_AT_ONCE", n_points)
@@ -162,6 +119,12 @@ def test_depths_sorted_a_few_at_a_time_give_the_same_medians_and_percentiles(
         found.append(rastered(cloud, known, tmp_path, percentiles=[5, 50]).walls[0])
     for name in ("depth_m", "percentiles_m", "count", "intensity"):
         np.testing.assert_array_equal(*(getattr(wall, name) for wall in found), err_msg=name)
+    percentiles_m = found[0].percentiles_m
+    for row, column in ((0, 0), (7, 11), (39, 59)):
+        own = (places.astype(int) == (column, row)).all(axis=1)
+        expected = np.percentile(depths_m[own], [5, 50])
+        np.testing.assert_allclose(percentiles_m[row, column], expected, atol=2e-6)
+    np.testing.assert_array_equal(np.isnan(percentiles_m).all(axis=2), found[0].count == 0)
 
 
 def test_the_buffer_is_three_tolerances_of_the_planes_unless_set(tmp_path: Path) -> None:
@@ -470,9 +433,10 @@ def assert_turned(wall: Wall, turned: Wall, turn: Turn) -> None:
 def test_a_turned_cloud_gives_the_turned_raster(tmp_path: Path, surface: str, turn: Turn) -> None:
     scattered = in_any_order(0.8)
     wall = rastered_turned(scattered, TURNS[0], tmp_path, surface=surface)
-    if surface != "tin":
-        assert 0.2 < np.mean(wall.mask == SurfaceMask.RECOVERED) < 0.5
-        assert (wall.mask == SurfaceMask.VOID).any()
+    assert 0.2 < np.mean(wall.mask == SurfaceMask.RECOVERED) < 0.6
+    # A net of triangles also closes the window.
+    closed = SurfaceMask.RECOVERED if surface == "tin" else SurfaceMask.VOID
+    assert (wall.mask[20:24, 9:15] == closed).all()
     assert_turned(wall, rastered_turned(scattered, turn, tmp_path, surface=surface), turn)
 
 

@@ -13,6 +13,7 @@ from orthoflow_plugins.read.ties import ReadTies
 from orthoflow.errors import InputError
 from orthoflow.files.images import encode_png
 from orthoflow.products import Cameras, CheckPoints, Photo, Photos, Ties
+from tests import photo_files
 from tests.method_runs import Reader
 
 HEAD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
@@ -90,18 +91,17 @@ def test_files_that_orient_no_photo_are_refused(tmp_path: Path) -> None:
         read_cameras(tmp_path, {"b.jpg": ""}, [photo("a.jpg")])
 
 
-PHOTOS = Photos(
-    photos=tuple(
-        Photo(name=name, encoded=encode_png(np.zeros((48, 64), np.uint8)), width=64, height=48)
-        for name in ("a.jpg", "b c.jpg")
-    )
-)
+PHOTOS = Photos(photos=(photo("a.jpg"), photo("b c.jpg")))
+
+
+def written(folder: Path, stem: str, texts: tuple[str, ...]) -> tuple[Path, ...]:
+    """Write tables to files with a stem and the numbers 0, 1 and so on."""
+    files = {f"{stem}{number}.csv": text.encode() for number, text in enumerate(texts)}
+    return photo_files.write(folder, files)
 
 
 def read_ties(folder: Path, *texts: str, **params: object) -> Ties:
-    paths = tuple(folder / f"ties{index}.csv" for index in range(len(texts)))
-    for path, text in zip(paths, texts, strict=True):
-        path.write_text(text)
+    paths = written(folder, "ties", texts)
     ties: Ties = Reader(ReadTies, folder).run(paths, params, photos=PHOTOS).ties
     return ties
 
@@ -137,11 +137,8 @@ def test_what_cannot_be_is_said_with_its_line(tmp_path: Path, text: str, message
 
 
 def read_points(folder: Path, *texts: str) -> tuple[CheckPoints, dict[str, float]]:
-    paths = tuple(folder / f"points{index}.csv" for index in range(len(texts)))
-    for path, text in zip(paths, texts, strict=True):
-        path.write_text(text)
     reader = Reader(ReadCheckpoints, folder)
-    return reader.run(paths, {}).checkpoints, reader.metrics
+    return reader.run(written(folder, "points", texts), {}).checkpoints, reader.metrics
 
 
 def test_all_columns_come_out(tmp_path: Path) -> None:

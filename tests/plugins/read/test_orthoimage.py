@@ -15,9 +15,9 @@ from rasterio.transform import Affine
 from orthoflow.errors import InputError
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.files.sidecars import frame_json
-from orthoflow.products import InputFiles, Orthoimage, Orthoimages
+from orthoflow.products import Orthoimage, Orthoimages
 from tests import inspect_scenes
-from tests import raster_scenes as scenes
+from tests.method_runs import Reader
 
 CORNER_M = (0.08, -0.04)
 
@@ -43,9 +43,8 @@ def write(
 
 
 def read(folder: Path, *paths: Path, wall: int = 0) -> tuple[Orthoimage, ...]:
-    ctx = scenes.context(folder)
-    inputs = ReadOrthoimage.In(files=InputFiles(name="ours", paths=tuple(sorted(paths))))
-    return ReadOrthoimage().run(inputs, ReadOrthoimage.Params(wall=wall), ctx).orthoimages.images
+    found = Reader(ReadOrthoimage, folder).run(tuple(sorted(paths)), {"wall": wall})
+    return found.orthoimages.images  # type: ignore[no-any-return]
 
 
 def foreign(folder: Path) -> list[Path]:

@@ -26,6 +26,7 @@ from orthoflow.products import Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
 from tests.long_loops import seeds
+from tests.method_runs import run
 from tests.raster_scenes import context
 from tests.scene_rays import cast, colours_at
 
@@ -36,8 +37,8 @@ GREY = np.array([0.299, 0.587, 0.114])
 def simulate(folder: Path, *, seed: int = 1, cores: int = 2, **params: object) -> SimulateRoom.Out:
     folder.mkdir(parents=True, exist_ok=True)
     context = StepContext(rng=np.random.default_rng(seed), cores=cores, scratch=folder)
-    chosen = SimulateRoom.Params.model_validate({**COARSE, **params})
-    return SimulateRoom().run(SimulateRoom.In(), chosen, context)
+    made: SimulateRoom.Out = run(SimulateRoom, context, {}, **{**COARSE, **params})
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
         photo_gsd_m=0.004,
         photo_noise_grey=0.0,
         photo_vignetting_share=0.0,
-        photo_supersample=2,
+        photo_supersample=1,
         check_points_most=8,
     )
 

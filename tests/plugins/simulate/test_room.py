@@ -17,6 +17,7 @@ from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import Photo, Photos, PointCloud, Truth
 from orthoflow.sdk import StepContext
 from tests import samples, scenes
+from tests.method_runs import run
 from tests.plane_scenes import cloud_of
 from tests.scene_rays import cast, colours_at
 
@@ -33,8 +34,7 @@ def simulate(folder: Path, *, seed: int = 1, cores: int = 2, **params: object) -
     if numbers not in made:
         folder.mkdir(parents=True, exist_ok=True)
         context = StepContext(rng=np.random.default_rng(seed), cores=cores, scratch=folder)
-        chosen = SimulateRoom.Params.model_validate(params)
-        made[numbers] = SimulateRoom().run(SimulateRoom.In(), chosen, context)
+        made[numbers] = run(SimulateRoom, context, {}, **params)
     return made[numbers]
 
 
@@ -90,27 +90,23 @@ def test_points_planes_and_colours_are_those_of_the_scene_in_any_world(
 
 
 def test_a_drawn_geometry_moves_planes_and_stations_and_keeps_the_truth(tmp_path: Path) -> None:
-    designed = simulate(tmp_path / "designed", **CLEAN)
-    drawn = [
-        simulate(tmp_path / str(seed), seed=seed, **CLEAN, geometry="drawn") for seed in (1, 2)
-    ]
+    designed, *drawn = (
+        simulate(tmp_path / f"{geometry}-{seed}", seed=seed, **CLEAN, geometry=geometry)
+        for geometry, seed in (("designed", 1), ("drawn", 1), ("drawn", 2))
+    )
     for out in drawn:
         assert set(out.truth.planes.names) == set(designed.truth.planes.names)
         for plane in range(len(out.truth.planes)):
             np.testing.assert_allclose(distances_m(out.cloud, out.truth, plane), 0.0, atol=2e-6)
+    truths = [out.truth for out in (designed, *drawn)]
     for name in ("main wall", "left wall", "niche", "floor", "ceiling"):
-        rooms = [designed, *drawn]
-        places = [out.truth.planes.names.index(name) for out in rooms]
-        normals = [out.truth.planes.normal[at] for out, at in zip(rooms, places, strict=True)]
-        offsets = [out.truth.planes.offset[at] for out, at in zip(rooms, places, strict=True)]
-        leans = [np.degrees(np.arcsin(normal[2])) for normal in normals]
+        planes = [truth.planes.plane(truth.planes.names.index(name)) for truth in truths]
+        leans = [np.degrees(np.arcsin(plane.normal[2])) for plane in planes]
         # The limits, in degrees and metres, are far above rounding errors.
         assert np.diff(sorted(leans)).min() > 0.005, name
-        assert np.diff(sorted(offsets)).min() > 0.0005, name
-    stations = [out.truth.stations for out in (designed, *drawn)]
-    for one, other in ((0, 1), (0, 2), (1, 2)):
-        apart = [np.ptp(at, axis=0) @ np.ptp(at, axis=0) for at in (stations[one], stations[other])]
-        assert abs(apart[0] - apart[1]) > 0.001
+        assert np.diff(sorted(plane.offset_m for plane in planes)).min() > 0.0005, name
+    spans_m2 = [np.sum(np.ptp(truth.stations, axis=0) ** 2) for truth in truths]
+    assert np.diff(sorted(spans_m2)).min() > 0.001
 
 
 def test_plaques_give_drawn_walls_check_points_at_edges(tmp_path: Path) -> None:
@@ -132,8 +128,7 @@ def test_plaques_give_drawn_walls_check_points_at_edges(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("charts")
 def test_the_main_wall_is_reported_where_the_floor_has_more_points(tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
-    params = SimulateRoom.Params(scan_step_m=0.02, panorama_step_m=0.02)
-    truth = SimulateRoom().run(SimulateRoom.In(), params, context).truth
+    truth = run(SimulateRoom, context, {}, scan_step_m=0.02, panorama_step_m=0.02).truth
     main = truth.planes.names.index("main wall")
     assert main > 0
     metrics = {metric.name: metric.value for metric in context.metrics}
