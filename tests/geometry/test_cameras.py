@@ -137,9 +137,7 @@ def test_a_rotation_that_mirrors_or_stretches_is_refused(scale: float, reason: s
         ([0.2, 0.0, 0.0, 0.0, 0.0], 10.0),
     ],
 )
-def test_a_lens_is_used_to_where_it_folds_and_no_farther_than_ten(
-    distortion: list[float], radius: float
-) -> None:
+def test_lenses_are_used_up_to_their_fold(distortion: list[float], radius: float) -> None:
     assert largest_radius(np.array(distortion)) == pytest.approx(radius)
 
 
@@ -210,9 +208,7 @@ def test_values_of_a_lens_are_logarithms_and_numbers() -> None:
 @pytest.mark.parametrize(
     ("logarithm", "factor"), [(0.5, 0.5), (0.9, 0.9), (1.1, 1.0), (-0.9, -0.9), (-7.0, -1.0)]
 )
-def test_a_focal_length_grows_to_its_e_fold_in_one_step_at_most(
-    logarithm: float, factor: float
-) -> None:
+def test_steps_of_focal_lengths_are_limited(logarithm: float, factor: float) -> None:
     viewing = skewed(3)
     moved = stepped(viewing, np.array([*np.zeros(6), logarithm]), LensFreedom(focal_sigma=0.1))
     assert moved.fx / viewing.fx == pytest.approx(np.exp(factor))

@@ -189,9 +189,7 @@ def test_photos_share_the_errors_of_places_but_not_their_own(shared_by: str) -> 
 
 
 @pytest.mark.parametrize(("n_points", "sigma0"), [(3, 1.7), (40, 0.0)])
-def test_points_without_redundancy_or_without_error_state_what_independent_ones_do(
-    n_points: int, sigma0: float
-) -> None:
+def test_points_without_redundancy_count_as_independent(n_points: int, sigma0: float) -> None:
     rng = np.random.default_rng(5)
     jacobian = rng.normal(size=(n_points, 2, 6))
     flat = jacobian.reshape(-1, 6)

@@ -200,9 +200,7 @@ def test_points_are_as_far_from_a_raster_as_from_its_rectangle(frame: WallFrame)
 
 
 @pytest.mark.parametrize(("crs", "corner"), [(None, (0.0, 0.0)), ("EPSG:32632", (1.0, 2.0))])
-def test_rasters_count_from_their_corner_and_maps_from_the_world(
-    crs: str | None, corner: tuple[float, float]
-) -> None:
+def test_origins_of_rasters_and_maps_differ(crs: str | None, corner: tuple[float, float]) -> None:
     frame = replace(FRAME, map_crs=crs)
     assert frame.raster_corner_m == corner
     places = frame.raster_from_wall(np.array([[0.0, 0.0], [2.0, 3.0]]))
@@ -247,9 +245,7 @@ def leaning(deg: float) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("direction", UP_VECTORS, ids=str)
 @pytest.mark.parametrize("rise_deg", [0.0, 45.0, 79.9, -79.9])
-def test_on_walls_and_slopes_u_is_level_and_to_the_right(
-    rise_deg: float, direction: UpDirection
-) -> None:
+def test_on_walls_u_is_level_and_to_the_right(rise_deg: float, direction: UpDirection) -> None:
     up = up_vector(direction)
     normal = leaning(rise_deg) @ basis_from_up(up)
     u, v = wall_axes(normal, up)
@@ -284,9 +280,7 @@ def test_floors_read_like_a_map_whichever_way_they_lean(rise_deg: float) -> None
         ((1e-9, 0.3), (1, 3)),
     ],
 )
-def test_a_grid_covers_its_rectangle_to_a_millionth_of_a_cell(
-    size_m: tuple[float, float], cells: tuple[int, int]
-) -> None:
+def test_grids_cover_their_rectangles(size_m: tuple[float, float], cells: tuple[int, int]) -> None:
     frame = over_rectangle(*size_m)
     assert (frame.width, frame.height) == cells
     np.testing.assert_array_equal(frame.origin_world, FRAME.origin_world)

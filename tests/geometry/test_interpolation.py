@@ -104,7 +104,7 @@ def rasters(
     ("seed", "lending", "reach_cells"),
     [(0, 0.5, 3.0), (1, 0.1, 3.0), (2, 0.03, 2.0), (3, 0.2, 0.2)],
 )
-def test_a_cell_holds_what_a_regression_over_its_surroundings_says(
+def test_cells_have_the_values_of_a_regression(
     seed: int, lending: float, reach_cells: float
 ) -> None:
     places, depth_m, intensity, rgb = rasters(seed, known=0.5, lending=lending)

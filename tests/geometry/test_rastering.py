@@ -64,9 +64,7 @@ def sorted_winners(cloud: PointCloud, slab: Slab) -> NDArray[np.uint32]:
 
 
 @pytest.mark.parametrize("seed", seeds(4))
-def test_the_topmost_point_is_the_one_that_sorting_finds_with_any_number_of_threads(
-    seed: int,
-) -> None:
+def test_topmost_points_are_those_found_by_sorting(seed: int) -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     cloud, slab = random_cloud(wall, n_points=60_000, seed=seed), slab_of(wall)
     winners = topmost_points(cloud, slab, threads=1)
@@ -128,9 +126,7 @@ def test_both_ends_of_the_buffer_are_inside() -> None:
     assert np.flatnonzero(winners["point"] != NO_POINT).tolist() == [0, 2]
 
 
-def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_blocks_beside_a_wall_are_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = scenes.leaning_wall(shape=(60, 80))
     some = random_cloud(wall, n_points=1_100_000, seed=2)
     # As a scanner goes: along the wall, and then along what lies beside it.

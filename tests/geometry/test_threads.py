@@ -87,9 +87,7 @@ def test_runs_have_one_length_but_for_the_last(
     assert sorted(seen) == runs
 
 
-def test_no_thread_is_started_where_memory_is_limited_to_little(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_no_thread_is_started_with_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """CPython waits without end for a thread that finds no memory at its beginning."""
 
     def refuse(*_: object) -> None:

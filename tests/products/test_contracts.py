@@ -80,9 +80,7 @@ def labels(*values: int) -> PointLabels:
 @pytest.mark.parametrize(
     ("values", "named"), [((0, 0, 0, 5), "5"), ((0, -2, 0, 0), "-2"), ((0, 0, 0), "3"), ((), "0")]
 )
-def test_labels_that_contradict_cloud_or_planes_are_refused(
-    values: tuple[int, ...], named: str
-) -> None:
+def test_contradictory_labels_are_refused(values: tuple[int, ...], named: str) -> None:
     labels(-1, 0, 0, -1).check_against(OTHERS)
     with pytest.raises(ProductError, match=rf"labels\.plane_index.*got {named}"):
         labels(*values).check_against(OTHERS)

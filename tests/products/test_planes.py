@@ -59,7 +59,7 @@ def test_a_plane_turned_round_is_the_same_plane_seen_from_behind() -> None:
 
 @pytest.mark.parametrize("index", [0, 2])
 @pytest.mark.parametrize("sigmas_rad", [(1e-3, 2e-4), (0.0, 3e-4), (5e-4, 5e-4)])
-def test_the_direction_is_as_exact_as_its_worst_axis(
+def test_sigma_of_the_direction_is_of_its_worst_axis(
     index: int, sigmas_rad: tuple[float, float]
 ) -> None:
     true = planes()

@@ -69,9 +69,7 @@ def test_people_know_a_wall_by_its_plane_and_else_by_its_place() -> None:
         ([[0, 0, 0, 0], [0, 0, 0, 0]], 0.5 / np.sqrt(0.1)),
     ],
 )
-def test_points_lie_as_far_apart_as_their_number_says(
-    counts: list[list[int]], apart_m: float
-) -> None:
+def test_spacing_follows_from_counts(counts: list[list[int]], apart_m: float) -> None:
     wall = replace(wall_at(0.0, "a"), count=np.array(counts, dtype=np.uint32))
     coarse = samples.wall(samples.facing_east(0.75, 4, 2, (3.0, 0.0, 1.0)), name="coarse")
     assert walls(coarse, wall).points_apart_m() == pytest.approx(apart_m)

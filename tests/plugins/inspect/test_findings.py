@@ -155,9 +155,7 @@ def test_maps_have_the_width_of_a_column_and_a_colour_bar() -> None:
     assert red > blue
 
 
-def test_arrows_run_from_where_things_should_be_to_where_they_are(
-    arrows: list[tuple[Any, ...]],
-) -> None:
+def test_arrows_point_from_true_to_shown_places(arrows: list[tuple[Any, ...]]) -> None:
     image = image_of(np.full((250, 250), 80.0))
     places = np.array([[50.0, 60.0], [150.0, 100.0], [100.0, 200.0]])
     shift_cells = np.array([[2.0, 0.0], [0.0, 2.0], [-8.0, 0.0]])

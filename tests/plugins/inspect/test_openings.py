@@ -50,9 +50,7 @@ def test_large_walls_are_judged_in_coarser_cells_but_sides_as_exactly(
 
 
 @pytest.mark.parametrize("outwards_m", [0.0, 0.03, -0.05])
-def test_an_outline_that_is_too_large_or_small_is_so_in_every_side(
-    tmp_path: Path, outwards_m: float
-) -> None:
+def test_all_sides_have_the_error_of_the_outline(tmp_path: Path, outwards_m: float) -> None:
     numbers, inspection = judged(tmp_path, opening(scene()[1], outwards_m=outwards_m))
     assert (numbers["n_true_openings"], numbers["n_found_openings"]) == (1, 1)
     assert (numbers["n_false_openings"], numbers["n_stray_sides"]) == (0, 0)
@@ -79,7 +77,7 @@ def test_openings_of_other_walls_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("right_m", "is_found"), [(0.24, True), (0.29, False), (-0.24, True)])
-def test_an_outline_is_of_what_it_shares_half_of_its_area_with(
+def test_outlines_match_by_half_of_their_area(
     tmp_path: Path, right_m: float, is_found: bool
 ) -> None:
     numbers, _ = judged(tmp_path, opening(scene()[1], right_m=right_m))

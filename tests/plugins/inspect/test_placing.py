@@ -61,7 +61,7 @@ def test_an_image_is_of_the_wall_of_its_plane() -> None:
         placed(wall=-1, plane_index=None)
 
 
-def test_cells_take_what_the_nearest_cell_of_the_wall_holds(
+def test_cells_have_the_values_of_the_nearest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     walls = slanted()
@@ -122,9 +122,7 @@ def test_cells_take_what_the_nearest_cell_of_the_wall_holds(
         (0.0, 80.0, True),
     ],
 )
-def test_images_that_lie_elsewhere_or_askew_are_refused(
-    shift_m: float, angle_deg: float, is_refused: bool
-) -> None:
+def test_misplaced_images_are_refused(shift_m: float, angle_deg: float, is_refused: bool) -> None:
     walls = slanted()
     frame = walls.walls[0].frame
     corners = frame.corners_world() + shift_m * frame.normal_world

@@ -165,9 +165,7 @@ def test_a_point_is_looked_for_on_the_nearest_wall_that_holds_it(depth_m: float,
 
 
 @pytest.mark.parametrize(("off_m", "is_found"), [(0.015, True), (0.045, False)])
-def test_a_target_is_found_within_the_search_and_carried_back_into_space(
-    off_m: float, is_found: bool
-) -> None:
+def test_a_target_is_found_and_back_projected(off_m: float, is_found: bool) -> None:
     # The target has quadrants of 5 cm around the middle of the wall, which project by 1 cm.
     rows, columns = np.indices((200, 240)) + 0.5
     bright = np.where((columns > 120.0) == (rows > 100.0), 220.0, 40.0)

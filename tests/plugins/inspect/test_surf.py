@@ -32,9 +32,7 @@ def inspect(
 
 
 @pytest.mark.parametrize("shift", [(1.4, -0.6), (20.0, 15.0)], ids=["small", "gross"])
-def test_a_displacement_is_told_to_a_tenth_of_a_cell(
-    tmp_path: Path, shift: tuple[float, float]
-) -> None:
+def test_displacements_are_known_to_0_1_cells(tmp_path: Path, shift: tuple[float, float]) -> None:
     metrics, found, context = inspect(tmp_path, displaced(*shift))
     assert metrics["n_pairs"] >= 50
     for axis, cells in zip("xy", shift, strict=True):
@@ -65,9 +63,7 @@ def test_part_of_the_image_displaced_shows_beyond_twice_the_rmse(tmp_path: Path)
     ("source", "sentence"),
     [("luminance", "no laser intensity"), ("none", "neither intensity nor colour")],
 )
-def test_walls_without_laser_intensity_are_refused_or_passed_over(
-    tmp_path: Path, source: str, sentence: str
-) -> None:
+def test_walls_need_laser_intensity(tmp_path: Path, source: str, sentence: str) -> None:
     image, walls = displaced(0.0, 0.0), inspect_scenes.walls(source=source)
     with pytest.raises(MethodError, match=sentence):
         inspect(tmp_path, image, walls)
@@ -138,9 +134,7 @@ def test_of_few_pairs_two_others_must_agree() -> None:
     assert not key_pairs.agreeing_pairs(places, shift).any()
 
 
-def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_tiles_give_the_pairs_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     shown, true = (OrthoimageGrey(displaced(*by)) for by in ((1.4, -0.6), (0.0, 0.0)))
     whole = find_key_pairs(shown, true, radius_cells=40.0)
     monkeypatch.setattr(key_pairs, "WHOLE_CELLS", 1000)

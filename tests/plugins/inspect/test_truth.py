@@ -137,9 +137,7 @@ def inspect_planes(folder: Path, truth: Truth, **inputs: Any) -> tuple[dict[str,
     return metrics, [one.code for one in ctx.diagnostics]
 
 
-def test_labels_of_chosen_points_in_another_order_are_compared_with_theirs(
-    tmp_path: Path, truth: Truth
-) -> None:
+def test_labels_are_compared_point_by_point(tmp_path: Path, truth: Truth) -> None:
     n_points = len(truth.labels)
     chosen = np.random.default_rng(1).permutation(n_points)[: n_points // 2]
     x = np.zeros(n_points, dtype=np.float32)
@@ -156,9 +154,7 @@ def test_labels_of_chosen_points_in_another_order_are_compared_with_theirs(
     assert codes == ["labels-not-compared"]
 
 
-def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
-    tmp_path: Path, truth: Truth
-) -> None:
+def test_a_missed_main_wall_is_reported(tmp_path: Path, truth: Truth) -> None:
     true = truth.planes
     near, far = true.offset.copy(), true.offset.copy()
     near[0] += 0.004
@@ -209,9 +205,7 @@ def finer(times: int) -> dict[str, Any]:
     }
 
 
-def test_bands_of_a_large_wall_give_what_the_whole_gives(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bands_of_a_wall_give_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     lens = {"width": 900, "height": 640, "fx": 1200.0, "fy": 1200.0, "cx": 450.0, "cy": 320.0}
     true, found = (
@@ -261,9 +255,7 @@ def test_bands_of_a_large_wall_give_what_the_whole_gives(
         assert some[name] == pytest.approx(whole[name], rel=0.1), name
 
 
-def test_a_large_wall_takes_the_memory_of_a_band(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_walls_take_the_memory_of_a_band(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs = finer(4)
     n_cells = inputs["orthoimages"].images[0].mask.size
     for name, value in (

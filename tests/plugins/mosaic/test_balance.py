@@ -214,9 +214,7 @@ def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slic
 
 
 @pytest.mark.parametrize(("factor", "differs"), [(1.03, False), (1.05, True), (0.95, True)])
-def test_photos_differ_where_either_has_to_change_by_two_percent(
-    factor: float, *, differs: bool
-) -> None:
+def test_photos_that_differ_by_4_percent_are_balanced(factor: float, *, differs: bool) -> None:
     # Each photo is corrected by half of the difference.
     pair = two_photos(factor)
     found = balancing.balance_of(pair, None, [None, None])
@@ -244,9 +242,7 @@ def test_near_a_seam_layers_go_over_to_each_other_unless_depths_leap_everywhere(
 
 
 @pytest.mark.parametrize("apart", [0.05, -0.15, 0.3])
-def test_layers_meet_at_a_seam_by_what_each_paints_about_it(
-    apart: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_layers_are_blended_at_a_seam(apart: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(balancing, "FEATHER_CELLS", 40)
     # Two layers cover a wall of 16 x 24 blocks, with the seam in the middle; the second is unknown
     # beyond the fourth block after the seam.
@@ -405,9 +401,7 @@ def test_light_is_multiplied_and_clipped(dtype: type[np.unsignedinteger], gain: 
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_blocks_have_the_mean_light_of_what_a_layer_paints_wholly(
-    dtype: type[np.unsignedinteger],
-) -> None:
+def test_fully_painted_blocks_have_their_mean_light(dtype: type[np.unsignedinteger]) -> None:
     highest = int(np.iinfo(dtype).max)
     rng = np.random.default_rng(2)
     rgb = rng.integers(highest // 4, highest // 2, (*SMALL_SHAPE, 3)).astype(dtype)

@@ -130,9 +130,7 @@ def test_photos_that_lie_apart_by_more_than_they_state_are_no_better_than_that()
 
 
 @pytest.mark.parametrize(("position_m", "depth_m"), [(0.004, 0.0), (0.0, 0.012), (0.004, 0.012)])
-def test_overlaps_tell_errors_of_depths_from_those_of_poses(
-    position_m: float, depth_m: float
-) -> None:
+def test_overlaps_separate_errors_of_depths_and_poses(position_m: float, depth_m: float) -> None:
     left = oblique()
     # A camera on the other side.
     centre = left.centre_world + 4.0 * FRAME.u_world

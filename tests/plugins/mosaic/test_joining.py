@@ -95,9 +95,7 @@ def test_preferences_are_the_same_row_by_row(rule: str) -> None:
 
 @pytest.mark.parametrize("cells_min", [2, 9])
 @pytest.mark.parametrize("seed", seeds(2))
-def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
-    seed: int, cells_min: int
-) -> None:
+def test_small_patches_go_to_the_most_frequent_source_nearby(seed: int, cells_min: int) -> None:
     rng = np.random.default_rng(seed)
     layers = [layer(10 + seed + k, painted=0.9, has_filled=False) for k in range(3)]
     # Large areas with specks.
@@ -128,9 +126,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
 
 
 @pytest.mark.parametrize("cells_min", [1, 7])
-def test_bands_decide_islands_as_the_whole_does(
-    monkeypatch: pytest.MonkeyPatch, cells_min: int
-) -> None:
+def test_bands_give_the_same_islands(monkeypatch: pytest.MonkeyPatch, cells_min: int) -> None:
     layers = [layer(30 + k, painted=0.8, has_filled=False) for k in range(3)]
     options = PLAIN.model_copy(update={"island_cells_min": cells_min})
     given = {"drawn": None, "wall": None, "balance": None, "allocate": in_memory}
@@ -181,9 +177,7 @@ def test_layers_of_a_wall_share_its_raster() -> None:
     joining.require_sources([other, one], ["b.jpg"])
 
 
-def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_distances_in_large_layers_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
     shape = (120, 150)
     mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
     mask[:, :30] = LayerMask.OUTSIDE
@@ -279,9 +273,7 @@ def two_layers(shape: tuple[int, int]) -> list[Layer]:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_blocks_have_the_mean_colour_of_what_is_painted_as_it_is_balanced(
-    dtype: type[np.unsignedinteger],
-) -> None:
+def test_blocks_have_the_balanced_mean_of_painted_cells(dtype: type[np.unsignedinteger]) -> None:
     rng = np.random.default_rng(3)
     highest = int(np.iinfo(dtype).max)
     layers = []

@@ -373,9 +373,7 @@ def test_written_seams_give_the_same_mosaic_whatever_the_rule(tmp_path: Path, ru
     assert (along(folder=tmp_path, seams=rule).source == first.source).mean() < 0.8
 
 
-def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drawn_area_takes_its_photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = along(folder=tmp_path)
     gsd_m = before.frame.gsd_m
     # The ring contains rows 5 to 19 and columns 10 to 39; X is to the right, Y upwards from the
@@ -408,9 +406,7 @@ def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
         ("photo 1", "west", 'needs the property "wall", the number of a wall; got'),
     ],
 )
-def test_seams_that_fit_no_layer_are_refused(
-    tmp_path: Path, photo: str, wall: object, said: str
-) -> None:
+def test_impossible_seams_are_refused(tmp_path: Path, photo: str, wall: object, said: str) -> None:
     path = drawn(tmp_path, photo, [[0.0, 0.0], [1.0, 0.0], [1.0, -1.0]], wall=wall)
     with pytest.raises(InputError, match=said):
         along(path, folder=tmp_path)

@@ -41,9 +41,7 @@ def of_depths(depths: np.ndarray, **known: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 0.9])
-def test_cells_show_their_own_place_where_they_are_seen_and_nothing_where_they_are_hidden(
-    tmp_path: Path, aside_m: float
-) -> None:
+def test_visible_cells_show_their_own_place(tmp_path: Path, aside_m: float) -> None:
     viewer = scenes.camera(scenes.frame(), aside_m=aside_m)
     given = scenes.inputs(scenes.rendered(aside_m=aside_m), viewers=[viewer])
     layer = layer_of(tmp_path, given, resampling="nearest")
@@ -61,9 +59,7 @@ def test_cells_show_their_own_place_where_they_are_seen_and_nothing_where_they_a
     assert not layer.quality[~shown].any()
 
 
-def test_stray_points_hide_nothing_and_a_sparse_board_as_well_as_a_dense_one(
-    tmp_path: Path,
-) -> None:
+def test_stray_points_hide_nothing_and_a_sparse_board_does(tmp_path: Path) -> None:
     where, clean = scenes.frame(), layer_of(tmp_path)
     stray = scenes.inputs(cloud=scenes.cloud(where, n_outliers=300))
     np.testing.assert_array_equal(layer_of(tmp_path, stray).mask, clean.mask)
@@ -82,7 +78,7 @@ def test_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_array_equal(tiled.quality, whole.quality)
 
 
-def test_erosion_takes_the_cells_beside_hidden_patches(
+def test_cells_beside_hidden_ones_are_hidden(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     eroded = layer_of(tmp_path)

@@ -65,9 +65,7 @@ def test_a_painted_relief_comes_back_cell_by_cell(tmp_path: Path, at_survey: boo
     np.testing.assert_allclose(layer.quality, 0.6, atol=1e-4)
 
 
-def test_a_point_in_front_of_the_buffer_never_shows_and_of_equally_high_ones_the_most_central(
-    tmp_path: Path,
-) -> None:
+def test_of_equally_high_points_the_most_central_one_is_shown(tmp_path: Path) -> None:
     known = scenes.upright_wall()
     columns, rows = scenes.cell_centres(known.shape)
     flat = np.zeros(columns.size)
@@ -166,9 +164,7 @@ def test_specks_of_pure_black_paint_no_cell_and_are_reported(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("colouring", ["topmost", "centre", "gaussian", "median"])
-def test_points_without_a_colour_are_skipped_where_that_is_asked_for(
-    tmp_path: Path, colouring: str
-) -> None:
+def test_points_without_colour_are_skipped_on_request(tmp_path: Path, colouring: str) -> None:
     known = scenes.leaning_wall(shape=(12, 15))
     columns, rows = scenes.cell_centres(known.shape)
     rgb = scenes.checker(columns, rows) // 2 + 100
@@ -230,9 +226,7 @@ def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("inpaint", ["between", "telea", "navier-stokes"])
 @pytest.mark.parametrize("cells", [0.6, 1.1, 1.6])
-def test_what_is_painted_from_a_cloud_is_where_it_is(
-    tmp_path: Path, cells: float, inpaint: str
-) -> None:
+def test_clouds_are_painted_in_place(tmp_path: Path, cells: float, inpaint: str) -> None:
     known = dataclasses.replace(scenes.leaning_wall(shape=(150, 190)), gsd_m=0.004)
     places = scenes.points_apart(known.shape, cells, seed=round(100 * cells), in_rows=False)
     shade = np.rint(255.0 * scenes.waves(*places.T)).astype(np.uint8)
@@ -356,9 +350,7 @@ def light_painted(
     return light, by_code.get("scans-balanced")
 
 
-def test_scans_of_one_white_balance_are_painted_as_they_are(
-    tmp_path: Path, room: tuple[PointCloud, Walls]
-) -> None:
+def test_equal_scans_are_not_balanced(tmp_path: Path, room: tuple[PointCloud, Walls]) -> None:
     found, by_code = light_painted(*room, tmp_path)
     plain, _ = light_painted(*room, tmp_path, balance_scans=False)
     np.testing.assert_array_equal(found, plain)

@@ -46,9 +46,7 @@ def layer_of(aside_m: float) -> Layer:
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.9])
-def test_every_pixel_paints_the_cell_that_it_shows_and_nothing_that_is_hidden(
-    aside_m: float,
-) -> None:
+def test_pixels_paint_the_visible_cells_that_they_show(aside_m: float) -> None:
     layer = layer_of(aside_m)
     assert layer.filled is not None
     taken = (layer.mask == LayerMask.PAINTED) & (layer.filled == 0)

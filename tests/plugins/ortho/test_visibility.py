@@ -72,9 +72,7 @@ def seen_of(
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 1.4])
 @pytest.mark.parametrize(("hides", "at_survey"), [(False, True), (True, False)])
-def test_places_and_quality_are_those_of_the_camera(
-    aside_m: float, hides: bool, at_survey: bool
-) -> None:
+def test_places_and_quality_match_the_camera(aside_m: float, hides: bool, at_survey: bool) -> None:
     where = scenes.frame(at_survey=at_survey)
     camera = replace(scenes.camera(where, aside_m=aside_m), skew=20.0)
     surface = surface_of(noisy_depths(), hides=hides, where=where)
@@ -280,9 +278,7 @@ def test_bounds_of_blocks_are_those_of_their_cells(
 
 
 @pytest.mark.parametrize(("least_m", "is_seen"), [(0.1, True), (1.99, True), (2.01, False)])
-def test_a_camera_stands_before_a_wall_where_any_of_it_is_lower(
-    least_m: float, is_seen: bool
-) -> None:
+def test_a_camera_must_be_in_front_of_some_cell(least_m: float, is_seen: bool) -> None:
     depths = np.full((40, 40), 2.5)
     depths[35, 36] = least_m
     frame = wall_of(depths).frame
@@ -403,9 +399,7 @@ def sampled(photo: Any, pixels: tuple[float, float], resampling: Any) -> Any:
 
 @pytest.mark.parametrize("resampling", ["nearest", "bilinear", "cubic", "lanczos"])
 @pytest.mark.parametrize("pixels", [(1.0, 1.0), (2.3, 1.9)])
-def test_what_is_cut_out_of_a_photo_does_not_show(
-    resampling: Any, pixels: tuple[float, float]
-) -> None:
+def test_parts_of_a_photo_are_sampled_alike(resampling: Any, pixels: tuple[float, float]) -> None:
     rng = np.random.default_rng(0)
     photo = cv2.GaussianBlur(rng.integers(0, 256, (120, 160, 3), dtype=np.uint8), (0, 0), 1.5)
     u, v = places_of(np.random.default_rng(0))
@@ -428,9 +422,7 @@ def test_what_is_cut_out_of_a_photo_does_not_show(
 
 
 @pytest.mark.parametrize(("pixels", "is_blurred"), [(1.06, False), (1.3, True)])
-def test_cells_of_hardly_more_than_a_pixel_are_not_averaged(
-    pixels: float, is_blurred: bool
-) -> None:
+def test_only_cells_of_several_pixels_are_averaged(pixels: float, is_blurred: bool) -> None:
     """With 8 bits, a Gaussian of less than a fifth of a pixel has no effect."""
     photo = np.random.default_rng(1).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     plain, filtered = (sampled(photo, (1.0, down), "cubic") for down in (1.0, pixels))

@@ -52,9 +52,7 @@ def cloud(n_scans: int = 3, n_points: int = 40_000) -> tuple[PointCloud, np.ndar
     )
 
 
-def test_scale_range_and_incidence_are_told_from_places_that_several_scans_see(
-    tmp_path: Path,
-) -> None:
+def test_scale_range_and_incidence_are_estimated_from_overlaps(tmp_path: Path) -> None:
     known, true = cloud()
     ctx = scenes.context(tmp_path)
     found = balanced(known, [slab()], ctx)
@@ -76,9 +74,7 @@ def test_scale_range_and_incidence_are_told_from_places_that_several_scans_see(
 
 
 @pytest.mark.parametrize("name", ["intensity", "scan", "stations"])
-def test_without_scans_that_are_known_nothing_changes_and_that_is_said(
-    name: str, tmp_path: Path
-) -> None:
+def test_without_known_scans_nothing_changes(name: str, tmp_path: Path) -> None:
     known, _ = cloud(n_points=500)
     plain = replace(known, **{name: None})
     ctx = scenes.context(tmp_path)

@@ -151,9 +151,7 @@ def in_each_tile(depth_m: float, count: int = 2) -> NDArray[np.float64]:
         (1.1, 2, "unseen"),
     ],
 )
-def test_two_points_behind_or_before_a_tile_tell_why_it_is_empty(
-    depth_m: float, count: int, cause: str
-) -> None:
+def test_two_points_give_the_cause_of_an_empty_tile(depth_m: float, count: int, cause: str) -> None:
     assert stated(in_each_tile(depth_m, count)) == {cause: pytest.approx(1.0)}
     # Objects count up to five metres in front of a wall.
     assert stated(in_each_tile(4.9), free_m=np.inf) == {"before": pytest.approx(1.0)}
@@ -171,9 +169,7 @@ def test_what_stands_before_counts_before_what_lies_behind() -> None:
 @pytest.mark.parametrize(
     ("along_m", "cause"), [(0.15, "unseen"), (0.55, "hidden"), (3.6, "hidden"), (4.1, "unseen")]
 )
-def test_a_screen_hides_what_lies_between_it_and_the_station_but_for_their_ends(
-    along_m: float, cause: str
-) -> None:
+def test_a_screen_hides_the_wall_behind_it_from_a_station(along_m: float, cause: str) -> None:
     # The void is seen at 45 degrees from 4.24 m; the screen is perpendicular to the rays.
     middle, station = np.array([0.3, 0.3, 0.0]), np.array([3.3, 0.3, 3.0])
     way = (station - middle) / np.linalg.norm(station - middle)

@@ -133,9 +133,7 @@ def test_a_wall_reaches_over_cornice_and_pilaster_to_what_adjoins_it(tmp_path: P
     assert np.nanmax(one.depth_m) < 0.13
 
 
-def test_a_floor_that_slopes_ends_the_wall_at_its_highest_place_and_this_is_said(
-    tmp_path: Path,
-) -> None:
+def test_a_sloping_floor_ends_the_wall_at_its_highest_point(tmp_path: Path) -> None:
     rise = 0.02
     surface = wall()
     surface = surface[surface[:, 2] > rise * surface[:, 0]]
@@ -242,7 +240,7 @@ def test_a_wall_grows_by_a_metre_at_most_where_a_fifth_of_a_line_of_cells_is_cov
     ],
     ids=str,
 )
-def test_relief_hangs_together_over_steps_of_a_tenth_of_a_metre(
+def test_relief_is_connected_over_small_steps(
     depths_m: tuple[float, ...], front_m: float, behind_m: float
 ) -> None:
     for side, expected_m in ((1.0, (front_m, 0.1)), (-1.0, (0.1, behind_m))):
@@ -297,9 +295,7 @@ def beside(side: str, beyond_m: float, towards: float) -> tuple[NDArray, NDArray
 
 @pytest.mark.parametrize(("beyond_m", "towards"), [(-0.09, 1.0), (0.99, -1.0)])
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
-def test_a_plane_bounds_the_side_that_it_lies_beside(
-    side: str, beyond_m: float, towards: float
-) -> None:
+def test_a_plane_bounds_the_side_next_to_it(side: str, beyond_m: float, towards: float) -> None:
     # Planes farther inside or outside than these limits do not bound the wall.
     for far_m in (-0.11, 1.01):
         assert bound_by(beside(side, far_m, towards)) is None
@@ -397,9 +393,7 @@ def basin(first_m: float = 0.0) -> list[NDArray]:
         ("before a scanner", 0.0),
     ],
 )
-def test_what_stands_far_before_a_wall_belongs_to_it_where_it_hangs_together_with_it(
-    case: str, front_m: float
-) -> None:
+def test_deep_relief_belongs_to_the_wall_it_is_connected_to(case: str, front_m: float) -> None:
     is_apart = case in {"apart from it", "joined by the ground"}
     patches = basin(1.0 if is_apart else 0.0)
     if case == "joined by the ground":

@@ -40,7 +40,7 @@ def one_point_per_cell(
 
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("at_survey", [False, True], ids=["local", "survey"])
-def test_each_cell_gets_the_depth_intensity_and_colour_of_its_point(
+def test_cells_have_the_values_of_their_point(
     tmp_path: Path, surface: str, at_survey: bool
 ) -> None:
     known = scenes.leaning_wall(at_survey=at_survey)
@@ -114,9 +114,7 @@ def test_points_outside_the_buffer_never_show(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("surface", SURFACES)
-def test_counts_conserve_the_points_and_threads_change_nothing(
-    tmp_path: Path, surface: str
-) -> None:
+def test_counts_sum_to_the_points_whatever_the_threads(tmp_path: Path, surface: str) -> None:
     known = scenes.leaning_wall(shape=(45, 70))
     rng = np.random.default_rng(11)
     n_points = 30_000
@@ -136,9 +134,7 @@ def test_counts_conserve_the_points_and_threads_change_nothing(
         np.testing.assert_array_equal(array, alone.arrays[name], err_msg=name)
 
 
-def test_without_intensity_the_grey_of_the_colours_stands_in_and_bare_points_give_depth_only(
-    tmp_path: Path,
-) -> None:
+def test_luminance_replaces_missing_intensity(tmp_path: Path) -> None:
     known = scenes.leaning_wall()
     cloud, _ = one_point_per_cell(known)
     grey = dataclasses.replace(cloud, intensity=None)
@@ -185,9 +181,7 @@ def test_what_gives_no_raster_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("askew_m", "n_warnings"), [(0.069, 0), (0.071, 1)])
-def test_what_an_adjoining_plane_cuts_off_is_warned_of_from_5_cm(
-    tmp_path: Path, askew_m: float, n_warnings: int
-) -> None:
+def test_cuts_of_5_cm_or_more_are_reported(tmp_path: Path, askew_m: float, n_warnings: int) -> None:
     known, ctx = scenes.leaning_wall(), scenes.context(tmp_path)
     extent = Extent(front_m=0.1, behind_m=0.1, cut_m={"left": askew_m})
     # A margin takes 2 cm of this.
@@ -415,7 +409,7 @@ def test_a_crop_without_an_area_or_beside_the_wall_is_refused(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("away_m", "is_told"), [(0.95, False), (1.05, True)])
-def test_a_point_a_metre_beside_the_nearest_wall_is_told_of(
+def test_a_distant_nearest_wall_is_reported(
     tmp_path: Path, away_m: float, *, is_told: bool
 ) -> None:
     _, ctx = cropped(tmp_path, near=[[2.0, -away_m, -1.0]])

@@ -165,9 +165,7 @@ def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path)
         assert peak() < 10.0 * walls.walls[0].mask.size, peak()
 
 
-def test_walls_may_take_three_quarters_of_the_memory_and_large_ones_that_of_a_band(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_walls_may_take_three_quarters_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     def give_memory(n_bytes: float) -> None:
         memory = SimpleNamespace(total=int(n_bytes))
         monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)

@@ -81,16 +81,12 @@ def test_only_level_planes_seen_from_above_are_maps(tmp_path: Path) -> None:
         ("site", -UP, "needs a cloud with x east, y north and z up"),
     ],
 )
-def test_what_is_no_map_in_metres_is_refused(
-    tmp_path: Path, crs: str, up: np.ndarray, said: str
-) -> None:
+def test_maps_must_be_in_metres(tmp_path: Path, crs: str, up: np.ndarray, said: str) -> None:
     with pytest.raises(MethodError, match=said):
         placed(level(up=up), tmp_path, crs)
 
 
-def test_no_address_is_asked_what_its_coordinate_system_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_url_is_opened_for_a_crs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # GDAL also accepts URLs, and untrusted workflows and records may contain any.
     monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")
     with socket.create_server(("127.0.0.1", 0)) as server:

@@ -103,9 +103,7 @@ def emptiness(**shares: float) -> Emptiness:
     )
 
 
-def test_walls_that_another_shows_are_reported_with_the_setting_of_their_step(
-    ctx: StepContext,
-) -> None:
+def test_walls_included_in_others_are_reported(ctx: StepContext) -> None:
     names = ("wall 0", "wall 1", "wall 2", "wall 3")
     reporting.warn_of_covered(ctx, names, {1: 0, 2: 0})
     reporting.warn_of_covered(ctx, names, {})
@@ -132,9 +130,7 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(ctx: StepC
     assert ctx.warnings == []
 
 
-def test_what_stands_before_a_wall_is_left_out_and_what_stands_on_a_floor_is_not(
-    ctx: StepContext,
-) -> None:
+def test_objects_in_front_of_walls_are_errors_and_on_floors_notes(ctx: StepContext) -> None:
     floor = wall([[1, 1]], name="floor 1")
     flat = replace(
         floor.frame,

@@ -80,7 +80,7 @@ MAIN = (0.0, 0.0, 5.0, 0.0)
         ((0.0, -0.84, 4.0, 0.0), False),
     ],
 )
-def test_a_plane_inside_a_walls_buffer_is_its_relief(
+def test_planes_in_a_buffer_are_covered(
     other: tuple[float, float, float, float], is_covered: bool
 ) -> None:
     both = planes(MAIN, other)
@@ -181,9 +181,7 @@ def leaning(degrees: float) -> Planes:
         (45.0, "any", True),
     ],
 )
-def test_walls_and_floors_lean_by_ten_degrees_at_most(
-    degrees: float, constraint: Any, fits: bool
-) -> None:
+def test_planes_may_lean_by_ten_degrees(degrees: float, constraint: Any, fits: bool) -> None:
     choice = but(CHOICE, constraint=constraint)
     if fits:
         assert chosen_walls(leaning(degrees), choice, buffer_m) == [0]

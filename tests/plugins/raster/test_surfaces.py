@@ -45,9 +45,7 @@ def scattered(
     return cloud, places, depths_m
 
 
-def test_intensity_and_colour_are_carried_to_the_centres_of_cells_alone_and_together(
-    tmp_path: Path,
-) -> None:
+def test_intensity_and_colour_are_extrapolated_to_cell_centres(tmp_path: Path) -> None:
     known = scenes.leaning_wall(shape=(20, 30))
     cloud, places, _ = scattered(known, per_cell=1.5)
     # Both rise along the wall, so extrapolated values are those at the cell centres.
@@ -107,9 +105,7 @@ def test_denoising_takes_the_noise_and_leaves_the_steps(tmp_path: Path) -> None:
     assert rms_mm["denoised"] < 0.45 * rms_mm["median"]
 
 
-def test_percentiles_are_numpys_and_do_not_depend_on_how_many_depths_are_sorted_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_percentiles_are_numpys_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = scenes.leaning_wall(shape=(40, 60))
     cloud, places, depths_m = scattered(known, per_cell=5.0, noise_m=NOISE_M)
     found = []
@@ -149,9 +145,7 @@ def test_scans_without_stations_cannot_be_balanced(tmp_path: Path) -> None:
     assert "intensity-not-balanced" in {one.code for one in ctx.diagnostics}
 
 
-def test_strays_in_the_shadow_of_an_edge_are_left_void_and_sparse_surfaces_stay(
-    tmp_path: Path,
-) -> None:
+def test_strays_in_a_shadow_become_void_and_sparse_surfaces_stay(tmp_path: Path) -> None:
     known = scenes.leaning_wall(shape=(120, 160))
     columns, rows = scenes.cell_centres(known.shape)
     rng = np.random.default_rng(8)
@@ -253,9 +247,7 @@ def flat(rows: int = 40, columns: int = 40, *, noise_m: float = 0.001) -> NDArra
     (0.09, 1, False),
     (-0.2, 1, True),
 ])  # fmt: skip
-def test_a_cell_that_fewer_than_two_around_agree_with_is_a_speck(
-    off_m: float, n_cells: int, is_speck: bool
-) -> None:
+def test_cells_without_two_like_them_are_specks(off_m: float, n_cells: int, is_speck: bool) -> None:
     depth_m = flat()
     depth_m[20, 20 : 20 + n_cells] = off_m
     expected = np.zeros(depth_m.shape, dtype=np.bool_)
@@ -301,9 +293,7 @@ def shadow(*, agree: int, n: int = 6) -> NDArray[np.float32]:
     ("agree", "n", "is_speck"),
     [(3, 6, False), (2, 6, True), (2, 3, True), (3, 3, False)],
 )
-def test_in_a_shadow_three_and_half_of_the_known_must_agree(
-    agree: int, n: int, is_speck: bool
-) -> None:
+def test_in_a_shadow_three_and_half_must_agree(agree: int, n: int, is_speck: bool) -> None:
     assert specks(shadow(agree=agree, n=n))[20, 30] == is_speck
 
 
@@ -318,9 +308,7 @@ def test_sparse_cells_agree_but_for_a_slope_of_one_in_two() -> None:
 
 
 @pytest.mark.parametrize(("sigmas", "is_speck"), [(3.2, False), (5.5, True)])
-def test_sparse_cells_agree_within_four_deviations_of_the_noise(
-    sigmas: float, is_speck: bool
-) -> None:
+def test_sparse_cells_agree_within_four_sigmas(sigmas: float, is_speck: bool) -> None:
     depth_m = flat(80, 80, noise_m=0.001)
     depth_m[:, 25:35] = np.nan
     depth_m[20, 30] = 0.5
@@ -356,9 +344,7 @@ def weighed(depth_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]
     return total / weights
 
 
-def test_noise_is_taken_out_within_three_sigmas_and_then_half_of_that(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_noise_is_removed_by_two_bilateral_filters(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surfaces, "depth_noise_m", lambda _depth_m: 0.01)
     depth_m = flat(30, 30, noise_m=0.012)
     depth_m[:, 15:] += 0.05
@@ -441,9 +427,7 @@ def test_a_turned_cloud_gives_the_turned_raster(tmp_path: Path, surface: str, tu
 
 
 @pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
-def test_even_cells_that_are_all_equally_near_are_weighed_evenly(
-    tmp_path: Path, turn: Turn
-) -> None:
+def test_equally_near_cells_have_equal_weights(tmp_path: Path, turn: Turn) -> None:
     """Every other cell is measured at its centre, so each gap has four equally near points."""
     columns, rows = scenes.cell_centres(TURNED)
     places = np.column_stack([columns, rows])

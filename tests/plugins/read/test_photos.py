@@ -128,9 +128,7 @@ def test_panoramas_and_fisheyes_become_the_faces_that_they_show(read: PhotoReade
     ],
     ids=["fisheye", "panorama"],
 )
-def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
-    tmp_path: Path, lens: bytes, faces: tuple[str, ...]
-) -> None:
+def test_cameras_calibrate_wide_photos(tmp_path: Path, lens: bytes, faces: tuple[str, ...]) -> None:
     (path,) = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
     model = made.write(
         tmp_path,
@@ -278,9 +276,7 @@ def test_bytes_that_a_decoder_passes_over_are_reported(read: PhotoReader) -> Non
         (b"\0\0\0\x1cftypheic\0\0\0\0mif1heic", r"is a HEIC file: install orthoflow-tls\[heic\]"),
     ],
 )
-def test_a_file_that_only_has_the_name_of_a_photo_is_named(
-    read: PhotoReader, content: bytes, named: str
-) -> None:
+def test_files_that_are_no_photos_are_named(read: PhotoReader, content: bytes, named: str) -> None:
     with pytest.raises(InputError, match=rf"photo a\.jpg {named}"):
         read.files({"a.jpg": content})
 
@@ -315,9 +311,7 @@ def test_the_calibration_reaches_the_photos_it_names(read: PhotoReader) -> None:
 # Other properties
 
 
-def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(
-    shared_data: Path, read: PhotoReader
-) -> None:
+def test_portraits_need_an_entry_of_their_own(shared_data: Path, read: PhotoReader) -> None:
     folder = shared_data / "cyprus-arch-photos/images"
     paths = [folder / f"DSC_{number}.JPG" for number in (6470, 6471, 6472)]
     photos = read(*paths)
@@ -419,7 +413,7 @@ def test_polygons_mask_photos_by_name_or_pattern(read: PhotoReader) -> None:
         ("a.json", b" " * (MOST_BYTES + 1), f"more than {MOST_BYTES} bytes"),
     ],
 )
-def test_what_is_no_mask_is_refused(
+def test_impossible_masks_are_refused(
     read: PhotoReader, name: str, content: bytes, said: str
 ) -> None:
     with pytest.raises(InputError, match=said):

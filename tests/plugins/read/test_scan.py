@@ -109,9 +109,7 @@ def test_a_box_keeps_the_points_in_it_and_on_its_faces(tmp_path: Path, read: Sca
     assert len(read(path, write_text(tmp_path / "c.xyz", steps + 7.0), box=far)) == 8
 
 
-def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
-    tmp_path: Path, read: ScanReader
-) -> None:
+def test_gsd_and_box_select_nodes_of_copc_files(tmp_path: Path, read: ScanReader) -> None:
     rng = np.random.default_rng(3)
     coarse, left, right = (
         rng.uniform(low, high, (400, 3)) for low, high in ((0.1, 7.9), (0.1, 3.9), (4.1, 7.9))
@@ -164,9 +162,7 @@ def test_up_is_told_and_nothing_is_turned(tmp_path: Path, read: ScanReader, up: 
     np.testing.assert_allclose(cloud.points_world(), POINTS, atol=1e-6)
 
 
-def test_rounded_coordinates_and_a_scan_of_less_than_a_metre_are_warned_of(
-    tmp_path: Path, read: ScanReader
-) -> None:
+def test_rounding_and_tiny_scans_are_reported(tmp_path: Path, read: ScanReader) -> None:
     path = write_text(tmp_path / "a.xyz", POINTS)
     read(path)
     assert "rounded" not in read.warnings
@@ -180,9 +176,7 @@ def test_rounded_coordinates_and_a_scan_of_less_than_a_metre_are_warned_of(
 # Several files and scans
 
 
-def test_several_files_become_one_cloud_whose_scans_have_stations(
-    tmp_path: Path, read: ScanReader
-) -> None:
+def test_several_files_become_one_cloud(tmp_path: Path, read: ScanReader) -> None:
     half, moved = np.sqrt(0.5), np.array([3.0, 4.0, 0.5])
     pose = {"rotation": (half, 0, 0, half), "translation": tuple(moved)}
     fields = scan_files.cartesian(POINTS)
@@ -206,9 +200,7 @@ def test_several_files_become_one_cloud_whose_scans_have_stations(
 # Stations
 
 
-def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
-    tmp_path: Path, read: ScanReader
-) -> None:
+def test_view_from_is_used_without_a_scanner_position(tmp_path: Path, read: ScanReader) -> None:
     cloud = read(write_text(tmp_path / "a.xyz", POINTS), view_from=[1.0, 2, 3.5], unit="ft")
     np.testing.assert_array_equal(cloud.stations, [[1.0, 2.0, 3.5]])
     assert cloud.stations_source == "view_from"
@@ -228,9 +220,7 @@ def test_the_user_can_set_full_intensity(tmp_path: Path, read: ScanReader) -> No
     assert "199 intensities are outside 0 to 200 (intensity_max) and were clipped" in read.warnings
 
 
-def test_zero_intensity_and_zero_colours_are_absent_not_black(
-    tmp_path: Path, read: ScanReader
-) -> None:
+def test_zero_intensity_and_colours_are_missing(tmp_path: Path, read: ScanReader) -> None:
     zeros = np.zeros((400, 3), np.int64)
     path = scan_files.write_las(tmp_path / "a.laz", POINTS, intensity=zeros[:, 0], rgb=zeros)
     cloud = read(path)
@@ -241,9 +231,7 @@ def test_zero_intensity_and_zero_colours_are_absent_not_black(
     assert "the colour of all points is zero" in read.warnings
 
 
-def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
-    tmp_path: Path, read: ScanReader
-) -> None:
+def test_luminance_is_no_laser_intensity(tmp_path: Path, read: ScanReader) -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
     grey = np.rint(rgb @ [0.299, 0.587, 0.114] * 257).astype(np.int64)
     cloud = read(scan_files.write_las(tmp_path / "a.laz", POINTS, intensity=grey, rgb=rgb * 256))
@@ -389,9 +377,7 @@ def dirtied(clean: PointBlock) -> PointBlock:
 
 @pytest.mark.parametrize("unit_m", [1.0, 0.001])
 @pytest.mark.parametrize("has_box", [False, True])
-def test_what_comes_in_blocks_is_what_there_is(
-    tmp_path: Path, unit_m: float, *, has_box: bool
-) -> None:
+def test_blocks_are_assembled_in_full(tmp_path: Path, unit_m: float, *, has_box: bool) -> None:
     first, second, third = block(1, 40), dirtied(block(2, 30, scan=1)), block(3, 20)
     blocks = [replace(one, points=one.points / unit_m) for one in (first, second, third)]
     box_m = np.array([HERE - 2.0, HERE + 4.0]) if has_box else None

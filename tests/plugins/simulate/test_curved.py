@@ -16,9 +16,7 @@ from orthoflow.testing import Trial, run_trial
 
 
 @pytest.mark.parametrize("subject", get_args(Subject))
-def test_points_of_a_scan_without_errors_are_on_the_true_surfaces(
-    subject: Subject, tmp_path: Path
-) -> None:
+def test_exact_points_are_on_the_true_surfaces(subject: Subject, tmp_path: Path) -> None:
     exact: dict[str, Any] = {"noise_m": 0.0, "outlier_share": 0.0, "beam_m": 0.0}
     params = {"subject": subject, "scan_step_m": 0.1, "shift_world_m": (4e6, 0, 9.0)} | exact
     out = run_trial(Trial(method=SimulateCurved, inputs={}, params=params), tmp_path).outputs

@@ -91,9 +91,7 @@ def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> N
     assert {SurfaceRole.OBJECT, SurfaceRole.WALL} <= set(truth.scene.role[hits.rectangle])
 
 
-def test_check_points_are_crossings_of_painted_lines_and_corners_of_mouldings(
-    room: SimulateRoom.Out,
-) -> None:
+def test_check_points_are_crossings_and_corners(room: SimulateRoom.Out) -> None:
     truth, points = room.truth, room.checkpoints
     assert points.classes == ("flat",) * 8 + ("vertical edge",) * 8
     assert points.names == tuple(f"{kind}{k:02d}" for kind in "FV" for k in range(8))
@@ -149,9 +147,7 @@ def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int)
         assert scene.role[hits.rectangle[0]] != SurfaceRole.OBJECT, shot.taken.photo
 
 
-def test_neither_world_nor_threads_nor_calibration_change_a_byte_of_a_photo(
-    tmp_path: Path, small: SimulateRoom.Out
-) -> None:
+def test_photos_are_the_same_in_any_world(tmp_path: Path, small: SimulateRoom.Out) -> None:
     world = {"shift_world_m": tuple(scenes.SURVEY_SHIFT_M), "up": "-y"}
     far = simulate(tmp_path, cores=1, photo_gsd_m=0.016, **world)
     assert [photo.encoded for photo in small.photos.photos] == [
@@ -180,9 +176,7 @@ def test_neither_world_nor_threads_nor_calibration_change_a_byte_of_a_photo(
 
 
 @pytest.mark.parametrize(("gap", "least", "most"), [("none", 0.95, 1.0), ("hard", -0.5, 0.75)])
-def test_the_spectral_gap_parts_laser_and_photos(
-    tmp_path: Path, gap: str, least: float, most: float
-) -> None:
+def test_the_spectral_gap_decorrelates(tmp_path: Path, gap: str, least: float, most: float) -> None:
     truth = simulate(tmp_path, spectral_gap=gap, photo_layout="none").truth
     scene = truth.scene
     fresco = np.flatnonzero((scene.plane_index == 0) & (scene.texture == 1))[0]
@@ -281,9 +275,7 @@ def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
 
 
 @pytest.mark.parametrize("exposures", [0.0, 0.3])
-def test_photos_get_more_or_less_light_and_files_say_a_wrong_focal_length(
-    tmp_path: Path, exposures: float
-) -> None:
+def test_exposures_vary_and_focal_lengths_are_inexact(tmp_path: Path, exposures: float) -> None:
     plan = partial(planned_shots, "variant2", gsd_m=0.05, obliquity_deg=8.0)
     shots = plan(rng(1))
     seeds: list[int] = []
