@@ -13,7 +13,7 @@ from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.surfaces import angles_around, zero_direction
 from orthoflow.products import PointCloud, Surface, Surfaces, surface_kind
 from tests import samples
-from tests.raster_scenes import UP, cloud_of
+from tests.raster_scenes import UP, cell_centres, cloud_of
 
 NO_PLANES = samples.planes(
     normal=np.zeros((0, 3)), offset=np.zeros(0), corners=np.zeros((0, 4, 3)), names=()
@@ -132,8 +132,7 @@ class Drum:
 
     def rendered(self, camera: ViewingCamera) -> NDArray[np.uint8]:
         """What a camera sees (height, width, 3), 0 beside the surface."""
-        rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
-        rays = camera.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
+        rays = camera.rays_world(np.column_stack(cell_centres((camera.height, camera.width))))
         start = np.broadcast_to(camera.centre_world, rays.shape)
         t = self.met(start, rays)
         grey, seen = np.zeros(len(t)), np.isfinite(t)

@@ -30,7 +30,7 @@ from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
 from tests.method_runs import run
-from tests.raster_scenes import SURVEY, UP, cloud_of, context
+from tests.raster_scenes import SURVEY, UP, cell_centres, cloud_of, context
 
 GSD_M = 0.004
 SHAPE = (240, 320)
@@ -132,8 +132,7 @@ def colours(seen: Seen) -> NDArray[np.uint8]:
 def _rendered(aside_m: float, width: int) -> NDArray[np.uint8]:
     where = frame()
     viewer = camera(where, aside_m=aside_m, width=width)
-    rows, columns = np.mgrid[: viewer.height, : viewer.width] + 0.5
-    rays = viewer.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
+    rays = viewer.rays_world(np.column_stack(cell_centres((viewer.height, viewer.width))))
     origins = np.broadcast_to(viewer.centre_world, rays.shape)
     return colours(cast(where, origins, rays)).reshape(viewer.height, viewer.width, 3)
 
@@ -203,8 +202,7 @@ def _grid(
 
 def truth(where: WallFrame, viewer: ViewingCamera) -> Seen:
     """What the camera sees where each cell of the wall should be, (n,) cell by cell."""
-    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
-    places = np.column_stack([columns.ravel(), rows.ravel()])
+    places = np.column_stack(cell_centres(SHAPE))
     points = where.world_from_wall(places, depth_m().ravel().astype(np.float64))
     origins = np.broadcast_to(viewer.centre_world, points.shape)
     return cast(where, origins, points - viewer.centre_world)
@@ -248,8 +246,7 @@ def places_off(layer: Layer) -> NDArray[np.float64]:
 
 def seen_at(viewer: ViewingCamera) -> NDArray[np.float64]:
     """Return photo positions (rows, cols, 2) of the cells of the wall."""
-    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
-    places = np.column_stack([columns.ravel(), rows.ravel()])
+    places = np.column_stack(cell_centres(SHAPE))
     depths = depth_m().ravel().astype(np.float64)
     points = frame().world_from_wall(places, depths)
     return viewer.project(points)[:, :2].reshape(*SHAPE, 2)

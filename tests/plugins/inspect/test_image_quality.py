@@ -63,18 +63,15 @@ def test_completeness_is_of_the_scanned_surface() -> None:
     depth = np.zeros(FRAME.shape, dtype=np.float32)
     depth[:, 10:] = np.nan
     depth[0, 0] = np.nan
-    found = completeness(image(masked()), wall(depth))
+    shown = image(masked())
+    found = completeness(shown, wall(depth))
     assert (found.name, found.unit) == ("completeness", "1")
     assert found.value == pytest.approx((7 * 10 - 1) / (20 * 10 - 1))
-    assert (
-        completeness(image(masked()), wall(np.full(FRAME.shape, np.nan, np.float32))).value == 0.0
-    )
-
-
-def test_the_filled_share_is_of_what_is_shown() -> None:
-    made = image(masked())
-    found = {f.name: f.value for f in quality_findings(made, wall(), None)}
-    assert found == {"filled_share": pytest.approx(2.0 / 7.0)}
+    nothing = wall(np.full(FRAME.shape, np.nan, np.float32))
+    assert completeness(shown, nothing).value == 0.0
+    # The filled share is relative to the cells that are shown.
+    (filled,) = quality_findings(shown, wall(), None)
+    assert (filled.name, filled.value) == ("filled_share", pytest.approx(2.0 / 7.0))
 
 
 def camera(cells_per_pixel: float, turn_deg: float = 0.0) -> ViewingCamera:

@@ -12,7 +12,7 @@ from orthoflow_plugins.mosaic.agreement import Overlaps
 from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 
 from orthoflow.geometry.bands import in_memory
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.frames import cross_matrix, rotation_from_vector
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole
 from tests import samples
@@ -45,17 +45,11 @@ def stated_m(
     )
 
 
-LENS = Intrinsics(
-    width=3000, height=2000, fx=1800.0, fy=1800.0, cx=1500.0, cy=1000.0, source="given"
-)
-
-
 def oblique() -> ViewingCamera:
     """Return a camera 3 m in front of the wall and 2 m beside its middle, aimed at the middle."""
     middle = FRAME.world_from_wall(np.array([[75.0, 50.0]]))[0]
     centre = middle + 3.0 * FRAME.normal_world - 2.0 * FRAME.u_world
-    rotation = looking_at(centre, middle, samples.UP)
-    return LENS.posed(rotation, -rotation @ centre)
+    return samples.aimed(centre, middle, 1800.0, (3000, 2000))
 
 
 def camera(viewing: ViewingCamera, **known: Any) -> Camera:
@@ -66,7 +60,7 @@ def camera(viewing: ViewingCamera, **known: Any) -> Camera:
     given = {
         "photo": "a.jpg",
         "status": "ok",
-        "intrinsics": LENS,
+        "intrinsics": Intrinsics.of(viewing, source="given"),
         "rotation_camera_from_world": viewing.rotation,
         "translation_camera_from_world": viewing.translation,
         "covariance": covariance,

@@ -20,7 +20,7 @@ from orthoflow.products import LayerMask
 from tests import curved_scenes, ortho_scenes
 from tests.curved_scenes import Drum
 from tests.method_runs import run
-from tests.raster_scenes import context, numbers
+from tests.raster_scenes import cell_centres, context, numbers
 
 GSD_M = 0.01
 BAND: dict[str, Any] = {"band_m": (0.2, 0.5), "height_m": 0.15}
@@ -57,8 +57,7 @@ def projected(name: str, folder: Path, method: Any = DsmBackward) -> tuple[Any, 
 def test_photos_colour_what_they_see_of_a_cylinder(name: str, tmp_path: Path) -> None:
     layers, drum, cameras, wall, metrics = projected(name, tmp_path)
     frame = wall.frame
-    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
-    cells = np.column_stack([columns.ravel(), rows.ravel()])
+    cells = np.column_stack(cell_centres(frame.shape))
     places = drum.places(frame.world_from_wall(cells))
     points, grey = drum.points(*places.T), curved_scenes.texture(places)
     for camera, layer in zip(cameras, layers, strict=True):
@@ -95,8 +94,8 @@ def test_points_colour_a_cylinder(tmp_path: Path) -> None:
     (layer,), drum, _, wall, _ = projected("tower", tmp_path, PointcloudDirect)
     frame = wall.frame
     assert (layer.mask == LayerMask.PAINTED).mean() > 0.99
-    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
-    places = drum.places(frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()])))
+    cells = np.column_stack(cell_centres(frame.shape))
+    places = drum.places(frame.world_from_wall(cells))
     errors = layer.rgb.reshape(-1, 3)[:, 0] / 255.0 - curved_scenes.texture(places)
     assert np.sqrt((errors**2).mean()) < 0.13
 

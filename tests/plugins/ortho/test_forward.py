@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 from functools import cache
-from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, Final
@@ -26,8 +24,6 @@ from orthoflow.products import Layer, LayerMask
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes
 from tests.long_loops import seeds
-from tests.method_runs import run
-from tests.raster_scenes import context
 
 
 def given(*, aside_m: float, width: int = 1000, **known: Any) -> dict[str, Any]:
@@ -83,12 +79,7 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
     # Pixels are at least 5 mm wide on 4 mm cells.
     gsd_m = 2.0 / (1.5 * 300)
     assert np.mean(holed.mask == LayerMask.PAINTED) <= 1.1 * (scenes.GSD_M / gsd_m) ** 2
-    # The clock advances with each call: once for all photos, and once for each photo.
-    clock = count()
-    ctx = replace(context(tmp_path), clock_s=lambda: float(next(clock)))
-    (closed,) = run(DsmForward, ctx, coarse, fill_gap_cells=2).layers.layers
-    by_name = {metric.name: metric.value for metric in ctx.metrics}
-    assert (by_name["occluders_s"], by_name["painting_s"]) == (2.0, 1.0)
+    closed, _ = thrown(coarse, tmp_path, fill_gap_cells=2)
     assert np.mean(closed.mask == LayerMask.PAINTED) > 0.97
     is_old = (closed.mask == LayerMask.PAINTED) & (closed.filled == 0)
     np.testing.assert_array_equal(is_old, holed.mask == LayerMask.PAINTED)

@@ -17,7 +17,7 @@ from orthoflow.testing import Trial, run_trial
 from tests import curved_scenes, samples
 from tests.curved_scenes import Drum
 from tests.method_runs import run
-from tests.raster_scenes import UP, cloud_of, context
+from tests.raster_scenes import UP, cell_centres, cloud_of, context
 
 GSD_M = 0.02
 BAND: dict[str, Any] = {"band_m": (0.2, 0.5), "height_m": 0.1}
@@ -51,8 +51,7 @@ def test_depths_are_distances_from_the_cylinder(name: str, tmp_path: Path) -> No
     expected_m = (np.ptp(drum.along_m), np.ptp(drum.arc_rad) * radius_m)
     np.testing.assert_allclose(sides_m, sorted(expected_m), atol=GSD_M)
     assert (wall.mask != SurfaceMask.VOID).mean() > 0.99
-    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
-    cells = np.column_stack([columns.ravel(), rows.ravel()])
+    cells = np.column_stack(cell_centres(frame.shape))
     places = drum.places(frame.world_from_wall(cells))
     from_edges_m = np.abs(places[:, 1, None] - drum.band_m).min(axis=1)
     known = np.isfinite(wall.depth_m.ravel()) & (from_edges_m > 2.0 * GSD_M)

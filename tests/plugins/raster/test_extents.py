@@ -410,19 +410,16 @@ def test_deep_relief_belongs_to_the_wall_it_is_connected_to(case: str, front_m: 
 
 
 def test_what_stands_on_a_floor_is_no_part_of_it() -> None:
-    floor = np.array([[0.0, 4, 0], [0, 0, 0], [4, 0, 0], [4, 4, 0]])
+    normal, corners = level(0.0, (0.0, 4.0), towards=1.0)
     planes = samples.planes(
-        normal=np.array([[0.0, 0.0, 1.0]]),
+        normal=normal[None],
         offset=np.zeros(1),
-        corners=floor[None],
+        corners=corners[None],
         n_points=np.array([100_000]),
         rms_m=np.full(1, NOISE_M),
         names=("floor 0",),
     )
-    step = np.arange(0.0, 4.0, 0.01)
-    x, y = (axis.ravel() for axis in np.meshgrid(step, step))
-    points = np.column_stack([x, y, np.zeros(x.size)])
-    chest = (x > 1.0) & (x < 2.5) & (y > 1.0) & (y < 2.5)
-    points[chest, 2] = 1.2
-    cloud = scenes.cloud_of(points + np.random.default_rng(1).normal(0, NOISE_M, points.shape))
-    assert extent(cloud, planes).front_m <= 0.5
+    points = patch((0.0, WIDTH_M), (0.0, 4.0), (0.0, 0.0))
+    on_chest = (np.abs(points[:, :2] - [1.75, -1.75]) < 0.75).all(axis=1)
+    points[on_chest, 2] = 1.2
+    assert extent(scanned(points), planes).front_m <= 0.5
