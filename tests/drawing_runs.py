@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner, Result
+from click.testing import Result
 from numpy.typing import NDArray
 from orthoflow_provenance.document import PublishedFile, RecordedProduct
 from orthoflow_provenance.record import write_record
 from scipy.spatial.transform import Rotation
 
-from orthoflow.cli.program import program
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of
 from orthoflow.files.publishing import (
@@ -41,6 +40,7 @@ from orthoflow.products.product import Payload, Product
 from tests import samples
 from tests.provenance_records import ProductShelf
 from tests.report_runs import cell, metrics, record
+from tests.studios import asked
 
 # As far from the origin as survey coordinates are, and turned.
 CORNER = np.array([4.0e5, 5.0e6, 100.0])
@@ -216,10 +216,9 @@ def write_drawing_run(
     return folder
 
 
-def export(run: Path, target: str, folder: Path, *more: object) -> Result:
+def export(run: Path, target: str, folder: Path, *more: object, code: int | None = None) -> Result:
     """Export a run in a format into a folder, by the command."""
-    words = ["export", str(run), "--to", target, "-o", str(folder), *map(str, more)]
-    return CliRunner().invoke(program, words)
+    return asked("export", run, "--to", target, "-o", folder, *more, code=code)
 
 
 def _recorded(shelf: ProductShelf, payload: Payload) -> RecordedProduct:

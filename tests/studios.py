@@ -18,16 +18,16 @@ from orthoflow.records.runs import Run
 from tests.workshop_runs import WORKSHOP, write_studio
 
 
-def asked(*arguments: object) -> Result:
-    """Give a command and wait for its end."""
-    return CliRunner().invoke(program, [str(argument) for argument in arguments])
+def asked(*arguments: object, code: int | None = None) -> Result:
+    """Give a command and wait for its end, with this exit code if one is given."""
+    result = CliRunner().invoke(program, [str(argument) for argument in arguments])
+    assert code in (None, result.exit_code), result.output
+    return result
 
 
 def said(*arguments: object, code: int = 0) -> str:
     """Give a command that ends with a code, and take what it prints."""
-    result = asked(*arguments)
-    assert result.exit_code == code, result.output
-    return result.output
+    return asked(*arguments, code=code).output
 
 
 @dataclass(frozen=True)
@@ -36,22 +36,19 @@ class Studio:
 
     folder: Path
 
-    def __call__(self, *arguments: object) -> Result:
+    def __call__(self, *arguments: object, code: int | None = None) -> Result:
         more = ("--executor", "inline") if arguments[0] in ("run", "replay") else ()
-        return asked(*arguments, *more)
+        return asked(*arguments, *more, code=code)
 
     def run(self, name: str, *arguments: object) -> Run:
         """Run the workflow into a folder of that name."""
-        done = self("run", "studio.yaml", "-o", name, *arguments)
-        assert done.exit_code == 0, done.output
+        self("run", "studio.yaml", "-o", name, *arguments, code=0)
         return open_run(self.folder / name)
 
     # Any: JSON.
     def json(self, *arguments: object, code: int = 0) -> Any:
         """Run a command with `--json` and read what it prints."""
-        done = self(*arguments, "--json")
-        assert done.exit_code == code, done.output
-        return json.loads(done.stdout)
+        return json.loads(self(*arguments, "--json", code=code).stdout)
 
 
 def open_studio(folder: Path, patch: pytest.MonkeyPatch) -> Studio:

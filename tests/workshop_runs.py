@@ -53,6 +53,9 @@ def orthoflow(
     *arguments: str,
     plugins: Sequence[Path] = (),
     environment: Mapping[str, str] = MappingProxyType({}),
+    code: int | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder and wait for its end; `plugins` are installed besides."""
-    return run_command(folder, arguments, {**workshop_environment(*plugins), **environment})
+    done = run_command(folder, arguments, {**workshop_environment(*plugins), **environment})
+    assert code in (None, done.returncode), done.stderr
+    return done

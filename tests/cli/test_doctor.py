@@ -10,10 +10,9 @@ from typing import Any
 
 import psutil
 import pytest
-from click.testing import CliRunner
 
-from orthoflow.cli import program
 from orthoflow.cli.doctor import required_libraries
+from tests.studios import asked
 
 GIB = 1 << 30
 
@@ -35,18 +34,14 @@ def _here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def findings(*options: str, code: int = 0) -> dict[str, dict[str, Any]]:
-    result = CliRunner().invoke(program, ["doctor", "--json", *options])
-    assert result.exit_code == code, result.output
-    answer = json.loads(result.stdout)
+    answer = json.loads(asked("doctor", "--json", *options, code=code).stdout)
     assert answer["ok"] is (code == 0)
     return {item["name"]: item for item in answer["findings"]}
 
 
 @pytest.mark.usefixtures("libraries")
 def test_where_all_is_there_nothing_is_restricted() -> None:
-    result = CliRunner().invoke(program, ["doctor", "--store", "new/er"])
-    assert result.exit_code == 0
-    lines = result.stdout.splitlines()
+    lines = asked("doctor", "--store", "new/er", code=0).stdout.splitlines()
     assert lines[-1] == "orthoflow works with 0 restrictions"
     assert [line.split()[0] for line in lines if "  ok  " in line] == [
         *("platform", "cores", "memory", "disk", "store", "click", "plugins"),
@@ -125,13 +120,12 @@ def test_broken_and_disabled_plugins_cost_their_methods(monkeypatch: pytest.Monk
     monkeypatch.syspath_prepend(packages)
     (packages / "odd_hooks.py").write_text("raise NameError('no such name')")
     assert findings()["plugin odd"]["found"] == "odd 1.0 cannot be loaded"
-    result = CliRunner().invoke(program, ["doctor"])
+    result = asked("doctor")
     assert "- plugin odd: its methods are missing: NameError: no such name" in result.output
     assert result.output.splitlines()[-1] == "orthoflow works with 1 restriction"
     monkeypatch.setenv("ORTHOFLOW_DISABLED_PLUGINS", "odd")
     assert findings()["plugin odd"]["found"] == "disabled"
-    unknown = CliRunner().invoke(program, ["plugins", "show", "plane.odd"])
-    assert unknown.exit_code == 2
+    unknown = asked("plugins", "show", "plane.odd", code=2)
     assert "ORTHOFLOW_DISABLED_PLUGINS disables odd" in unknown.output
 
     def fail() -> None:

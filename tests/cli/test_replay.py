@@ -52,8 +52,7 @@ def with_preimage(cell: RecordedCell, **changes: object) -> RecordedCell:
 
 
 def refused(studio: Studio, *arguments: str, code: int = 3) -> str:
-    done = studio("replay", "first", "-o", "again", *arguments)
-    assert done.exit_code == code, done.output
+    done = studio("replay", "first", "-o", "again", *arguments, code=code)
     assert not (studio.folder / "again").exists()
     assert not (studio.folder / "again.store").exists()
     return done.stderr
@@ -94,24 +93,20 @@ def test_inputs_are_found_by_content_where_a_user_says(studio: Studio) -> None:
     assert "was found; pass --input number=PATH" in missing
     (studio.folder / "o.txt").write_text("1.6")
     assert refused(studio, "--input", "number=o.txt", code=2) == missing
-    done = studio("replay", "first", "-o", "again", "--input", "number=elsewhere")
-    assert done.exit_code == 0, done.output
+    done = studio("replay", "first", "-o", "again", "--input", "number=elsewhere", code=0)
     # The step saw it under its recorded name, which is part of what it was computed from.
     assert "2 products: 2 identical" in done.stdout.splitlines()
     assert not list(studio.folder.glob(".inputs-*"))
-    done = studio("export", "first", "--embed", "-o", "whole", "--input", f"number={renamed}")
-    assert done.exit_code == 0, done.output
+    studio("export", "first", "--embed", "-o", "whole", "--input", f"number={renamed}", code=0)
 
 
 def test_an_input_is_found_where_a_run_found_it(studio: Studio) -> None:
     (studio.folder / "mydata" / "deep").mkdir(parents=True)
     (studio.folder / "n.txt").rename(studio.folder / "mydata" / "deep" / "m.txt")
-    done = studio("export", "first", "--embed", "-o", "whole")
-    assert done.exit_code == 2
+    done = studio("export", "first", "--embed", "-o", "whole", code=2)
     assert [*done.stderr.splitlines()[-2:-1], "error: 1 problem"] == done.stderr.splitlines()
     studio.run("second", "--input", "number=mydata/deep")
-    done = studio("export", "second", "--embed", "-o", "whole")
-    assert done.exit_code == 0, done.output
+    studio("export", "second", "--embed", "-o", "whole", code=0)
 
 
 @pytest.mark.parametrize(
@@ -187,8 +182,7 @@ def test_a_metric_that_the_replay_does_not_confirm_is_named(studio: Studio) -> N
 
     write_changed(studio, change)
     assert studio("verify", "first").exit_code == 0
-    done = studio("replay", "first", "-o", "again")
-    assert done.exit_code == 3, done.output
+    done = studio("replay", "first", "-o", "again", code=3)
     lines = done.stdout.splitlines()
     assert lines[-6] == "2 products: 2 identical"
     assert lines[-4].split()[:5] == ["survey.offset_m", "7.0", "m", "1.5", "m"]
@@ -207,8 +201,7 @@ def assert_record_alone_is_enough(studio: Studio, record: Path) -> None:
     for path in studio.folder.iterdir():
         if path != alone:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-    verified = studio("verify", "alone")
-    assert verified.exit_code == 0
+    verified = studio("verify", "alone", code=0)
     assert "2 products (0 more by digest only), 1 input file, " in verified.stdout
     assert "published files are not in products/" in verified.stdout
     said = studio.json("replay", "alone/run.h5", "-o", "again")
@@ -222,8 +215,7 @@ def test_an_embedded_run_replays_from_its_record_alone(studio: Studio) -> None:
 
 
 def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
-    done = studio("export", "first", "--embed", "-o", "whole")
-    assert done.exit_code == 0, done.output
+    done = studio("export", "first", "--embed", "-o", "whole", code=0)
     assert "run.h5 with 2 products and 1 input file, seal sha256:" in done.stdout
     assert "input number: n.txt, 3 B, sha256 " in studio("show", "first").stdout
     assert ", in the record" not in studio("show", "first").stdout
@@ -232,8 +224,7 @@ def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
     # What is embedded once can be embedded again, with neither store nor files.
     shutil.rmtree(studio.folder / ".orthoflow")
     (studio.folder / "n.txt").unlink()
-    again = studio("export", "whole", "--embed", "-o", "twice")
-    assert again.exit_code == 0
+    again = studio("export", "whole", "--embed", "-o", "twice", code=0)
     seal = done.output.rpartition("sha256:")[2]
     assert again.output.endswith(seal)
     first, second = (studio.folder / name / "run.h5" for name in ("whole", "twice"))
@@ -249,8 +240,7 @@ def test_of_a_record_with_changed_arrays_neither_it_nor_its_seal_is_handed_on(
         file["products"][digest.removeprefix("sha256:")]["arrays/normal"][...] = 0
     ways = (("--embed",), ("--to", "ro-crate", "--embed"), ("--to", "ro-crate"), ("--to", "sheet"))
     for words in ways:
-        refused = studio("export", "first", *words, "-o", "whole")
-        assert refused.exit_code == 3, refused.output
+        refused = studio("export", "first", *words, "-o", "whole", code=3)
         assert "its seal does not match /products/" in refused.stderr
         assert "; changed records are not exported: use an unchanged copy" in refused.stderr
         assert not (studio.folder / "whole").exists()
@@ -269,8 +259,7 @@ def test_a_refused_export_of_a_record_alone_leaves_nothing(
     monkeypatch.chdir(alone)
     (studio.folder / "n.txt").unlink()
     for command in (("export", "run.h5", "--embed"), ("replay", "run.h5")):
-        refused = studio(*command)
-        assert refused.exit_code == 2
+        refused = studio(*command, code=2)
         assert "was found; pass --input number=PATH" in refused.stderr
     assert [path.name for path in alone.rglob("*") if path.is_file()] == ["run.h5"]
 
@@ -303,8 +292,7 @@ def test_products_that_nobody_has_are_named_and_no_store_is_made(
 
 def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
     (studio.folder / "n.txt").write_text("1.6")
-    refused = studio("export", "first", "--embed", "-o", "whole")
-    assert refused.exit_code == 3
+    refused = studio("export", "first", "--embed", "-o", "whole", code=3)
     assert "was found; n.txt has been changed" in refused.stderr
 
 
@@ -317,8 +305,7 @@ def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:
     assert verdict["published"] == sum(path.is_file() for path in products.rglob("*"))
     written = table.read_text()
     table.write_text(written.replace("cell", "sell"))
-    refused = studio("verify", "first")
-    assert refused.exit_code == 3
+    refused = studio("verify", "first", code=3)
     assert "products/metrics.csv: changed since it was published" in refused.stdout
     assert "is intact, but files next to it have" in refused.stderr
     table.write_text(written)

@@ -27,8 +27,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
     """A folder with a finished run `good`; what the run wrote to stdout and stderr."""
     folder = tmp_path_factory.mktemp("finished")
     write_studio(folder)
-    done = orthoflow(folder, "run", "studio.yaml", "-o", "good", "--set", "survey.offset_m=-3")
-    assert done.returncode == 0, done.stderr
+    done = orthoflow(
+        folder, "run", "studio.yaml", "-o", "good", "--set", "survey.offset_m=-3", code=0
+    )
     return folder, done.stdout, done.stderr
 
 
@@ -81,8 +82,7 @@ def test_a_second_run_is_cached_and_a_forced_step_runs_again(
 ) -> None:
     folder = finished[0]
     arguments = ("run", "studio.yaml", "--set", "survey.offset_m=-3", *INLINE)
-    again = orthoflow(folder, *arguments)
-    assert again.returncode == 0, again.stderr
+    again = orthoflow(folder, *arguments, code=0)
     assert "2 of 2 steps cached" in again.stdout.splitlines()
     [named] = (folder / "runs").glob("studio-*")
     run, original = open_run(named), open_run(folder / "good")
@@ -92,15 +92,6 @@ def test_a_second_run_is_cached_and_a_forced_step_runs_again(
     # Early cut-off: the forced step gives equal planes, so the paint is not done again.
     forced = orthoflow(folder, *arguments, "--force", "survey", "-o", "forced")
     assert "1 of 2 steps cached" in forced.stdout.splitlines()
-
-
-def test_until_leaves_out_what_follows_and_says_so(finished: tuple[Path, str, str]) -> None:
-    folder = finished[0]
-    orthoflow(folder, "run", "studio.yaml", "--until", "survey", "-o", "part", *INLINE)
-    part = open_run(folder / "part")
-    assert (list(part.cells), part.record.overrides) == (["survey"], ("--until survey",))
-    page = (folder / "part" / "report.html").read_text(encoding="utf-8")
-    assert "Only a part of the workflow was run: <code>--until survey</code>." in page
 
 
 @pytest.mark.parametrize(
@@ -118,8 +109,7 @@ def test_a_failed_cell_leaves_a_record_a_report_and_its_exit_code(
     write_studio(tmp_path, method)
     (tmp_path / "empty.txt").touch()
     given = ("--input", "number=empty.txt") if code == 2 else ()
-    done = orthoflow(tmp_path, "run", "studio.yaml", *given, "-o", "r", *INLINE)
-    assert done.returncode == code
+    done = orthoflow(tmp_path, "run", "studio.yaml", *given, "-o", "r", *INLINE, code=code)
     assert sentence in done.stderr
     assert "Traceback" not in done.stderr + done.stdout
     run = open_run(tmp_path / "r")
@@ -169,8 +159,7 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
         ".outline.json",
         *("figures", "journal.jsonl", "logs", "products", "report.html"),
     }
-    shown = orthoflow(tmp_path, "show", "r", "--json")
-    assert shown.returncode == 0, shown.stderr
+    shown = orthoflow(tmp_path, "show", "r", "--json", code=0)
     assert "skipped" in {cell["status"] for cell in json.loads(shown.stdout)["cells"]}
     page = (tmp_path / "r" / "report.html").read_text()
     assert "<li>Finished: survey</li>" in page
@@ -178,8 +167,7 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     assert "<pre>orthoflow run studio.yaml --set survey.offset_m=2 -o r</pre>" in page
     assert "not finished" in page
     write_studio(tmp_path, "paint.plain")
-    again = orthoflow(tmp_path, *arguments)
-    assert again.returncode == 0, again.stderr
+    again = orthoflow(tmp_path, *arguments, code=0)
     assert any(line.startswith("resuming run ") for line in again.stderr.splitlines())
     assert "0 of 2 steps cached, 1 from before the interruption" in again.stdout.splitlines()
     assert ["survey", "survey.offset", "kept"] in [

@@ -118,8 +118,7 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     assert all(rows[name]["reason"] for name in ("linked", "pipe"))
     assert "its journal cannot be read: " in rows["waiting"]["reason"]
     assert not [name for name in rows if "loop" in name]
-    shown = asked("show", "torn")
-    assert shown.exit_code == 3
+    shown = asked("show", "torn", code=3)
     assert shown.output.startswith(
         "error: torn/run.h5 cannot be read because the file is damaged: "
     )
@@ -142,8 +141,7 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     ids=" ".join,
 )
 def test_mistakes_get_a_sentence(runs: Path, words: list[str], snapshot: SnapshotAssertion) -> None:
-    result = asked("runs", *words)
-    assert result.exit_code == 2
+    result = asked("runs", *words, code=2)
     assert result.output == snapshot
 
 

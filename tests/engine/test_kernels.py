@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 from pathlib import Path
 
 import pytest
 
+from orthoflow.cli import plugins, warm
 from orthoflow.engine import kernels
 from orthoflow.engine.kernels import VARIABLE, all_kernels, is_private, kernel_folder
-from tests.workshop_runs import orthoflow, write_studio
+from orthoflow.workflow.source import shipped_workflow
+from tests.studios import asked
+from tests.workshop_runs import WORKSHOP, orthoflow, write_studio
 
 
 class _Hostile:
@@ -33,8 +37,7 @@ def compiled(tmp_path: Path) -> dict[Path, bytes]:
     """Numba's files of a run in `tmp_path`, below its folder for all kernels."""
     write_studio(tmp_path, "paint.kernel")
     environment = {"XDG_CACHE_HOME": str(tmp_path / "first"), VARIABLE: ""}
-    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "first-run", environment=environment)
-    assert done.returncode == 0, done.stderr
+    orthoflow(tmp_path, "run", "studio.yaml", "-o", "first-run", environment=environment, code=0)
     # Nothing executable lies in a store.
     endings = {path.suffix for path in (tmp_path / ".orthoflow").rglob("*") if path.is_file()}
     assert not endings & {".nbi", ".nbc", ".pkl", ".pickle", ".py", ".pyc", ".so", ".o"}
@@ -60,8 +63,7 @@ def test_only_the_private_folder_of_the_user_is_read(
     cache = tmp_path / "second"
     environment = {"XDG_CACHE_HOME": str(cache), VARIABLE: str(world_writable)}
     arguments = ["run", "studio.yaml", "--force", "paint", "-o"]
-    done = orthoflow(tmp_path, *arguments, "second-run", environment=environment)
-    assert done.returncode == 0, done.stderr
+    orthoflow(tmp_path, *arguments, "second-run", environment=environment, code=0)
     assert not mark.exists()
     own = _files(cache)
     assert {path.name.partition(".")[0] for path in own} == {
@@ -79,8 +81,7 @@ def test_only_the_private_folder_of_the_user_is_read(
         (root / path).write_bytes(content[: 40 * (number % 2)])
     environment = {"XDG_CACHE_HOME": str(tmp_path / "first"), VARIABLE: ""}
     environment["NUMBA_DISABLE_JIT"] = "1"
-    done = orthoflow(tmp_path, *arguments, "fourth-run", environment=environment)
-    assert done.returncode == 0, done.stderr
+    orthoflow(tmp_path, *arguments, "fourth-run", environment=environment, code=0)
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o722])
@@ -113,3 +114,42 @@ def test_old_states_of_the_code_are_removed(
     kept = {path.name for path in (all_kernels() / "plugins").iterdir()}
     assert len(kept) == 9
     assert "state-9" in kept
+
+
+# Kernels compiled beforehand ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "kernels"))
+    monkeypatch.syspath_prepend(str(WORKSHOP))
+    return tmp_path / "kernels"
+
+
+def test_what_was_compiled_beforehand_is_not_compiled_by_a_run(
+    tmp_path: Path, own_kernels: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    studio = write_studio(tmp_path, "paint.kernel")
+    assert all(shipped_workflow(name).is_file() and sets for name, sets in warm.RECIPES.items())
+    monkeypatch.setattr(warm, "RECIPES", {str(studio): ("survey.offset_m=2",)})
+    warmed = json.loads(asked("warm", "--json", code=0).stdout)
+    assert warmed["methods"] == ["paint.kernel", "survey.offset"]
+    assert (warmed["n_compiled"], warmed["n_before"], warmed["failed"]) == (2, 0, {})
+    assert warmed["folder"] == str(own_kernels)
+    before = _files(own_kernels)
+    environment = {VARIABLE: str(own_kernels)}
+    orthoflow(tmp_path, "run", "studio.yaml", "-o", "run", environment=environment, code=0)
+    assert _files(own_kernels) == before
+    assert _files(tmp_path / ".orthoflow") == {}
+
+
+def test_the_conformance_suite_shares_the_kernels_of_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(WORKSHOP))
+    monkeypatch.delenv(VARIABLE)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with plugins.sharing_kernels("paint.kernel"):
+        folder = Path(os.environ[VARIABLE])
+    assert folder.is_relative_to(tmp_path / "orthoflow" / "numba")
+    assert VARIABLE not in os.environ

@@ -25,13 +25,13 @@ from orthoflow.testing.examples import example, few_points
 from tests import drawing_runs
 from tests import hostile_records as hostile
 from tests.fuzz.harness import Target
-from tests.fuzz.hostile_files import changed_json
 from tests.fuzz.mutation import mutate_bytes
 from tests.fuzz.records import (
     MARK,
     SECRET,
     Command,
     RefusedError,
+    changed_json,
     check_command,
     check_made,
     surroundings,

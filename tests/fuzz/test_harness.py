@@ -10,9 +10,8 @@ from random import Random
 import numpy as np
 
 from orthoflow.errors import InputError
-from tests.fuzz.e57_pages import crc32c
 from tests.fuzz.harness import IS_FUZZED, Outcome, Target, fuzz, write_case
-from tests.fuzz.mutation import mutate_e57
+from tests.fuzz.mutation import crc32c, mutate_e57
 from tests.optional import skip_unless
 from tests.scan_files import write_e57
 

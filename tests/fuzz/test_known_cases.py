@@ -26,8 +26,8 @@ from orthoflow.files.images import encode_png
 from orthoflow.files.sidecars import frame_json
 from tests import scan_files
 from tests.fuzz import readers
-from tests.fuzz.e57_pages import LogicalE57, e57_of, logical_of
 from tests.fuzz.harness import MAX_CPU_S, Target
+from tests.fuzz.mutation import LogicalE57, e57_of, logical_of
 
 _CORPUS: Final = Path(__file__).parent / "corpus"
 _STEPS: Final = "orthoflow: 1\nsteps:\n  room: {use: simulate.room}\n"
@@ -200,10 +200,16 @@ KNOWN: Final = {
 }  # fmt: skip
 
 
+# Readers whose libraries are loaded.
+_LOADED: Final = set[Target]()
+
+
 def _read(target: Target, path: Path) -> float:
     """Read a file; gives the processor time, also when it is refused, with libraries loaded."""
-    with tempfile.TemporaryDirectory() as folder, suppress(OrthoflowError):
-        target.read(Path(shutil.copy(path, folder)))
+    if target not in _LOADED:
+        _LOADED.add(target)
+        with tempfile.TemporaryDirectory() as folder, suppress(OrthoflowError):
+            target.read(Path(shutil.copy(path, folder)))
     began = time.process_time()
     try:
         target.read(path)

@@ -133,7 +133,7 @@ def test_any_changed_byte_is_found(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     content = path.read_bytes()
     rng = np.random.default_rng(11)
-    for offset in rng.integers(0, len(content), 40):
+    for offset in rng.integers(0, len(content), 16):
         flipped = bytearray(content)
         flipped[offset] ^= 1 << int(rng.integers(8))
         path.write_bytes(flipped)

@@ -175,6 +175,7 @@ def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
         cell("check", status="skipped", error_message="needs paint, which failed"),
         cell("theirs", status="skipped", error_type=NOT_ASKED_FOR),
         cell("match", status="skipped", error_type=NOT_ASKED_FOR),
+        overrides=("--until check",),
     )
     assert results(whole_run) == {
         "ok": ("wall",),
@@ -186,6 +187,7 @@ def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert "<li>Not reached: check</li>" in page
     assert "<li>Not selected: theirs, match</li>" in page
+    assert "Only a part of the workflow was run: <code>--until check</code>." in page
 
 
 def test_a_third_party_method_declares_its_headlines() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from pathlib import Path
@@ -13,9 +14,10 @@ import orthoflow
 from orthoflow.files.geotiff import read_raster
 from orthoflow.geometry import angle_between_deg
 from tests.road.conftest import Shell, metrics_of
+from tests.studios import asked
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
-# The room of tests/road/test_openings.py, which is simulated once for both.
+# The room of the openings, too, which is simulated once for both.
 SMALL = ("--set", "room.scan_step_m=0.016", "--set", "wall.gsd_m=0.024")
 # What is compared with the truth and with itself is the main wall.
 ONE_WALL = ("--set", "wall.n_walls_max=1")
@@ -27,7 +29,6 @@ def road(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     """A folder in which `direct.yaml` ran once on the small simulated room, as `run`."""
     shell = Shell(tmp_path_factory.mktemp("road"), store)
     ended = shell("run", "direct.yaml", *SMALL_WALL, "-o", "run", "--executor", "inline")
-    assert ended.code == 0, ended.said
     assert str(Path("run") / "report.html") in ended.out
     assert str(Path("run") / "run.h5") in ended.out
     assert "wall_0_ortho.tif" in ended.out
@@ -42,27 +43,24 @@ def planes_of(folder: Path) -> list[dict[str, object]]:
 
 
 def test_layers_are_written_when_asked_for(road: Shell) -> None:
-    ended = road("export", "run", "--to", "layers", "--store", str(road.store))
-    assert ended.code == 0, ended.said
+    road("export", "run", "--to", "layers", "--store", str(road.store))
     layer = read_raster(road.folder / "run" / "export" / "layers" / "wall_0_layer_0_cloud.tif")
     # A single layer is its mosaic.
     mosaic = read_raster(road.folder / "run" / "products" / "mosaic" / "wall_0_ortho.tif")
     np.testing.assert_array_equal(layer.values[layer.shown], mosaic.values[layer.shown])
     assert layer.shown.sum() == mosaic.shown.sum()
     # The record only names the layers.
-    lost = road("export", "run", "--to", "layers", "--store", "elsewhere", "-o", "lost")
-    assert lost.code == 2
+    lost = road("export", "run", "--to", "layers", "--store", "elsewhere", "-o", "lost", code=2)
     assert "neither the record nor the store elsewhere" in lost.said
 
 
 def test_the_record_verifies_and_a_second_run_comes_from_the_cache(road: Shell) -> None:
-    assert road("verify", "run").code == 0
+    road("verify", "run")
     again = road("run", "direct.yaml", *SMALL_WALL, "-o", "again")
-    assert again.code == 0, again.said
-    assert "6 of 6 steps cached" in again.out
+    assert "7 of 7 steps cached" in again.out
     run = orthoflow.open_run(road.folder / "run")
-    cells = ["cloud", "room", "survey", "plane", "wall", "ortho", "mosaic", "points", "check"]
-    assert sorted(run.cells) == sorted(cells)
+    cells = {"cloud", "room", "survey", "plane", "curved", "wall", "ortho", "mosaic", "points"}
+    assert set(run.cells) == {*cells, "check"}
     assert (run.cells["cloud"].status, run.cells["check"].status) == ("skipped", "ok")
 
 
@@ -77,11 +75,10 @@ def test_the_main_wall_and_its_orthoimage_agree_with_the_truth(road: Shell) -> N
 
 def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:
     shift = "[" + ", ".join(map(str, SHIFT_M)) + "]"
-    ended = road(
+    road(
         *("run", "direct.yaml", "--until", "mosaic", *SMALL_WALL, "-o", "shifted"),
         *("--set", f"room.shift_world_m={shift}", "--executor", "inline"),
     )
-    assert ended.code == 0, ended.said
     here, there = planes_of(road.folder / "run")[0], planes_of(road.folder / "shifted")[0]
     normal, moved = (np.array(plane["normal"]) for plane in (here, there))
     assert angle_between_deg(normal, moved) < 1e-6
@@ -98,8 +95,7 @@ def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:
 def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path) -> None:
     scan = shared_data / "heritage-hall-west-wall" / "west_wall.laz"
     options = ("--set=wall.gsd_m=0.02", "--set=wall.buffer_m=0.45", *ONE_WALL, "--executor=inline")
-    ended = shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
-    assert ended.code == 0, ended.said
+    shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
     main = planes_of(shell.folder / "run")[0]
     normal = np.array(main["normal"])
     expected = np.array([0.9998, -0.018, 0.0])
@@ -115,8 +111,7 @@ def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path)
 def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path) -> None:
     scan = shared_data / "pump-e57" / "pumpAVisualReferenceImage.e57"
     options = ("--set=wall.gsd_m=0.02", *ONE_WALL, "--executor=inline")
-    ended = shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
-    assert ended.code == 0, ended.said
+    shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
     floor = planes_of(shell.folder / "run")[0]
     assert abs(floor["normal"][2]) > 0.999
     walls = shell.folder / "run" / "products" / "wall"
@@ -147,7 +142,7 @@ def test_every_other_scan_goes_through_or_ends_with_a_sentence(
     defaults = ("--set", "wall.gsd_m=0.02") if "wall.gsd_m" not in str(options) else ()
     ended = shell(
         "run", "direct.yaml", "--input", f"scan={shared_data / scan}", *defaults, *options,
-        "--executor", "inline", "-o", "run",
+        "--executor", "inline", "-o", "run", code=None,
     )  # fmt: skip
     assert "Traceback" not in ended.said
     if ended.code == 0:
@@ -155,3 +150,64 @@ def test_every_other_scan_goes_through_or_ends_with_a_sentence(
     else:
         assert ended.code in (1, 2)
         assert re.search(r": failed in [^:]+: \w", ended.err)
+
+
+# What goes wrong ends in a sentence ---------------------------------------------------------------
+
+
+def test_a_bad_scan_ends_in_one_sentence_with_exit_code_two(
+    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "corrupt.laz").write_bytes(b"LASF" + bytes(range(256)) * 8)
+    monkeypatch.chdir(tmp_path)
+    # In this process; the steps of the next test are processes.
+    how = ("--executor", "inline", "--store", shell.store)
+    ended = asked("run", "direct.yaml", "--input", "scan=corrupt.laz", "-o", "run", *how, code=2)
+    assert "Traceback" not in ended.output
+    assert "corrupt.laz" in ended.output
+
+
+def test_a_truncated_laz_is_named(shell: Shell, tmp_path: Path, shared_data: Path) -> None:
+    whole = (shared_data / "lion-takanawa" / "lion_takanawa_1mm.laz").read_bytes()
+    (tmp_path / "half.laz").write_bytes(whole[: len(whole) // 2])
+    ended = shell("run", "direct.yaml", "--input", "scan=half.laz", "-o", "run", code=2)
+    assert "Traceback" not in ended.said
+    assert "half.laz" in ended.said
+
+
+# From a scan to outlines of openings, and from there to other programs ----------------------------
+
+
+@pytest.fixture(scope="module")
+def outlined(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
+    """A folder in which `openings.yaml` ran on the room of `test_direct`, as `run`."""
+    shell = Shell(tmp_path_factory.mktemp("openings"), store)
+    shell("run", "openings.yaml", *SMALL, "-o", "run", "--executor", "inline")
+    return shell
+
+
+def test_niche_door_and_windows_of_the_room_are_found(outlined: Shell) -> None:
+    numbers = metrics_of(outlined.folder / "run")
+    assert numbers["check", "n_true_openings"] == 4
+    assert numbers["check", "n_found_openings"] == 4
+    assert numbers["check", "n_false_openings"] == 0
+    # Cells of 24 mm, points of the walls beside 16 to 48 mm apart.
+    assert numbers["check", "opening_iou_min"] >= 0.93
+    assert numbers["check", "side_rmse_cells"] <= 1.0
+    assert numbers["check", "side_error_over_sigma"] <= 1.5
+    assert numbers["check", "opening_depth_error_max_mm"] <= 5.0
+
+
+def test_they_are_published_and_exported(outlined: Shell) -> None:
+    published = outlined.folder / "run" / "products" / "openings"
+    with (published / "openings.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 4
+    assert {row["kind"] for row in rows} == {"niche"}
+    ended = outlined("export", "run", "--to", "geojson")
+    assert "4 openings" in ended.out
+    room = json.loads((outlined.folder / "run" / "export" / "geojson" / "room.geojson").read_text())
+    found = [f for f in room["features"] if f["properties"]["kind"] == "opening"]
+    depths = sorted(feature["properties"]["depth_m"] for feature in found)
+    # The door, the niche, and two windows as they are designed.
+    assert depths == pytest.approx([0.12, 0.25, 0.3, 0.3], abs=0.005)

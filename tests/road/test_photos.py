@@ -43,7 +43,6 @@ def quick(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     # Libraries and kernels are loaded once for all steps, and no chart is drawn.
     how = (*SMALL, "--embed", "--executor", "inline")
     ended = shell("run", "quickstart.yaml", *how, "-o", "run", timeout_s=900)
-    assert ended.code == 0, ended.said
     assert str(Path("run") / "report.html") in ended.out
     assert "wall_0_ortho.tif" in ended.out
     return shell
@@ -63,7 +62,6 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
 
     cameras = orthoflow.open_run(quick.folder / "run").product("orient", "cameras").cameras
     ended = quick("export", "run", "--to", "colmap", "-o", "model")
-    assert ended.code == 0, ended.said
     # Those of the room are the true ones.
     assert (
         "note: using the orientations of orient; --step selects others: room, first" in ended.said
@@ -74,8 +72,7 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
     centres = {image.name: image.projection_center() for image in scene.images.values()}
     for camera in cameras:
         np.testing.assert_allclose(centres[camera.photo], camera.viewing().centre_world, atol=1e-9)
-    first = quick("export", "run", "--to", "colmap", "--step", "first")
-    assert first.code == 0, first.said
+    quick("export", "run", "--to", "colmap", "--step", "first")
     assert (quick.folder / "run" / "export" / "colmap" / "images.txt").is_file()
 
 
@@ -84,7 +81,6 @@ def test_the_cloud_is_exported(quick: Shell) -> None:
     cloud, labels = run.product("room", "cloud"), run.product("plane", "labels")
     said = f": cloud.laz: {len(cloud)} points coloured by photos, cloud of plane"
     ended = quick("export", "run", "--to", "laz", "-o", "planes")
-    assert ended.code == 0, ended.said
     assert ended.out.rstrip().endswith(said)
     read = laspy.read(quick.folder / "planes" / "cloud.laz")
     np.testing.assert_array_equal(read["plane"], labels.plane_index)
@@ -100,7 +96,6 @@ def test_the_cloud_is_exported(quick: Shell) -> None:
 def test_the_orthoimages_are_handed_over(quick: Shell) -> None:
     for target, file in (("gltf", "room.glb"), ("stac", "collection.json")):
         ended = quick("export", "run", "--to", target)
-        assert ended.code == 0, ended.said
         assert f"{target}: run/export/{target}: {file}" in ended.out
         assert (quick.folder / "run" / "export" / target / file).is_file()
 
@@ -161,12 +156,11 @@ def test_own_files_give_the_same_accuracy_wherever_they_lie(quick: Shell) -> Non
         *("--input", f"scan={folder / 'scan.las'}", "--input", f"photos={folder / 'photos'}"),
         *("--input", f"calibration={folder / 'calibration.yaml'}"),
     ]
-    ended = quick(
+    quick(
         *("run", "photos-on-scan.yaml", "--until", "orient", *said, "-o", folder / "run"),
         *("--executor", "inline"),
         timeout_s=900,
     )
-    assert ended.code == 0, ended.said
     found = json.loads((folder / "run" / "products" / "orient" / "cameras.json").read_text())
     oriented = 0
     assert found["cameras"].keys() == BROUGHT

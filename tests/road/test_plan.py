@@ -83,12 +83,11 @@ def plan(
         height = GROUND + 1.2
         rows.append(f"T{k},{east},{north},{height},flat,{east + 0.003},{north - 0.004}")
     (shell.folder / "check.csv").write_text("\n".join(rows))
-    ended = shell(
+    shell(
         *("run", "plan.yaml", "--input", "scan=site.laz", "--input", "checkpoints=check.csv"),
         *options,
         *("--set", "wall.crs=EPSG:2100", "-o", "run", "--executor", "inline"),
     )
-    assert ended.code == 0, ended.said
     return shell.folder / "run"
 
 

@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.cli import program
 from orthoflow.errors import ArgumentError
 from orthoflow.scaffold import Project, write_project
+from orthoflow.scaffold.comparing import own_comparison_text
 from orthoflow.testing import Trial, conformance_cases, example_inputs, run_trial
 from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from tests.author_environments import install, new_environment, succeed
 from tests.long_loops import long_only
+from tests.studios import asked
 
 KINDS = sorted(discover_catalog().kinds)
 ALL_BUT_TRUTH = ",".join(sorted({*discover_catalog().products} - {"truth"}))
-COMPARED = {"plane", "raster", "ortho", "mosaic", "inspect", "match", "orient"}
+COMPARED = {"surface", "plane", "raster", "ortho", "mosaic", "inspect", "match", "orient"}
 
 
 def write_installed(project: Project, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -90,9 +90,8 @@ def test_a_new_kind_takes_and_gives_what_is_asked_and_passes_the_suite(
     name = f"kind-{takes}-{gives}".replace(",", "-")[:30]
     kind = name.replace("-", "_")
     known = set(discover_catalog().products)
-    asked = ["--new-kind", kind, "--takes", takes, "--gives", gives, "--folder", str(tmp_path)]
-    done = CliRunner().invoke(program, ["plugins", "new", name, *asked])
-    assert done.exit_code == 0, done.output
+    words = ["--new-kind", kind, "--takes", takes, "--gives", gives, "--folder", str(tmp_path)]
+    asked("plugins", "new", name, *words, code=0)
     folder = tmp_path / name
     install(folder, name, monkeypatch)
     catalog = discover_catalog()
@@ -112,6 +111,15 @@ def test_a_new_kind_takes_and_gives_what_is_asked_and_passes_the_suite(
     assert [cell.params["factor"] for cell in cells] == [1.0, 2.0]
     assert [cell.skip_reason for cell in cells] == ["", ""]
     assert lint_workflow(workflow) == ()
+    assert workflow.compare is not None
+    assert workflow.compare.metrics == (f"{kind}.n_items",)
+
+
+def test_what_no_recipe_gives_is_compared_in_none() -> None:
+    catalog = discover_catalog()
+    assert own_comparison_text("part.mine", ["no_such_product"], catalog) == ""
+    # Nor where every recipe has a step of that name already.
+    assert own_comparison_text("plane.mine", ["cloud"], catalog) == ""
 
 
 def test_a_new_plugin_on_another_ones_product_requires_it_and_has_an_example(

@@ -100,7 +100,7 @@ def test_equal_depths_before_and_behind_the_plane_have_equally_strong_colours(
 
 
 def test_relief_lies_where_the_depths_do(run: Path, tmp_path: Path) -> None:
-    assert export(run, "relief", tmp_path / "out", "--light", "90,20").exit_code == 0
+    export(run, "relief", tmp_path / "out", "--light", "90,20", code=0)
     depth = next((run / "products").rglob(f"wall_{WALL}_depth.tif"))
     with (
         rasterio.open(depth) as given,
@@ -112,7 +112,7 @@ def test_relief_lies_where_the_depths_do(run: Path, tmp_path: Path) -> None:
     assert lines["type"] == "FeatureCollection"
     with Image.open(tmp_path / "out" / f"wall_{WALL}_relief.png") as figure:
         assert figure.width > 600
-    assert export(run, "relief", tmp_path / "no", "--light", "90").exit_code == 2
+    export(run, "relief", tmp_path / "no", "--light", "90", code=2)
 
 
 def test_walls_unfold_in_the_order_of_a_viewer_who_turns_right() -> None:
@@ -142,10 +142,7 @@ def test_walls_unfold_in_the_order_of_a_viewer_who_turns_right() -> None:
 
 
 def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> None:
-    assert (
-        export(run, "elevation", tmp_path / "out", "--scale", "25", "--language", "fr").exit_code
-        == 0
-    )
+    export(run, "elevation", tmp_path / "out", "--scale", 25, "--language", "fr", code=0)
     with pdfplumber.open(tmp_path / "out" / "elevation_1.pdf") as pdf:
         (page,) = pdf.pages
         (image,) = page.images
@@ -160,7 +157,7 @@ def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> Non
 
 
 def test_a_qgis_project_shifts_x_alone(run: Path, tmp_path: Path) -> None:
-    assert export(run, "qgis", tmp_path / "out").exit_code == 0
+    export(run, "qgis", tmp_path / "out", code=0)
     project = (tmp_path / "out" / "walls.qgs").read_text()
     virtual = sorted((tmp_path / "out").glob("*_ortho.vrt"))
     assert virtual
@@ -193,7 +190,7 @@ def test_every_export_states_the_same_of_a_wall(tmp_path: Path) -> None:
         ("iiif", "manifest.json"),
         ("stac", f"products/mosaic/wall_{WALL}_ortho.item.json"),
     ):
-        assert export(run, target, tmp_path / target).exit_code == 0
+        export(run, target, tmp_path / target, code=0)
         assert wall.about.sentence in (tmp_path / target / file).read_text(), target
     item = json.loads((tmp_path / "stac" / file).read_text())
     assert item["properties"]["orthoflow:expected_mm_median"] == pytest.approx(2.0)
@@ -213,7 +210,7 @@ def test_an_iiif_manifest_has_a_scale_and_its_tiles_are_the_picture(
     run: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "out"
-    assert export(run, "iiif", folder, "--base-url", "https://example.org/room/").exit_code == 0
+    export(run, "iiif", folder, "--base-url", "https://example.org/room/", code=0)
     text = (folder / "manifest.json").read_text()
     manifest = json.loads(text)
     (canvas,) = manifest["items"]

@@ -48,8 +48,7 @@ def sheet(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[pdfpl
     block = folder / "block.yaml"
     block.write_text("project: Sala Łukowa\ndrawing: 21-017\n", encoding="utf-8")
     more = ("--scale", 50, "--beside", "depth", "--title-block", block, "--grid", 0.5)
-    done = export(run, "sheet", folder / "out", *more)
-    assert done.exit_code == 0, done.output
+    export(run, "sheet", folder / "out", *more, code=0)
     assert [path.name for path in (folder / "out").iterdir()] == [f"wall_{WALL}_sheet_1.pdf"]
     with pdfplumber.open(folder / "out" / f"wall_{WALL}_sheet_1.pdf") as pdf:
         (page,) = pdf.pages
@@ -119,8 +118,7 @@ def test_the_step_of_the_wall_is_a_contour(sheet: pdfplumber.page.Page) -> None:
 
 
 def test_a_wall_that_does_not_fit_takes_several_sheets(run: Path, tmp_path: Path) -> None:
-    done = export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A4")
-    assert done.exit_code == 0, done.output
+    export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A4", code=0)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == [f"wall_{WALL}_sheet_{number}.pdf" for number in range(1, len(names) + 1)]
     areas = 0.0
@@ -169,8 +167,7 @@ def test_a_record_alone_is_drawn_as_its_run_is(run: Path, tmp_path: Path) -> Non
     alone.write_bytes((run / "run.h5").read_bytes())
     made = []
     for source in (run, alone):
-        done = export(source, "geojson", tmp_path / source.stem)
-        assert done.exit_code == 0, done.output
+        done = export(source, "geojson", tmp_path / source.stem, code=0)
         made.append({path.name: path.read_bytes() for path in (tmp_path / source.stem).iterdir()})
     assert f"note: {alone} has no files next to it: its rasters are recreated" in done.output
     assert made[0] == made[1] != {}
@@ -208,8 +205,7 @@ def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
 def test_what_cannot_be_drawn_is_refused_and_nothing_is_written(
     run: Path, tmp_path: Path, more: tuple[object, ...], said: str
 ) -> None:
-    done = export(run, "sheet", tmp_path / "out", *more)
-    assert done.exit_code == 2
+    done = export(run, "sheet", tmp_path / "out", *more, code=2)
     assert said in done.output
     assert list(tmp_path.iterdir()) == []
 
@@ -217,8 +213,7 @@ def test_what_cannot_be_drawn_is_refused_and_nothing_is_written(
 @pytest.fixture(scope="module")
 def drawn(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dxf") / "out"
-    done = export(run, "dxf", folder)
-    assert done.exit_code == 0, done.output
+    done = export(run, "dxf", folder, code=0)
     assert "1 wall, and the room: 6 planes, 12 edges, 8 corners, 1 opening" in done.output
     return folder
 
@@ -368,8 +363,7 @@ def test_openings_are_outlined_on_sheets_in_scale(sheet: pdfplumber.page.Page) -
 
 
 def test_vectors_are_geojson_of_rings_and_lines(run: Path, tmp_path: Path) -> None:
-    done = export(run, "geojson", tmp_path / "out")
-    assert done.exit_code == 0, done.output
+    export(run, "geojson", tmp_path / "out", code=0)
     room = json.loads((tmp_path / "out" / "room.geojson").read_text())
     kinds = [feature["properties"]["kind"] for feature in room["features"]]
     counts = {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}

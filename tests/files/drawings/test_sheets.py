@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -21,7 +22,8 @@ from PIL import Image
 from orthoflow.cli.exports.sheets import usual_scale
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings import pens
-from orthoflow.files.drawings.printed_pictures import encode_part
+from orthoflow.files.drawings.key_plans import key_plan
+from orthoflow.files.drawings.printed_pictures import encode_part, label_place
 from orthoflow.files.drawings.sheet_contents import (
     FOOT_M,
     SCALES,
@@ -42,7 +44,16 @@ from orthoflow.geometry.frames import frame_over
 from orthoflow.products import OrthoMask
 from orthoflow.records.open import open_run
 from tests import samples
-from tests.drawing_runs import WALL, box_image, export, write_drawing_run
+from tests.drawing_runs import (
+    GAP_M,
+    SIZE_M,
+    WALL,
+    box_image,
+    box_planes,
+    export,
+    wall_frame,
+    write_drawing_run,
+)
 from tests.long_loops import long_only
 
 MM = 25.4 / 72.0
@@ -140,8 +151,7 @@ def test_text_and_lines_have_the_sizes_of_the_standards_and_nothing_overlaps(
     # The whole title block has no room on A4.
     if layout is not None and "A4" not in more:
         given = ("--title-block", office(tmp_path, layout=layout))
-    done = export(run, "sheet", tmp_path / "out", *more, *given)
-    assert done.exit_code == 0, done.output
+    export(run, "sheet", tmp_path / "out", *more, *given, code=0)
     for path in (tmp_path / "out").iterdir():
         with page_of(path) as page:
             assert page.chars
@@ -168,8 +178,7 @@ def test_a_title_block_has_what_the_office_and_its_client_want(
 ) -> None:
     block = office(tmp_path, layout=layout)
     more = ("--scale", 50, "--title-block", block, "--paper", "A2")
-    done = export(run, "sheet", tmp_path / "out", *more)
-    assert done.exit_code == 0, done.output
+    export(run, "sheet", tmp_path / "out", *more, code=0)
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
         text = words_of(page)
         for said in (
@@ -198,8 +207,7 @@ def test_a_title_block_has_what_the_office_and_its_client_want(
 
 def test_what_a_title_block_has_too_much_of_is_refused(run: Path, tmp_path: Path) -> None:
     more = ("--scale", 50, "--paper", "160x160", "--title-block", office(tmp_path))
-    done = export(run, "sheet", tmp_path / "out", *more)
-    assert done.exit_code == 2
+    done = export(run, "sheet", tmp_path / "out", *more, code=2)
     assert "--paper 160x160 is too small for the title block" in done.output
     assert not (tmp_path / "out").exists()
 
@@ -390,8 +398,7 @@ def test_too_many_sheets_are_refused() -> None:
 
 
 def test_match_lines_name_the_sheet_on_which_the_wall_goes_on(run: Path, tmp_path: Path) -> None:
-    done = export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A3")
-    assert done.exit_code == 0, done.output
+    export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A3", code=0)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     n_sheets = len(names)
     seen: dict[int, set[int]] = {}
@@ -504,8 +511,7 @@ def test_a_wall_with_an_empty_image_has_a_sheet_only_where_it_is_asked_for(tmp_p
     )
     run = write_drawing_run(tmp_path / "run", others=(empty,))
     for options, number in ((), WALL), (("--wall", 1), 1):
-        done = export(run, "sheet", tmp_path / str(number), "--scale", 25, *options)
-        assert done.exit_code == 0, done.output
+        done = export(run, "sheet", tmp_path / str(number), "--scale", 25, *options, code=0)
         assert ("; left out as empty: wall 1" in done.output) == (not options)
         names = [path.name for path in (tmp_path / str(number)).iterdir()]
         assert names == [f"wall_{number}_sheet_1.pdf"]
@@ -533,11 +539,109 @@ def test_a_wall_that_is_not_recommended_says_so_on_its_sheet(
         image, mask=mask, rgb=rgb, source=source, error_m=errors_m, n_check_points=12 * has_ties
     )
     run = write_drawing_run(tmp_path / "run", image=image)
-    done = export(run, "sheet", tmp_path / "out", "--scale", 25, "--language", "de")
-    assert done.exit_code == 0, done.output
+    done = export(run, "sheet", tmp_path / "out", "--scale", 25, "--language", "de", code=0)
     assert (f"warning: not recommended for delivery: wall {WALL} (" in done.stderr) == bool(said)
     assert said in done.stderr
     with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
         text = words_of(page)
     assert ("nicht empfohlen" in text) == bool(said)
     assert note in text
+
+
+# Parts of a sheet: the key plan and the numbers of contours ---------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("direction_deg", "turned_deg"),
+    [(0, 0), (30, 30), (90, 90), (91, -89), (225, 45), (300, -60)],
+)
+def test_a_number_lies_along_its_line_and_is_never_upside_down(
+    direction_deg: float, turned_deg: float
+) -> None:
+    angle = math.radians(direction_deg)
+    line = np.array([[5.0, 6.0], [5.0 + 40.0 * math.cos(angle), 6.0 + 40.0 * math.sin(angle)]])
+    place = label_place(line, 4.0, [])
+    assert place is not None
+    np.testing.assert_allclose(place[0], line.mean(axis=0))
+    assert math.isclose(math.sin(math.radians(place[1] - turned_deg)), 0.0, abs_tol=1e-9)
+    assert -90.0 - 1e-9 <= place[1] <= 90.0
+
+
+def test_numbers_keep_apart_and_short_lines_have_none() -> None:
+    line = np.array([[0.0, 0.0], [80.0, 0.0]])
+    first = label_place(line, 4.0, [])
+    assert first is not None
+    second = label_place(line, 4.0, [np.array(first[0])])
+    assert second is not None
+    assert abs(second[0][0] - first[0][0]) >= 12.0
+    everywhere = [np.array([x, 1.0]) for x in np.arange(0.0, 81.0, 10.0)]
+    assert label_place(line, 4.0, everywhere) is None
+    assert label_place(line[:, :] * 0.24, 4.0, []) is None
+
+
+def test_a_number_stands_where_its_line_is_straight() -> None:
+    # A corner in the middle: there the number would lie beside its line.
+    line = np.array([[0.0, 0.0], [30.0, 0.0], [28.0, 1.0], [0.0, 1.0]])
+    place = label_place(line, 6.0, [])
+    assert place is not None
+    assert place[0][1] in (0.0, 1.0)
+    assert place[0][0] < 27.0
+    zigzag = np.array([[float(k % 2), 0.2 * k] for k in range(60)])
+    assert label_place(zigzag, 6.0, []) is None
+
+
+@pytest.mark.parametrize(("sine", "share"), [(0.89, 0.25), (0.91, 0.5)])
+def test_a_corner_below_a_number_is_a_blunt_one(sine: float, share: float) -> None:
+    # From the corner both ways: the ends of the number are that sine of its width apart.
+    half = 40.0 * np.array([sine, math.sqrt(1.0 - sine**2)])
+    line = np.array([half * (-1.0, 1.0), [0.0, 0.0], half])
+    place = label_place(line, 5.0, [])
+    assert place is not None
+    at = line[0] * (1.0 - 2.0 * share)
+    below = 2.5 * math.sqrt(1.0 - sine**2) if share == 0.5 else 0.0
+    np.testing.assert_allclose(place[0], at + np.array([0.0, below]), atol=1e-9)
+
+
+def test_the_marked_wall_is_as_long_as_its_points_and_seen_along_its_normal() -> None:
+    planes = box_planes()
+    plan = key_plan(planes, wall_frame(planes))
+    assert len(plan.walls) == 4
+    left, right = plan.marked
+    wide_m = SIZE_M[0] - 2 * GAP_M
+    assert np.linalg.norm(right - left) == pytest.approx(wide_m, abs=1e-6)
+    assert plan.arrow is not None
+    begin, end = plan.arrow
+    across = (right - left) / wide_m
+    middle = 0.5 * (left + right)
+    # It stands over the middle of the wall, points straight at it, and ends before it.
+    for place in (begin, end):
+        assert abs(float((place - middle) @ across)) < 1e-6
+    assert np.linalg.norm(begin - middle) == pytest.approx(0.25 * wide_m, abs=1e-6)
+    assert np.linalg.norm(end - middle) == pytest.approx(0.025 * wide_m, abs=1e-6)
+    assert (begin - middle) @ (end - middle) > 0.0
+    # In the room: on the same side as the other walls.
+    others = plan.walls.reshape(-1, 2).mean(axis=0)
+    assert (begin - middle) @ (others - middle) > 0.0
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0, -25.0])
+def test_arrows_are_as_long_at_walls_that_lean(tilt_deg: float) -> None:
+    angle = np.radians(tilt_deg)
+    normal = np.array([0.0, -np.cos(angle), np.sin(angle)])
+    down = np.array([0.0, -np.sin(angle), -np.cos(angle)])
+    corner = np.array([1.0, 2.0, 3.0])
+    sides = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], dtype=np.float64)
+    corners = corner + 4.0 * sides[:, :1] * [1.0, 0.0, 0.0] + 2.0 * sides[:, 1:] * down
+    planes = samples.planes(
+        normal=normal[None],
+        offset=np.array([normal @ corner]),
+        corners=corners[None],
+        names=("wall 0",),
+    )
+    plan = key_plan(planes, frame_over(corners, normal, gsd_m=0.01))
+    assert plan.arrow is not None
+    along = plan.arrow[1] - plan.arrow[0]
+    # A quarter of the wall before it, but for a tenth of that; towards it, seen from above.
+    assert np.linalg.norm(along) == pytest.approx(0.25 * 4.0 * 0.9)
+    before = plan.arrow[0] - plan.marked.mean(axis=0)
+    np.testing.assert_allclose(before, -along / 0.9, atol=1e-9)

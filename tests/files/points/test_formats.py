@@ -21,7 +21,7 @@ from orthoflow.files.points.fields import columns_of_user
 from orthoflow.files.points.lzf_kernels import decompress_lzf
 from orthoflow.files.points.scan_file import load_library, reading
 from tests import scan_files
-from tests.fuzz.e57_pages import e57_of
+from tests.fuzz.mutation import e57_of
 from tests.scan_files import read_all, read_points
 
 POINTS = np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (40, 3)), 4)

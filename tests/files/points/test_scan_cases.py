@@ -13,11 +13,12 @@ from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.errors import InputError
 from orthoflow.products import PointCloud
+from tests.long_loops import long_only
 from tests.method_runs import Reader
 from tests.scan_cases import CASES, Case, Draw
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [*range(3), *long_only(3, 4, 5)])
 @pytest.mark.parametrize("name", CASES)
 def test_scans_of_other_programs_are_read_right(name: str, seed: int, tmp_path: Path) -> None:
     case = CASES[name](Draw(seed, tmp_path))
