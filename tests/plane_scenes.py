@@ -15,6 +15,7 @@ from orthoflow_plugins.plane.search import Search
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import Method, StepContext
+from tests.method_runs import run
 
 NOISE_M = 0.002
 TOLERANCE_M, FIT_TOLERANCE_M = 0.05, 0.015
@@ -93,12 +94,6 @@ def cloud_of(
     )
 
 
-def context(folder: Path, *, cores: int = 2) -> StepContext:
-    """A step context with a scratch folder of its own."""
-    folder.mkdir(parents=True, exist_ok=True)
-    return StepContext(rng=np.random.default_rng(0), cores=cores, scratch=folder)
-
-
 def detect(
     method: type[Method],
     cloud: PointCloud,
@@ -111,7 +106,7 @@ def detect(
     """What a detector finds in a cloud, and the context that it reported to."""
     folder.mkdir(parents=True, exist_ok=True)
     ctx = StepContext(rng=np.random.default_rng(seed), cores=cores, scratch=folder)
-    return method().run(method.In(cloud=cloud), method.Params(**params), ctx), ctx
+    return run(method, ctx, {"cloud": cloud}, **params), ctx
 
 
 def nearest(planes: Planes, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> int:

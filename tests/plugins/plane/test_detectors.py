@@ -93,11 +93,8 @@ def test_every_surface_of_a_room_is_found_and_nothing_else(
     np.testing.assert_array_equal(counts, planes.n_points)
     assert (np.diff(planes.n_points) <= 0).all()
     kinds = [name.split()[0] for name in planes.names]
-    assert list(planes.names) == [f"{kind} {place}" for place, kind in enumerate(kinds)]
-    assert sorted(kinds) == ["ceiling", "floor", "level", *["wall"] * 4]
-    assert kinds[nearest(planes, ROOM[6].normal, np.array(ROOM[6].centre))] == "level"
-    floor, ceiling = kinds.index("floor"), kinds.index("ceiling")
-    assert planes.normal[floor] @ planes.up > 0.99 > -0.99 > planes.normal[ceiling] @ planes.up
+    for surface, kind in zip(ROOM, [*["wall"] * 4, "floor", "ceiling", "level"], strict=True):
+        assert kinds[nearest(planes, surface.normal, np.array(surface.centre))] == kind
 
 
 def test_up_may_be_another_axis(rooms: dict[str, Any], tmp_path: Path) -> None:
@@ -316,12 +313,7 @@ every_kind = pytest.mark.parametrize("method", [Hough2d, Hough3d, Ransac, Region
 SIZE_M = np.array([5.0, 4.0, 2.8])
 
 
-def wall(noise_m: float, n_points: int) -> NDArray[np.float64]:
-    """Return a flat, upright wall of 12 x 6 m, with independent noise along its normal."""
-    rng = np.random.default_rng(3)
-    points = rng.uniform((0.0, 0.0, 0.0), (12.0, 0.0, 6.0), (n_points, 3))
-    points[:, 1] = rng.normal(0.0, noise_m, n_points)
-    return points
+FLAT = Rectangle("wall", (6.0, 0.0, 3.0), (6.0, 0, 0), (0, 0, 3.0), 120_000)
 
 
 def waves(rng: np.random.Generator, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -362,12 +354,12 @@ def detected(method: Any, points: NDArray[np.float64], folder: Path) -> Planes:
 @pytest.mark.parametrize("noise_m", [0.001, 0.02])
 @pytest.mark.usefixtures("all_places")
 def test_the_noise_of_a_flat_wall_is_measured(noise_m: float) -> None:
-    found = measure_noise(wall(noise_m, 120_000))
+    found = measure_noise(sampled((FLAT,), noise_m=noise_m))
     assert found == pytest.approx((noise_m, noise_m), rel=0.12)
 
 
 def test_errors_that_neighbours_share_show_in_large_neighbourhoods() -> None:
-    points = wall(0.002, 200_000)
+    points = sampled((FLAT,))
     points[:, 1] += 0.015 * waves(np.random.default_rng(4), points[:, [0, 2]])
     found = measure_noise(points)
     assert found is not None
@@ -384,15 +376,6 @@ def test_a_cloud_without_flat_places_has_no_measured_noise_and_a_clean_one_usual
     assert measure_noise(np.zeros((3, 3))) is None
     planes = detected(Hough2d, room(np.random.default_rng(2), 0.002, 0.0), tmp_path)
     assert planes.tolerance_m == 0.05
-
-
-@every_kind
-@pytest.mark.usefixtures("all_places")
-def test_one_noisy_wall_is_found_at_defaults(method: type, tmp_path: Path) -> None:
-    planes = detected(method, wall(0.02, 60_000), tmp_path)
-    assert len(planes) == 1
-    assert np.degrees(np.arccos(abs(planes.normal[0, 1]))) < 0.03
-    assert abs(planes.offset[0]) < 0.0013
 
 
 @pytest.mark.parametrize(
@@ -439,7 +422,7 @@ ON_MAIN = np.array([-2.865, -1.1, 1.4])
 
 @pytest.fixture(scope="module")
 def hall(shared_data: Path) -> PointCloud:
-    points = points_of(shared_data / "heritage-hall-west-wall" / "west_wall.laz")[::8]
+    points = points_of(shared_data / "heritage-hall-west-wall" / "west_wall.laz")[::16]
     centre = np.floor(points.mean(axis=0))
     return cloud_of(points - centre, origin=tuple(centre))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane import cloud as clouds
-from orthoflow_plugins.plane.cloud import draw_sample, robust_box
+from orthoflow_plugins.plane.cloud import PreparedCloud, draw_sample, robust_box
 from orthoflow_plugins.plane.hough import (
     best_bins,
     sharpest,
@@ -23,19 +23,17 @@ from orthoflow_plugins.plane.kernels import (
     LEVEL,
     STEPS_PER_TOLERANCE,
     VERTICAL,
-    BlockedPoints,
-    assign_points,
     bin_distances,
     flattest,
     in_blocks,
     refine_robustly,
-    sum_assigned,
 )
-from orthoflow_plugins.plane.support import Support, SurfaceRaster
+from orthoflow_plugins.plane.planes import measure_planes
+from orthoflow_plugins.plane.support import INNER_SHARE, Support, SurfaceRaster, measure_cells
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow.geometry.slabs import Offsets, read_only
+from orthoflow.geometry.slabs import read_only
 from tests import scenes
 from tests.long_loops import seeds
 from tests.plane_scenes import cloud_of, prepared, search_in
@@ -45,121 +43,18 @@ UP: Final = np.array([0.0, 0.0, 1.0])
 N_POINTS: Final = 3 * BLOCK_POINTS + 61
 
 
-def offsets_of(points_m: NDArray[np.float64]) -> Offsets:
-    return read_only(*np.ascontiguousarray(points_m.T.astype(np.float32)))
-
-
-def points_of(points_m: NDArray[np.float64]) -> BlockedPoints:
-    return in_blocks(offsets_of(points_m), parts=1)
-
-
-def exact(points: BlockedPoints) -> NDArray[np.float64]:
-    """Return the positions (n, 3) as the passes see them."""
-    return np.column_stack([points.x, points.y, points.z]).astype(np.float64)
-
-
-def runs_of(rng: np.random.Generator, values: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Repeat values (n, ...) a few times each, like neighbouring points of a scan."""
-    return np.repeat(values, rng.integers(1, 5, len(values)), axis=0)[:n]
-
-
-def slab_rows(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Return random slabs (count, 12) through a box."""
-    rows = []
-    for _ in range(count):
-        normal = rng.normal(size=3)
-        normal /= np.linalg.norm(normal)
-        u, v = wall_axes(normal, UP)
-        low = rng.uniform(-0.2, 0.2, 3)
-        rows.append([*normal, low[0], *u, low[1], *v, low[2]])
-    return np.array(rows)
-
-
-def along(slab: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions (n, 3) along the slab's normal, u and v."""
-    rows = slab.reshape(3, 4)
-    return points_m @ rows[:, :3].T - rows[:, 3]
-
-
 # --- blocks and the plan ---
 
 
 @pytest.mark.parametrize("parts", [1, 3])
 def test_boxes_enclose_the_points_of_their_block(parts: int) -> None:
-    offsets = offsets_of(np.random.default_rng(parts).uniform(-9.0, 9.0, (N_POINTS, 3)))
+    rows = np.random.default_rng(parts).uniform(-9.0, 9.0, (3, N_POINTS)).astype(np.float32)
+    offsets = read_only(*rows)
     points = in_blocks(offsets, parts=parts)
     for block, box in enumerate(points.boxes):
         held = slice(block * BLOCK_POINTS, (block + 1) * BLOCK_POINTS)
         sides = [side(values[held]) for values in offsets for side in (np.min, np.max)]
         np.testing.assert_array_equal(box, sides)
-
-
-# --- one slab, and many ---
-
-
-def summed_cells(
-    placed: NDArray[np.float64], cells: NDArray[np.int64], n_cells: int, limits_m: list[float]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return counts within three tolerances, and sums of steps and their squares, per cell."""
-    find_m, inner_m, fit_m = limits_m
-    sizes = np.abs(placed[:, 0])
-    steps = np.floor(placed[:, 0] * (STEPS_PER_TOLERANCE / fit_m) + 0.5).astype(np.int64)
-    counts, sums = np.zeros((n_cells, 3), dtype=np.int64), np.zeros((n_cells, 2), dtype=np.int64)
-    for column, limit_m in enumerate((find_m, inner_m, fit_m)):
-        held = (cells >= 0) & (sizes <= limit_m) & (sizes <= find_m)
-        np.add.at(counts[:, column], cells[held], 1)
-    held = (cells >= 0) & (sizes <= fit_m) & (sizes <= find_m)
-    np.add.at(sums[:, 0], cells[held], steps[held])
-    np.add.at(sums[:, 1], cells[held], steps[held] ** 2)
-    return counts, sums
-
-
-@pytest.mark.parametrize("seed", seeds(3))
-def test_all_planes_at_once_sum_the_points_that_they_own(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    slabs = slab_rows(rng, 4)
-    points_m = runs_of(rng, rng.uniform(-1.0, 1.0, (N_POINTS, 3)), N_POINTS)
-    # All points of this block are on a single plane, so they need not be tested one by one.
-    slabs[3, 3] = 9.0
-    points_m[:BLOCK_POINTS] = 0.1 * points_m[:BLOCK_POINTS] + 9.0 * slabs[3, :3]
-    points = points_of(points_m)
-    find_m, inner_m, fit_m = 0.3, 0.12, 0.2
-    bounds = np.column_stack([np.full(4, find_m), np.tile([-0.9, 0.8, -0.7, 0.9], (4, 1))])
-    claims = np.empty(len(points.x), dtype=np.int8)
-    assign_points(points, claims, slabs, bounds)
-    placed = np.array([along(slab, exact(points)) for slab in slabs])
-    u, v = placed[..., 1], placed[..., 2]
-    held = (np.abs(placed[..., 0]) <= find_m) & (np.abs(u + 0.05) <= 0.85)
-    held &= np.abs(v - 0.1) <= 0.8
-    away = np.where(held, np.abs(placed[..., 0]), np.inf)
-    owner = np.where(held.any(axis=0), away.argmin(axis=0), -1)
-    np.testing.assert_array_equal(claims, owner)
-    assert (np.bincount(owner + 1, minlength=5) > 9).all()
-    # Slab 1 has no rows, so its points are not summed. Points outside the raster are added to cells
-    # at its edge.
-    shapes = [(5, 6), (0, 0), (7, 3), (4, 4)]
-    starts = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
-    per_m = 1.0 / 0.2
-    rasters = np.array(
-        [
-            [-0.5, -0.4, per_m, *shape, start, fit_m, inner_m]
-            for shape, start in zip(shapes, starts, strict=False)
-        ]
-    )
-    counts = np.zeros((int(starts[-1]), 3), dtype=np.int32)
-    sums = np.zeros((int(starts[-1]), 2), dtype=np.int64)
-    sum_assigned(points, slabs, bounds, rasters, np.ones(4, dtype=bool), counts, sums)
-    for k, (rows, columns) in enumerate(shapes):
-        if rows == 0:
-            continue
-        mine = placed[k][owner == k]
-        column = np.clip(np.floor((mine[:, 1] + 0.5) * per_m), 0, columns - 1).astype(int)
-        row = np.clip(np.floor((mine[:, 2] + 0.4) * per_m), 0, rows - 1).astype(int)
-        cells = row * columns + column
-        expected = summed_cells(mine, cells, rows * columns, [find_m, inner_m, fit_m])
-        table = slice(starts[k], starts[k + 1])
-        np.testing.assert_array_equal(counts[table], expected[0])
-        np.testing.assert_array_equal(sums[table], expected[1])
 
 
 # --- hypotheses ---
@@ -356,50 +251,67 @@ def test_the_best_bin_stands_out_most_from_the_emptier_window_beside_it(
         assert places[row] == (int(line.argmax()) if best >= 0 else 0)
 
 
-FIND_M = 0.3
+FIND_M, FIT_M = 0.3, 0.2
 
 
-def crossing_rasters(rng: np.random.Generator, count: int) -> list[SurfaceRaster]:
-    """Return random planes through the box, with rectangles that do not cover it."""
+def crossing_rasters(rng: np.random.Generator, offsets_m: list[float]) -> list[SurfaceRaster]:
+    """Return planes of random directions, with rectangles of 1.8 x 1.6 m on them."""
     rasters = []
-    for normal in rng.normal(size=(count, 3)):
-        plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=rng.uniform(-0.5, 0.5))
+    for normal, offset_m in zip(rng.normal(size=(len(offsets_m), 3)), offsets_m, strict=True):
+        plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m)
         low, axes = rng.uniform(-1.5, -0.5, 2), wall_axes(plane.normal, UP)
         rasters.append(SurfaceRaster(plane=plane, axes=axes, low_m=low, cell_m=0.2, shape=(8, 9)))
     return rasters
 
 
 def nearest_holder(points_m: NDArray[np.float64], rasters: list[SurfaceRaster]) -> NDArray[np.int8]:
-    """Return, for each point, the nearest plane whose slab and rectangle contain it."""
+    """Return, for each point, the nearest plane whose slab and widened rectangle contain it."""
     distances = np.full((len(rasters), len(points_m)), np.inf)
     for k, raster in enumerate(rasters):
         away_m = np.abs(raster.plane.distances_m(points_m))
-        placed = (points_m @ raster.axes.T - raster.low_m) / raster.cell_m
-        inside = ((placed >= 0.0) & (placed <= np.array(raster.shape[::-1]))).all(axis=1)
+        placed = points_m @ raster.axes.T - raster.low_m
+        far = raster.cell_m * np.array(raster.shape[::-1]) + FIND_M
+        inside = ((placed >= -FIND_M) & (placed <= far)).all(axis=1)
         distances[k] = np.where(inside & (away_m <= FIND_M), away_m, np.inf)
     nearest = distances.argmin(axis=0).astype(np.int8)
     return np.where(np.isfinite(distances.min(axis=0)), nearest, np.int8(-1))
 
 
-@pytest.mark.parametrize("seed", seeds(4))
-def test_planes_that_cross_share_the_sample_by_distance(seed: int) -> None:
+def crossed(seed: int) -> tuple[PreparedCloud, list[SurfaceRaster]]:
+    """Return points about four planes that cross, on a fifth one, and a sixth plane elsewhere."""
     rng = np.random.default_rng(seed)
-    rasters = crossing_rasters(rng, 5)
-    cloud = prepared(rng.uniform(-2.0, 2.0, (6_000, 3)), parts=2)
-    search = search_in(replace(cloud, tolerance_m=FIND_M))
-    points_m = search.cloud.sample.offsets_m
-    supports = [
-        Support(
+    rasters = crossing_rasters(rng, [*rng.uniform(-0.5, 0.5, 4), 9.0, 50.0])
+    points_m = rng.uniform(-2.0, 2.0, (6_000, 3))
+    # All points of a block are on the fifth plane, so they need not be tested one by one.
+    points_m[:BLOCK_POINTS] *= 0.1
+    points_m[:BLOCK_POINTS] += rasters[4].plane.offset_m * rasters[4].plane.normal
+    cloud = prepared(points_m, parts=2)
+    return replace(cloud, tolerance_m=FIND_M, fit_tolerance_m=FIT_M), rasters
+
+
+# Slabs may measure positions along their axes from anywhere.
+STARTS_M = (0.1, -0.2)
+
+
+def slabs_of(rasters: list[SurfaceRaster]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return slabs (k, 12) and rectangles (k, 4)."""
+    slabs = np.array([raster.slab() for raster in rasters])
+    slabs[:, [7, 11]] = STARTS_M
+    return slabs, np.array([raster.bounds_m() for raster in rasters]) - np.repeat(STARTS_M, 2)
+
+
+@pytest.mark.parametrize("seed", seeds(4))
+def test_planes_that_cross_share_the_points_by_distance(seed: int) -> None:
+    cloud, rasters = crossed(seed)
+    search, points_m = search_in(cloud), cloud.sample.offsets_m
+    for k, raster in enumerate(rasters):
+        support = Support(
             cells=np.ones(raster.shape, dtype=bool),
             part_of_cell=np.zeros(raster.shape, dtype=np.int32),
             parts_m=raster.bounds_m()[None],
-            # Rectangles are widened by the tolerance.
-            bounds_m=raster.bounds_m() + FIND_M * np.array([1.0, -1.0, 1.0, -1.0]),
+            bounds_m=raster.bounds_m(),
             n_points=0,
         )
-        for raster in rasters
-    ]
-    for k, (raster, support) in enumerate(zip(rasters, supports, strict=True)):
         search.claim(raster, support)
         expected = nearest_holder(points_m, rasters[: k + 1])
         np.testing.assert_array_equal(search.claims, expected)
@@ -408,9 +320,50 @@ def test_planes_that_cross_share_the_sample_by_distance(seed: int) -> None:
         np.testing.assert_array_equal(offsets_m, points_m[expected < 0])
         np.testing.assert_array_equal(points.x, points_m[expected < 0, 0].astype(np.float32))
     # A pass for all planes gives the same result as one pass per plane.
-    bounds_m = [search.cloud.bounds_of(support.bounds_m) for support in supports]
-    search.cloud.assign(np.array([raster.slab() for raster in rasters]), np.array(bounds_m))
-    np.testing.assert_array_equal(search.cloud.claims, expected)
+    slabs, rectangles_m = slabs_of(rasters)
+    cloud.assign(slabs, cloud.bounds_of(rectangles_m))
+    np.testing.assert_array_equal(cloud.claims, expected)
+
+
+@pytest.mark.parametrize("seed", seeds(4))
+def test_planes_that_cross_are_measured_on_their_own_points(seed: int) -> None:
+    cloud, rasters = crossed(seed)
+    points_m, (slabs, rectangles_m) = cloud.sample.offsets_m, slabs_of(rasters)
+    cloud.claims[:] = claims = nearest_holder(points_m, rasters)
+    found = measure_planes(cloud, slabs, rectangles_m)
+    # The points of a plane whose raster has no rows are not summed.
+    rasters[1] = replace(rasters[1], shape=(0, 0))
+    bounds_m = cloud.bounds_of(rectangles_m + np.repeat(STARTS_M, 2))
+    tables = measure_cells(cloud, rasters, bounds_m=list(bounds_m[:, None]))
+    for k, (raster, sums) in enumerate(zip(rasters, tables, strict=True)):
+        own = points_m[claims == k]
+        assert found.n_points[k] == found.histogram[k].sum() == len(own)
+        if k in {1, 5}:
+            continue
+        away_m, placed = raster.plane.distances_m(own), own @ raster.axes.T
+        # Points beside the raster are added to cells at its edge.
+        cells = ((placed - raster.low_m) / raster.cell_m).astype(int)
+        column, row = np.clip(cells, 0, np.array(raster.shape[::-1]) - 1).T
+        steps = np.floor(away_m * STEPS_PER_TOLERANCE / FIT_M + 0.5)
+        limits_m = (FIND_M, INNER_SHARE * FIND_M, FIT_M, FIT_M, FIT_M)
+        values = (*[np.ones(len(own))] * 3, steps, steps**2)
+        for table, limit_m, value in zip(sums, limits_m, values, strict=True):
+            summed, held = np.zeros(raster.shape), np.abs(away_m) <= limit_m
+            np.add.at(summed, (row[held], column[held]), value[held])
+            np.testing.assert_array_equal(table, summed)
+        fits = np.abs(away_m) <= FIT_M
+        assert found.n_fit[k] == fits.sum() > 50
+        assert found.rms_m[k] == pytest.approx(np.sqrt((away_m**2).mean()), rel=1e-4)
+        assert found.rms_fit_m[k] == pytest.approx(np.sqrt((away_m[fits] ** 2).mean()), rel=1e-4)
+        assert found.mean_fit_m[k] == pytest.approx(away_m[fits].mean(), abs=1e-5)
+        placed -= STARTS_M
+        low_m, high_m = rectangles_m[k].reshape(2, 2).T
+        within = placed[fits & ((placed >= low_m) & (placed <= high_m)).all(axis=1)]
+        extent_m = np.column_stack([within.min(axis=0), within.max(axis=0)])
+        np.testing.assert_allclose(found.extents_m[k], extent_m.ravel(), atol=1e-6)
+    # Without points near it, a plane extends as far as its rectangle.
+    assert (found.n_points[5], found.rms_m[5], found.mean_fit_m[5]) == (0, 0.0, 0.0)
+    np.testing.assert_array_equal(found.extents_m[5], rectangles_m[5])
 
 
 # --- the sample, and the extent of the scene ---

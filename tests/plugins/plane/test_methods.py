@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from orthoflow_plugins.plane.cloud import prepare
 from orthoflow_plugins.plane.comparators import Open3dPatches, Open3dRansac, load_open3d
 from orthoflow_plugins.plane.hough import (
-    PlanProposer,
     SpaceProposer,
     directions_over,
     normals_of,
@@ -121,27 +120,6 @@ def test_the_plain_maximum_lies_in_the_middle_of_a_bin_and_of_a_step(
         assert abs(normal @ middle - raw["offset_m"]) < 0.04
     assert found[0] == pytest.approx(round(found[0]), abs=1e-6)
     assert found[1] != pytest.approx(round(found[1]), abs=1e-3)
-
-
-def test_with_one_vote_per_cell_the_plain_maximum_is_no_wall() -> None:
-    """In Figure 10b of markiewicz2015, floor and ceiling obscure the walls ("no clear maximum")."""
-    floors = tuple(
-        Rectangle(r.name, r.centre, r.half_a, r.half_b, 5 * r.n_points) for r in ROOM[4:6]
-    )
-    points = sampled((*ROOM[:4], *floors)) @ turned(17.37).T
-    search = search_in(prepared(points), min_share=0.02)
-    away_deg = []
-    for accumulator in ("unit", "counts"):
-        params = {"cell_m": 0.05, "constraint": "vertical", "scoring": "votes"}
-        chosen = Hough2d.Params.model_validate({**params, "accumulator": accumulator})
-        candidate = PlanProposer(search, chosen).propose(search)
-        assert candidate is not None
-        normals = turned(17.37) @ np.array([wall.normal for wall in ROOM[:4]]).T
-        cosines = np.abs(candidate.plane.normal @ normals)
-        away_deg.append(np.degrees(np.arccos(cosines.max())))
-    # The maximum is a diagonal through the middle of the room.
-    assert away_deg[0] > 5.0
-    assert away_deg[1] < 1.0
 
 
 # --- all directions ---
