@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photos, Ties
 from orthoflow.testing import photographed as ms
-from tests import samples
+from tests import tied_photos as tp
 
 _VIEWS = (
     ((0.8, -2.4, 1.1), (1.3, 0.0, 1.0), 0.0),
@@ -20,7 +20,7 @@ _VIEWS = (
     ((1.5, -2.2, 1.3), (1.5, 0.0, 1.0), 0.0),
     ((2.6, -2.2, 1.0), (1.8, 0.0, 1.0), 0.0),
 )
-SCENE = ms.textured_wall(0)
+SCENE = tp.SCENE
 
 
 def viewers() -> tuple[ViewingCamera, ...]:
@@ -58,37 +58,18 @@ def photos(*, calibrated: bool) -> Photos:
 
 
 def scan_ties(
-    seed: int,
-    *,
-    n: int = 150,
-    noise_px: float = 0.5,
-    noise_m: float = 0.001,
-    wrong_share: float = 0.1,
-    shift_m: np.ndarray | None = None,
+    seed: int, *, n: int = 150, wrong_share: float = 0.1, shift_m: np.ndarray | None = None
 ) -> Ties:
     """Ties of each photo with points of its own on the wall, some at random pixels."""
-    rng = np.random.default_rng(seed)
-    owner, pixels, points = [], [], []
+    rng, each = np.random.default_rng(seed), []
     for index, camera in enumerate(viewers()):
-        cells = rng.uniform([5, 5], [495, 328], (8 * n, 2))
-        depth = SCENE.depth_m(cells[:, 0] * ms.GSD_M, cells[:, 1] * ms.GSD_M)
-        true = SCENE.frame.world_from_wall(cells, depth)
-        seen = camera.project(true)[:, :2]
-        chosen = np.flatnonzero(camera.sees(seen))[:n]
-        found = seen[chosen] + noise_px * rng.normal(size=(n, 2))
-        n_wrong = round(wrong_share * n)
-        found[:n_wrong] = rng.uniform([0, 0], [900, 640], (n_wrong, 2))
-        owner.append(np.full(n, index, np.int32))
-        pixels.append(found)
-        points.append(true[chosen] + noise_m * rng.normal(size=(n, 3)))
-    shift = np.zeros(3) if shift_m is None else shift_m
-    n_all = n * len(viewers())
-    return samples.ties(
-        np.vstack(pixels),
-        photo_names=names(),
-        photo=np.concatenate(owner),
-        points_world=np.vstack(points) + shift,
-        sigma_px=np.full(n_all, noise_px),
-        sigma_m=np.full(n_all, noise_m),
-        walls=(samples.tie_wall(SCENE.frame.corners_world() + shift, ms.GSD_M),),
-    )
+        own = tp.known_ties(
+            camera,
+            rng,
+            n=n,
+            wrong_share=wrong_share,
+            sigma_m=0.001,
+            shift_m=shift_m,
+        )
+        each.append(replace(own, photo_names=names(), photo=np.full(n, index, np.int32)))
+    return tp.joined(*each)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +93,18 @@ def tied(
 
 def known_ties(
     camera: ViewingCamera,
-    seed: int,
+    seed: int | np.random.Generator,
     *,
     n: int = 200,
     wrong_share: float = 0.0,
     relief: float = 1.0,
+    sigma_m: float = 1e-4,
     shift_m: NDArray[np.float64] | None = None,
 ) -> Ties:
-    """Ties with 0.5 px of noise on the textured wall, a share of them at random places."""
+    """Ties with 0.5 px of noise on the textured wall, a share of them at random places.
+
+    Points of the scan have errors where `sigma_m` is not the default.
+    """
     rng = np.random.default_rng(seed)
     cells = rng.uniform([5, 5], [495, 328], (8 * n, 2))
     depth = relief * SCENE.depth_m(cells[:, 0] * ms.GSD_M, cells[:, 1] * ms.GSD_M)
@@ -109,11 +114,20 @@ def known_ties(
     points, pixels = points[chosen], pixels[chosen] + 0.5 * rng.normal(size=(len(chosen), 2))
     n_wrong = round(wrong_share * len(chosen))
     pixels[:n_wrong] = rng.uniform([0, 0], SIZE_PX, (n_wrong, 2))
+    if sigma_m > 1e-4:
+        points += sigma_m * rng.normal(size=points.shape)
     shift = np.zeros(3) if shift_m is None else shift_m
     return samples.ties(
         pixels,
         points_world=points + shift,
         sigma_px=np.full(len(chosen), 0.5),
-        sigma_m=np.full(len(chosen), 1e-4),
+        sigma_m=np.full(len(chosen), sigma_m),
         walls=(samples.tie_wall(SCENE.frame.corners_world() + shift, ms.GSD_M),),
     )
+
+
+def joined(*each: Ties) -> Ties:
+    """The ties of all, of which the first has what they share."""
+    arrays = [name for name, value in vars(each[0]).items() if isinstance(value, np.ndarray)]
+    both = {name: np.concatenate([getattr(ties, name) for ties in each]) for name in arrays}
+    return replace(each[0], **both)

@@ -321,12 +321,8 @@ def test_pairs_show_enough_of_each_others_walls(share: float, is_pair: bool) -> 
     behind = points.copy()
     behind[:6, 1] = -500.0
     views = [camera(-1.0, 0.0, 0.0), camera(1.0, 0.0, 0.0)]
-    assert photo_ties.overlapping_pairs(views, [behind, points], share) == (
-        [(0, 1)] if is_pair else []
-    )
-    assert photo_ties.overlapping_pairs(views, [points, behind], share) == (
-        [(0, 1)] if is_pair else []
-    )
+    for shown in ([behind, points], [points, behind]):
+        assert photo_ties.overlapping_pairs(views, shown, share) == [(0, 1)] * is_pair
     assert photo_ties.overlapping_pairs(views, [points[:0], points], share) == []
 
 

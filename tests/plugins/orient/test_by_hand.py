@@ -69,10 +69,7 @@ def clicked(
 
 def joined(first: Ties, second: Ties) -> Ties:
     """Return the ties of both, with the second ones marked as measured by hand."""
-    pair = (replace(first, by_hand=np.zeros(len(first.photo), np.uint8)), second)
-    arrays = (name for name, value in vars(second).items() if isinstance(value, np.ndarray))
-    both = {name: np.concatenate([getattr(ties, name) for ties in pair]) for name in arrays}
-    return replace(first, **both)
+    return tp.joined(replace(first, by_hand=np.zeros(len(first.photo), np.uint8)), second)
 
 
 Orient = Callable[[Ties, Photos], tuple[Cameras, list[str]]]

@@ -14,7 +14,7 @@ from orthoflow_plugins.orient.pnp import estimate_by_opencv
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.resection import adjust, misfit, predicted_covariances
+from orthoflow.geometry.resection import adjust, misfit
 from orthoflow.products import Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
@@ -22,17 +22,13 @@ from tests.scenes import SURVEY_SHIFT_M
 from tests.tied_photos import photo, seen_by, tied
 
 PARAMS = lenses.OrientParams()
-
-
-def camera() -> ViewingCamera:
-    return ms.camera_before()
+CAMERA = ms.camera_before()
 
 
 def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone() -> None:
     """Large residuals get less weight relative to the actual errors of ties, not their sigmas."""
-    viewer = camera()
     rng = np.random.default_rng(7)
-    seen = seen_by(viewer, 200, sigma_px=0.5)
+    seen = seen_by(CAMERA, 200, sigma_px=0.5)
     # The errors have longer tails than a normal distribution, so many exceed the limit.
     off_px = 0.35 * rng.standard_t(3, size=(200, 2))
     seen = replace(seen, pixels_photo=seen.pixels_photo + off_px)
@@ -41,7 +37,7 @@ def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone() -> None:
     # With this threshold, the same ties are sampled first.
     params = lenses.OrientParams(threshold_px=4.0)
     found, other = (
-        lenses.estimate_pose(tied(photo(viewer), each, is_check=check), params)
+        lenses.estimate_pose(tied(photo(CAMERA), each, is_check=check), params)
         for each in (seen, scaled)
     )
     assert isinstance(found, lenses.Estimate)
@@ -130,51 +126,48 @@ def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
 def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
     off: float, n_ties: int, is_contradicted: bool
 ) -> None:
-    true = camera()
-    claimed = replace(true, fx=(1.0 + off) * true.fx, fy=(1.0 + off) * true.fy)
+    claimed = replace(CAMERA, fx=(1.0 + off) * CAMERA.fx, fy=(1.0 + off) * CAMERA.fy)
     # The sigma is so large that no tie is rejected because of the wrong focal length.
-    seen = seen_by(true, n_ties, sigma_px=6.0)
+    seen = seen_by(CAMERA, n_ties, sigma_px=6.0)
     found = lenses.estimate_pose(tied(photo(claimed), seen), PARAMS)
     assert isinstance(found, str) == is_contradicted
     if isinstance(found, str):
         # The reason contains the focal length from the ties.
         by_ties = float(found.split("focal length of ")[1].split(" px")[0])
-        assert by_ties == pytest.approx(true.fx, rel=0.01)
+        assert by_ties == pytest.approx(CAMERA.fx, rel=0.01)
 
 
 def test_opencv_refuses_a_lens_with_skew() -> None:
     """solvePnP cannot model skew."""
-    of = tied(photo(replace(camera(), skew=2.5)), seen_by(camera(), 40))
+    of = tied(photo(replace(CAMERA, skew=2.5)), seen_by(CAMERA, 40))
     assert isinstance(estimate_by_opencv(of, PARAMS), str)
 
 
 def test_withheld_ties_have_no_say_in_the_start_and_four_places_make_none() -> None:
-    true = camera()
-    seen = seen_by(true, 60)
+    seen = seen_by(CAMERA, 60)
     is_check = np.arange(60) % 2 == 0
     wrong = replace(seen, pixels_photo=np.where(is_check[:, None], 10.0, seen.pixels_photo))
-    start = lenses.robust_start(tied(photo(true), wrong, is_check=is_check), PARAMS)
+    start = lenses.robust_start(tied(photo(CAMERA), wrong, is_check=is_check), PARAMS)
     assert start is not None
     np.testing.assert_array_equal(start.agreeing, ~is_check)
     assert start.lens.source == "calibration"
-    np.testing.assert_allclose(start.camera.centre_world, true.centre_world, atol=1e-3)
+    np.testing.assert_allclose(start.camera.centre_world, CAMERA.centre_world, atol=1e-3)
     for n_places in (4, 5):
         places = seen.take(np.arange(40) % n_places)
-        start = lenses.robust_start(tied(photo(true), places), PARAMS)
+        start = lenses.robust_start(tied(photo(CAMERA), places), PARAMS)
         assert (start is not None) == (n_places == 5)
 
 
 @pytest.mark.parametrize("times", [0.5, 2.0])
 def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: float) -> None:
-    true = camera()
     # The sigma of each tie is half a pixel, but errors are `times` as large; a tenth of the ties is
     # wrong.
-    seen = seen_by(true, 300, noise_px=0.5 * times, seed=3)
+    seen = seen_by(CAMERA, 300, noise_px=0.5 * times, seed=3)
     wrong = np.arange(300) % 10 == 0
     pixels = seen.pixels_photo + wrong[:, None] * np.array([0.5 * times * 6.5, 0.0])
     is_check = np.arange(300) % 4 == 0
     spoilt = replace(seen, pixels_photo=pixels)
-    found = lenses.estimate_pose(tied(photo(true), spoilt, is_check=is_check), PARAMS)
+    found = lenses.estimate_pose(tied(photo(CAMERA), spoilt, is_check=is_check), PARAMS)
     assert isinstance(found, lenses.Estimate)
     assert found.limit == pytest.approx(3.5 * times, rel=0.2)
     assert found.agreeing[~wrong].mean() > 0.98
@@ -195,8 +188,7 @@ def lens_photo(name: str = "a.jpg", size: tuple[int, int] = (600, 400), **known:
 
 
 def oriented(*focal_px: float) -> list[ViewingCamera]:
-    camera = ms.camera_before()
-    return [replace(camera, fx=focal, fy=focal) for focal in focal_px]
+    return [replace(CAMERA, fx=focal, fy=focal) for focal in focal_px]
 
 
 @pytest.mark.parametrize(
@@ -261,7 +253,7 @@ def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
 
 
 def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:
-    camera = replace(ms.camera_before(), distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
+    camera = replace(CAMERA, distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
     # With k1 = -0.5, no distorted ray is farther than 0.54 focal lengths from the axis.
     rays = lenses.camera_rays(
         camera,
@@ -285,10 +277,6 @@ def ties(n: int = 12) -> Ties:
     )
 
 
-def small_photo(name: str) -> Photo:
-    return Photo(name=name, encoded=b"", width=100, height=100)
-
-
 @pytest.mark.parametrize(
     ("n_ties", "names", "reason"),
     [
@@ -301,7 +289,7 @@ def test_what_no_orientation_can_start_from_is_refused(
     n_ties: int, names: str, reason: str
 ) -> None:
     with pytest.raises(MethodError, match=reason):
-        photos.require(ties(n_ties), Photos(photos=tuple(map(small_photo, names))))
+        photos.require(ties(n_ties), Photos(photos=tuple(map(lens_photo, names))))
 
 
 def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:
@@ -310,7 +298,7 @@ def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:
     of = replace(ties(400), by_hand=by_hand)
     of.role[[0, 4]], of.role[2] = TieRole.REJECTED, TieRole.CHECK
     params = lenses.OrientParams()
-    tied = photos.tied_photo(small_photo("a"), of, params, np.random.default_rng(1))
+    tied = photos.tied_photo(lens_photo("a"), of, params, np.random.default_rng(1))
     # Ties that matching rejected are not used; its check points are.
     np.testing.assert_array_equal(tied.chosen, [2, *range(6, 400, 2)])
     np.testing.assert_array_equal(tied.by_hand, by_hand[tied.chosen] > 0)
@@ -319,7 +307,7 @@ def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:
     assert share == pytest.approx(params.check_share, abs=0.1)
     for name in ("pixels_photo", "sigma_px", "sigma_m"):
         np.testing.assert_array_equal(getattr(tied.seen, name), getattr(of, name)[tied.chosen])
-    plain = photos.tied_photo(small_photo("a"), ties(400), params, np.random.default_rng(1))
+    plain = photos.tied_photo(lens_photo("a"), ties(400), params, np.random.default_rng(1))
     assert not plain.by_hand.any()
 
 
@@ -339,9 +327,6 @@ def test_check_points_are_withheld_evenly(share: float, n_check: int) -> None:
     assert photos.withheld(pixels[:0], (600, 600), 0.5, rng).shape == (0,)
 
 
-CAMERA = ms.camera_before()
-
-
 def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:
     ahead = CAMERA.rotation[2]
     # The points are 2 mm and 2 m in front of the camera, with a sigma of 3 mm, so the first may be
@@ -351,24 +336,6 @@ def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:
     near, far = misfit(seen, CAMERA).normalised
     assert np.isinf(near)
     assert 0.5 < far < 1.5
-
-
-def test_survey_coordinates_lose_nothing() -> None:
-    seen = seen_by(CAMERA, 120, noise_px=0.5)
-    near = adjust(seen, CAMERA)
-    shifted = replace(seen, points_world=seen.points_world + SURVEY_SHIFT_M)
-    far = adjust(shifted, CAMERA.shifted(-SURVEY_SHIFT_M))
-    np.testing.assert_allclose(
-        far.camera.centre_world - SURVEY_SHIFT_M, near.camera.centre_world, atol=2e-6
-    )
-    at = seen.points_world[:5]
-    np.testing.assert_allclose(
-        predicted_covariances(far, at + SURVEY_SHIFT_M),
-        predicted_covariances(near, at),
-        # Coordinates of 10^6 m cost eleven of sixteen digits, which leaves an error of 1e-5 square
-        # pixels.
-        atol=1e-5,
-    )
 
 
 def test_a_soft_limit_bears_outliers() -> None:
