@@ -11,18 +11,14 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Ties, Walls
-from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests.method_runs import run
+from tests.tied_photos import context
 
 
 @cache
 def walls(seed: int) -> Walls:
     return ms.walls_of(ms.textured_wall(seed))
-
-
-def context(folder: Path) -> StepContext:
-    return StepContext(rng=np.random.default_rng(1), cores=2, scratch=folder)
 
 
 # Any: inputs and parameters differ by method.

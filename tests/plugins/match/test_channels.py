@@ -313,14 +313,7 @@ def test_nothing_to_match_is_refused() -> None:
     silent = wall(np.zeros((2, 2), np.float32))
     shown = replace(silent, intensity=np.zeros((2, 2), np.float32))
     pictures.require_intensity(samples.walls(silent, shown))
-    for refuse, of, reason in (
-        (pictures.require_photos, Photos(photos=()), "there are no photos to match"),
-        (pictures.require_intensity, samples.walls(), "there are no walls to match photos with"),
-        (
-            pictures.require_intensity,
-            samples.walls(silent),
-            "the scan has neither intensity nor colour",
-        ),
-    ):
-        with pytest.raises(MethodError, match=reason):
-            refuse(of)  # type: ignore[operator]
+    with pytest.raises(MethodError, match="there are no walls to match photos with"):
+        pictures.require_intensity(samples.walls())
+    with pytest.raises(MethodError, match="there are no photos to match"):
+        pictures.require_photos(Photos(photos=()))

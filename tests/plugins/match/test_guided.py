@@ -25,7 +25,7 @@ measure = partial(displacements.measure, radius_cells=6, min_score=0.3)
 ROUGH = (0.004, -0.005, 0.003, 0.01, -0.02, 0.01)
 
 
-SCENE = ms.textured_wall(2)
+SCENE = ms.textured_wall(1)
 
 
 def guided(photos: Photos, walls: Walls, cameras: Cameras, folder: Path, **params: object) -> Ties:
@@ -88,7 +88,7 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them() -> None:
 
 @pytest.mark.parametrize("content", ["grey", "colours"])
 def test_a_rough_pose_suffices(tmp_path: Path, content: str) -> None:
-    camera, walls = ms.camera_before(roll=0.1), mw.walls(2)
+    camera, walls = ms.camera_before(roll=0.1), mw.walls(1)
     photo = ms.photo_of(SCENE, camera)
     if content == "colours":
         # For the laser, red is bright and green is dark.
@@ -109,7 +109,7 @@ def test_a_rough_pose_suffices(tmp_path: Path, content: str) -> None:
 
 
 def test_cells_finer_than_points_lie_apart_do_as_well(tmp_path: Path) -> None:
-    fine = ms.walls_of(replace(SCENE, frame=ms.textured_wall(2, gsd_m=0.003).frame)).walls[0]
+    fine = ms.walls_of(replace(SCENE, frame=ms.textured_wall(1, gsd_m=0.003).frame)).walls[0]
     # Every fifth cell has a point and no gap is filled, so points are 6.7 mm apart.
     is_void = np.random.default_rng(8).random(fine.frame.shape) > 0.2
     sparse = samples.wall(
@@ -120,7 +120,7 @@ def test_cells_finer_than_points_lie_apart_do_as_well(tmp_path: Path) -> None:
         intensity=np.where(is_void, np.float32(np.nan), fine.intensity),
     )
     camera = ms.camera_before()
-    walls = replace(mw.walls(2), walls=(sparse,))
+    walls = replace(mw.walls(1), walls=(sparse,))
     ties = guided(ms.photos(ms.photo_of(SCENE, camera)), walls, rough(camera), tmp_path)
     error = mw.off_px(ties, camera)
     assert len(error) > 200
@@ -134,7 +134,7 @@ def test_cells_finer_than_points_lie_apart_do_as_well(tmp_path: Path) -> None:
 def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(tmp_path: Path) -> None:
     # The intensity depends on the absolute difference of grey from its median, so edges have no
     # sign.
-    (wall,) = mw.walls(2).walls
+    (wall,) = mw.walls(1).walls
     assert wall.intensity is not None
     stripes = np.where(wall.intensity > np.nanmedian(wall.intensity), 1.0, -1.0)
     strange = replace(wall, intensity=(0.5 + stripes * (wall.intensity - 0.5)).astype(np.float32))
@@ -146,7 +146,7 @@ def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(tmp_p
     start = ms.cameras(
         ms.oriented(ms.nudged(cameras["a.png"], ROUGH)), Camera(photo="b.png", status="no ties")
     )
-    ties = guided(photos, replace(mw.walls(2), walls=(strange,)), start, tmp_path)
+    ties = guided(photos, replace(mw.walls(1), walls=(strange,)), start, tmp_path)
     mine = ties.photo == 1
     error = ties.pixels_photo[mine] - cameras["b.png"].project(ties.points_world[mine])[:, :2]
     assert mine.sum() > 100
@@ -161,7 +161,7 @@ def test_ties_on_a_part_of_the_wall_that_was_moved_are_rejected(tmp_path: Path) 
     rgb[220:380, 380:540] = rgb[220:380, 372:532]
     moved = replace(photo, encoded=encode_png(rgb))
     start = ms.cameras(ms.oriented(camera))
-    ties = guided(ms.photos(moved), mw.walls(2), start, tmp_path)
+    ties = guided(ms.photos(moved), mw.walls(1), start, tmp_path)
     error_px = np.linalg.norm(mw.off_px(ties, camera), axis=1)
     assert len(error_px) > 200
     assert error_px.max() < 4.0
@@ -173,17 +173,17 @@ def test_no_oriented_photo_is_refused_and_a_pose_far_off_gives_hardly_any_ties(
     camera = ms.camera_before()
     photos = ms.photos(ms.photo_of(SCENE, camera))
     off = ms.nudged(camera, (0.0, 0.15, 0.0, -0.4, 0.0, 0.0))
-    assert len(guided(photos, mw.walls(2), ms.cameras(ms.oriented(off)), tmp_path).photo) < 30
+    assert len(guided(photos, mw.walls(1), ms.cameras(ms.oriented(off)), tmp_path).photo) < 30
     refused = ms.cameras(Camera(photo="a.png", status="3 ties with the walls"))
     with pytest.raises(MethodError, match=r"no photo is oriented.*a\.png: 3 ties with the walls"):
-        guided(photos, mw.walls(2), refused, tmp_path)
+        guided(photos, mw.walls(1), refused, tmp_path)
 
 
 def test_the_papers_mask_keeps_best_matches_from_going_astray(tmp_path: Path) -> None:
     # The photo shows a quarter of the wall; without the ratio test, every key point of the wall has
     # a match.
     camera = ms.camera_before(centre=(1.0, -1.3, 1.0), towards=(1.0, 0.0, 1.0))
-    inputs = {"photos": ms.photos(ms.photo_of(SCENE, camera)), "walls": mw.walls(2)}
+    inputs = {"photos": ms.photos(ms.photo_of(SCENE, camera)), "walls": mw.walls(1)}
     wrong, n_right = {}, {}
     for ratio in (1.0, 0.8):
         settings = {"preset": "paper", "ratio": ratio}

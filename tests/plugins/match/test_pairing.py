@@ -166,37 +166,26 @@ def test_of_ties_of_one_key_point_with_one_place_the_most_exact_stays() -> None:
         assert kept(first, second) == [[0.002], [] if is_twin else [0.003]]
 
 
-def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
-    first = piece([(1.0, 2.0), (3.0, 4.0)], [(0, 0, 0), (1, 1, 1)], [0.1, 0.2], photo=1)
-    second = piece([(5.0, 6.0)], [(2, 2, 2)], [0.3], wall=0, role=TieRole.CHECK)
-    walls = inspect_scenes.walls()
-    photos = photos_of(None, None)
-    ties = ties_of([first, second], photos, walls, {"said": 1}, search_radius_px=(4.0, None))
-    assert ties.photo_names == ("a", "b")
-    np.testing.assert_array_equal(ties.photo, [1, 1, 0])
-    np.testing.assert_array_equal(ties.wall, [0, 0, 0])
-    np.testing.assert_array_equal(ties.pixels_photo, [[1, 2], [3, 4], [5, 6]])
-    np.testing.assert_array_equal(ties.points_world[:, 0], [0, 1, 2])
-    np.testing.assert_array_equal(ties.sigma_m, [0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(ties.role, [TieRole.CONTROL, TieRole.CONTROL, TieRole.CHECK])
-    assert np.isnan(ties.residual_px).all()
-    assert ties.residual_px.shape == (3, 2)
-    assert (ties.search_radius_px, ties.details) == ((4.0, None), {"said": 1})
-    empty = ties_of([], photos, walls, {})
-    assert empty.pixels_photo.shape == (0, 2)
-    assert empty.points_world.shape == (0, 3)
-
-
-def test_ties_in_masked_pixels_are_left_out() -> None:
+def test_ties_of_all_pieces_are_joined_without_those_in_masked_pixels() -> None:
     used = np.full((8, 10), 255, dtype=np.uint8)
     used[5:7, 3] = used[:, 0] = used[0] = 0
     # The pixels are in the mask, next to it, on the border of the photo, which is outside, and in
     # the first column and row, which begin at 0.
     pixels = [(3.2, 5.9), (4.01, 5.9), (10.0, 8.0), (0.4, 3.3), (3.3, 0.4), (1.2, 1.2)]
-    every = piece(pixels, [(k, k, k) for k in range(6)], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    ties = ties_of([every], photos_of(encode_png(used)), inspect_scenes.walls(), {})
-    np.testing.assert_array_equal(ties.sigma_m, [0.2, 0.3, 0.6])
-    np.testing.assert_array_equal(ties.pixels_photo, [pixels[at] for at in (1, 2, 5)])
+    masked = piece(
+        pixels, [(k, k, k) for k in range(6)], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], role=TieRole.CHECK
+    )
+    whole = piece([(0.4, 3.3)], [(9, 9, 9)], [0.7], photo=1)
+    photos, walls = photos_of(encode_png(used), None), inspect_scenes.walls()
+    ties = ties_of([whole, masked], photos, walls, {"said": 1}, search_radius_px=(4.0, None))
+    np.testing.assert_array_equal(ties.sigma_m, [0.7, 0.2, 0.3, 0.6])
+    np.testing.assert_array_equal(ties.pixels_photo[1:], [pixels[at] for at in (1, 2, 5)])
+    np.testing.assert_array_equal(ties.points_world[:, 0], [9, 1, 2, 5])
+    assert (ties.photo_names, ties.photo.tolist()) == (("a", "b"), [1, 0, 0, 0])
+    assert ties.role.tolist() == [TieRole.CONTROL, *[TieRole.CHECK] * 3]
+    assert np.isnan(ties.residual_px).all()
+    assert (ties.search_radius_px, ties.details) == ((4.0, None), {"said": 1})
+    assert ties_of([], photos, walls, {}).points_world.shape == (0, 3)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.25])

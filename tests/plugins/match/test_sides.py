@@ -11,9 +11,9 @@ from orthoflow_plugins.match.sides import FaceByPhotos
 
 from orthoflow.products import Planes, PointCloud
 from orthoflow.testing import photographed as ms
-from tests import matched_walls as mw
 from tests import samples
 from tests.method_runs import run
+from tests.tied_photos import context
 
 SCENE = ms.textured_wall(1)
 CLOUD = ms.cloud_of(SCENE)
@@ -41,7 +41,7 @@ def planes(viewpoint: str = "guess") -> Planes:
 def faced(
     given: Planes, folder: Path, *, cloud: PointCloud = CLOUD, shown: ms.TexturedWall = SCENE
 ) -> tuple[Planes, dict[str, float]]:
-    ctx = mw.context(folder)
+    ctx = context(folder)
     photos = ms.photos(ms.photo_of(shown, ms.camera_before()))
     inputs = {"planes": given, "cloud": cloud, "photos": photos}
     found = run(FaceByPhotos, ctx, inputs).planes

@@ -21,15 +21,20 @@ from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
 from tests import samples
 from tests.method_runs import run
+from tests.tied_photos import context
 
 SCENE = ms.textured_wall(1)
+
+
+def level_photo() -> Photo:
+    return ms.photo_of(SCENE, ms.camera_before())
 
 
 def sift(
     folder: Path, photo: Photo, walls: Walls | None = None, hand: Ties | None = None
 ) -> tuple[Ties, list[str]]:
     """Return the ties of a photo and the codes of diagnostics."""
-    ctx = mw.context(folder)
+    ctx = context(folder)
     inputs = {"photos": ms.photos(photo), "walls": walls or mw.walls(1), "hand": hand}
     return run(MatchSift, ctx, inputs).ties, [each.code for each in ctx.diagnostics]
 
@@ -54,7 +59,7 @@ def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: 
 def test_where_photos_are_upside_down_the_run_goes_no_further(tmp_path: Path) -> None:
     with pytest.raises(MethodError, match="upside down"):
         sift(tmp_path, ms.photo_of(SCENE, ms.camera_before(roll=3.1)))
-    ties, _ = sift(tmp_path, ms.photo_of(SCENE, ms.camera_before()))
+    ties, _ = sift(tmp_path, level_photo())
     down = replace(ties, pixels_photo=-ties.pixels_photo)
     # The ties of a floor or ceiling do not tell.
     level = replace(down, points_world=ties.points_world[:, [0, 2, 1]])
@@ -63,7 +68,7 @@ def test_where_photos_are_upside_down_the_run_goes_no_further(tmp_path: Path) ->
 
 
 def test_a_photo_of_nothing_known_is_warned_of(tmp_path: Path) -> None:
-    photo = ms.photo_of(SCENE, ms.camera_before())
+    photo = level_photo()
     blank = replace(photo, encoded=encode_png(np.full((photo.height, photo.width), 128, np.uint8)))
     ties, codes = sift(tmp_path, blank)
     assert not (ties.role != TieRole.REJECTED).any()
@@ -109,14 +114,6 @@ def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertaint
     assert edge[1][0] > 0.05
 
 
-HAND_SCENE = ms.textured_wall(0)
-HAND_CAMERA = ms.camera_before(centre=(1.3, -2.6, 1.1))
-
-
-def hand_photo() -> Photo:
-    return ms.photo_of(HAND_SCENE, HAND_CAMERA)
-
-
 def measured(*names: str) -> Ties:
     count = len(names)
     return samples.ties(
@@ -132,10 +129,10 @@ def measured(*names: str) -> Ties:
 
 
 def test_ties_by_hand_stand_behind_those_that_are_found(tmp_path: Path) -> None:
-    alone, _ = sift(tmp_path, hand_photo(), mw.walls(0))
+    alone, _ = sift(tmp_path, level_photo())
     assert alone.by_hand is None
     hand = measured("a.png", "stranger.png", "a.png")
-    both, _ = sift(tmp_path, hand_photo(), mw.walls(0), hand)
+    both, _ = sift(tmp_path, level_photo(), hand=hand)
     count = len(alone.photo)
     np.testing.assert_array_equal(both.pixels_photo[:count], alone.pixels_photo)
     np.testing.assert_array_equal(both.pixels_photo[count:], hand.pixels_photo[[0, 2]])
@@ -147,7 +144,7 @@ def test_ties_by_hand_stand_behind_those_that_are_found(tmp_path: Path) -> None:
 
 
 def test_a_tie_by_hand_lies_on_the_nearest_wall(tmp_path: Path) -> None:
-    (wall,) = mw.walls(0).walls
+    (wall,) = mw.walls(1).walls
     moves = np.array([[0.0, 1.0, 0.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     frames = [replace(wall.frame, origin_world=wall.frame.origin_world + move) for move in moves]
     walls = tuple(replace(wall, frame=frame, intensity=None) for frame in frames)
@@ -155,21 +152,21 @@ def test_a_tie_by_hand_lies_on_the_nearest_wall(tmp_path: Path) -> None:
         measured("a.png", "a.png", "a.png"),
         points_world=np.array([[1.0, 0.9, 1], [5.5, 0.2, 1], [1.0, 0.3, 1]]),
     )
-    ties, _ = sift(tmp_path, hand_photo(), replace(mw.walls(0), walls=walls), hand)
+    ties, _ = sift(tmp_path, level_photo(), replace(mw.walls(1), walls=walls), hand)
     np.testing.assert_array_equal(ties.wall, [0, 1, 2])
 
 
 def test_walls_that_show_nothing_leave_the_ties_by_hand(tmp_path: Path) -> None:
     bare = replace(
-        mw.walls(0), walls=tuple(replace(wall, intensity=None) for wall in mw.walls(0).walls)
+        mw.walls(1), walls=tuple(replace(wall, intensity=None) for wall in mw.walls(1).walls)
     )
     with pytest.raises(MethodError, match="neither intensity nor colour"):
-        sift(tmp_path, hand_photo(), bare)
+        sift(tmp_path, level_photo(), bare)
     hand = measured("a.png", "a.png")
-    inputs = {"photos": ms.photos(hand_photo()), "walls": bare, "hand": hand}
-    cameras = {"cameras": ms.cameras(ms.oriented(HAND_CAMERA))}
+    inputs = {"photos": ms.photos(level_photo()), "walls": bare, "hand": hand}
+    cameras = {"cameras": ms.cameras(ms.oriented(ms.camera_before()))}
     for method, more in ((MatchSift, {}), (MatchGuided, cameras)):
-        ctx = mw.context(tmp_path)
+        ctx = context(tmp_path)
         ties = run(method, ctx, {**inputs, **more}).ties
         np.testing.assert_array_equal(ties.by_hand, [1, 1])
         assert len(ties.walls) == 1

@@ -18,9 +18,10 @@ from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.occluders import occluders_before
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Photo, PointCloud, Wall
+from orthoflow.products import Photo, Wall
 from orthoflow.testing import photographed as ms
 from tests import samples
+from tests.raster_scenes import cloud_of
 from tests.scenes import SURVEY_SHIFT_M
 from tests.tied_photos import photo, seen_by
 
@@ -120,14 +121,7 @@ def test_six_cells_behind_a_surface_are_hidden(apart_cells: float, is_hidden: bo
 def board_before(wall: Wall, camera: ViewingCamera) -> warping.Before:
     # Put a board, which is in no raster, half a metre in front of the left half of the wall.
     across, down = np.meshgrid(np.arange(-0.35, -0.05, 0.005), np.arange(-0.5, 0.5, 0.005))
-    x = across.ravel().astype(np.float32)
-    cloud = PointCloud(
-        origin=np.array([0.0, -0.5, 0.0]),
-        x=x,
-        y=np.zeros_like(x),
-        z=down.ravel().astype(np.float32),
-        up=samples.UP,
-    )
+    cloud = cloud_of(np.column_stack([across.ravel(), np.full(across.size, -0.5), down.ravel()]))
     occluders = occluders_before(
         cloud,
         [Slab(frame=wall.frame, front_m=0.1, behind_m=0.1)],
