@@ -91,44 +91,30 @@ class Drum:
         a = (beside**2).sum(axis=1)
         b = (across * beside).sum(axis=1)
         side = -1.0 if shape.is_concave else 1.0
+        arc = np.array(self.arc_rad) * shape.radius_m
         best = np.full(len(rays), np.inf)
-        for radius_m, is_band in (
-            (shape.radius_m, False),
-            (shape.radius_m + side * self.height_m, True),
-        ):
-            with np.errstate(invalid="ignore"):
-                root = np.sqrt(b * b - a * ((across**2).sum(axis=1) - radius_m**2))
-            for sign in (-1.0, 1.0):
-                with np.errstate(invalid="ignore", divide="ignore"):
-                    t = (-b + sign * root) / a
-                self._keep(start, rays, t, best, is_band=is_band)
-        for edge_m in self.band_m if self.height_m else ():
-            with np.errstate(invalid="ignore", divide="ignore"):
-                t = (edge_m - first) / slope
-            radii = np.linalg.norm(across + t[:, None] * beside, axis=1)
-            depth = side * (radii - shape.radius_m)
-            t[~((depth > 0.0) & (depth < self.height_m))] = np.nan
-            self._keep(start, rays, t, best, is_band=None)
-        return best
 
-    def _keep(
-        self,
-        start: NDArray[np.float64],
-        rays: NDArray[np.float64],
-        t: NDArray[np.float64],
-        best: NDArray[np.float64],
-        *,
-        is_band: bool | None,
-    ) -> None:
-        ahead = np.flatnonzero((t > 1e-6) & (t < best))
-        places = self.places(start[ahead] + t[ahead, None] * rays[ahead])
-        arc = np.array(self.arc_rad) * self.cylinder.radius_m
-        good = (places[:, 0] >= arc[0]) & (places[:, 0] <= arc[1])
-        good &= (places[:, 1] >= self.along_m[0]) & (places[:, 1] <= self.along_m[1])
-        if is_band is not None:
+        def keep(t: NDArray[np.float64], *, is_band: bool | None) -> None:
+            ahead = np.flatnonzero((t > 1e-6) & (t < best))
+            places = self.places(start[ahead] + t[ahead, None] * rays[ahead])
+            good = (places >= [arc[0], self.along_m[0]]) & (places <= [arc[1], self.along_m[1]])
             on_band = (places[:, 1] >= self.band_m[0]) & (places[:, 1] < self.band_m[1])
-            good &= on_band == is_band if self.height_m else True
-        best[ahead[good]] = t[ahead[good]]
+            if is_band is not None and self.height_m:
+                good &= (on_band == is_band)[:, None]
+            best[ahead[good.all(axis=1)]] = t[ahead[good.all(axis=1)]]
+
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for is_band in (False, True):
+                radius_m = shape.radius_m + side * self.height_m * is_band
+                root = np.sqrt(b * b - a * ((across**2).sum(axis=1) - radius_m**2))
+                keep((-b - root) / a, is_band=is_band)
+                keep((-b + root) / a, is_band=is_band)
+            for edge_m in self.band_m if self.height_m else ():
+                t = (edge_m - first) / slope
+                radii = np.linalg.norm(across + t[:, None] * beside, axis=1)
+                depth = side * (radii - shape.radius_m)
+                keep(np.where((depth > 0.0) & (depth < self.height_m), t, np.nan), is_band=None)
+        return best
 
     def rendered(self, camera: ViewingCamera) -> NDArray[np.uint8]:
         """What a camera sees (height, width, 3), 0 beside the surface."""

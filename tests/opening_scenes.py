@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.products import PointCloud, Walls
 from tests import samples
-from tests.raster_scenes import SURVEY, UP, leaning_wall
+from tests.raster_scenes import SURVEY, cloud_of, leaning_wall
 
 GSD_M = 0.01
 SHAPE = (240, 400)
@@ -46,7 +48,7 @@ def inside(corners: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray
     return is_inside
 
 
-def frame(*, map_crs: str | None = None) -> WallFrame:
+def frame() -> WallFrame:
     """At survey coordinates, turned and leaning."""
     wall = leaning_wall(shape=SHAPE)
     u, v = wall.axes
@@ -58,7 +60,6 @@ def frame(*, map_crs: str | None = None) -> WallFrame:
         gsd_m=GSD_M,
         width=SHAPE[1],
         height=SHAPE[0],
-        map_crs=map_crs,
     )
 
 
@@ -100,8 +101,8 @@ def cloud(*, knows_stations: bool = True) -> PointCloud:
     where, station = frame(), np.array(STATION)
     rows, columns = np.indices((120, 200))
     crossings = np.stack([columns, rows], axis=2).reshape(-1, 2) * 2.0 + 1.0
-    ends = np.column_stack([crossings, np.zeros(len(crossings))])
     on = np.column_stack([crossings, np.zeros(len(crossings))])
+    ends = on.copy()
     for corners, depth_m in ((WINDOW, -2.0), (HIDDEN, 0.8)):
         chosen = inside(corners, crossings)
         share = (station[2] - depth_m) / station[2]
@@ -110,16 +111,9 @@ def cloud(*, knows_stations: bool = True) -> PointCloud:
     ends = ends[seen]
     # A gross error far behind the face, alone.
     ends[17, 2] = -3.0
-    points = where.world_from_wall(ends[:, :2], ends[:, 2]) - SURVEY
-    x, y, z = (np.ascontiguousarray(axis) for axis in points.T.astype(np.float32))
+    bare = cloud_of(where.world_from_wall(ends[:, :2], ends[:, 2]))
+    if not knows_stations:
+        return bare
     at = where.world_from_wall(station[None, :2], station[2:])
-    return PointCloud(
-        origin=SURVEY.copy(),
-        x=x,
-        y=y,
-        z=z,
-        up=UP,
-        scan=np.zeros(len(x), dtype=np.uint16) if knows_stations else None,
-        stations=at if knows_stations else None,
-        stations_source="file" if knows_stations else None,
-    )
+    scan = np.zeros(len(bare), dtype=np.uint16)
+    return replace(bare, scan=scan, stations=at, stations_source="file")

@@ -11,36 +11,30 @@ from orthoflow_plugins.colour.photos import ColourPhotos
 
 from orthoflow.errors import MethodError
 from orthoflow.files.clouds import photo_colours as module
-from orthoflow.products import Cameras, Photos, PointCloud
+from orthoflow.products import Cameras, PointCloud, Product
 from tests import ortho_scenes
 from tests import raster_scenes as scenes
+from tests.method_runs import run
 from tests.ortho_scenes import BLUE, BOARD, NOTHING
 
 
 def coloured(
-    folder: Path, cloud: PointCloud, photos: Photos, cameras: Cameras, **params: object
+    folder: Path, *, unseen: str = "drop", **changes: Product
 ) -> tuple[PointCloud, dict[str, float]]:
+    """Return the points of a scene, coloured by a photo, and the metrics."""
+    scene = ortho_scenes.inputs(**changes)
     ctx = scenes.context(folder)
-    inputs = ColourPhotos.In(cloud=cloud, photos=photos, cameras=cameras)
-    out = ColourPhotos().run(inputs, ColourPhotos.Params.model_validate(params), ctx)
-    return out.cloud, {metric.name: metric.value for metric in ctx.metrics}
+    inputs = {name: scene[name] for name in ("cloud", "photos", "cameras")}
+    return run(ColourPhotos, ctx, inputs, unseen=unseen).cloud, scenes.numbers(ctx)
 
 
 def test_points_take_the_colour_of_what_the_photo_sees_there(tmp_path: Path) -> None:
     where = ortho_scenes.frame()
     viewer = ortho_scenes.camera(where)
-    photos = ortho_scenes.photos(ortho_scenes.rendered())
-    cloud, metrics = coloured(
-        tmp_path,
-        ortho_scenes.cloud(where),
-        photos,
-        ortho_scenes.cameras(viewer),
-    )
-    assert cloud.rgb is not None
+    cloud, metrics = coloured(tmp_path)
     points = cloud.points_world()
     # Each point keeps its index in the given cloud, which is needed to compare labels with the
     # truth.
-    assert cloud.point_id is not None
     given = ortho_scenes.cloud(where)
     np.testing.assert_array_equal(given.points_world()[cloud.point_id], points)
     truth = ortho_scenes.cast(
@@ -59,33 +53,19 @@ def test_points_take_the_colour_of_what_the_photo_sees_there(tmp_path: Path) -> 
     assert same[seen].mean() > 0.97
     assert (truth.surface[seen] == BOARD).any()
     assert not (truth.surface == NOTHING).any()
-
-
-def test_unseen_points_may_stay_in_grey(tmp_path: Path) -> None:
-    where = ortho_scenes.frame()
-    photos = ortho_scenes.photos(ortho_scenes.rendered())
-    cameras = ortho_scenes.cameras(ortho_scenes.camera(where))
-    bare = ortho_scenes.cloud(where)
-    kept, metrics = coloured(tmp_path, bare, photos, cameras, unseen="grey")
-    assert len(kept) == len(bare)
-    assert kept.rgb is not None
+    # Unseen points may stay, in grey.
+    kept, metrics = coloured(tmp_path, unseen="grey")
+    assert len(kept) == len(given)
     grey = np.all(kept.rgb == 128, axis=1).mean()
     assert grey == pytest.approx(1.0 - metrics["coloured_share"], abs=0.01)
 
 
 def test_photos_that_are_not_oriented_or_look_elsewhere_are_refused(tmp_path: Path) -> None:
-    where = ortho_scenes.frame()
-    photos = ortho_scenes.photos(ortho_scenes.rendered())
-    viewer = ortho_scenes.camera(where)
-    lost = Cameras(cameras=(replace(ortho_scenes.cameras(viewer).cameras[0], status="lost"),))
+    (found,) = ortho_scenes.cameras(ortho_scenes.camera(ortho_scenes.frame())).cameras
     with pytest.raises(MethodError, match="none of the photos is oriented"):
-        coloured(tmp_path, ortho_scenes.cloud(where), photos, lost)
-    away = ortho_scenes.cloud(ortho_scenes.frame(at_survey=True))
+        coloured(tmp_path, cameras=Cameras(cameras=(replace(found, status="lost"),)))
     with pytest.raises(MethodError, match="no photo shows a point"):
-        coloured(tmp_path, away, photos, ortho_scenes.cameras(viewer))
-
-
-# --- one photo ---
+        coloured(tmp_path, cloud=ortho_scenes.cloud(ortho_scenes.frame(at_survey=True)))
 
 
 def test_the_box_holds_the_cameras_and_the_cloud_but_for_outliers() -> None:

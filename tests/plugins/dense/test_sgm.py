@@ -41,11 +41,19 @@ def matched(
     return out.cloud, {metric.name: metric.value for metric in ctx.metrics}
 
 
-def test_points_lie_on_the_surface(tmp_path: Path, room: SimulateRoom.Out) -> None:
-    cameras = room.truth.cameras
-    assert cameras is not None
-    assert room.cameras == cameras
-    cloud, metrics = matched(tmp_path, DenseSgm.In(photos=room.photos, cameras=room.cameras))
+@pytest.fixture(scope="module")
+def dense(
+    room: SimulateRoom.Out, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[PointCloud, dict[str, float]]:
+    inputs = DenseSgm.In(photos=room.photos, cameras=room.cameras)
+    return matched(tmp_path_factory.mktemp("dense"), inputs)
+
+
+def test_points_lie_on_the_surface(
+    room: SimulateRoom.Out, dense: tuple[PointCloud, dict[str, float]]
+) -> None:
+    assert room.cameras == room.truth.cameras
+    cloud, metrics = dense
     # There are three rows of six photos; the last photo of a row has no neighbour to its right.
     assert metrics["n_pairs"] == 15
     assert metrics["n_points"] == len(cloud)
@@ -58,53 +66,43 @@ def test_points_lie_on_the_surface(tmp_path: Path, room: SimulateRoom.Out) -> No
     points, stations = cloud.points_world(chosen), cloud.stations[cloud.scan[chosen]]
     # Compute the distance of the first surface on the ray from the station through each point.
     views = SceneCameras(room.truth.scene, cores=1)
-    share = np.concatenate(
-        [
-            views.cast(station, points[(stations == station).all(axis=1)] - station).t
-            for station in cloud.stations
-        ]
-    )
-    distance = np.concatenate(
-        [
-            np.linalg.norm(points[(stations == station).all(axis=1)] - station, axis=1)
-            for station in cloud.stations
-        ]
-    )
-    off_m = np.abs(share - 1.0) * distance
+    off = []
+    for station in cloud.stations:
+        rays = points[(stations == station).all(axis=1)] - station
+        off.append(np.abs(views.cast(station, rays).t - 1.0) * np.linalg.norm(rays, axis=1))
+    off_m = np.concatenate(off)
     # With 8 mm pixels and a base of a third of the distance, 0.3 px of disparity are 8 mm.
     assert np.median(off_m) < 0.008
     # The other points are at edges, where one photo shows areas that the other does not show.
     assert np.mean(off_m < 0.03) > 0.85
 
 
-def test_of_points_in_one_cube_one_is_kept(tmp_path: Path, room: SimulateRoom.Out) -> None:
+def test_of_points_in_one_cube_one_is_kept(
+    tmp_path: Path, room: SimulateRoom.Out, dense: tuple[PointCloud, dict[str, float]]
+) -> None:
     inputs = DenseSgm.In(photos=room.photos, cameras=room.cameras)
-    dense, _ = matched(tmp_path / "dense", inputs)
-    coarse, _ = matched(tmp_path / "coarse", inputs, spacing_m=0.05)
+    coarse, _ = matched(tmp_path, inputs, spacing_m=0.05)
     assert coarse.scan is not None
     cubes = np.column_stack([coarse.scan, np.floor(coarse.points_world() / 0.05 + 1e-6)])
     # Offsets are float32, so a few points at the sides of cubes are in the next cube.
     assert len(np.unique(cubes, axis=0)) > 0.99 * len(coarse)
-    assert len(coarse) < 0.2 * len(dense)
-    given = {tuple(row) for row in np.round(dense.points_world(), 4)}
+    assert len(coarse) < 0.2 * len(dense[0])
+    given = {tuple(row) for row in np.round(dense[0].points_world(), 4)}
     assert all(tuple(row) in given for row in np.round(coarse.points_world()[:1000], 4))
 
 
 def test_photos_without_a_neighbour_and_surfaces_elsewhere_are_refused(
     tmp_path: Path, room: SimulateRoom.Out
 ) -> None:
-    alone = Cameras(cameras=room.cameras.cameras[:1])
-    with pytest.raises(MethodError, match=r"among the oriented photos \(1\): neighbouring"):
-        matched(tmp_path / "alone", DenseSgm.In(photos=room.photos, cameras=alone))
-    refused = [replace(room.cameras.cameras[0], status="refused"), *room.cameras.cameras[1:2]]
-    with pytest.raises(MethodError, match=r"among the oriented photos \(1\)"):
-        matched(
-            tmp_path / "refused",
-            DenseSgm.In(photos=room.photos, cameras=Cameras(cameras=tuple(refused))),
-        )
-    # Use the first photo and the one above it, whose base is along the columns.
-    above = Cameras(cameras=(room.cameras.cameras[0], room.cameras.cameras[6]))
-    with pytest.raises(MethodError, match=r"among the oriented photos \(2\)"):
-        matched(tmp_path / "above", DenseSgm.In(photos=room.photos, cameras=above))
+    first, second = room.cameras.cameras[:2]
+    # The base of the first photo and the one above it is along the columns.
+    for cameras, n_oriented in (
+        ((first,), 1),
+        ((replace(first, status="refused"), second), 1),
+        ((first, room.cameras.cameras[6]), 2),
+    ):
+        inputs = DenseSgm.In(photos=room.photos, cameras=Cameras(cameras=cameras))
+        with pytest.raises(MethodError, match=rf"oriented photos \({n_oriented}\): neighbouring"):
+            matched(tmp_path, inputs)
     with pytest.raises(ValueError, match=r"farthest_m 1 must be greater than nearest_m 1\.5"):
         DenseSgm.Params(nearest_m=1.5, farthest_m=1.0)

@@ -16,6 +16,7 @@ from orthoflow.products import CheckPoints
 from tests import raster_scenes as scenes
 from tests.inspect_scenes import points_at
 from tests.long_loops import seeds
+from tests.method_runs import run
 
 STATIONS = np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 2.0]])
 SURVEY = np.array([634512.347, 486215.781, 112.193])
@@ -35,9 +36,8 @@ def register(
     cloud = scenes.cloud_of(np.random.default_rng(1).uniform(-4.0, 4.0, (500, 3)))
     # As with a cloud from photos, z points down.
     cloud = replace(cloud, up=np.array([0.0, 0.0, -1.0]), stations=STATIONS, stations_source="file")
-    inputs = RegisterSimilarity.In(cloud=cloud, points=points, control=control)
-    out = RegisterSimilarity().run(inputs, RegisterSimilarity.Params.model_validate(params), ctx)
-    return out, {metric.name: metric.value for metric in ctx.metrics}
+    inputs = {"cloud": cloud, "points": points, "control": control}
+    return run(RegisterSimilarity, ctx, inputs, **params), scenes.numbers(ctx)
 
 
 def places(seed: int, count: int = 8) -> NDArray[np.float64]:
@@ -77,10 +77,7 @@ def test_sigma0_is_the_noise_of_a_coordinate_and_left_out_points_tell_more(tmp_p
 def test_too_few_pairs_and_lines_are_refused(tmp_path: Path) -> None:
     source = places(3, 5)
     other = replace(points_at(source), names=("A", "B", "P2", "P3", "C"))
-    with pytest.raises(
-        MethodError,
-        match="at least 3 names must be in both lists of points, but only these are: P2, P3",
-    ):
+    with pytest.raises(MethodError, match=r"at least 3 names .* only these are: P2, P3"):
         register(tmp_path, points_at(source), other)
     line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
     with pytest.raises(MethodError, match="are on one line"):
@@ -90,14 +87,11 @@ def test_too_few_pairs_and_lines_are_refused(tmp_path: Path) -> None:
 def test_residuals_and_what_they_add_up_to_are_told(tmp_path: Path) -> None:
     source, off = places(4, 6), 0.001 * np.random.default_rng(9).normal(size=(6, 3))
     true = turned(4)
-    control = replace(
-        points_at(true.apply(source) + off), names=("P5", "P4", "P3", "P2", "P1", "P0")
-    )
+    control = replace(points_at(true.apply(source) + off), names=tuple("FEDCBA"))
     # Pairs have the same names, in the order of the points.
     points = replace(points_at(source), names=control.names)
-    out, metrics = register(tmp_path, points, replace(
-        control, names=control.names[::-1], points_world=control.points_world[::-1]
-    ))  # fmt: skip
+    backwards = {"names": control.names[::-1], "points_world": control.points_world[::-1]}
+    out, metrics = register(tmp_path, points, replace(control, **backwards))
     inspection = out.inspection
     details: Any = inspection.details
     fitted = details["target_from_source"]
@@ -133,7 +127,6 @@ def test_lists_that_mirror_each_other_are_refused(tmp_path: Path, with_scale: bo
 
 @pytest.mark.parametrize(("params", "up"), [({}, [0, 0, 1]), ({"up": "-y"}, [0, -1, 0])])
 def test_up_is_that_of_the_control(tmp_path: Path, params: dict[str, str], up: list[int]) -> None:
-    out, _ = register(
-        tmp_path, points_at(places(1)), points_at(turned(1).apply(places(1))), **params
-    )
+    points, control = points_at(places(1)), points_at(turned(1).apply(places(1)))
+    out, _ = register(tmp_path, points, control, **params)
     np.testing.assert_array_equal(out.cloud.up, up)

@@ -21,6 +21,7 @@ from orthoflow_plugins.segment.areas import (
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, Wall
 from tests import samples
+from tests.raster_scenes import cloud_of
 
 GSD_M = 0.02
 SHAPE = (60, 80)
@@ -217,15 +218,8 @@ def cloud(
     source: str = "file",
 ) -> PointCloud:
     """Return a cloud of points (n, 3) given in metres right, down and in front of the wall."""
-    x, y, z = (
-        np.ascontiguousarray(axis, dtype=np.float32) for axis in world(ends).T - CORNER[:, None]
-    )
-    return PointCloud(
-        origin=CORNER.copy(),
-        x=x,
-        y=y,
-        z=z,
-        up=np.array([0.0, 0.0, 1.0]),
+    return replace(
+        cloud_of(world(ends)),
         stations=None if stations is None else world(stations),
         stations_source=None if stations is None else source,  # type: ignore[arg-type]
         scan=None if scan is None else scan.astype(np.uint16),

@@ -15,7 +15,8 @@ from orthoflow.products import OpeningKind, Openings, Orthoimages, OutlineSource
 from orthoflow.sdk import StepContext
 from tests import opening_scenes as scenes
 from tests import samples
-from tests.raster_scenes import context
+from tests.method_runs import run
+from tests.raster_scenes import context, numbers
 
 
 def found(
@@ -25,11 +26,9 @@ def found(
     images: Orthoimages | None = None,
     **params: object,
 ) -> tuple[Openings, StepContext]:
-    folder.mkdir(exist_ok=True)
     ctx = context(folder)
-    inputs = SegmentOpenings.In(walls=walls or scenes.walls(), cloud=cloud, orthoimages=images)
-    outputs = SegmentOpenings().run(inputs, SegmentOpenings.Params.model_validate(params), ctx)
-    return outputs.openings, ctx
+    inputs = {"walls": walls or scenes.walls(), "cloud": cloud, "orthoimages": images}
+    return run(SegmentOpenings, ctx, inputs, **params).openings, ctx
 
 
 def test_each_area_is_what_the_rays_say(tmp_path: Path) -> None:
@@ -40,8 +39,8 @@ def test_each_area_is_what_the_rays_say(tmp_path: Path) -> None:
     assert niche.depth_m == pytest.approx(scenes.NICHE_M, abs=0.0005)
     assert window.depth_m is None
     assert mirror.depth_m is None
-    numbers = {metric.name: metric.value for metric in ctx.metrics}
-    assert (numbers["n_openings"], numbers["n_through"], numbers["n_no_data"]) == (3, 1, 1)
+    found_of = numbers(ctx)
+    assert [found_of[name] for name in ("n_openings", "n_through", "n_no_data")] == [3, 1, 1]
     assert [figure.name for figure in ctx.figures] == ["wall_4_openings"]
     assert ctx.warnings == []
 
@@ -74,7 +73,7 @@ def test_an_empty_area_as_shadows_have_it_is_none(tmp_path: Path) -> None:
     shaded = replace(walls, walls=(replace(wall, depth_m=depth, mask=mask),))
     openings, ctx = found(tmp_path, walls=shaded)
     assert [opening.kind for opening in openings.openings] == ["niche", "no data", "no data"]
-    assert {metric.name: metric.value for metric in ctx.metrics}["n_unbounded"] == 1
+    assert numbers(ctx)["n_unbounded"] == 1
 
 
 def test_a_plane_before_the_wall_is_not_its_face_and_far_before_it_of_something_else(
@@ -131,8 +130,7 @@ def test_photos_place_sides_that_the_scan_is_too_coarse_for(tmp_path: Path) -> N
     np.testing.assert_allclose(sides, true, atol=0.15)
     assert (window.side_sigma_m / scenes.GSD_M).max() <= 0.55
     assert (niche.side_sigma_m / scenes.GSD_M).min() >= 0.7
-    numbers = {metric.name: metric.value for metric in ctx.metrics}
-    assert numbers["image_side_share"] == pytest.approx(4 / 12)
+    assert numbers(ctx)["image_side_share"] == pytest.approx(4 / 12)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from orthoflow.products import PointCloud, PointLabels, Surface, Surfaces, Truth
 from orthoflow.testing import Trial, run_trial
 from orthoflow.testing.surveyed import few_points
 from orthoflow.testing.trials import TrialRun
+from tests.long_loops import long_only, seeds
 
 SHIFT_M = (4e5, 5e6, 100.0)
 
@@ -83,7 +84,7 @@ def test_surfaces_are_found_as_accurately_as_stated(
         assert surface.n_points == np.count_nonzero(own)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", seeds(2))
 def test_a_room_of_planes_has_no_cylinder(seed: int, tmp_path: Path) -> None:
     params = {"geometry": "drawn", "decoration": "drawn", "scan_step_m": 0.02}
     room = run_trial(
@@ -159,7 +160,9 @@ def test_what_is_no_cylinder_is_rejected_with_the_reason(
     assert reason is None or reason in reasons
 
 
-@pytest.mark.parametrize(("noise_m", "half_rad"), [(0.005, 2.6), (0.02, 2.6), (0.005, math.pi)])
+@pytest.mark.parametrize(
+    ("noise_m", "half_rad"), [*long_only((0.005, 2.6)), (0.02, 2.6), (0.005, math.pi)]
+)
 def test_a_leaning_cylinder_without_stations_is_found_despite_noise(
     noise_m: float, half_rad: float, tmp_path: Path
 ) -> None:
@@ -191,7 +194,7 @@ def test_a_leaning_cylinder_without_stations_is_found_despite_noise(
         assert abs(math.atan2(start[1], start @ [0.8, 0.0, -0.6]) - 1.0) < 0.2
 
 
-@pytest.mark.parametrize("half_angle_deg", [3.0, 10.0, 25.0])
+@pytest.mark.parametrize("half_angle_deg", [3.0, *long_only(10.0), 25.0])
 def test_a_cone_is_found_by_its_method_and_no_cylinder_is(
     half_angle_deg: float, tmp_path: Path
 ) -> None:
