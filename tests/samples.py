@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthoflow.geometry import Cone, Cylinder, WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.key_points import Features
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import (
     Layer,
@@ -158,6 +159,17 @@ def ties(pixels_photo: NDArray[np.float64], **known: Any) -> Ties:
         "residual_px": np.full((count, 2), np.nan),
     }
     return Ties(pixels_photo=pixels_photo, **{**plain, **known})
+
+
+def features(pixels: NDArray[np.float64], **known: Any) -> Features:
+    """Key points of one size and direction, whose descriptors tell nothing unless given."""
+    n = len(pixels)
+    usual: dict[str, Any] = {
+        "sizes_px": np.full(n, 4.0),
+        "angles_deg": np.zeros(n),
+        "descriptors": np.zeros((n, 128), dtype=np.float32),
+    }
+    return Features(pixels=np.asarray(pixels, dtype=np.float64), **{**usual, **known})
 
 
 def seen(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from orthoflow_plugins.orient.gates import KnownWall
 from orthoflow_plugins.orient.pose import TiedPhoto
 
 from orthoflow.files.images import encode_png
@@ -131,3 +132,24 @@ def joined(*each: Ties) -> Ties:
     arrays = [name for name, value in vars(each[0]).items() if isinstance(value, np.ndarray)]
     both = {name: np.concatenate([getattr(ties, name) for ties in each]) for name in arrays}
     return replace(each[0], **both)
+
+
+def known_wall(
+    across_m: tuple[float, float],
+    up_m: tuple[float, float] = (0.0, 2.0),
+    *,
+    number: int = 0,
+    gsd_m: float | None = None,
+) -> KnownWall:
+    """A rectangle in the plane y = 0 that faces -y."""
+    (left, right), (low, high) = across_m, up_m
+    corners = [[left, 0.0, high], [left, 0.0, low], [right, 0.0, low], [right, 0.0, high]]
+    return KnownWall(
+        index=number,
+        number=number,
+        name=f"wall {number}",
+        corners_world=np.array(corners),
+        normal=-samples.NORTH,
+        gsd_m=gsd_m,
+        has_side=True,
+    )

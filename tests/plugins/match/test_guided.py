@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
 from tests import samples
 
-measure = partial(displacements.measure, radius_cells=6, min_score=0.3)
 ROUGH = (0.004, -0.005, 0.003, 0.01, -0.02, 0.01)
 
 
@@ -51,7 +49,7 @@ def test_a_known_shift_is_measured_without_bias(content, moved: tuple[float, flo
     ]
     first, second = (content(image) for image in noisy)
     places = channels.textured_places(channels.texture(first), first.known > 0.0, 200)
-    found = measure(first, second, places)
+    found = displacements.measure(first, second, places, radius_cells=6, min_score=0.3)
     assert len(found.places) > 100
     error = found.shift_cells - moved
     np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.02)
@@ -60,30 +58,6 @@ def test_a_known_shift_is_measured_without_bias(content, moved: tuple[float, flo
         # Half of a normal distribution is within 0.67 standard deviations.
         ratios = np.abs(error) / found.sigma_cells[:, None]
         assert np.median(ratios) == pytest.approx(0.67, abs=0.2)
-
-
-def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them() -> None:
-    rng, moved = np.random.default_rng(5), (2.37, -1.41)
-    grains = rng.normal(size=(3, 240, 300))
-    smooth = [200.0 * gaussian_filter(grain, 2.0, mode="wrap") for grain in grains]
-    colours = np.stack(smooth, axis=-1)
-    # For the laser, red is bright on the left; on the right, red is dark and green is bright.
-    response = np.where(np.arange(300)[None, :, None] < 150, [0.7, 0.1, 0.2], [-0.6, 0.5, 0.0])
-    wall = (colours * response).sum(axis=2)
-    later = shift(colours, (moved[1], moved[0], 0.0), order=5, mode="grid-wrap")
-    first = channels.grey_channels((wall + rng.normal(size=wall.shape)).astype(np.float32))
-    noisy = (later + rng.normal(size=later.shape)).astype(np.float32)
-    places = channels.textured_places(channels.texture(first), first.known > 0.0, 200)
-    places = places[np.abs(places[:, 0] - 150) > 12]
-    found = measure(first, channels.colour_channels(noisy), places)
-    as_grey = measure(first, channels.grey_channels(noisy.mean(axis=2)), places)
-    assert len(found.places) > 100
-    # In the half with mixed contrast, grey finds almost nothing.
-    n_right = [int((each.places[:, 0] > 150).sum()) for each in (found, as_grey)]
-    assert n_right[0] > 50 > 4 * n_right[1]
-    error = found.shift_cells - moved
-    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.035)  # three sigmas of a mean
-    assert np.sqrt(np.mean(error**2)) < 0.12
 
 
 @pytest.mark.parametrize("content", ["grey", "colours"])

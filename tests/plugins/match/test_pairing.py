@@ -12,27 +12,17 @@ from orthoflow_plugins.match.key_points import Pair, mapped, rematched, verified
 from orthoflow_plugins.match.ties import TiePiece, key_point_ties, ties_of, without_twins
 
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.key_points import Features, Matches
-from orthoflow.products import Photos, TieRole
+from orthoflow.geometry.key_points import Matches
+from orthoflow.products import TieRole
 from orthoflow.testing import photographed as ms
 from tests import inspect_scenes
 from tests.inspect_scenes import GSD_M
+from tests.samples import features
 from tests.tied_photos import photo
 
 LOOSE_PX = 20.0
 # Transform from wall pixels to photo pixels, which are rotated, reduced and slightly oblique.
 TILTED = np.array([[0.8, -0.3, 500.0], [0.25, 0.9, 300.0], [1e-5, -2e-5, 1.0]])
-
-
-# The type is Any, since the fields of key points have different types.
-def features(pixels: NDArray[np.float64], **known: Any) -> Features:
-    n = len(pixels)
-    usual: dict[str, Any] = {
-        "sizes_px": np.full(n, 4.0),
-        "angles_deg": np.zeros(n),
-        "descriptors": np.zeros((n, 128), dtype=np.float32),
-    }
-    return Features(pixels=np.asarray(pixels, dtype=np.float64), **{**usual, **known})
 
 
 def on_wall(n: int, seed: int = 1) -> NDArray[np.float64]:
@@ -136,12 +126,6 @@ def piece(
     )
 
 
-def photos_of(*masks: bytes | None) -> Photos:
-    """Return photos a, b, ... with or without masks of usable pixels."""
-    named = zip("ab", masks, strict=False)
-    return ms.photos(*(photo(name=name, width=10, height=8, mask=mask) for name, mask in named))
-
-
 def kept(*pieces: TiePiece) -> list[list[float]]:
     """Return the remaining ties, identified by their `sigma_m`."""
     return [item.sigma_m.tolist() for item in without_twins(pieces)]
@@ -176,7 +160,9 @@ def test_ties_of_all_pieces_are_joined_without_those_in_masked_pixels() -> None:
         pixels, [(k, k, k) for k in range(6)], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], role=TieRole.CHECK
     )
     whole = piece([(0.4, 3.3)], [(9, 9, 9)], [0.7], photo=1)
-    photos, walls = photos_of(encode_png(used), None), inspect_scenes.walls()
+    size = {"width": 10, "height": 8}
+    photos = ms.photos(photo(name="a", mask=encode_png(used), **size), photo(name="b", **size))
+    walls = inspect_scenes.walls()
     ties = ties_of([whole, masked], photos, walls, {"said": 1}, search_radius_px=(4.0, None))
     np.testing.assert_array_equal(ties.sigma_m, [0.7, 0.2, 0.3, 0.6])
     np.testing.assert_array_equal(ties.pixels_photo[1:], [pixels[at] for at in (1, 2, 5)])

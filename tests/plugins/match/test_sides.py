@@ -16,7 +16,7 @@ from tests.method_runs import run
 from tests.tied_photos import context
 
 SCENE = ms.textured_wall(1)
-CLOUD = ms.cloud_of(SCENE)
+CLOUD = ms.cloud_of(SCENE, spacing_m=0.008)
 
 
 def planes(viewpoint: str = "guess") -> Planes:

@@ -20,6 +20,7 @@ from orthoflow.products import Photo, TieRole, Ties, Walls
 from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
 from tests import samples
+from tests.long_loops import long_only
 from tests.method_runs import run
 from tests.tied_photos import context
 
@@ -39,7 +40,7 @@ def sift(
     return run(MatchSift, ctx, inputs).ties, [each.code for each in ctx.diagnostics]
 
 
-@pytest.mark.parametrize("roll", [0.0, 1.57], ids=["level", "portrait"])
+@pytest.mark.parametrize("roll", [0.0, *long_only(1.57)])
 def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: float) -> None:
     camera = ms.camera_before(roll=roll)
     ties, _ = sift(tmp_path, ms.photo_of(SCENE, camera))
@@ -205,7 +206,7 @@ def test_a_photo_is_found_in_the_mixture_that_the_laser_sees(
     ties, _ = sift(tmp_path, photo_with(rgb), wall_with(*laser))
     assert right(ties) > 150
     assert right(ties) > 0.9 * (ties.role != TieRole.REJECTED).sum()
-    assert picture_of(ties) == mixture
+    assert ties.details["photos"]["a.png"]["picture"] == mixture  # type: ignore[call-overload,index]
 
 
 def test_a_photo_of_something_else_gets_no_ties_in_any_mixture(tmp_path: Path) -> None:
@@ -218,11 +219,6 @@ def right(ties: Ties) -> int:
     """Count the ties within two cells of the true pixels of their points."""
     kept = ties.role != TieRole.REJECTED
     return int((np.linalg.norm(mw.off_px(ties, CAMERA)[kept], axis=1) < 4.0).sum())
-
-
-def picture_of(ties: Ties) -> str:
-    """Return the name of the matched picture."""
-    return ties.details["photos"]["a.png"]["picture"]  # type: ignore[call-overload,index,return-value]
 
 
 # --- choice of mixtures ---
@@ -239,14 +235,11 @@ def test_a_mixture_of_hardly_any_contrast_shows_nothing(levels: int, *, shows: b
         assert (np.diff(found[0].astype(int)) >= 0).all()
 
 
-BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
-
-
 @pytest.mark.long
 def test_photos_of_repeating_windows_are_oriented_where_they_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.syspath_prepend(Path(__file__).parents[3] / "benchmarks")
     courtyard = import_module("courtyard")
     built = courtyard.courtyard(2, 4, coarser=2.0)
     n_facades, errors = courtyard.oriented(built, coarser=2.0)

@@ -85,7 +85,6 @@ def frame_errors_px(found: ViewingCamera, true: ViewingCamera) -> NDArray[np.flo
 @pytest.mark.parametrize(
     ("distortion", "true"),
     [("none", DISTORTED), ("k1", DISTORTED), ("k1 k2 p1 p2", camera(-0.08, 0.03, 4e-4, -3e-4))],
-    ids=["none", "k1", "k1 k2 p1 p2"],
 )
 def test_with_distortion_the_corners_are_right_and_without_off_by_ten_pixels(
     tmp_path: Path, seed: int, distortion: str, true: ViewingCamera

@@ -19,6 +19,7 @@ from orthoflow.geometry.cameras import LensFreedom, ViewingCamera
 from orthoflow.geometry.resection import Resection
 from orthoflow.products import Photo
 from tests import samples
+from tests.tied_photos import known_wall
 
 N_TIES = 100
 DISTANCE_M = 3.0
@@ -35,16 +36,7 @@ def camera(*, turn_deg: float = 0.0) -> ViewingCamera:
 
 def wall(half_m: tuple[float, float] = (1.0, 0.5)) -> gates.KnownWall:
     across, up = half_m
-    corners = [[-across, 0.0, up], [-across, 0.0, -up], [across, 0.0, -up], [across, 0.0, up]]
-    return gates.KnownWall(
-        index=0,
-        number=0,
-        name="wall 0",
-        corners_world=np.array(corners),
-        normal=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.002,
-        has_side=True,
-    )
+    return known_wall((-across, across), (-up, up), gsd_m=0.002)
 
 
 def posed(

@@ -157,9 +157,10 @@ def _case(
     return AdverseCase(camera=camera, ties=ties, photo=tp.photo(camera), shift_m=shift)
 
 
-def _exif(case: AdverseCase, factor: float) -> AdverseCase:
+def _exif(rng: Random, *factors: float, **how: float) -> AdverseCase:
     """A photo without calibration; of a factor 0 EXIF states nothing either."""
-    return replace(case, photo=tp.photo(exif_focal_px=factor * case.camera.fx or None))
+    case = _case(rng, 300, **how)
+    return replace(case, photo=tp.photo(exif_focal_px=rng.choice(factors) * case.camera.fx or None))
 
 
 def _guessed(case: AdverseCase, chosen: NDArray[np.bool_], rng: Random) -> AdverseCase:
@@ -228,14 +229,11 @@ def _wrong_calibration(rng: Random) -> AdverseCase:
 
 KINDS: Final[Mapping[str, tuple[bool, Callable[[Random], AdverseCase]]]] = {
     "plane": (True, lambda rng: _case(rng, 200, wrong_share=0.3)),
-    "plane, EXIF 2 % off": (
-        True,
-        lambda rng: _exif(_case(rng, 300, wrong_share=0.3), rng.choice([0.98, 1.02])),
-    ),
+    "plane, EXIF 2 % off": (True, lambda rng: _exif(rng, 0.98, 1.02, wrong_share=0.3)),
     "relief, 60 % wrong": (True, lambda rng: _case(rng, 300, relief=2.0, wrong_share=0.6)),
     "relief, EXIF 5 % off": (
         True,
-        lambda rng: _exif(_case(rng, 300, relief=2.0, wrong_share=0.4), rng.choice([0.95, 1.05])),
+        lambda rng: _exif(rng, 0.95, 1.05, relief=2.0, wrong_share=0.4),
     ),
     "80 % wrong": (True, lambda rng: _case(rng, 500, relief=1.0, wrong_share=0.8)),
     "40 ties": (True, lambda rng: _case(rng, 40)),
@@ -245,11 +243,8 @@ KINDS: Final[Mapping[str, tuple[bool, Callable[[Random], AdverseCase]]]] = {
     "obstacle": (True, _obstacle),
     "survey coordinates": (True, lambda rng: _case(rng, 200, wrong_share=0.3, survey=True)),
     "8 to 14 ties": (False, lambda rng: _case(rng, int(rng.integers(8, 15)), wrong_share=0.2)),
-    "no focal length": (False, lambda rng: _exif(_case(rng, 300, wrong_share=0.3), 0.0)),
-    "EXIF 30 % off": (
-        False,
-        lambda rng: _exif(_case(rng, 300, wrong_share=0.3), rng.choice([0.7, 1.3])),
-    ),
+    "no focal length": (False, lambda rng: _exif(rng, 0.0, wrong_share=0.3)),
+    "EXIF 30 % off": (False, lambda rng: _exif(rng, 0.7, 1.3, wrong_share=0.3)),
     "calibration of another lens": (False, _wrong_calibration),
     "another room": (False, lambda rng: _case(rng, 300, wrong_share=1.0)),
     "another room, few places": (False, _crowded_elsewhere),

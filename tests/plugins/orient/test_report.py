@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import report
-from orthoflow_plugins.orient.gates import KnownWall
 from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.report import residual_rows
 
@@ -19,7 +18,6 @@ from orthoflow.files.drawing import COLUMN_INCHES
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Camera, Photo, TieRole
 from orthoflow.testing import photographed as ms
-from tests import samples
 from tests import tied_photos as tp
 from tests.tied_photos import context
 
@@ -155,24 +153,14 @@ def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
 # --- predicted errors ---
 
 
-def wall_of(left: float, right: float, *, number: int = 0) -> KnownWall:
-    """Return a 2 m high wall in the plane y = 0."""
-    corners = [[left, 0.0, 2.0], [left, 0.0, 0.0], [right, 0.0, 0.0], [right, 0.0, 2.0]]
-    return KnownWall(
-        index=number,
-        number=number,
-        name=f"wall {number}",
-        corners_world=np.array(corners),
-        normal=-samples.NORTH,
-        gsd_m=None,
-        has_side=True,
-    )
-
-
 def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     drawings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wall, hidden, shape = wall_of(0.0, 9.0, number=8), wall_of(0.0, 9.0, number=9), (20, 90)
+    wall, hidden, shape = (
+        tp.known_wall((0.0, 9.0), number=8),
+        tp.known_wall((0.0, 9.0), number=9),
+        (20, 90),
+    )
     sigmas = np.random.default_rng(0).uniform(0.001, 0.01, (2, *shape))
     sigmas[0, :5], sigmas[1, 3:, :4] = np.inf, np.nan
 
@@ -209,7 +197,7 @@ def test_photos_stand_before_the_wall_and_look_at_it(
     camera = SimpleNamespace(centre_world=np.array([4.0, -3.0, 1.5]), rotation=looks)
     points = np.array([[2.0, 0.0, 1.0], [3.0, -0.1, 0.5], [8.0, 0.0, 1.9]])
     candidate: Any = SimpleNamespace(
-        known=(wall_of(1.0, 9.0),),
+        known=(tp.known_wall((1.0, 9.0)),),
         estimate=SimpleNamespace(resection=SimpleNamespace(camera=camera)),
         seen=SimpleNamespace(points_world=points),
         control=np.array([True, True, False]),

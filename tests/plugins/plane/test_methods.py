@@ -28,7 +28,6 @@ from orthoflow_plugins.plane.region import Region, RegionProposer
 from orthoflow_plugins.plane.voxels import (
     HALF_STEPS,
     Neighbourhood,
-    SurfaceVoxels,
     surface_voxels,
 )
 from pydantic import ValidationError
@@ -38,6 +37,7 @@ from orthoflow.errors import PluginError
 from orthoflow.geometry import angle_between_deg
 from orthoflow.sdk import Method
 from tests import plane_scenes
+from tests.long_loops import long_only
 from tests.plane_scenes import (
     FIT_TOLERANCE_M,
     ROOM,
@@ -171,7 +171,7 @@ def test_the_plan_model_finds_the_walls_and_lets_them_lean(tmp_path: Path) -> No
         Ransac.Params(model="2d", constraint="horizontal")
 
 
-@pytest.mark.parametrize("noise_m", [0.001, 0.005])
+@pytest.mark.parametrize("noise_m", [*long_only(0.001), 0.005])
 @pytest.mark.usefixtures("all_places")
 def test_the_tolerance_found_by_itself_follows_the_noise(noise_m: float, tmp_path: Path) -> None:
     cloud = cloud_of(sampled(noise_m=noise_m), stations=STATION)
@@ -268,10 +268,6 @@ NICHE = Rectangle("niche", (2.0, 2.25, 0), (0.4, 0, 0), (0, 0, 0.8), 13_000)
 FLOOR = Rectangle("floor", (0, 1, -1.0), (1.5, 0, 0), (0, 1, 0), 20_000)
 
 
-def voxels_of(points: NDArray[np.float64], *, parts: int = 1) -> SurfaceVoxels:
-    return surface_voxels(prepared(points, parts=parts), CUBE)
-
-
 def grown(points: NDArray[np.float64], min_share: float, **params: Any) -> RegionProposer:
     """Return the regions of a cloud in cubes of 15 cm; each has at least a fifth of `min_share`."""
     cloud = cloud_of(points, stations=VIEWER)
@@ -290,7 +286,8 @@ def detect_regions(
 
 def test_voxels_and_wider_ones_hold_the_moments_of_their_points() -> None:
     points = sampled((WALL, NICHE))[::7]
-    voxels, cloud = voxels_of(points), prepared(points)
+    cloud = prepared(points)
+    voxels = surface_voxels(cloud, CUBE)
     wide, of_member = voxels.table.coarser(np.arange(len(voxels.counts)))
     assert wide.voxel_m == 2.0 * voxels.table.voxel_m
     voxel_of = voxels.table.voxel_of(cloud.points)

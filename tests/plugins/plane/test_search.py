@@ -335,19 +335,6 @@ def test_parts_are_joined_over_gaps_of_four_cells_and_listed_by_points() -> None
     np.testing.assert_allclose(alone.bounds_m, parts_m[0])
 
 
-def test_cells_that_all_lie_scattered_support_nothing() -> None:
-    # Single cells are eleven cells apart, so that no gap is closed and each part has 1/49 of the
-    # cells.
-    belongs = np.zeros((77, 77), dtype=bool)
-    raster = raster_of(WALL, (-1.0, 3.0), (77, 77))
-    assert support_of(raster, belongs, sums_of(belongs.astype(np.int64))) is None
-    belongs[::11, ::11] = True
-    sums = sums_of(belongs.astype(np.int64))
-    assert support_of(raster, belongs, sums) is None
-    belongs[0, 0:2] = True
-    assert support_of(raster, belongs, sums, part_share=0.04) is not None
-
-
 # Permitted range of the ratio of true to predicted errors, over many trials.
 CALIBRATED = (0.7, 1.4)
 SHAPE = (30, 45)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.segment import areas
-from orthoflow_plugins.segment import areas as module
 from orthoflow_plugins.segment.areas import (
     Area,
     Relief,
@@ -302,7 +301,7 @@ def test_large_clouds_are_followed_part_by_part(monkeypatch: pytest.MonkeyPatch)
     scan = np.random.default_rng(5).integers(0, 4, len(ends))
     given = cloud(ends, STATIONS, scan)
     whole = sight_lines(given, slab())
-    monkeypatch.setattr(module, "BLOCK", 64)
+    monkeypatch.setattr(areas, "BLOCK", 64)
     parts = sight_lines(given, slab())
     np.testing.assert_array_equal(parts.crossed, whole.crossed)
     np.testing.assert_array_equal(parts.stopped, whole.stopped)

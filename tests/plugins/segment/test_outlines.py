@@ -11,6 +11,7 @@ from orthoflow_plugins.segment.areas import Area, Relief
 from orthoflow_plugins.segment.outlines import Outline, outline_of
 
 from orthoflow.errors import MethodError
+from tests.opening_scenes import inside
 
 GSD_M = 0.01
 SHAPE = (120, 160)
@@ -85,11 +86,7 @@ def turned(corners: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
 def within(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return cells whose centres are in a convex polygon with the orientation of outlines."""
     rows, columns = np.indices(SHAPE) + 0.5
-    is_inside = np.ones(SHAPE, dtype=np.bool_)
-    for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        way = end - begin
-        is_inside &= way[0] * (rows - begin[1]) - way[1] * (columns - begin[0]) <= 0.0
-    return is_inside
+    return inside(corners, np.stack([columns, rows], axis=2))
 
 
 @pytest.mark.parametrize("degrees", [3.0, 17.0, 45.0, -30.0])

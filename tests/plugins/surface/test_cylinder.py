@@ -121,22 +121,18 @@ def test_planes_that_are_strips_of_a_vault_are_searched_and_walls_are_not(tmp_pa
     assert (own & (truth.labels >= 0)).mean() < 0.002
 
 
-def directions(n_points: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    vectors = rng.normal(size=(n_points, 3))
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
-
-
-def prism(n_sides: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Points of the sides of a prism with an inscribed circle of 2 m."""
-    side = 2.0 * math.pi / n_sides * rng.integers(0, n_sides, 60_000)
-    along = rng.uniform(-1.0, 1.0, len(side)) * 2.0 * math.tan(math.pi / n_sides)
-    x = 2.0 * np.cos(side) - along * np.sin(side)
-    y = 2.0 * np.sin(side) + along * np.cos(side)
-    return np.column_stack([x, y, rng.uniform(-1.5, 1.5, len(side))])
-
-
-def bent_wall(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Points of a wall 6 m long that is bent by 5 cm."""
+def points_of(name: str, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return points of the sides of a prism, of a dome or of a wall that is bent by 5 cm."""
+    if name == "octagon":
+        # Its inscribed circle has a radius of 2 m.
+        side = math.pi / 4.0 * rng.integers(0, 8, 60_000)
+        along = rng.uniform(-2.0, 2.0, len(side)) * math.tan(math.pi / 8.0)
+        x = 2.0 * np.cos(side) - along * np.sin(side)
+        y = 2.0 * np.sin(side) + along * np.cos(side)
+        return np.column_stack([x, y, rng.uniform(-1.5, 1.5, len(side))])
+    if name == "dome":
+        vectors = np.abs(rng.normal(size=(60_000, 3)))
+        return np.asarray(2.5 * vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
     x, z = rng.uniform(-3.0, 3.0, (2, 60_000)) * np.array([[1.0], [0.5]])
     return np.column_stack([x, 3.0 + 0.05 * (x / 3.0) ** 2, z])
 
@@ -148,11 +144,7 @@ def test_what_is_no_cylinder_is_rejected_with_the_reason(
     name: str, reason: str | None, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(1)
-    points = {
-        "octagon": lambda: prism(8, rng),
-        "dome": lambda: 2.5 * np.abs(directions(60_000, rng)),
-        "bent wall": lambda: bent_wall(rng),
-    }[name]()
+    points = points_of(name, rng)
     points += rng.normal(scale=0.002, size=points.shape)
     run = found_in(tmp_path, few_points(points))
     assert run.outputs["surfaces"].surfaces == ()
