@@ -277,19 +277,14 @@ def ties(n: int = 12) -> Ties:
     )
 
 
-@pytest.mark.parametrize(
-    ("n_ties", "names", "reason"),
-    [
+def test_what_no_orientation_can_start_from_is_refused() -> None:
+    for n_ties, names, reason in (
         (12, "", "there are no photos to orient"),
         (0, "ab", "there are no ties between photos and walls"),
         (12, "a", "the ties refer to photo b, which is not among"),
-    ],
-)
-def test_what_no_orientation_can_start_from_is_refused(
-    n_ties: int, names: str, reason: str
-) -> None:
-    with pytest.raises(MethodError, match=reason):
-        photos.require(ties(n_ties), Photos(photos=tuple(map(lens_photo, names))))
+    ):
+        with pytest.raises(MethodError, match=reason):
+            photos.require(ties(n_ties), Photos(photos=tuple(map(lens_photo, names))))
 
 
 def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:

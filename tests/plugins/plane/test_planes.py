@@ -407,19 +407,14 @@ def test_contradicting_parameters_are_refused(params: dict[str, object], message
         GivenPlane.Params.model_validate(params)
 
 
-@pytest.mark.parametrize(
-    ("params", "message"),
-    [
+def test_planes_without_points_are_refused(tmp_path: Path) -> None:
+    for params, message in (
         ({"points": ((0, 0, 0), (1, 1, 1), (2, 2, 2))}, "three points that define a plane"),
         (FAR, r"no point .* within 0.15 m .* between -12.0\d\d m and"),
         ({"planes": (TRIPLE, FAR)}, r"planes\[1\]: no point of the cloud is within"),
-    ],
-)
-def test_planes_without_points_are_refused(
-    params: dict[str, Any], message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(MethodError, match=message):
-        lay(cloud_of(sampled()), tmp_path, **params)
+    ):
+        with pytest.raises(MethodError, match=message):
+            lay(cloud_of(sampled()), tmp_path, **params)
 
 
 def test_several_planes_are_those_that_each_alone_would_be(tmp_path: Path) -> None:

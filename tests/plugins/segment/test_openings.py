@@ -88,20 +88,14 @@ def test_a_plane_before_the_wall_is_not_its_face_and_far_before_it_of_something_
     assert any("it is another surface, with no openings" in text for text in ctx.warnings)
 
 
-@pytest.mark.parametrize(
-    ("params", "kinds"),
-    [
+def test_parameters_leave_out_what_is_less_deep_wide_or_large(tmp_path: Path) -> None:
+    for params, kinds in (
         ({"behind_m": 0.25}, ["through", "no data"]),
         ({"width_least_m": 0.6}, ["niche", "through"]),
         ({"area_least_m2": 0.5}, ["niche", "through"]),
-    ],
-    ids=["deeper", "wider", "larger"],
-)
-def test_parameters_leave_out_what_is_less(
-    tmp_path: Path, params: dict[str, float], kinds: list[str]
-) -> None:
-    openings, _ = found(tmp_path, cloud=scenes.cloud(), **params)
-    assert [opening.kind for opening in openings.openings] == kinds
+    ):
+        openings, _ = found(tmp_path, cloud=scenes.cloud(), **params)
+        assert [opening.kind for opening in openings.openings] == kinds
 
 
 def image(source: str, out_cells: float = 0.35) -> Orthoimages:
