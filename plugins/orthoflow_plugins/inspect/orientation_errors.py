@@ -274,7 +274,8 @@ def error_on_walls(
     chosen = _on_walls(seen, walls, scene)
     if not chosen.any():
         return None
-    points, normal = seen.points[chosen], scene.normal[seen.rectangle[chosen]]
+    points = seen.points[chosen]
+    normal = scene.normals_at(seen.rectangle[chosen], points.T)
     camera = found.shifted(scene.origin)
     try:
         rays = camera.rays_world(grid[chosen])
@@ -293,18 +294,20 @@ def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]
     """Return a mask of the points in the raster and buffer of a wall on surfaces parallel to it."""
     on_walls = np.zeros(len(seen.points), dtype=np.bool_)
     hit = seen.rectangle >= 0
+    normals = scene.normals_at(seen.rectangle[hit], seen.points[hit].T)
     for index in range(len(walls.walls)):
         slab = walls.slab(index)
         frame = slab.frame
         if frame.bend is not None:
             on_wall = frame.wall_from_world(seen.points[hit] + scene.origin)
             columns, rows = frame.gsd_m * on_wall[:, 0], frame.gsd_m * on_wall[:, 1]
-            depths, facing = on_wall[:, 2], np.ones(len(on_wall))
+            depths, on_front = on_wall[:, 2], frame.axes_at(on_wall[:, :2])[:, 2]
+            facing = np.abs(np.einsum("ij,ij->i", normals, on_front))
         else:
             relative = seen.points[hit] - (frame.origin_world - scene.origin)
             columns, rows = relative @ frame.u_world, relative @ frame.v_world
             depths = relative @ frame.normal_world
-            facing = np.abs(scene.normal[seen.rectangle[hit]] @ frame.normal_world)
+            facing = np.abs(normals @ frame.normal_world)
         on_walls[hit] |= (
             (facing > _LEAST_COSINE)
             & (columns > 0.0)

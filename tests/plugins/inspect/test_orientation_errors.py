@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -19,7 +20,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
 )
 
 from orthoflow.errors import GeometryError, MethodError
-from orthoflow.geometry import WallFrame
+from orthoflow.geometry import CylinderBend, WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import TieRole
@@ -106,7 +107,10 @@ def no_rays(_: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool) -> None:
-    scene: Any = SimpleNamespace(origin=np.array([10.0, 20.0, 30.0]), normal=FACING[2:] * -1.0)
+    scene: Any = SimpleNamespace(
+        origin=np.array([10.0, 20.0, 30.0]),
+        normals_at=lambda rectangle, _: np.repeat(-FACING[2:], len(rectangle), axis=0),
+    )
     frame = frame_at(6.0, 34.0, depth_m=24.0, size_m=8.0)
     walls = one_wall(frame, front_m=0.1, behind_m=0.1)
     true = camera_at(np.zeros(3) + scene.origin)
@@ -136,6 +140,35 @@ def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool
     assert error_on_walls(unknown, true, walls, scene, views) == math.inf
     nothing = one_wall(frame, front_m=0.1, behind_m=-1.0)
     assert error_on_walls(found, true, nothing, scene, views) is None
+
+
+def test_errors_on_a_curved_wall_are_measured_in_its_tangent_planes() -> None:
+    bend = CylinderBend(along="u", radius_m=4.0)
+    frame = replace(
+        frame_at(0.0, 4.0, size_m=8.0),
+        origin_world=np.array([-4.0, 0.0, 4.0]),
+        u_world=np.array([0.0, 1.0, 0.0]),
+        normal_world=np.array([1.0, 0.0, 0.0]),
+        width=1250,
+        bend=bend,
+    )
+    slopes = []
+
+    def trace(_: ViewingCamera, pixels: NDArray[np.float64]) -> Any:
+        x, z = ((pixels - (500.0, 400.0)) / (800.0, 820.0)).T
+        rays = np.column_stack([x, np.ones(len(x)), -z]) / np.hypot(x, 1.0)[:, None]
+        slopes.append(rays)
+        return SimpleNamespace(points=4.0 * rays, rectangle=np.zeros(len(x), dtype=int))
+
+    scene: Any = SimpleNamespace(
+        origin=np.zeros(3), normals_at=lambda _, points: points.T * [-0.25, -0.25, 0.0]
+    )
+    true, found = camera_at(np.zeros(3)), camera_at(np.array([0.004, 0.0, 0.0]))
+    walls = one_wall(frame, front_m=0.1, behind_m=0.1)
+    error = error_on_walls(found, true, walls, scene, SimpleNamespace(trace=trace))
+    # The shift less its component along the normal, which is along the ray on the surface.
+    off = 0.004 * (np.array([1.0, 0.0, 0.0]) - slopes[0][:, :1] * slopes[0])
+    assert error == pytest.approx(np.sqrt(0.5 * (off**2).sum(axis=1).mean()), rel=1e-9)
 
 
 def test_a_photo_shows_most_of_the_nearest_wall_that_faces_it() -> None:
