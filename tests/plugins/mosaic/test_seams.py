@@ -35,6 +35,7 @@ from orthoflow.products import (
 from orthoflow.sdk import StepContext
 from tests import inspect_scenes, samples
 from tests.method_runs import run
+from tests.plugins.mosaic import test_joining
 from tests.raster_scenes import context, numbers
 from tests.turns import OTHER_TURNS, TURNS, Turn
 
@@ -60,18 +61,10 @@ def image_of(folder: Path, *layers: Layer, **given: Any) -> Orthoimage:
 
 
 def random_layer(seed: int, *, wall: int = 0) -> Layer:
-    rng = np.random.default_rng(seed)
-    shape = (6, 8)
-    mask = rng.integers(0, 4, shape, dtype=np.uint8)
-    is_painted = mask == LayerMask.PAINTED
-    return samples.layer(
-        mask,
-        wall=wall,
-        source=f"photo {seed}",
-        rgb=np.where(is_painted[..., None], rng.integers(0, 256, (*shape, 3)), 0).astype(np.uint8),
-        quality=np.where(is_painted, rng.random(shape), 0.0).astype(np.float32),
-        filled=(is_painted & (rng.random(shape) < 0.3)).astype(np.uint8),
-    )
+    made = test_joining.layer(seed, source=f"photo {seed}")
+    rgb = np.random.default_rng(seed).integers(0, 256, (*made.mask.shape, 3), dtype=np.uint8)
+    rgb[made.mask != LayerMask.PAINTED] = 0
+    return replace(made, wall=wall, rgb=rgb)
 
 
 def test_every_wall_of_the_layers_gets_an_orthoimage(tmp_path: Path) -> None:

@@ -109,25 +109,6 @@ def test_no_wall_is_quite_square_to_the_next_and_the_main_one_leans() -> None:
         assert 0.05 < off < 1.5
 
 
-@pytest.mark.parametrize("name", WALLS)
-def test_every_hole_of_a_wall_is_closed_by_what_lies_in_or_behind_it(name: str) -> None:
-    found = along(room(), name)
-    for hole in found.holes:
-        behind = [
-            k
-            for k in range(len(found.depth_m))
-            if np.allclose(found.extent[k], hole) and found.depth_m[k] <= 1e-9
-        ]
-        assert len(behind) == 1
-        # Holes are inside the wall, except at the floor.
-        assert hole[0] > -2.7
-        assert hole[1] < 2.7
-        assert hole[3] < CEILING_M
-    for one, other in itertools.combinations(found.holes, 2):
-        assert not overlaps(one, other)
-    assert len(found.holes) == {"main wall": 3, "opposite wall": 2}.get(name, 0)
-
-
 def test_relief_scales_mouldings_and_nothing_else() -> None:
     flat, usual, double = (room(relief=scale) for scale in (0.0, 1.0, 2.0))
     for name in WALLS:
