@@ -1,15 +1,15 @@
-"""`orthoflow cache verify` and a run report what was damaged in the store."""
+"""`orthoflow cache` lists, verifies and collects what is in the store."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.engine_world import toy_world
-from tests.killed_runs import run_here
+from tests.studios import asked, said
 
 WORKFLOW = """
 orthoflow: 1
@@ -21,25 +21,14 @@ steps:
 """
 RUN = ("run", "toy.yaml", "--executor", "inline", "-o")
 
-Said = Callable[..., tuple[int, str]]
 
-
-@pytest.fixture
-def say(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Iterator[Said]:
-    """Run a command in a folder with the toys; give its exit code and what it printed."""
-
-    def said(*arguments: str) -> tuple[int, str]:
-        capsys.readouterr()
-        code = run_here(arguments)
-        printed = capsys.readouterr()
-        return code, printed.err + printed.out
-
+@pytest.fixture(autouse=True)
+def _toys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The working directory, with the toys and their workflow."""
     (tmp_path / "toy.yaml").write_text(WORKFLOW)
     monkeypatch.chdir(tmp_path)
     with toy_world(tmp_path):
-        yield said
+        yield
 
 
 def flip(path: Path) -> None:
@@ -48,33 +37,30 @@ def flip(path: Path) -> None:
     path.write_bytes(content)
 
 
-def test_the_store_is_listed_verified_and_collected(say: Said, tmp_path: Path) -> None:
+def test_the_store_is_listed_verified_and_collected(tmp_path: Path) -> None:
     as_stored = "0 results and 0 objects in .orthoflow are unchanged\n"
-    assert say("cache", "verify") == (0, as_stored)
-    assert say(*RUN, "first")[0] == 0
-    assert say("cache", "verify") == (0, as_stored.replace("0", "2"))
-    assert {row["method"] for row in json.loads(say("cache", "list", "--json")[1])} == {
-        "make.range",
-        "work.draws",
-    }
-    assert say("cache", "list")[1].splitlines()[-1] == "2 results in .orthoflow"
+    assert said("cache", "verify") == as_stored
+    asked(*RUN, "first", code=0)
+    assert said("cache", "verify") == as_stored.replace("0", "2")
+    listed = json.loads(said("cache", "list", "--json"))
+    assert {row["method"] for row in listed} == {"make.range", "work.draws"}
+    assert said("cache", "list").splitlines()[-1] == "2 results in .orthoflow"
     [figure] = (tmp_path / ".orthoflow" / "objects").glob("*/blob")
     name = figure.parent.name
     flip(figure)
-    code, text = say("cache", "verify", "--json")
-    found = json.loads(text)
-    assert (code, found["ok"], found["n_results"], found["n_objects"]) == (3, False, 1, 1)
+    found = json.loads(asked("cache", "verify", "--json", code=3).stdout)
+    assert (found["ok"], found["n_results"], found["n_objects"]) == (False, 1, 1)
     assert [item["what"] for item in found["damaged"]] == [
         "blob",
         f"objects/{name[:12]}/object.json",
     ]
     assert found["damaged"][0]["name"] == f"objects/{name}"
     assert not figure.exists()
-    assert say("cache", "verify")[0] == 0
-    assert say(*RUN, "again")[0] == 0
+    asked("cache", "verify", code=0)
+    asked(*RUN, "again", code=0)
     # What is young is kept, and a rehearsal removes nothing.
-    assert json.loads(say("cache", "gc", "--json")[1])["n_results"] == 0
-    would = say("cache", "gc", "--older-than", "0", "--dry-run")[1]
+    assert json.loads(said("cache", "gc", "--json"))["n_results"] == 0
+    would = said("cache", "gc", "--older-than", "0", "--dry-run")
     assert would.startswith("would remove 2 results and 2 objects, ")
-    assert say("cache", "gc", "--older-than", "0")[0] == 0
-    assert json.loads(say("cache", "list", "--json")[1]) == []
+    asked("cache", "gc", "--older-than", "0", code=0)
+    assert json.loads(said("cache", "list", "--json")) == []
