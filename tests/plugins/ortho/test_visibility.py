@@ -15,8 +15,6 @@ from orthoflow_plugins.ortho import painting, surfaces
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.parameters import BackwardParams, VisibilityParams
 from orthoflow_plugins.ortho.visibility_kernels import (
-    BLOCK_CELLS,
-    FINE_CELLS,
     NO_SURFACE,
     OCCLUDED,
     PAINTED,
@@ -131,7 +129,7 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
     depths = noisy_depths()
     for row, column in rng.integers(0, scenes.SHAPE, (40, 2)):
         rows, columns = rng.integers(1, 12, 2)
-        depths[row : row + rows, column : column + columns] += rng.uniform(0.01, 0.06)
+        depths[row : row + rows, column : column + columns] += rng.choice([-0.05, 0.01, 0.06])
     surface, camera = surface_of(depths), scenes.camera(scenes.frame(), aside_m=aside_m)
     visible = seen_of(surface, camera)
     asked = (visible.mask == PAINTED) | (visible.mask == OCCLUDED)
@@ -171,15 +169,25 @@ def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(aside_m: flo
         np.testing.assert_array_equal((mask[free] == OCCLUDED)[is_clear], hidden[is_clear])
 
 
-def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full() -> None:
+def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rng = np.random.default_rng(3)
     depth = rng.normal(0.0, 0.002, (77, 61)).astype(np.float32)
     depth[20:40, 10:30] += 0.1
     depth[50:60, 5:9] = depth[:2, :2] = depth[30, 50] = np.nan
     depth[70, 40] = 0.5
     edge_m = 0.015
-    frame = samples.facing_south(edge_m / 5.0, 61, 77)
-    occluding = surfaces.relief_of(samples.wall(frame, depth_m=depth)).occluding
+    wall = samples.wall(samples.facing_south(edge_m / 5.0, 61, 77), depth_m=depth)
+    relief = surfaces.relief_of(wall)
+    occluding = relief.occluding
+    # For writable arrays, kernels would be compiled again.
+    assert not relief.depth.flags.writeable
+    assert not occluding.flags.writeable
+    assert surfaces.relief_of(wall, hides=False).highest_m == -np.inf
+    # Bands of a large wall do not affect the result.
+    monkeypatch.setattr(surfaces, "BAND_CELLS", 20 * 61)
+    np.testing.assert_array_equal(surfaces.relief_of(wall).occluding, occluding)
 
     def of_windows(
         values: NDArray[np.float32], pick: np.ufunc, steps: range
@@ -230,51 +238,6 @@ def test_cells_at_the_border_of_a_photo_ask_the_last_pixel_of_the_buffer() -> No
 
 
 GSD_M = 0.01
-
-
-def rough(shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return depths with a void block, void cells, and a raised part."""
-    rng = np.random.default_rng(5)
-    depths = rng.normal(0.0, 0.003, shape)
-    depths[rng.random(shape) < 0.02] = np.nan
-    depths[shape[0] // 2 :, shape[1] // 3 :] += 0.08
-    depths[:9, : BLOCK_CELLS + 3] = np.nan
-    return depths.astype(np.float32)
-
-
-def of_blocks(values: NDArray[np.floating], side: int, pick: np.ufunc) -> NDArray[np.float64]:
-    for axis, length in enumerate(values.shape):
-        values = pick.reduceat(values, np.arange(0, length, side), axis=axis)
-    return values.astype(np.float64)
-
-
-@pytest.mark.parametrize("shape", [(9, 17), (70, 101), (5, 40)], ids=str)
-def test_bounds_of_blocks_are_those_of_their_cells(
-    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
-) -> None:
-    depths = rough(shape)
-    relief, clear = (
-        surfaces.relief_of(wall_of(depths)),
-        surfaces.relief_of(wall_of(depths), hides=False),
-    )
-    low = np.where(np.isnan(depths), np.inf, depths)
-    for prepared in (relief, clear):
-        np.testing.assert_array_equal(prepared.bottoms, of_blocks(low, BLOCK_CELLS, np.minimum))
-        np.testing.assert_array_equal(prepared.depth, depths)
-        # For writable arrays, kernels would be compiled again.
-        assert not prepared.depth.flags.writeable
-        assert not prepared.occluding.flags.writeable
-    tops = of_blocks(relief.occluding, BLOCK_CELLS, np.maximum)
-    np.testing.assert_array_equal(relief.tops, tops)
-    fine_tops = of_blocks(relief.occluding, FINE_CELLS, np.maximum)
-    np.testing.assert_array_equal(relief.fine_tops, fine_tops)
-    np.testing.assert_array_equal(relief.fine_bottoms, of_blocks(low, FINE_CELLS, np.minimum))
-    assert relief.highest_m == tops.max()
-    assert clear.occluding.size == 0
-    assert clear.highest_m == clear.tops.max() == -np.inf
-    # Bands of a large wall do not affect the result.
-    monkeypatch.setattr(surfaces, "BAND_CELLS", 20 * shape[1])
-    np.testing.assert_array_equal(surfaces.relief_of(wall_of(depths)).occluding, relief.occluding)
 
 
 @pytest.mark.parametrize(("least_m", "is_seen"), [(0.1, True), (1.99, True), (2.01, False)])
