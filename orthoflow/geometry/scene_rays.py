@@ -41,7 +41,7 @@ class PaintTable(NamedTuple):
         frames: (r, 9) float64: centre, axis a and axis b of each rectangle, as in `Scene`.
         kinds: (r,) int32 `TextureKind`.
         params: (r, 8) float64 texture parameters.
-        bends: (r, 4) float64 curvature and normal of each rectangle.
+        bends: (r, 5) float64 curvature, normal (3 numbers) and taper of each rectangle.
     """
 
     frames: NDArray[np.float64]
@@ -267,7 +267,11 @@ def paint_points(
             towards = 0.0
             for axis in range(3):
                 towards += (points[axis, i] - frames[index, axis]) * bends[index, 1 + axis]
-            a = _arc_length(bends[index, 0], a, towards)
+            a, b = _unrolled(bends[index, 0], bends[index, 4], a, b, towards)
+            if bends[index, 4] != 0.0:
+                # On a plane, lines that meet in the apex are not parallel.
+                apart, turn = 1.0 / bends[index, 4], bends[index, 4] * a
+                a, b = (apart + b) * math.sin(turn), (apart + b) * math.cos(turn) - apart
         shade = colour_at(table.kinds[index], table.params[index], a, b)
         painted[0, i] = shade.red
         painted[1, i] = shade.green
@@ -276,15 +280,29 @@ def paint_points(
 
 
 @kernel_part
-def _arc_length(curvature: float, along: float, towards: float) -> float:
-    """Return the arc length a of a position on a bent rectangle.
+def _unrolled(curvature: float, taper: float, x: float, y: float, z: float) -> tuple[float, float]:
+    """Return the position (a, b) of a point on or near a bent rectangle.
 
     Args:
-        curvature: reciprocal radius of the rectangle.
-        along: position relative to the centre of the rectangle, along axis a.
-        towards: position relative to the centre, along the normal.
+        curvature: see `Scene`.
+        taper: see `Scene`.
+        x: position relative to the centre of the rectangle, along axis a.
+        y: position along axis b.
+        z: position along the normal.
+
+    Returns:
+        The position; b is minus infinity if the point is on the mirror image of a cone.
     """
-    return math.atan2(curvature * along, 1.0 - curvature * towards) / curvature
+    square = curvature * curvature + taper * taper
+    turn = math.sqrt(square)
+    axial = 1.0 + taper * y - curvature * z
+    a = math.atan2(turn * x, axial) / turn
+    if taper == 0.0:
+        return a, y
+    if curvature * curvature * (1.0 + taper * y) + curvature * taper * taper * z <= 0.0:
+        return a, -math.inf
+    reach = taper * (math.sqrt(square * x * x + axial * axial) - 1.0 + curvature * z)
+    return a, (reach + curvature * curvature * y) / square
 
 
 Index: TypeAlias = int | np.int64
@@ -300,8 +318,8 @@ class CastTable(NamedTuple):
 
     Attributes:
         axes: (3, 3) float64 rotation from the scene's axes to the axes of the boxes.
-        rectangles: (r, 19) float64: centre, axis a, axis b and normal (3 numbers each), extent (4),
-            index of its first hole, index after its last hole, and curvature.
+        rectangles: (r, 20) float64: centre, axis a, axis b and normal (3 numbers each), extent (4),
+            index of its first hole, index after its last hole, curvature and taper.
         holes: (h, 4) float64 extents of the holes.
         nodes: (m, 9) float64 nodes of the tree: lower and upper corner of the box (3 numbers each);
             next node for rays that miss the box; first index and end index of its rectangles in
@@ -345,8 +363,8 @@ def _contains(
 def _bent_distance(
     r: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
-    """Like `_hit_distance`, but for a rectangle that is bent to a part of a cylinder."""
-    bend = r[index, 18]
+    """Like `_hit_distance`, but for a rectangle that is bent to a part of a cylinder or cone."""
+    bend, taper = r[index, 18], r[index, 19]
     x, y, z = ray.x - r[index, 0], ray.y - r[index, 1], ray.z - r[index, 2]
     along = x * r[index, 3] + y * r[index, 4] + z * r[index, 5]
     b = x * r[index, 6] + y * r[index, 7] + z * r[index, 8]
@@ -354,18 +372,26 @@ def _bent_distance(
     d_along = ray.dx * r[index, 3] + ray.dy * r[index, 4] + ray.dz * r[index, 5]
     d_b = ray.dx * r[index, 6] + ray.dy * r[index, 7] + ray.dz * r[index, 8]
     d_towards = ray.dx * r[index, 9] + ray.dy * r[index, 10] + ray.dz * r[index, 11]
-    # The equation of the circle is along^2 + towards^2 - 2 towards / bend = 0.
+    # The equation of a circle is along^2 + towards^2 - 2 towards / bend = 0. That of a cone also
+    # has the terms -(ratio towards)^2 - 2 ratio b towards.
+    ratio = taper / bend
     square = d_along * d_along + d_towards * d_towards
+    square -= ratio * d_towards * (ratio * d_towards + 2.0 * d_b)
     half = along * d_along + (towards - 1.0 / bend) * d_towards
-    root = half * half - square * (along * along + towards * (towards - 2.0 / bend))
-    if square < 1e-24 or root < 0.0:
+    half -= ratio * (ratio * towards * d_towards + towards * d_b + b * d_towards)
+    start = along * along + towards * (towards - 2.0 / bend)
+    start -= ratio * towards * (ratio * towards + 2.0 * b)
+    root = half * half - square * start
+    if abs(square) < 1e-24 or root < 0.0:
         return math.inf
-    root = math.sqrt(root)
+    root = math.copysign(math.sqrt(root), square)
     for sign in (-1.0, 1.0):
         t: float = (sign * root - half) / square
         if t >= _NEAREST:
-            a = _arc_length(bend, along + t * d_along, towards + t * d_towards)
-            if _contains(r, holes, index, a, b + t * d_b):
+            at_a, at_b = _unrolled(
+                bend, taper, along + t * d_along, b + t * d_b, towards + t * d_towards
+            )
+            if _contains(r, holes, index, at_a, at_b):
                 return t
     return math.inf
 
@@ -508,7 +534,7 @@ class SceneRays:
             frames=np.ascontiguousarray(np.hstack([scene.centre, scene.axis_a, scene.axis_b])),
             kinds=np.array(scene.texture),
             params=np.array(scene.texture_params),
-            bends=np.column_stack([scene.curvatures_per_m, scene.normal]),
+            bends=np.column_stack([scene.curvatures_per_m, scene.normal, scene.tapers_per_m]),
         )
 
     def cast(
@@ -580,6 +606,7 @@ def _cast_table(scene: Scene) -> CastTable:
                 holes[:-1],
                 holes[1:],
                 turned.curvatures_per_m,
+                turned.tapers_per_m,
             ]
         ),
         holes=np.array(scene.hole_extent),
@@ -656,12 +683,13 @@ class _BoxTree:
 
 def _enclosing_ring(scene: Scene, index: int) -> NDArray[np.float64]:
     """Return points (n, 3) whose bounding box contains a bent rectangle: corners of prisms."""
-    bend = float(scene.curvatures_per_m[index])
+    taper = float(scene.tapers_per_m[index])
+    turn = math.hypot(float(scene.curvatures_per_m[index]), taper)
     a = np.linspace(scene.extent[index, 0], scene.extent[index, 1], _RING_POINTS)
     # Between two adjacent points, the arc is inside the box around these points and their copies
     # shifted by the sagitta along each axis.
-    radius_m = 1.0 / abs(bend)
-    sagitta_m = radius_m * (1.0 - math.cos(0.5 * abs(bend) * float(a[1] - a[0])))
+    radius_m = float((1.0 + taper * scene.extent[index, 2:]).max()) / turn
+    sagitta_m = radius_m * (1.0 - math.cos(0.5 * turn * float(a[1] - a[0])))
     rectangle = np.full(2 * len(a), index)
     b = np.repeat(scene.extent[index, 2:], len(a))
     points = scene.points_m(rectangle, np.tile(a, 2), b)

@@ -1,6 +1,7 @@
 """Simulated scenes that consist of textured rectangles.
 
-Rectangles can be bent to parts of cylinders, so that vaults and towers consist of few rectangles.
+Rectangles can be bent to parts of cylinders and cones, so that vaults, towers and spires consist of
+few rectangles.
 
 Random numbers are functions of a lattice cell, a seed and an index (`draw`), so they do not depend
 on the order of computation or the number of threads. The formulas are those of `scene_rays`,
@@ -79,6 +80,10 @@ class Scene:
             about an axis parallel to `axis_b` without being stretched, so that a is an arc length.
             The curvature is positive if a rectangle is bent towards its normal, and 0 if it is
             flat. None if all rectangles are flat.
+        taper_per_m: (r,) float64, in 1 / metre, of rectangles that are bent to parts of cones.
+            Lines along `axis_b` meet at b = -1 / taper. Along them, b is a length, and a is an arc
+            length at b = 0, which is 1 + b taper times as long at b. The taper is 0 for cylinders
+            and flat rectangles. None if no rectangle is part of a cone.
     """
 
     origin: NDArray[np.float64]
@@ -93,6 +98,7 @@ class Scene:
     hole_rectangle: NDArray[np.int32]
     hole_extent: NDArray[np.float64]
     curvature_per_m: NDArray[np.float64] | None = None
+    taper_per_m: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.centre)
@@ -108,6 +114,7 @@ class Scene:
             "texture_params": (self.texture_params.shape, (count, N_TEXTURE_PARAMS)),
             "hole_extent": (self.hole_extent.shape, (len(self.hole_rectangle), 4)),
             "curvature_per_m": (self.curvatures_per_m.shape, (count,)),
+            "taper_per_m": (self.tapers_per_m.shape, (count,)),
         }
         for name, (shape, expected) in shapes.items():
             if shape != expected:
@@ -129,17 +136,24 @@ class Scene:
         bent = self.curvature_per_m
         return np.zeros(len(self.centre)) if bent is None else bent
 
+    @property
+    def tapers_per_m(self) -> NDArray[np.float64]:
+        """Tapers (r,) in 1 / metre; 0 for rectangles that are not part of a cone."""
+        return np.zeros(len(self.centre)) if self.taper_per_m is None else self.taper_per_m
+
     def points_m(
         self, rectangle: NDArray[np.int64], a: NDArray[np.float64], b: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the points (n, 3) at (a, b) of rectangles (n,), in metres from `origin`."""
-        points = self.centre[rectangle] + b[:, None] * self.axis_b[rectangle]
-        bent = self.curvatures_per_m[rectangle]
-        radius = 1.0 / np.where(bent == 0.0, 1.0, bent)
-        along = np.where(bent == 0.0, a, radius * np.sin(a * bent))
-        towards = np.where(bent == 0.0, 0.0, radius * (1.0 - np.cos(a * bent)))
+        bent, taper = self.curvatures_per_m[rectangle], self.tapers_per_m[rectangle]
+        turn = np.where(bent == 0.0, 1.0, np.hypot(bent, taper))
+        radius = (1.0 + taper * b) / turn
+        along = np.where(bent == 0.0, a, radius * np.sin(a * turn))
+        lifted = np.where(bent == 0.0, 0.0, radius * (1.0 - np.cos(a * turn)))
+        points = self.centre[rectangle]
+        points += (b - lifted * taper / turn)[:, None] * self.axis_b[rectangle]
         points += along[:, None] * self.axis_a[rectangle]
-        return points + towards[:, None] * self.normal[rectangle]
+        return points + (lifted * bent / turn)[:, None] * self.normal[rectangle]
 
     def normals_at(
         self, rectangle: NDArray[np.int32], points: NDArray[np.float64]
@@ -154,8 +168,18 @@ class Scene:
         if len(chosen):
             own = rectangle[chosen]
             offset = points[:, chosen].T - self.centre[own]
-            offset -= np.einsum("ni,ni->n", offset, self.axis_b[own])[:, None] * self.axis_b[own]
-            normals[chosen] -= bent[chosen, None] * offset
+            x, y, z = (
+                np.einsum("ni,ni->n", offset, axes[own])
+                for axes in (self.axis_a, self.axis_b, self.normal)
+            )
+            bends, tapers = bent[chosen], self.tapers_per_m[own]
+            # The width is that of the cone at the foot of a point, relative to b = 0.
+            squares = bends**2 + tapers**2
+            axial = 1.0 + tapers * y - bends * z
+            reach = tapers * (np.sqrt(squares * x * x + axial**2) - 1.0 + bends * z)
+            b = np.where(tapers == 0.0, y, (reach + bends**2 * y) / squares)
+            offset -= b[:, None] * self.axis_b[own]
+            normals[chosen] -= (bends / (1.0 + tapers * b))[:, None] * offset
         return normals
 
     def corners_m(self) -> NDArray[np.float64]:

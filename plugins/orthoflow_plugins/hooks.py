@@ -19,8 +19,8 @@ _METHODS: Final = {
     "their wall",
     "simulate.room:SimulateRoom": "a simulated room, scanned and photographed, with its true "
     "geometry",
-    "simulate.curved:SimulateCurved": "a simulated vault, apse, tower or column, scanned and "
-    "photographed, with its true geometry",
+    "simulate.curved:SimulateCurved": "a simulated vault, apse, tower, column or spire, scanned "
+    "and photographed, with its true geometry",
     "register.similarity:RegisterSimilarity": "translation, rotation and scale from pairs of "
     "points, with sigma0 and residuals",
     "plane.hough2d:Hough2d": "Hough transform of the plan, with cells weighted by number of points",

@@ -55,6 +55,7 @@ class Surface(NamedTuple):
     plane: int = -1
     holes: Sequence[Extent] = ()
     curvature_per_m: float = 0.0
+    taper_per_m: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +94,7 @@ class SceneDraft:
         """
         surfaces = self.surfaces
         bends = np.array([surface.curvature_per_m for surface in surfaces])
+        tapers = np.array([surface.taper_per_m for surface in surfaces])
         holes = [(i, hole) for i, surface in enumerate(surfaces) for hole in surface.holes]
         return Scene(
             origin=np.zeros(3),
@@ -109,6 +111,7 @@ class SceneDraft:
             hole_rectangle=np.array([index for index, _ in holes], dtype=np.int32),
             hole_extent=np.array([hole for _, hole in holes], dtype=np.float64).reshape(-1, 4),
             curvature_per_m=bends if bends.any() else None,
+            taper_per_m=tapers if tapers.any() else None,
         )
 
 

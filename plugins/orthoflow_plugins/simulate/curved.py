@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 from pydantic import Field
 
+from orthoflow.geometry import Cylinder
 from orthoflow.products import (
     Calibration,
     Cameras,
@@ -48,9 +49,9 @@ _GAP: Final = 0.3
 class SimulateCurved(Method):
     """Scan and photograph a building with curved walls and random dimensions.
 
-    The building is a barrel vault, a cross vault, an apse, a round tower seen from outside, or a
-    column of which half is hidden. It has furniture, mouldings and painted textures. Errors of the
-    scanner and the photos are those of `simulate.room`.
+    The building is a barrel vault, a cross vault, an apse, a round tower seen from outside, a
+    column of which half is hidden, or a conical spire. It has furniture, mouldings and painted
+    textures. Errors of the scanner and the photos are those of `simulate.room`.
     """
 
     id: ClassVar[str] = "simulate.curved"
@@ -172,7 +173,7 @@ class SimulateCurved(Method):
             highest_elevation_deg=math.degrees(_HIGHEST_RAD),
         )
         ctx.metric("n_points", len(cloud), "1")
-        ctx.metric("n_true_surfaces", len(building.cylinders), "1")
+        ctx.metric("n_true_surfaces", len(building.surfaces), "1")
         ctx.metric("outlier_share", truth.n_spoilt / max(1, len(cloud)), "1")
         report_photos(photos, shots, ctx)
         return self.Out(
@@ -186,12 +187,16 @@ class SimulateCurved(Method):
 
 def _true_surfaces(building: Building, delivery: Delivery) -> Surfaces:
     rectangle = delivery.scan.points.rectangle
-    own = building.on_cylinder[rectangle[rectangle >= 0]]
-    counts = np.bincount(own + 1, minlength=len(building.cylinders) + 1)[1:]
+    own = building.on_surface[rectangle[rectangle >= 0]]
+    counts = np.bincount(own + 1, minlength=len(building.surfaces) + 1)[1:]
     surfaces = []
     for index, chosen in enumerate(np.argsort(-counts, kind="stable").tolist()):
-        true = building.cylinders[chosen]
-        shape = replace(true.shape, point_world=true.shape.point_world + delivery.shift_world_m)
+        true = building.surfaces[chosen]
+        shape, shift = true.shape, delivery.shift_world_m
+        if isinstance(shape, Cylinder):
+            shape = replace(shape, point_world=shape.point_world + shift)
+        else:
+            shape = replace(shape, apex_world=shape.apex_world + shift)
         surfaces.append(
             Surface(
                 name=f"{surface_kind(shape, delivery.up_world)} {index}",

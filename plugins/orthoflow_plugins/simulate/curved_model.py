@@ -1,4 +1,4 @@
-"""Simulated buildings with curved walls: barrel vault, cross vault, apse, tower and column.
+"""Simulated buildings with curved walls: barrel and cross vault, apse, tower, column and spire.
 
 All dimensions are random. Coordinates in the frame of a building are in metres, with z upwards and
 the origin at eye level.
@@ -15,7 +15,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Cylinder
+from orthoflow.geometry import Cone, Cylinder
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow_plugins.simulate.building import (
@@ -30,7 +30,7 @@ from orthoflow_plugins.simulate.building import (
     wall_side,
 )
 
-Subject = Literal["barrel-vault", "cross-vault", "apse", "tower", "column"]
+Subject = Literal["barrel-vault", "cross-vault", "apse", "tower", "column", "spire"]
 
 FLOOR_M: Final = -1.6
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -49,17 +49,17 @@ _STRIP_M: Final = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrueCylinder:
-    """A cylinder that a detector should find.
+class TrueSurface:
+    """A cylinder or cone that a detector should find.
 
     Attributes:
-        shape: the cylinder; its point is at the middle of the surface's length.
+        shape: the surface; the point of a cylinder is at the middle of the surface's length.
         zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
         arc_rad: smallest and largest angle.
         along_m: smallest and largest position along the axis.
     """
 
-    shape: Cylinder
+    shape: Cylinder | Cone
     zero: NDArray[np.float64]
     arc_rad: tuple[float, float]
     along_m: tuple[float, float]
@@ -72,9 +72,9 @@ class Building:
     Attributes:
         scene: the surfaces of the building.
         planes: its large planes; `scene.plane_index` is an index into them.
-        cylinders: its cylindrical surfaces.
-        on_cylinder: (r,) index of the cylinder that contains each rectangle of the scene; -1 for
-            none.
+        surfaces: its curved surfaces.
+        on_surface: (r,) index of the curved surface that contains each rectangle of the scene; -1
+            for none.
         stations: (s, 3) positions from which it is scanned.
         photographed: for each photo, the point at which it is aimed, the normal at this point, and
             the distance of the camera.
@@ -82,32 +82,46 @@ class Building:
 
     scene: Scene
     planes: tuple[TruePlane, ...]
-    cylinders: tuple[TrueCylinder, ...]
-    on_cylinder: NDArray[np.int16]
+    surfaces: tuple[TrueSurface, ...]
+    on_surface: NDArray[np.int16]
     stations: NDArray[np.float64]
     photographed: tuple[tuple[NDArray[np.float64], NDArray[np.float64], float], ...]
 
 
 @dataclass(kw_only=True)
 class _Bend:
-    """A cylindrical wall under construction.
+    """A wall on a cylinder or cone under construction.
 
-    Positions on the wall are (a, b): arc length from angle 0, and distance along the axis. Depths
-    are positive towards the viewer.
+    Positions on the wall are (a, b): arc length from angle 0 at b = 0, and distance along a
+    generatrix, away from the apex of a cone. Depths are positive towards the viewer.
 
     Attributes:
         draft: the draft to which rectangles are added.
-        shape: the cylinder.
+        shape: the cylinder or cone.
         zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
+        slant_m: distance from the apex of a cone at b = 0; infinite for a cylinder.
         extents: extents of all parts of the wall, without mouldings and recesses.
         rows: indices of these parts in the draft.
     """
 
     draft: SceneDraft
-    shape: Cylinder
+    shape: Cylinder | Cone
     zero: NDArray[np.float64]
+    slant_m: float = math.inf
     extents: list[Extent] = field(default_factory=list)
     rows: list[int] = field(default_factory=list)
+
+    @property
+    def half_angle_rad(self) -> float:
+        """Angle between axis and generatrices."""
+        return self.shape.half_angle_rad if isinstance(self.shape, Cone) else 0.0
+
+    @property
+    def radius_m(self) -> float:
+        """Radius at b = 0."""
+        if isinstance(self.shape, Cylinder):
+            return self.shape.radius_m
+        return self.slant_m * math.sin(self.half_angle_rad)
 
     def place(
         self,
@@ -119,18 +133,21 @@ class _Bend:
     ) -> None:
         """Add a bent rectangle; its extent is given at depth 0."""
         sign = -1.0 if self.shape.is_concave else 1.0
-        radius_m = self.shape.radius_m + sign * depth_m
-        scale = radius_m / self.shape.radius_m
+        centre, _, _, generatrix = self.at(0.0, 0.0, depth_m)
+        # Distances from the axis along the normal, at the depth and on the wall.
+        to_axis_m = self.radius_m / math.cos(self.half_angle_rad)
+        scale = (to_axis_m + sign * depth_m) / to_axis_m
         self.draft.surfaces.append(
             Surface(
-                self.shape.point_world + radius_m * self.zero,
+                centre,
                 sign * np.cross(self.shape.axis_world, self.zero),
-                self.shape.axis_world,
+                generatrix,
                 _scaled(extent, sign * scale),
                 paint,
                 role,
                 holes=[_scaled(hole, sign * scale) for hole in holes],
-                curvature_per_m=-sign / radius_m,
+                curvature_per_m=-sign / (to_axis_m + sign * depth_m),
+                taper_per_m=1.0 / (scale * self.slant_m),
             )
         )
         if role == SurfaceRole.WALL:
@@ -143,38 +160,48 @@ class _Bend:
         self.place(extent, depths_m[1], paint, role)
         a0, a1, b0, b1 = extent
         for a in (a0, a1):
-            foot, _, normal = self.at(a, 0.0)
+            foot, _, normal, generatrix = self.at(a, 0.0)
             span = (b0, b1, min(depths_m), max(depths_m))
-            self.draft.surfaces.append(
-                Surface(foot, self.shape.axis_world, normal, span, paint, role)
-            )
-        n_pieces = math.ceil(abs(a1 - a0) / (_PIECE_RAD * self.shape.radius_m))
+            self.draft.surfaces.append(Surface(foot, generatrix, normal, span, paint, role))
+        n_pieces = math.ceil(abs(a1 - a0) / (_PIECE_RAD * self.radius_m))
         half_m = 0.5 * (a1 - a0) / n_pieces
         for b in (b0, b1):
+            reach_m = half_m * (1.0 + b / self.slant_m)
             for a in a0 + half_m * (2.0 * np.arange(n_pieces) + 1.0):
-                foot, along, normal = self.at(float(a), b)
-                span = (-half_m, half_m, min(depths_m), max(depths_m))
+                foot, along, normal, _ = self.at(float(a), b)
+                span = (-reach_m, reach_m, min(depths_m), max(depths_m))
                 self.draft.surfaces.append(Surface(foot, along, normal, span, paint, role))
 
-    def at(
-        self, a: float, b: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the point at (a, b), the direction of increasing a, and the normal."""
-        angle, aside = a / self.shape.radius_m, np.cross(self.shape.axis_world, self.zero)
+    def at(self, a: float, b: float, depth_m: float = 0.0) -> tuple[NDArray[np.float64], ...]:
+        """Return the point at (a, b), the direction of increasing a, the normal, and that of b."""
+        axis, angle = self.shape.axis_world, a / self.radius_m
+        depth_m = -depth_m if self.shape.is_concave else depth_m
+        sine, cosine = math.sin(self.half_angle_rad), math.cos(self.half_angle_rad)
+        aside = np.cross(axis, self.zero)
         outwards = math.cos(angle) * self.zero + math.sin(angle) * aside
         along = math.cos(angle) * aside - math.sin(angle) * self.zero
-        point = self.shape.point_world + self.shape.radius_m * outwards + b * self.shape.axis_world
-        return point, along, -outwards if self.shape.is_concave else outwards
+        generatrix = sine * outwards + cosine * axis
+        if isinstance(self.shape, Cylinder):
+            middle = self.shape.point_world
+        else:
+            middle = self.shape.apex_world + self.slant_m * cosine * axis
+        point = middle + (self.radius_m + cosine * depth_m) * outwards + b * generatrix
+        point -= sine * depth_m * axis
+        normal = cosine * outwards - sine * axis
+        return point, along, -normal if self.shape.is_concave else normal, generatrix
 
-    def true_cylinder(self) -> TrueCylinder:
-        """Return the cylinder with the extent of the wall itself."""
+    def true_surface(self) -> TrueSurface:
+        """Return the surface with the extent of the wall itself."""
         a0, a1, b0, b1 = np.array(self.extents).T
-        arc = np.array([a0.min(), a1.max()]) / self.shape.radius_m
-        return TrueCylinder(
+        arc = np.array([a0.min(), a1.max()]) / self.radius_m
+        along = np.array([b0.min(), b1.max()])
+        if isinstance(self.shape, Cone):
+            along = (self.slant_m + along) * math.cos(self.half_angle_rad)
+        return TrueSurface(
             shape=self.shape,
             zero=self.zero,
             arc_rad=(float(arc[0]), float(arc[1])),
-            along_m=(float(b0.min()), float(b1.max())),
+            along_m=(float(along[0]), float(along[1])),
         )
 
 
@@ -195,10 +222,10 @@ def build(subject: Subject, rng: np.random.Generator, *, relief: float, gap: flo
     """
     draft = SceneDraft()
     bends, stations = _BUILDERS[subject](draft, rng, relief)
-    on_cylinder = np.full(len(draft.surfaces), -1, dtype=np.int16)
+    on_surface = np.full(len(draft.surfaces), -1, dtype=np.int16)
     for index, bend in enumerate(bends):
         for row in bend.rows:
-            on_cylinder[row] = index
+            on_surface[row] = index
     tilt = np.append(rng.uniform(-1.0, 1.0, 2) * math.radians(_TILT_DEG), 0.0)
     turn = rotation_from_vector(tilt) @ rotation_from_vector(
         np.array([0.0, 0.0, rng.uniform(0.0, 2.0 * math.pi)])
@@ -215,31 +242,32 @@ def build(subject: Subject, rng: np.random.Generator, *, relief: float, gap: flo
             )
             for item in draft.planes
         ),
-        cylinders=tuple(_turned(bend.true_cylinder(), turn) for bend in bends),
-        on_cylinder=on_cylinder,
+        surfaces=tuple(_turned(bend.true_surface(), turn) for bend in bends),
+        on_surface=on_surface,
         stations=stations @ turn.T,
         photographed=tuple((turn @ point, turn @ normal, d) for point, normal, d in photographed),
     )
 
 
-def _turned(true: TrueCylinder, turn: NDArray[np.float64]) -> TrueCylinder:
-    shape = replace(
-        true.shape,
-        point_world=turn @ true.shape.point_world,
-        axis_world=turn @ true.shape.axis_world,
-    )
+def _turned(true: TrueSurface, turn: NDArray[np.float64]) -> TrueSurface:
+    shape, axis = true.shape, turn @ true.shape.axis_world
+    if isinstance(shape, Cylinder):
+        shape = replace(shape, point_world=turn @ shape.point_world, axis_world=axis)
+    else:
+        shape = replace(shape, apex_world=turn @ shape.apex_world, axis_world=axis)
     return replace(true, shape=shape, zero=turn @ true.zero)
 
 
 def _targets(bend: _Bend) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
     """Yield a grid of photo targets: at least three along the arc and two along the axis."""
-    true, radius_m = bend.true_cylinder(), bend.shape.radius_m
-    distance_m = min(0.9 * radius_m, 3.0) if bend.shape.is_concave else 3.0
-    n_along = max(2, math.ceil((true.along_m[1] - true.along_m[0]) / 1.5))
-    n_around = max(3, math.ceil((true.arc_rad[1] - true.arc_rad[0]) * radius_m / 1.8))
-    for b in np.linspace(*true.along_m, 2 * n_along + 1)[1::2]:
-        for angle in np.linspace(*true.arc_rad, 2 * n_around + 1)[1::2]:
-            point, _, normal = bend.at(float(angle * radius_m), float(b))
+    a0, a1, b0, b1 = np.array(bend.extents).T
+    width_m, length_m = float(a1.max() - a0.min()), float(b1.max() - b0.min())
+    distance_m = min(0.9 * bend.radius_m, 3.0) if bend.shape.is_concave else 3.0
+    n_along = max(2, math.ceil(length_m / 1.5))
+    n_around = max(3, math.ceil(width_m / 1.8))
+    for b in np.linspace(b0.min(), b1.max(), 2 * n_along + 1)[1::2]:
+        for angle in np.linspace(*bend.true_surface().arc_rad, 2 * n_around + 1)[1::2]:
+            point, _, normal, _ = bend.at(float(angle * bend.radius_m), float(b))
             yield point, normal, distance_m
 
 
@@ -447,10 +475,40 @@ def _column(
     )
 
 
+def _spire(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    base_m, half_rad = rng.uniform(1.3, 1.7), math.radians(rng.uniform(13.0, 18.0))
+    slant_m = base_m / math.sin(half_rad)
+    shape = Cone(
+        apex_world=(FLOOR_M + slant_m * math.cos(half_rad)) * _UP,
+        axis_world=-_UP,
+        half_angle_rad=half_rad,
+        is_concave=False,
+    )
+    # Positions are measured from the middle of the spire, whose tip is missing.
+    middle_m, reach_m = 0.6 * slant_m, 0.4 * slant_m
+    zero = np.array([1.0, 0.0, 0.0])
+    spire = _Bend(draft=draft, shape=shape, zero=zero, slant_m=middle_m)
+    turn_m = math.pi * spire.radius_m
+    spire.place((-turn_m, turn_m, -reach_m, reach_m), 0.0, _FRESCO, SurfaceRole.WALL)
+    if relief > 0.0:
+        for b in rng.uniform(-0.1, 0.1, 2) + np.array([-0.3, 0.4]) * reach_m:
+            spire.box((-turn_m, turn_m, b - 0.1, b + 0.1), (0.0, 0.06 * relief), _STUCCO)
+        for a in rng.uniform(-0.8, 0.8, 3) * turn_m:
+            spire.box((a - 0.2, a + 0.2, -0.2, 0.2), (0.0, 0.04 * relief), _STUCCO)
+    _level(draft, "floor", FLOOR_M, (12.0, 12.0))
+    away_m, azimuth = base_m + rng.uniform(3.0, 5.0, 4), 0.5 * math.pi * np.arange(4)
+    azimuth += rng.uniform(-0.2, 0.2, 4)
+    places = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(4)], axis=1)
+    return [spire], away_m[:, None] * places
+
+
 _BUILDERS: Final = {
     "barrel-vault": _barrel_vault,
     "cross-vault": _cross_vault,
     "apse": _apse,
     "tower": _tower,
     "column": _column,
+    "spire": _spire,
 }

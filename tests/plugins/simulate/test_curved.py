@@ -25,9 +25,9 @@ def test_exact_points_are_on_the_true_surfaces(subject: Subject, tmp_path: Path)
     on_any = np.zeros(len(points), dtype=np.bool_)
     for surface in truth.surfaces.surfaces:
         shape = surface.shape
-        assert isinstance(shape, Cylinder)
+        start = shape.point_world if isinstance(shape, Cylinder) else shape.apex_world
         on = np.abs(shape.distances_m(points)) < 1e-4
-        frame = shape.point_world, shape.axis_world
+        frame = start, shape.axis_world
         angles = angles_around(points[on], *frame, surface.zero_world)
         along = (points[on] - frame[0]) @ frame[1]
         inside = (angles > surface.arc_rad[0] - 1e-6) & (angles < surface.arc_rad[1] + 1e-6)
