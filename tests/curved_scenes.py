@@ -1,4 +1,4 @@
-"""Textured vaults and towers with a projecting band, known exactly, and photos of them."""
+"""Textured vaults, towers and spires with a projecting band, known exactly, and photos of them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Cylinder
+from orthoflow.geometry import Cone, Cylinder
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.geometry.surfaces import angles_around, zero_direction
+from orthoflow.geometry.surfaces import along_and_across, angles_around, zero_direction
 from orthoflow.products import PointCloud, Surface, Surfaces, surface_kind
 from tests import samples
 from tests.raster_scenes import UP, cell_centres, cloud_of
@@ -22,9 +22,13 @@ NO_PLANES = samples.planes(
 
 @dataclass(frozen=True, kw_only=True)
 class Drum:
-    """A cylinder with a band around it, `band_m` along its axis, that projects by `height_m`."""
+    """A cylinder or cone with a band around it, `band_m` along it, that projects by `height_m`.
 
-    cylinder: Cylinder
+    On a cone, positions along it are distances from the apex, and lengths of the arc those at the
+    middle of `along_m`.
+    """
+
+    shape: Cylinder | Cone
     arc_rad: tuple[float, float]
     along_m: tuple[float, float]
     band_m: tuple[float, float] = (0.0, 0.0)
@@ -32,10 +36,36 @@ class Drum:
 
     @property
     def zero_world(self) -> NDArray[np.float64]:
-        return zero_direction(self.cylinder.axis_world, UP)
+        return zero_direction(self.shape.axis_world, UP)
+
+    @property
+    def half_rad(self) -> float:
+        """Angle between the axis and the generatrices."""
+        return self.shape.half_angle_rad if isinstance(self.shape, Cone) else 0.0
+
+    @property
+    def start_world(self) -> NDArray[np.float64]:
+        shape = self.shape
+        return shape.point_world if isinstance(shape, Cylinder) else shape.apex_world
+
+    @property
+    def radius_m(self) -> float:
+        if isinstance(self.shape, Cylinder):
+            return self.shape.radius_m
+        return float(np.mean(self.along_m)) * math.sin(self.half_rad)
+
+    @property
+    def sides_m(self) -> tuple[float, float]:
+        """Sides of the unrolled surface, or of the box around its sector."""
+        low_m, high_m = self.along_m
+        half_m = 0.5 * float(np.ptp(self.arc_rad)) * self.radius_m
+        if isinstance(self.shape, Cylinder):
+            return high_m - low_m, 2.0 * half_m
+        turn = 2.0 * half_m / (low_m + high_m)
+        return high_m - low_m * math.cos(turn), 2.0 * high_m * math.sin(turn)
 
     def surfaces(self) -> Surfaces:
-        shape = self.cylinder
+        shape, (low_m, high_m) = self.shape, self.along_m
         surface = Surface(
             name=f"{surface_kind(shape, UP)} 0",
             shape=shape,
@@ -43,7 +73,7 @@ class Drum:
             n_points=1000,
             rms_m=0.001,
             zero_world=self.zero_world,
-            along_m=self.along_m,
+            along_m=(low_m * math.cos(self.half_rad), high_m * math.cos(self.half_rad)),
             arc_rad=self.arc_rad,
         )
         return Surfaces(surfaces=(surface,), up=UP)
@@ -52,46 +82,57 @@ class Drum:
         self, arc_m: NDArray[np.float64], along_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """World points (n, 3) of the surface at lengths of the arc from the zero direction."""
-        shape, side = self.cylinder, -1.0 if self.cylinder.is_concave else 1.0
         on_band = (along_m >= self.band_m[0]) & (along_m < self.band_m[1])
-        radii_m = shape.radius_m + side * self.height_m * on_band
-        angles = arc_m / shape.radius_m
-        beside = np.cross(shape.axis_world, self.zero_world)
+        depths_m = (-1.0 if self.shape.is_concave else 1.0) * self.height_m * on_band
+        sine, cosine = math.sin(self.half_rad), math.cos(self.half_rad)
+        radii_m = cosine * depths_m + sine * along_m
+        if isinstance(self.shape, Cylinder):
+            radii_m = radii_m + self.radius_m
+        axis, angles = self.shape.axis_world, arc_m / self.radius_m
+        beside = np.cross(axis, self.zero_world)
         outwards = np.outer(np.cos(angles), self.zero_world) + np.outer(np.sin(angles), beside)
-        return shape.point_world + np.outer(along_m, shape.axis_world) + radii_m[:, None] * outwards
+        axial = np.outer(cosine * along_m - sine * depths_m, axis)
+        return self.start_world + axial + radii_m[:, None] * outwards
 
     def places(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Length of the arc and position along the axis (n, 2) of world points, in metres."""
-        shape = self.cylinder
-        angles = angles_around(points, shape.point_world, shape.axis_world, self.zero_world)
+        start, axis = self.start_world, self.shape.axis_world
+        angles = angles_around(points, start, axis, self.zero_world)
         middle = sum(self.arc_rad) / 2.0
         angles = middle + (angles - middle + math.pi) % math.tau - math.pi
-        along = (points - shape.point_world) @ shape.axis_world
-        return np.column_stack([shape.radius_m * angles, along])
+        axial, across = along_and_across(points, start, axis)
+        along = math.cos(self.half_rad) * axial
+        along += math.sin(self.half_rad) * np.linalg.norm(across, axis=1)
+        return np.column_stack([self.radius_m * angles, along])
+
+    def texture(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Grey values (n,) of places; those of a cone are a function of the unrolled position."""
+        if isinstance(self.shape, Cone):
+            turns = math.sin(self.half_rad) * places_m[:, 0] / self.radius_m
+            slants = places_m[:, 1]
+            places_m = np.column_stack([slants * np.sin(turns), slants * np.cos(turns)])
+        return texture(places_m)
 
     def cloud(self, step_m: float) -> PointCloud:
         """Points with the texture as intensity and colour."""
-        arc = np.array(self.arc_rad) * self.cylinder.radius_m
+        arc = np.array(self.arc_rad) * self.radius_m
         arcs, alongs = np.meshgrid(np.arange(*arc, step_m), np.arange(*self.along_m, step_m))
         places = np.column_stack([arcs.ravel(), alongs.ravel()])
         places += np.random.default_rng(3).uniform(-0.3, 0.3, places.shape) * step_m
         inside = (places[:, 0] >= arc[0]) & (places[:, 1] >= self.along_m[0])
         places = places[inside]
-        grey = texture(places)
+        grey = self.texture(places)
         rgb = np.repeat(np.rint(255.0 * grey)[:, None], 3, axis=1).astype(np.uint8)
         return cloud_of(self.points(*places.T), rgb=rgb, intensity=grey.astype(np.float32))
 
     def met(self, start: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distances (n,), in lengths of the rays (n, 3), at which they first meet the surface."""
-        shape = self.cylinder
-        relative = start - shape.point_world
-        first, slope = relative @ shape.axis_world, rays @ shape.axis_world
-        across = relative - np.outer(first, shape.axis_world)
-        beside = rays - np.outer(slope, shape.axis_world)
-        a = (beside**2).sum(axis=1)
-        b = (across * beside).sum(axis=1)
-        side = -1.0 if shape.is_concave else 1.0
-        arc = np.array(self.arc_rad) * shape.radius_m
+        sine, cosine = math.sin(self.half_rad), math.cos(self.half_rad)
+        side = -1.0 if self.shape.is_concave else 1.0
+        base_m = self.radius_m if isinstance(self.shape, Cylinder) else 0.0
+        axial, across = along_and_across(start, self.start_world, self.shape.axis_world)
+        slope, beside = along_and_across(rays, np.zeros(3), self.shape.axis_world)
+        arc = np.array(self.arc_rad) * self.radius_m
         best = np.full(len(rays), np.inf)
 
         def keep(t: NDArray[np.float64], *, is_band: bool | None) -> None:
@@ -103,17 +144,29 @@ class Drum:
                 good &= (on_band == is_band)[:, None]
             best[ahead[good.all(axis=1)]] = t[ahead[good.all(axis=1)]]
 
-        with np.errstate(invalid="ignore", divide="ignore"):
-            for is_band in (False, True):
-                radius_m = shape.radius_m + side * self.height_m * is_band
-                root = np.sqrt(b * b - a * ((across**2).sum(axis=1) - radius_m**2))
-                keep((-b - root) / a, is_band=is_band)
-                keep((-b + root) / a, is_band=is_band)
-            for edge_m in self.band_m if self.height_m else ():
-                t = (edge_m - first) / slope
-                radii = np.linalg.norm(across + t[:, None] * beside, axis=1)
-                depth = side * (radii - shape.radius_m)
-                keep(np.where((depth > 0.0) & (depth < self.height_m), t, np.nan), is_band=None)
+        # Lines of the profile: cosines of the distance from the axis and of the one along it, and
+        # their sum; those of the surface, of the band and of its two edges.
+        lines: list[tuple[float, float, float, bool | None]] = [
+            (cosine, -sine, cosine * base_m, False),
+            (cosine, -sine, cosine * base_m + side * self.height_m, True),
+            *((sine, cosine, edge_m, None) for edge_m in (self.band_m if self.height_m else ())),
+        ]
+        for of_radius, of_axial, total, is_band in lines:
+            rest, slopes = total - of_axial * axial, of_axial * slope
+            a = of_radius**2 * (beside**2).sum(axis=1) - slopes**2
+            b = of_radius**2 * (across * beside).sum(axis=1) + rest * slopes
+            c = of_radius**2 * (across**2).sum(axis=1) - rest**2
+            for sign in (-1.0, 1.0):
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    root = b * b - a * c
+                    t = (-b + sign * np.sqrt(np.maximum(root, 0.0))) / a
+                    t[root < -1e-9 * b * b] = np.nan
+                    radii = np.linalg.norm(across + t[:, None] * beside, axis=1)
+                    t[np.abs(of_radius * radii - (rest - t * slopes)) > 1e-6] = np.nan
+                    depths = side * (cosine * (radii - base_m) - sine * (axial + t * slope))
+                if is_band is None:
+                    t[~((depths > 0.0) & (depths < self.height_m))] = np.nan
+                keep(t, is_band=is_band)
         return best
 
     def rendered(self, camera: ViewingCamera) -> NDArray[np.uint8]:
@@ -122,7 +175,7 @@ class Drum:
         start = np.broadcast_to(camera.centre_world, rays.shape)
         t = self.met(start, rays)
         grey, seen = np.zeros(len(t)), np.isfinite(t)
-        grey[seen] = texture(self.places(start[seen] + t[seen, None] * rays[seen]))
+        grey[seen] = self.texture(self.places(start[seen] + t[seen, None] * rays[seen]))
         image = np.rint(255.0 * grey).astype(np.uint8).reshape(camera.height, camera.width)
         return np.repeat(image[..., None], 3, axis=2)
 
@@ -149,7 +202,7 @@ def vault(*, half_deg: float = 75.0, length_m: float = 3.0, **band: object) -> D
     )
     half, reach = math.radians(half_deg), 0.5 * length_m
     return Drum(
-        cylinder=cylinder,
+        shape=cylinder,
         arc_rad=(-half, half),
         along_m=(-reach, reach),
         **band,  # type: ignore[arg-type]
@@ -168,9 +221,27 @@ def tower(
         is_concave=is_concave,
     )
     return Drum(
-        cylinder=cylinder,
+        shape=cylinder,
         arc_rad=(-math.radians(half_deg), math.radians(half_deg)),
         along_m=(-1.0, 1.0),
+        **band,  # type: ignore[arg-type]
+    )
+
+
+def spire(*, half_deg: float = 150.0, is_concave: bool = False, **band: object) -> Drum:
+    """A leaning spire with a half angle of 15 degrees, without its tip, or a funnel's inside."""
+    axis = np.array([0.02, 0.01, 1.0 if is_concave else -1.0])
+    cone = Cone(
+        apex_world=np.array([10.0, 20.0, 8.0]),
+        axis_world=axis / np.linalg.norm(axis),
+        half_angle_rad=math.radians(15.0),
+        is_concave=is_concave,
+    )
+    half = math.radians(half_deg)
+    return Drum(
+        shape=cone,
+        arc_rad=(-half, half),
+        along_m=(2.5, 4.5),
         **band,  # type: ignore[arg-type]
     )
 
@@ -185,13 +256,17 @@ def camera(
     aim_m: float = 0.0,
 ) -> ViewingCamera:
     """A camera that looks at a place of the surface from a distance, a little tilted."""
-    arc_m = np.array([math.radians(arc_deg) * drum.cylinder.radius_m])
+    arc_m = np.array([math.radians(arc_deg) * drum.radius_m])
     target = drum.points(arc_m, np.array([along_m + aim_m]))[0]
     foot = drum.points(arc_m, np.array([along_m]))
-    centre = foot[0] + away_m * drum.cylinder.normals(foot)[0]
-    axis = drum.cylinder.axis_world
-    up = axis if abs(axis @ UP) > 0.7 else np.cross(drum.cylinder.normals(foot)[0], axis)
-    turn = np.cos(0.1) * up + np.sin(0.1) * np.cross(up, drum.cylinder.normals(foot)[0])
+    centre = foot[0] + away_m * drum.shape.normals(foot)[0]
+    axis = drum.shape.axis_world
+    up = (
+        np.sign(axis @ UP) * axis
+        if abs(axis @ UP) > 0.7
+        else np.cross(drum.shape.normals(foot)[0], axis)
+    )
+    turn = np.cos(0.1) * up + np.sin(0.1) * np.cross(up, drum.shape.normals(foot)[0])
     return samples.camera(
         looking_at(centre, target, turn),
         centre,

@@ -90,6 +90,8 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         geotiff = geotiff.replace(" - gsd_m", " + gsd_m")
     if frame.bend is not None:
         geotiff = geotiff.replace("in the plane", "on the unrolled surface")
+    if isinstance(frame.bend, ConeBend):
+        geotiff = "X and Y: metres on the unrolled cone from its apex, to the right and up"
     return placed | {
         "origin_world": numbers(frame.origin_world),
         "u_world": numbers(frame.u_world),

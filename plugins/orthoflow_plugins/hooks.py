@@ -110,7 +110,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="raster",
-            summary="bin the cloud into a raster on each plane and unrolled cylinder",
+            summary="bin the cloud into a raster on each plane and unrolled surface",
             inputs=_ports("cloud planes surfaces"),
             outputs=_ports("walls"),
         ),

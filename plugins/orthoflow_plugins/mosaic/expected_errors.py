@@ -160,8 +160,6 @@ def _pose_variances(
     pixels = near.project(points)[:, :2]
     in_front = (points @ near.rotation[2] + near.translation[2]) > 0.0
     shown = np.isfinite(pixels).all(axis=1) & in_front
-    if frame.bend is not None:
-        shown &= frame.shows(nodes.reshape(-1, 2))
     if not shown.any():
         return None
     variances = np.full(len(points), np.nan)

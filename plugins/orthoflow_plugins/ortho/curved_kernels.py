@@ -102,7 +102,7 @@ def look_at_curved_cells(
             from_axis = radius + about.side * about.cosine * depth
             first, second = from_axis * towards_first, from_axis * towards_second
             axial = about.cosine * along - about.side * about.sine * depth
-            u, v, distance = project_point(about.camera, first, second, axial)
+            u, v, distance = project_point(view.axial_camera, first, second, axial)
             visible.mask[i, j] = OUTSIDE
             if not (0.0 <= u < view.camera[21] and 0.0 <= v < view.camera[22]):
                 continue
@@ -165,9 +165,8 @@ def _position_at(ray: Ray, share: float, about: AxisView) -> tuple[float, float]
 
 
 @kernel_part
-def _cell_at(distance: float, angle: float, view: WallView) -> tuple[float, float]:
+def _cell_at(distance: float, angle: float, about: AxisView, gsd_m: float) -> tuple[float, float]:
     """Return the row and column of a position on the surface; (0, 0) is the first centre."""
-    about = view.about
     if about.sine == 0.0:
         along, aside = distance, about.radius_m * angle
     else:
@@ -175,7 +174,7 @@ def _cell_at(distance: float, angle: float, view: WallView) -> tuple[float, floa
         along, aside = distance * math.cos(turn), distance * math.sin(turn)
     x = about.place_x + along * about.along_x + aside * about.aside_x
     y = about.place_y + along * about.along_y + aside * about.aside_y
-    return y / view.gsd_m - 0.5, x / view.gsd_m - 0.5
+    return y / gsd_m - 0.5, x / gsd_m - 0.5
 
 
 @kernel_part
@@ -231,10 +230,10 @@ def _is_covered(view: WallView, relief: Relief, ray: Ray, depth: float) -> bool:
     end = _reaches(ray, about, top) if depth + view.tolerance_m < top else 0.0
     share = 0.0
     while True:
-        share += 1.0 / max(_cells_per_share(ray, share, view), 1e-6)
+        share += 1.0 / max(_cells_per_share(ray, share, about, view.gsd_m), 1e-6)
         if share >= end:
             return False
-        row, column = _cell_at(*_position_at(ray, share, about), view)
+        row, column = _cell_at(*_position_at(ray, share, about), about, view.gsd_m)
         if not _is_on_wall(relief, row, column):
             return False
         level = _depth_at(ray, share, about) + view.tolerance_m
@@ -243,19 +242,18 @@ def _is_covered(view: WallView, relief: Relief, ray: Ray, depth: float) -> bool:
 
 
 @kernel_part
-def _cells_per_share(ray: Ray, share: float, view: WallView) -> float:
+def _cells_per_share(ray: Ray, share: float, about: AxisView, gsd_m: float) -> float:
     """Return the number of cells that a ray crosses per unit of its share."""
-    about = view.about
     first, second = ray.first + share * ray.to_first, ray.second + share * ray.to_second
     square = first * first + second * second
     turning = abs(first * ray.to_second - second * ray.to_first) / square
     if about.sine == 0.0:
-        return max(turning * about.radius_m, abs(ray.to_axial)) / view.gsd_m
+        return max(turning * about.radius_m, abs(ray.to_axial)) / gsd_m
     away = math.sqrt(square)
     distance = about.sine * away + about.cosine * (ray.axial + share * ray.to_axial)
     lifting = (first * ray.to_first + second * ray.to_second) / away
     lengthening = about.sine * lifting + about.cosine * ray.to_axial
-    return math.hypot(about.sine * distance * turning, lengthening) / view.gsd_m
+    return math.hypot(about.sine * distance * turning, lengthening) / gsd_m
 
 
 @kernel_part
@@ -267,7 +265,7 @@ def _is_behind_the_wall(view: WallView, relief: Relief, ray: Ray) -> bool:
     inwards -= about.sine * least * ray.to_axial
     if not (0.0 < share < 1.0 and inwards < 0.0):
         return False
-    row, column = _cell_at(*_position_at(ray, share, about), view)
+    row, column = _cell_at(*_position_at(ray, share, about), about, view.gsd_m)
     return _is_on_wall(relief, row, column) and (
         _surface_at(relief.occluding, row, column) > -math.inf
     )
@@ -276,12 +274,15 @@ def _is_behind_the_wall(view: WallView, relief: Relief, ray: Ray) -> bool:
 @kernel_part
 def _highest_in_the_way(view: WallView, relief: Relief, ray: Ray, depth: float) -> float:
     """Return an upper bound of the surface along the part of a ray that it may interrupt."""
+    about = view.about
     top, n_rows, n_columns = relief.highest_m, relief.depth.shape[0], relief.depth.shape[1]
+    row, column = _cell_at(*_position_at(ray, 0.0, about), about, view.gsd_m)
     for _ in range(_ROUNDS):
         if not depth + view.tolerance_m < top:
             return top
+        end = _reaches(ray, about, top)
         low_row, high_row, low_column, high_column = _cells_along(
-            view, ray, _reaches(ray, view.about, top)
+            ray, end, row, column, about, view.gsd_m
         )
         first_row = max(0, int(low_row - 1.0)) // BLOCK_CELLS
         last_row = max(0, min(n_rows - 1, int(high_row + 2.0))) // BLOCK_CELLS
@@ -295,19 +296,25 @@ def _highest_in_the_way(view: WallView, relief: Relief, ray: Ray, depth: float) 
 
 
 @kernel_part
-def _cells_along(view: WallView, ray: Ray, end: float) -> tuple[float, float, float, float]:
-    """Return bounds of the rows and columns of a ray up to a share: two rows, two columns."""
-    about = view.about
-    (near, start), (far, stop) = _position_at(ray, 0.0, about), _position_at(ray, end, about)
+def _cells_along(
+    ray: Ray, end: float, row: float, column: float, about: AxisView, gsd_m: float
+) -> tuple[float, float, float, float]:
+    """Return bounds of the rows and columns of a ray up to a share: two rows, two columns.
+
+    Args:
+        ray: the ray.
+        end: the share.
+        row: row of the cell in which the ray starts; (0, 0) is the first centre.
+        column: its column.
+        about: the surface.
+        gsd_m: side of a cell.
+    """
+    far, angle = _position_at(ray, end, about)
+    end_row, end_column = _cell_at(far, angle, about, gsd_m)
+    low_row, high_row = min(row, end_row), max(row, end_row)
+    low_column, high_column = min(column, end_column), max(column, end_column)
     if about.sine == 0.0:
-        row, column = _cell_at(near, start, view)
-        end_row, end_column = _cell_at(far, stop, view)
-        return (
-            min(row, end_row),
-            max(row, end_row),
-            min(column, end_column),
-            max(column, end_column),
-        )
+        return low_row, high_row, low_column, high_column
     # The distance from the apex is a convex function of the share, so it is largest at an end. A
     # lower bound follows from the smallest distance from the axis and the lowest position along it.
     across = ray.to_first * ray.to_first + ray.to_second * ray.to_second
@@ -316,15 +323,25 @@ def _cells_along(view: WallView, ray: Ray, end: float) -> tuple[float, float, fl
     first, second = ray.first + middle * ray.to_first, ray.second + middle * ray.to_second
     nearest = math.sqrt(first * first + second * second)
     axial = min(ray.axial, ray.axial + end * ray.to_axial)
-    least, most = about.sine * nearest + about.cosine * axial, max(near, far)
-    low_row = low_column = math.inf
-    high_row = high_column = -math.inf
-    for distance, angle in ((least, start), (most, start), (least, stop), (most, stop)):
-        row, column = _cell_at(distance, angle, view)
-        low_row, high_row = min(low_row, row), max(high_row, row)
-        low_column, high_column = min(low_column, column), max(high_column, column)
-    # An arc exceeds the box of its ends by its height at most.
-    beyond = most * (1.0 - math.cos(0.5 * about.sine * (stop - start))) / view.gsd_m
+    least = (about.sine * nearest + about.cosine * axial) / gsd_m
+    apex_row = about.place_y / gsd_m - 0.5
+    apex_column = about.place_x / gsd_m - 0.5
+    down, right = row - apex_row, column - apex_column
+    end_down, end_right = end_row - apex_row, end_column - apex_column
+    near, far = math.hypot(down, right), math.hypot(end_down, end_right)
+    most = max(near, far)
+    # The box contains the points at both distances on both generatrices, and the arcs between them.
+    for towards_down, towards_right in (
+        (down / near, right / near),
+        (end_down / far, end_right / far),
+    ):
+        for distance in (least, most):
+            at_row = apex_row + distance * towards_down
+            at_column = apex_column + distance * towards_right
+            low_row, high_row = min(low_row, at_row), max(high_row, at_row)
+            low_column, high_column = min(low_column, at_column), max(high_column, at_column)
+    cosine = (down * end_down + right * end_right) / (near * far)
+    beyond = most * (1.0 - math.sqrt(max(0.0, 0.5 + 0.5 * cosine)))
     return low_row - beyond, high_row + beyond, low_column - beyond, high_column + beyond
 
 

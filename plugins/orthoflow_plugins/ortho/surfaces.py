@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,11 +118,11 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
         tolerance_m=float(surface.tolerance_m),
         cosine_least=math.cos(math.radians(params.incidence_max_deg)),
         border_px=max(1.0, _BORDER_SHARE * min(camera.width, camera.height)),
-        **({} if frame.bend is None else {"about": _about_axis(near, frame, frame.bend)}),
+        **({} if frame.bend is None else _about_axis(near, frame, frame.bend)),
     )
 
 
-def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> AxisView:
+def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> dict[str, Any]:
     """Return a camera, relative to the corner of a raster, in the axes of its curved surface."""
     own, axes = bend.revolution, np.array([frame.u_world, frame.v_world, frame.normal_world])
     from_axis = own.axes @ axes
@@ -131,8 +131,7 @@ def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> AxisView:
     flat[:9] = (shifted.rotation @ from_axis.T).ravel()
     size_m = frame.gsd_m * np.array([frame.width, frame.height])
     first, second, axial = (from_axis @ shifted.centre_world).tolist()
-    return AxisView(
-        camera=flat,
+    about = AxisView(
         first=first,
         second=second,
         axial=axial,
@@ -148,6 +147,7 @@ def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> AxisView:
         aside_x=float(own.aside[0]),
         aside_y=float(own.aside[1]),
     )
+    return {"about": about, "axial_camera": flat}
 
 
 def cells_seen(

@@ -32,7 +32,6 @@ class AxisView(NamedTuple):
     """A camera in the axes of a cylinder or cone (see `bends.Revolution`).
 
     Attributes:
-        camera: (25,) flat camera for points in these axes from `start`.
         first: coordinate of the projection centre towards angle 0.
         second: its coordinate towards an angle of 90 degrees.
         axial: its coordinate along the axis.
@@ -49,7 +48,6 @@ class AxisView(NamedTuple):
         aside_y: see `aside_x`.
     """
 
-    camera: NDArray[np.float64]
     first: float
     second: float
     axial: float
@@ -66,7 +64,8 @@ class AxisView(NamedTuple):
     aside_y: float
 
 
-_PLANE: Final = AxisView(np.zeros(25), *(14 * (0.0,)))
+_PLANE: Final = AxisView(*(14 * (0.0,)))
+_NO_CAMERA: Final = np.zeros(25)
 
 
 class WallView(NamedTuple):
@@ -85,6 +84,7 @@ class WallView(NamedTuple):
         border_px: width of the strip along the image border in which quality decreases to 0.
         about: the camera in the axes of a curved surface. The axes of the wall are then those at
             the top-left corner of its raster.
+        axial_camera: (25,) flat camera for points in the axes of a curved surface from `start`.
     """
 
     camera: NDArray[np.float64]
@@ -97,6 +97,7 @@ class WallView(NamedTuple):
     cosine_least: float
     border_px: float
     about: AxisView = _PLANE
+    axial_camera: NDArray[np.float64] = _NO_CAMERA
 
 
 class Relief(NamedTuple):

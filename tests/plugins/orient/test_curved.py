@@ -1,4 +1,4 @@
-"""Photos matched with an unrolled vault and oriented, judged by the truth."""
+"""Photos matched with an unrolled vault and spire and oriented, judged by the truth."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
@@ -37,7 +38,7 @@ def texture_of(drum: Drum, frame: WallFrame) -> NDArray[np.float64]:
     """The true grey values of a wall."""
     rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
     places = drum.places(frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()])))
-    return curved_scenes.texture(places).reshape(frame.shape)
+    return drum.texture(places).reshape(frame.shape)
 
 
 def shifts_m(layer: Layer, true: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -56,14 +57,27 @@ def shifts_m(layer: Layer, true: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array(found)
 
 
-def test_an_oriented_vault_is_unrolled_to_a_tenth_of_a_cell(tmp_path: Path) -> None:
-    drum = curved_scenes.vault(half_deg=45.0, length_m=1.2, band_m=(0.2, 0.35), height_m=0.08)
+# The drum, and the angles of cameras, their positions along it and distances.
+SCENES = {
+    "vault": (
+        curved_scenes.vault(half_deg=45.0, length_m=1.2, band_m=(0.2, 0.35), height_m=0.08),
+        [(-30.0, -0.2, 2.4), (0.0, 0.2, 2.5), (30.0, -0.2, 2.4)],
+    ),
+    "spire": (
+        curved_scenes.spire(half_deg=60.0, band_m=(3.2, 3.35), height_m=0.08),
+        [(-40.0, 3.3, 2.4), (0.0, 3.7, 2.5), (40.0, 3.3, 2.4)],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_oriented_photos_are_unrolled_to_a_tenth_of_a_cell(name: str, tmp_path: Path) -> None:
+    drum, poses = SCENES[name]
     random = np.random.default_rng(11)
     points = drum.cloud(0.7 * GSD_M)
     world = points.points_world()
-    world += random.normal(0.0, 1e-3, len(world))[:, None] * drum.cylinder.normals(world)
+    world += random.normal(0.0, 1e-3, len(world))[:, None] * drum.shape.normals(world)
     cloud = replace(cloud_of(world, intensity=points.intensity), rgb=points.rgb)
-    poses = [(-30.0, -0.2, 2.4), (0.0, 0.2, 2.5), (30.0, -0.2, 2.4)]
     viewers = [curved_scenes.camera(drum, *pose, width=1000) for pose in poses]
     pictures = [drum.rendered(viewer) for viewer in viewers]
     noisy = [

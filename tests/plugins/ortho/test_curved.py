@@ -1,4 +1,4 @@
-"""Photos and points projected onto unrolled cylinders: colours, visibility and quality."""
+"""Photos and points projected onto unrolled surfaces: colours, visibility and quality."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from tests.raster_scenes import cell_centres, context, numbers
 
 GSD_M = 0.01
 BAND: dict[str, Any] = {"band_m": (0.2, 0.5), "height_m": 0.15}
+RING: dict[str, Any] = {"band_m": (3.4, 3.7), "height_m": 0.15}
 # The drum, and cameras: place along the arc in degrees, along the axis, and distance.
 SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
     "vault": (curved_scenes.vault(length_m=2.0, **BAND), [(0.0, -0.6, 2.5), (30.0, 0.7, 2.4)]),
@@ -34,6 +35,8 @@ SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
         curved_scenes.tower(radius_m=0.6, half_deg=180.0, **BAND),
         [(0.0, -0.6, 2.0), (175.0, 0.3, 1.5)],
     ),
+    "spire": (curved_scenes.spire(**RING), [(0.0, 3.0, 2.5), (60.0, 3.9, 1.6)]),
+    "funnel": (curved_scenes.spire(is_concave=True, **RING), [(100.0, 3.8, 1.3)]),
 }
 
 
@@ -54,18 +57,18 @@ def projected(name: str, folder: Path, method: Any = DsmBackward) -> tuple[Any, 
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_photos_colour_what_they_see_of_a_cylinder(name: str, tmp_path: Path) -> None:
+def test_photos_colour_what_they_see_of_a_curved_surface(name: str, tmp_path: Path) -> None:
     layers, drum, cameras, wall, metrics = projected(name, tmp_path)
     frame = wall.frame
     cells = np.column_stack(cell_centres(frame.shape))
     places = drum.places(frame.world_from_wall(cells))
-    points, grey = drum.points(*places.T), curved_scenes.texture(places)
+    points, grey = drum.points(*places.T), drum.texture(places)
     for camera, layer in zip(cameras, layers, strict=True):
         rays = points - camera.centre_world
         lengths_m = np.linalg.norm(rays, axis=1)
         met = drum.met(np.broadcast_to(camera.centre_world, rays.shape), rays)
         pixels = camera.project(points)[:, :2]
-        is_seen = (met > 1.0 - GSD_M / lengths_m) & camera.sees(pixels)
+        is_seen = (met > 1.0 - GSD_M / lengths_m) & camera.sees(pixels) & frame.shows(cells)
         cosines = -np.einsum("ij,ij->i", rays, frame.axes_at(cells)[:, 2]) / lengths_m
         mask = layer.mask.ravel()
         is_painted = mask == LayerMask.PAINTED
@@ -96,7 +99,7 @@ def test_points_colour_a_cylinder(tmp_path: Path) -> None:
     assert (layer.mask == LayerMask.PAINTED).mean() > 0.99
     cells = np.column_stack(cell_centres(frame.shape))
     places = drum.places(frame.world_from_wall(cells))
-    errors = layer.rgb.reshape(-1, 3)[:, 0] / 255.0 - curved_scenes.texture(places)
+    errors = layer.rgb.reshape(-1, 3)[:, 0] / 255.0 - drum.texture(places)
     assert np.sqrt((errors**2).mean()) < 0.13
 
 
@@ -121,7 +124,7 @@ def test_points_get_the_colours_of_photos(name: str, tmp_path: Path) -> None:
             camera.project(points)[:, :2]
         )
     assert is_seen.mean() > 0.99
-    errors = cloud.rgb[:, 0] / 255.0 - curved_scenes.texture(drum.places(points))
+    errors = cloud.rgb[:, 0] / 255.0 - drum.texture(drum.places(points))
     assert np.sqrt((errors**2).mean()) < 0.13
 
 
