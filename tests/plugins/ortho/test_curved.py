@@ -46,7 +46,7 @@ def projected(name: str, folder: Path, method: Any = DsmBackward) -> tuple[Any, 
     cloud = drum.cloud(0.6 * GSD_M)
     found = {"cloud": cloud, "planes": curved_scenes.NO_PLANES, "surfaces": drum.surfaces()}
     walls = run(RasterGrid, context(folder), found, gsd_m=GSD_M).walls
-    cameras = [curved_scenes.camera(drum, *pose, width=800) for pose in poses]
+    cameras = [curved_scenes.camera(drum, *pose, width=500) for pose in poses]
     inputs = {"walls": walls, "cloud": cloud}
     if method is not PointcloudDirect:
         inputs["photos"] = ortho_scenes.photos(*map(drum.rendered, cameras))
@@ -108,7 +108,7 @@ def test_points_get_the_colours_of_photos(name: str, tmp_path: Path) -> None:
     drum, poses = SCENES[name]
     # The cloud has no points on the sides of the band, through which the back would be seen.
     drum = replace(drum, height_m=0.0)
-    cameras = [curved_scenes.camera(drum, *pose, width=800) for pose in poses]
+    cameras = [curved_scenes.camera(drum, *pose, width=500) for pose in poses]
     inputs = {
         "cloud": drum.cloud(GSD_M),
         "photos": ortho_scenes.photos(*map(drum.rendered, cameras)),

@@ -55,7 +55,7 @@ def in_files(walls: Walls, folder: Path) -> Walls:
     return dataclasses.replace(walls, walls=(dataclasses.replace(wall, **arrays),))
 
 
-def large_inputs(folder: Path, n: int = 5) -> DsmBackward.In:
+def large_inputs(folder: Path, n: int = 4) -> DsmBackward.In:
     """Return the wall of `ortho_scenes` with n times smaller cells, in files, and two photos."""
     where = ortho_scenes.frame()
     fine = dataclasses.replace(where, gsd_m=where.gsd_m / n, width=n * 320, height=n * 240)
