@@ -324,6 +324,8 @@ class _Problem:
         by_place = whiten(
             _pixel_covariances(linear, self._seen), linear.by_camera_point @ camera.rotation
         )
+        follows = np.zeros((1, self.n_free, 3))
+        follows[0, 3:POSE_PARAMETERS] = camera.rotation
         return AdjustedPoints(
             photo=np.zeros(len(self._seen), dtype=np.intp),
             places=self._seen.points_world,
@@ -331,6 +333,7 @@ class _Problem:
             jacobian=errors.jacobian,
             by_place=by_place,
             pulls=np.einsum("nip,nid->npd", errors.jacobian, by_place),
+            follows=follows,
             towards=np.tile(
                 outwards(self._seen.points_world, camera.centre_world), (len(self._seen), 1)
             ),

@@ -105,19 +105,15 @@ DRAWN: Final[dict[str, tuple[Draw, int]]] = {
 
 @pytest.mark.long
 def test_what_neighbours_share_is_stated() -> None:
-    """Stated over true of each kind of error, and normalised errors of all of them together.
+    """Stated over true of each kind of error.
 
-    Of rough errors only the quotient of variance and length is known, of which the longer ones move
-    a camera more: they are stated too large rather than too small.
+    The residuals of a photo hardly show the tilts between scans side by side.
     """
-    normalised = []
     for name, (error, n_seen) in DRAWN.items():
         draws = [drawn_resection(seed, error, n_seen) for seed in range(8)]
         true, stated = np.array(draws).T
-        most = 1.6 if name.startswith("independent") else 2.8
-        assert 0.7 < math.sqrt(stated.mean() / true.mean()) < most, name
-        normalised.append(float(np.mean(true / stated)))
-    assert 0.5 < np.mean(normalised) < 1.6
+        least = 0.45 if name == "registration" else 0.7
+        assert least < math.sqrt(stated.mean() / true.mean()) < 1.5, name
 
 
 def test_no_common_error_switches_from_nothing_to_all_of_it() -> None:
@@ -131,58 +127,61 @@ def test_no_common_error_switches_from_nothing_to_all_of_it() -> None:
 N_PHOTOS: Final = 4
 
 
-def shifted_photos(
-    seed: int, errors: NDArray[np.float64], places: NDArray[np.float64]
+def stretched_photos(
+    rng: np.random.Generator, errors: NDArray[np.float64], places: NDArray[np.float64]
 ) -> AdjustedPoints:
-    """The same places in four photos, each shifted by two unknowns, with noise of one pixel."""
-    rng = np.random.default_rng(seed)
+    """The same places in four photos, each shifted and stretched, with noise of one pixel."""
     n = len(places)
     photo = np.repeat(np.arange(N_PHOTOS), n)
     # A kilopixel to the metre; of photos from other sides, depth pulls another way.
-    by_place = np.zeros((N_PHOTOS, n, 2, 3))
-    by_place[:, :, 0, 0] = by_place[:, :, 1, 1] = 1000.0
-    by_place[:, :, 0, 2] = 1000.0 * np.linspace(-0.6, 0.6, N_PHOTOS)[:, None]
-    by_place = by_place.reshape(-1, 2, 3)
-    seen = np.einsum("nid,nd->ni", by_place, errors) + rng.normal(size=(N_PHOTOS * n, 2))
-    jacobian = np.zeros((N_PHOTOS * n, 2, 2 * N_PHOTOS))
+    by_photo = np.zeros((N_PHOTOS, 2, 3))
+    by_photo[:, 0, 0] = by_photo[:, 1, 1] = 1000.0
+    by_photo[:, 0, 2] = 1000.0 * np.linspace(-0.6, 0.6, N_PHOTOS)
+    jacobian = np.zeros((N_PHOTOS * n, 2, 4 * N_PHOTOS))
+    follows = np.zeros((N_PHOTOS, 4 * N_PHOTOS, 3))
+    off_centre = np.tile(places - places.mean(axis=0), (N_PHOTOS, 1))
     for axis in range(2):
-        jacobian[np.arange(N_PHOTOS * n), axis, 2 * photo + axis] = 1.0
-    means = np.array([seen[photo == k].mean(axis=0) for k in range(N_PHOTOS)])
+        jacobian[np.arange(N_PHOTOS * n), axis, 4 * photo + axis] = 1.0
+        jacobian[np.arange(N_PHOTOS * n), axis, 4 * photo + 2 + axis] = off_centre[:, axis]
+        follows[np.arange(N_PHOTOS), 4 * np.arange(N_PHOTOS) + axis] = by_photo[:, axis]
+    rows = jacobian.reshape(-1, 4 * N_PHOTOS)
+    cofactors = np.linalg.inv(rows.T @ rows)
+    seen = np.einsum("nid,nd->ni", by_photo[photo], errors) + rng.normal(size=(N_PHOTOS * n, 2))
     return AdjustedPoints(
         photo=photo,
         places=np.tile(places, (N_PHOTOS, 1)),
-        residuals=seen - means[photo],
+        residuals=seen - (rows @ cofactors @ rows.T @ seen.ravel()).reshape(-1, 2),
         jacobian=jacobian,
-        by_place=by_place,
-        pulls=np.einsum("nip,nid->npd", jacobian, by_place),
+        by_place=by_photo[photo],
+        pulls=np.einsum("nip,nid->npd", jacobian, by_photo[photo]),
+        follows=follows,
         towards=np.tile([0.0, 0.0, 1.0], (N_PHOTOS * n, 1)),
-        cofactors=np.eye(2 * N_PHOTOS) / n,
+        cofactors=cofactors,
     )
 
 
 @pytest.mark.parametrize("shared_by", ["depths", *long_only("places", "photos")])
 def test_photos_share_the_errors_of_places_but_not_their_own(shared_by: str) -> None:
-    """Their shifts, correlated between photos as those of drawn errors scatter."""
-    covariances, shifts = [], []
+    """Their stretches, correlated between photos as those of drawn errors scatter."""
+    covariances, stretches = [], []
     among = np.array([0.0, 0.0, 1.0]) if shared_by == "depths" else np.ones(3)
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        places = rng.uniform([0.0, 0.0, 0.0], [6.0, 4.0, 0.2], (90, 3))
-        fields = [rough(0.002, 0.45)(places, rng) for _ in range(N_PHOTOS)]
+    rng = np.random.default_rng(0)
+    places = rng.uniform([0.0, 0.0, 0.0], [6.0, 4.0, 0.2], (90, 3))
+    for nth in range(60):
+        fields = [rough(0.002, 0.9)(places, rng) for _ in range(N_PHOTOS)]
         errors = np.concatenate(fields if shared_by == "photos" else [fields[0]] * N_PHOTOS)
-        points = shifted_photos(seed, errors * among, places)
-        covariances.append(honest_covariance(points, 1.0))
-        for other in range(80):
-            draw = np.random.default_rng([seed, other])
-            n_drawn = N_PHOTOS if shared_by == "photos" else 1
-            again = [rough(0.002, 0.45)(places, draw).mean(axis=0) for _ in range(n_drawn)]
-            mean = np.broadcast_to(np.array(again) * among, (N_PHOTOS, 3))
-            by = points.by_place.reshape(N_PHOTOS, -1, 2, 3)[:, 0]
-            noise = draw.normal(size=(N_PHOTOS, 2)) / math.sqrt(90)
-            shifts.append((np.einsum("kid,kd->ki", by, mean) + noise).ravel())
-    stated, true = np.mean(covariances, axis=0), np.cov(np.array(shifts).T)
-    # Depths alone leave less behind, so that more of what is known beforehand remains.
-    assert 0.8 < math.sqrt(np.trace(stated) / np.trace(true)) < 2.0
+        points = stretched_photos(rng, errors * among, places)
+        noise = np.linalg.cholesky(points.cofactors) @ rng.normal(size=4 * N_PHOTOS)
+        pulled = np.einsum("npd,nd->p", points.pulls, errors * among)
+        stretches.append((points.cofactors @ pulled + noise).reshape(N_PHOTOS, 4)[:, 2:].ravel())
+        if nth < 3:
+            stretch = np.flatnonzero(np.arange(4 * N_PHOTOS) % 4 >= 2)
+            covariances.append(honest_covariance(points, 1.0)[np.ix_(stretch, stretch)])
+    stated, true = (
+        np.mean(covariances, axis=0),
+        np.mean([np.outer(one, one) for one in stretches], axis=0),
+    )
+    assert 0.7 < math.sqrt(np.trace(stated) / np.trace(true)) < 1.5
     # Of the first and the last photo, down the picture.
     correlation = stated[1, 7] / math.sqrt(stated[1, 1] * stated[7, 7])
     assert (correlation > 0.4) == (shared_by == "places")
@@ -200,6 +199,7 @@ def test_points_without_redundancy_count_as_independent(n_points: int, sigma0: f
         jacobian=jacobian,
         by_place=rng.normal(size=(n_points, 2, 3)) * 1e3,
         pulls=rng.normal(size=(n_points, 6, 3)) * 1e3,
+        follows=np.zeros((1, 6, 3)),
         towards=np.tile([0.0, 0.0, 1.0], (n_points, 1)),
         cofactors=np.linalg.inv(flat.T @ flat),
     )

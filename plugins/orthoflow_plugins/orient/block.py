@@ -363,6 +363,7 @@ def _adjusted_points(
     jacobian, pulls = (np.zeros((n_known, k, len(cofactors))) for k in (2, 3))
     residuals, by_place = np.zeros((n_known, 2)), np.zeros((n_known, 2, 3))
     towards, information = np.zeros((n_known, 3)), np.zeros((len(block.points), 3, 3))
+    follows = np.zeros((len(block.cameras), len(cofactors), 3))
     of_pixels = (seen.sigma_px**2)[:, None, None] * np.eye(2)
     with_places = pixel_covariances(block, alone=True)
     for photo, camera in enumerate(block.cameras):
@@ -376,6 +377,7 @@ def _adjusted_points(
             "nip,nid->ndp", by_camera, by_point
         )
         np.add.at(information, seen.point[mine], np.einsum("nid,nie->nde", by_point, by_point))
+        follows[photo, own[3:POSE_PARAMETERS]] = camera.rotation
         if len(mine) >= _MIN_FOR_PLANE:
             towards[mine] = outwards(at_scan.known[seen.point[mine]], camera.centre_world)
     variances = np.where(np.isfinite(at_scan.sigma_m), at_scan.sigma_m, 0.0) ** 2
@@ -387,6 +389,7 @@ def _adjusted_points(
         jacobian=jacobian,
         by_place=by_place,
         pulls=np.einsum("ndp,nde->npe", pulls, held[seen.point]),
+        follows=follows,
         towards=towards,
         cofactors=cofactors,
     )
