@@ -98,7 +98,7 @@ def detect(
     tests = [] if plane_index is None else tested_planes(sample)
     flat = [test.index for test in tests if not test.is_strip]
     searched = sample.take(~np.isin(sample.label, flat)) if flat else sample
-    levels, noise_m = _levels(searched, cloud, params)
+    levels, noise_m = _levels(searched, cloud, params, cores=cores)
     limits = Limits(
         tolerance_m=max(params.tolerance_m, 3.0 * noise_m),
         noise_m=noise_m,
@@ -168,14 +168,14 @@ def detect(
 
 
 def _levels(
-    sample: Sample, cloud: PointCloud, params: DetectorParams
+    sample: Sample, cloud: PointCloud, params: DetectorParams, *, cores: int
 ) -> tuple[list[tuple[float, Voxels]], float]:
     """Return voxels of several sizes, largest first, and the noise of the cloud."""
     if len(sample) < _LEAST_POINTS:
         return [], 0.0
     every = max(1, len(sample) // _FIRST_POINTS)
     first = in_voxels(sample.take(slice(None, None, every)), _FIRST_VOXEL_M)
-    noise_m = noise_of(first.voxels(cloud, BLOCK_VOXELS))
+    noise_m = noise_of(first.voxels(cloud, BLOCK_VOXELS, cores=cores))
     # On a surface, the points of a voxel cover an area of about the square of its size.
     per_voxel = max(1.0, every * float(first.moments[:, 0].mean()))
     spacing_m = _FIRST_VOXEL_M / math.sqrt(per_voxel)
@@ -183,7 +183,7 @@ def _levels(
     levels: list[tuple[float, Voxels]] = []
     # Voxels of the next size are used to find radii up to twice as large.
     while not levels or MOST_RADIUS * levels[-1][0] < params.max_radius_m:
-        levels.append((grid.size_m, grid.voxels(cloud, BLOCK_VOXELS, noise_m)))
+        levels.append((grid.size_m, grid.voxels(cloud, BLOCK_VOXELS, noise_m, cores=cores)))
         grid = grid.coarser()
     return levels[::-1], noise_m
 

@@ -64,7 +64,7 @@ class DetectorOut(Ports):
 class Detector(Method):
     """Base class of the detectors of curved surfaces."""
 
-    result_version = 2
+    result_version = 3
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = (
         MetricSpec("n_surfaces", label="curved surfaces found"),

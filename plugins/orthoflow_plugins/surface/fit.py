@@ -37,8 +37,10 @@ _LEAST_AROUND: Final = 32
 # Size, in cells, of the tiles to whose means the surface is fitted. Tukey's weights detect smaller
 # deviations of tiles, such as those of tangential walls, than of cells.
 _TILE: Final = 4
-# Sizes, in tiles, of the clusters from whose scatter the covariance is estimated.
-_CLUSTERS: Final = (1, 4)
+# Sizes, in tiles, of the clusters from whose scatter the covariance is estimated, and number of
+# sectors over the whole length, whose scatter is large if the profile is not a circle.
+_CLUSTERS: Final = ((1, 1), (4, 4))
+_SECTORS: Final = 18
 # Numbers of cells around surfaces are multiples of this number.
 _MULTIPLE: Final = 16
 _OPEN_SHARE: Final = 0.15
@@ -281,11 +283,12 @@ def _covariance(
     leverage = weights * np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
     scores = matrix * (weights * rest / (1.0 - np.minimum(leverage, 0.9)))[:, None]
     best = np.zeros_like(inverse)
-    for side in _CLUSTERS:
-        cluster = (tiles.i // side) * (tiles.j.max() + 1) + tiles.j // side
+    sector = max(1, math.ceil(len(np.unique(tiles.i)) / _SECTORS))
+    for around, along in (*_CLUSTERS, (sector, int(tiles.j.max()) + 1)):
+        cluster = (tiles.i // around) * (tiles.j.max() + 1) + tiles.j // along
         n_clusters = len(np.unique(cluster[weights > 0.0]))
-        if n_clusters <= 3 * len(inverse):
-            break
+        if n_clusters <= 2 * len(inverse):
+            continue
         sums = np.column_stack([np.bincount(cluster, column) for column in scores.T])
         factor = n_clusters / (n_clusters - len(inverse))
         found = factor * inverse @ (sums.T @ sums) @ inverse

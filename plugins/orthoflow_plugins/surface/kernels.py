@@ -81,21 +81,23 @@ def fill_voxels(
 def find_normals(
     keys: NDArray[np.int64],
     moments: NDArray[np.float64],
+    part: tuple[int, int],
     normals: NDArray[np.float64],
     spreads: NDArray[np.float64],
 ) -> None:
-    """Compute the normal of each voxel from the points of the voxel and its 26 neighbours.
+    """Compute normals of voxels from the points of each voxel and its 26 neighbours.
 
     Args:
         keys: (v,) keys of the voxels, ascending. The neighbours of a voxel are then in nine runs
             of the list, which all move forwards from one voxel to the next.
         moments: (v, 10) sums over the points of each voxel.
+        part: first voxel, and last voxel (exclusive).
         normals: output (v, 3), unit vectors.
         spreads: output (v, 4): standard deviations along the normal and along the two principal
             directions of the surface, ascending, and the number of points.
     """
     total, starts = np.empty(MOMENTS), np.zeros(9, dtype=np.int64)
-    for v in range(keys.shape[0]):
+    for v in range(part[0], part[1]):
         total[:] = 0.0
         for run in range(9):
             aside = ((run // 3 - 1) << (2 * KEY_BITS)) + ((run % 3 - 1) << KEY_BITS)

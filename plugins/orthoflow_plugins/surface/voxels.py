@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.rows import Rows, spread_index
+from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud
 from orthoflow_plugins.surface.kernels import KEY_BITS, MOMENTS, fill_voxels, find_normals
 
@@ -100,7 +101,9 @@ class VoxelGrid:
             low=self.low,
         )
 
-    def voxels(self, cloud: PointCloud, block_voxels: int, noise_m: float | None = None) -> Voxels:
+    def voxels(
+        self, cloud: PointCloud, block_voxels: int, noise_m: float | None = None, *, cores: int
+    ) -> Voxels:
         """Return the voxels that have a normal, i.e. enough points close to a plane.
 
         Args:
@@ -108,9 +111,15 @@ class VoxelGrid:
             block_voxels: size of a block of voxels.
             noise_m: standard deviation of the points normal to surfaces, if known; voxels with much
                 more scatter are at edges and are omitted.
+            cores: number of threads.
         """
         normals, spreads = np.zeros((len(self.first), 3)), np.zeros((len(self.first), 4))
-        find_normals(keys_of(self.places), self.moments, normals, spreads)
+        keys = keys_of(self.places)
+
+        def find(first: int, end: int) -> None:
+            find_normals(keys, self.moments, (first, end), normals, spreads)
+
+        in_parts(find, len(keys), threads=cores)
         is_flat = (spreads[:, 3] >= _NORMAL_POINTS) & (spreads[:, 0] < _FLATNESS * spreads[:, 1])
         if noise_m is not None:
             is_flat &= spreads[:, 0] < _THICKEST_NOISES * noise_m + _THICKEST_VOXELS * self.size_m

@@ -152,6 +152,16 @@ def test_what_is_no_cylinder_is_rejected_with_the_reason(
     assert reason is None or reason in reasons
 
 
+def test_the_radius_of_a_slightly_elliptical_vault_is_stated_as_uncertain(tmp_path: Path) -> None:
+    """Its radius of curvature is 3.16 m at the crown and 2.71 m far below it."""
+    rng = np.random.default_rng(4)
+    angles, along = rng.uniform(-1.4, 1.4, 150_000), rng.uniform(-2.5, 2.5, 150_000)
+    points = np.column_stack([3.0 * np.sin(angles), along, 2.85 * np.cos(angles)])
+    points += rng.normal(scale=0.002, size=points.shape)
+    (found,) = found_in(tmp_path, few_points(points)).outputs["surfaces"].surfaces
+    assert found.sigma_radius_m > 0.005
+
+
 @pytest.mark.parametrize(
     ("noise_m", "half_rad"), [*long_only((0.005, 2.6)), (0.02, 2.6), (0.005, math.pi)]
 )
