@@ -30,7 +30,7 @@ from orthoflow.geometry.rastering import (
 from orthoflow.geometry.robust import least_absolute
 from orthoflow.geometry.slabs import Slab
 from orthoflow.geometry.unrolling import unrolled
-from orthoflow.products import PointCloud
+from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 
 # Standard deviation, in cells, of the Gaussian weight; it gives a point in the corner of a cell a
@@ -93,17 +93,34 @@ class CellColours:
     depth_m: NDArray[np.float32]
 
 
-def on_plane(painters: Painters, slab: Slab) -> tuple[Painters, Slab]:
-    """Unroll the points of a curved wall and its slab; a plane remains as it is."""
+def on_plane(
+    painters: Painters, slab: Slab, mask: NDArray[np.uint8] | None = None
+) -> tuple[Painters, Slab]:
+    """Unroll the points of a curved wall and its slab; a plane remains as it is.
+
+    Args:
+        painters: the points.
+        slab: the frame and the depth range of the wall.
+        mask: (rows, columns) `SurfaceMask` of the wall; points in its void cells, such as those
+            beyond the groins of a vault, are left out.
+    """
     if slab.frame.bend is None:
         return painters, slab
-    near = unrolled(painters.cloud, slab)
+    near, flat = unrolled(painters.cloud, slab), slab.frame.flat
     cloud = replace(
         painters.cloud.selected(near.index), origin=near.origin, x=near.x, y=near.y, z=near.z
     )
     left_out = None if painters.is_left_out is None else painters.is_left_out[near.index]
-    flat = Painters(cloud=cloud, values=painters.values[near.index], is_left_out=left_out)
-    return flat, replace(slab, frame=slab.frame.flat)
+    if mask is not None:
+        offsets = np.column_stack([near.x, near.y, near.z]).astype(np.float64)
+        column, row = (
+            np.clip((offsets @ axis / flat.gsd_m).astype(np.intp), 0, length - 1)
+            for axis, length in ((flat.u_world, flat.width), (flat.v_world, flat.height))
+        )
+        is_void = mask[row, column] == SurfaceMask.VOID
+        left_out = is_void if left_out is None else left_out | is_void
+    own = Painters(cloud=cloud, values=painters.values[near.index], is_left_out=left_out)
+    return own, replace(slab, frame=flat)
 
 
 def colours_of(

@@ -106,7 +106,7 @@ class PointcloudDirect(Method):
     Params = DirectParams
 
     class In(Ports):
-        """The coloured cloud, and the walls; only the frames and buffers of the walls are used."""
+        """The coloured cloud, and the walls: their frames, buffers, and voids if curved."""
 
         walls: Walls
         cloud: PointCloud
@@ -144,7 +144,7 @@ class PointcloudDirect(Method):
                 filled=filled,
             )
             started = ctx.clock_s()
-            own, slab = on_plane(painters, slabs[k])
+            own, slab = on_plane(painters, slabs[k], wall.mask)
             seconds[0] += ctx.clock_s() - started
             for band in bands_with_reach(shape, cells_most=BAND_CELLS, reach_rows=reach):
                 started = ctx.clock_s()

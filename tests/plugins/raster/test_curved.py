@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.curved import SimulateCurved
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.surfaces import angles_around
-from orthoflow.products import SurfaceMask, Wall
+from orthoflow.products import LayerMask, SurfaceMask, Wall
 from orthoflow.testing import Trial, run_trial
 from tests import curved_scenes, samples
 from tests.curved_scenes import Drum
@@ -126,9 +127,11 @@ def test_crossing_vaults_end_at_their_groins(tmp_path: Path) -> None:
     room = run_trial(trial, tmp_path / "room").outputs
     surfaces = room["truth"].surfaces
     inputs = {"cloud": room["cloud"], "planes": curved_scenes.NO_PLANES, "surfaces": surfaces}
-    walls = run(RasterGrid, context(tmp_path), inputs, gsd_m=0.04).walls.walls
-    assert len(walls) == 2
-    for wall, surface in zip(walls, surfaces.surfaces, strict=True):
+    walls = run(RasterGrid, context(tmp_path), inputs, gsd_m=0.04).walls
+    coloured = {"walls": walls, "cloud": room["cloud"]}
+    layers = run(PointcloudDirect, context(tmp_path), coloured, inpaint="none").layers.layers
+    assert len(walls.walls) == 2
+    for wall, layer, surface in zip(walls.walls, layers, surfaces.surfaces, strict=True):
         rows, columns = np.mgrid[: wall.frame.height, : wall.frame.width] + 0.5
         points = wall.frame.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()]))
         shape = surface.shape
@@ -137,6 +140,7 @@ def test_crossing_vaults_end_at_their_groins(tmp_path: Path) -> None:
         # The plane of a groin is at 45 degrees to both axes.
         beyond_m = (shape.radius_m * np.abs(np.sin(angles)) - along_m).reshape(wall.mask.shape)
         assert not wall.mask[beyond_m > 0.001].any()
+        assert (layer.mask[beyond_m > 0.001] != LayerMask.PAINTED).all()
         on = (beyond_m < -0.06) & (along_m.reshape(wall.mask.shape) < surface.along_m[1] - 0.1)
         assert (wall.mask[on] > 0).mean() > 0.9
         assert np.abs(np.nanmedian(wall.depth_m[on])) < 0.001
