@@ -14,10 +14,9 @@ from orthoflow_plugins.orient.bundle import OrientColmapBundle
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.raster.grid import RasterGrid
 
-from orthoflow.files.images import encode_png
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Intrinsics, Layer, LayerMask, Photo, Photos
-from tests import curved_scenes
+from orthoflow.products import Intrinsics, Layer, LayerMask, Photos
+from tests import curved_scenes, ortho_scenes
 from tests.curved_scenes import Drum
 from tests.method_runs import run
 from tests.raster_scenes import cloud_of, context
@@ -86,14 +85,8 @@ def test_oriented_photos_are_unrolled_to_a_tenth_of_a_cell(name: str, tmp_path: 
     ]
     photos = Photos(
         photos=tuple(
-            Photo(
-                name=f"{k}.png",
-                encoded=encode_png(picture),
-                width=viewer.width,
-                height=viewer.height,
-                intrinsics=Intrinsics.of(viewer),
-            )
-            for k, (picture, viewer) in enumerate(zip(noisy, viewers, strict=True))
+            replace(photo, intrinsics=Intrinsics.of(viewer))
+            for photo, viewer in zip(ortho_scenes.photos(*noisy).photos, viewers, strict=True)
         )
     )
     scan = {"cloud": cloud, "planes": curved_scenes.NO_PLANES, "surfaces": drum.surfaces()}

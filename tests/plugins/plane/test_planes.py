@@ -28,6 +28,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import Planes, PointCloud
 from tests import plane_scenes
+from tests.long_loops import long_only
 from tests.plane_scenes import ROOM, Rectangle, cloud_of, detect, sampled
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -266,7 +267,7 @@ def measured(cloud: PointCloud, folder: Path, **params: object) -> tuple[Any, di
     return out.planes, {metric.name: metric.value for metric in ctx.metrics}
 
 
-@pytest.mark.parametrize("noise_m", [0.001, 0.004])
+@pytest.mark.parametrize("noise_m", [*long_only(0.001), 0.004])
 @pytest.mark.usefixtures("all_places")
 def test_thickness_is_the_noise_and_not_the_bow(noise_m: float, tmp_path: Path) -> None:
     _, metrics = measured(cloud_of(wall(noise_m, bow_m=0.006), stations=STATION), tmp_path)
