@@ -32,7 +32,10 @@ from orthoflow.products import Surface, Truth
 from orthoflow.records.open import open_run
 
 RECIPE = "photos-on-scan.yaml"
-SHOWN = ("rmse_u_mm", "rmse_v_mm", "depth_rmse_mm", "completeness")
+SHOWN = (
+    *("rmse_u_mm", "rmse_v_mm", "nmad_u_mm", "nmad_v_mm"),
+    *("patch_rmse_u_mm", "patch_rmse_v_mm", "completeness"),
+)
 
 
 def main() -> None:
