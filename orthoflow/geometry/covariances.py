@@ -21,8 +21,11 @@ _SMOOTH: Final = (0.1, 0.25, 0.63, 1.8)
 # differs: true errors are 0.56 to 1.47 times the stated ones, 0.39 to 1.24 times without this kind,
 # and 0.45 to 1.62 times with shares of 0.8 to 0.95.
 _OF_ALL_PHOTOS: Final = (1.0, 0.9, 0.0)
-# Ratios of the standard deviation of the common error to that of the independent error.
+# Ratios of the standard deviation of the common error to that of the independent error. Their prior
+# is uniform on a logarithmic scale and decays exponentially above a ratio of about 10, since the
+# unknowns absorb most of a large error with a long correlation length.
 _RATIOS: Final = np.geomspace(0.01, 40.0, 28)
+_DECAY: Final = 0.1
 # Correlation length of the short-range error of positions (matching, structure of the surface), and
 # ratios of its standard deviation to that of the independent error.
 _SHORT: Final = 0.05
@@ -95,7 +98,7 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
     by a test; it is a mean over all kinds, lengths and sizes of errors, each weighted by the
     likelihood of the residuals (restricted likelihood: Harville 1977,
     doi:10.1080/01621459.1977.10480998; model averaging: Hoeting et al. 1999,
-    doi:10.1214/ss/1009212519; prior of standard deviations: Gelman 2006, doi:10.1214/06-BA117A).
+    doi:10.1214/ss/1009212519).
 
     The mean error of the points of a photo is not included, since a photo that is shifted by the
     same amount is correct relative to the scan. This error leaves almost no residual, and it is the
@@ -132,8 +135,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     ]
     found = [[seen.evidence(left, spread) for spread in spreads] for left, _ in fields]
     evidence, variances = np.moveaxis(np.array(found), 2, 0)
-    # The prior of the standard deviation is half a Cauchy distribution with a scale of 1.
-    evidence += np.log(_RATIOS / (1.0 + _RATIOS**2))
+    evidence -= _DECAY * _RATIOS
     weights = np.exp(evidence - evidence.max())
     weights *= variances / weights.sum()
     # Average the standard deviation, since a mean of the variance would depend on the tail of the

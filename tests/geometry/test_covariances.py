@@ -121,7 +121,7 @@ def test_no_common_error_switches_from_nothing_to_all_of_it() -> None:
     sizes_m = np.linspace(0.00045, 0.00081, 7)
     stated = np.sqrt([drawn_resection(3, rough(sigma_m, 0.5), 200)[1] for sigma_m in sizes_m])
     assert (stated[1:] / stated[:-1] < 1.4).all()
-    assert stated[-1] > 1.5 * stated[0]
+    assert stated[-1] > 1.3 * stated[0]
 
 
 N_PHOTOS: Final = 4
@@ -181,7 +181,9 @@ def test_photos_share_the_errors_of_places_but_not_their_own(shared_by: str) -> 
         np.mean(covariances, axis=0),
         np.mean([np.outer(one, one) for one in stretches], axis=0),
     )
-    assert 0.7 < math.sqrt(np.trace(stated) / np.trace(true)) < 1.5
+    # Depths alone leave less behind, so that more of what is known beforehand remains.
+    most = 2.0 if shared_by == "depths" else 1.5
+    assert 0.7 < math.sqrt(np.trace(stated) / np.trace(true)) < most
     # Of the first and the last photo, down the picture.
     correlation = stated[1, 7] / math.sqrt(stated[1, 1] * stated[7, 7])
     assert (correlation > 0.4) == (shared_by == "places")
