@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
+from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.raster.grid import RasterGrid
 
@@ -95,7 +96,7 @@ def test_oriented_photos_are_unrolled_to_a_tenth_of_a_cell(name: str, tmp_path: 
     ties = run(MatchSift, context(tmp_path), given).ties
     assert ties.walls[0].frame.has_cells_of(walls.walls[0].frame)
     inputs = {"ties": ties, "photos": photos}
-    first = run(OrientColmapBundle, context(tmp_path), inputs, **LOOSE).cameras
+    first = run(OrientPnp, context(tmp_path), inputs, **LOOSE).cameras
     more = {**given, "cameras": first, "cloud": cloud}
     again = run(MatchGuided, context(tmp_path), more).ties
     inputs = {"ties": again, "photos": photos}
