@@ -105,9 +105,9 @@ def judged(run_folder: Path, subject: str, truth: Truth, options: argparse.Names
     """Print the errors of the photos and of each curved wall."""
     run = open_run(run_folder)
     cells = {cell.step: cell for cell in run.cells.values()}
-    failed = [f"{step}: {cell.error}" for step, cell in cells.items() if cell.status == "failed"]
+    failed = [step for step, cell in cells.items() if cell.status == "failed"]
     if failed or cells["mosaic"].status != "ok":
-        print(f"{subject}: {'; '.join(failed) or 'no orthoimage'}", flush=True)
+        print(f"{subject}: no orthoimage; failed: {', '.join(failed) or 'none'}", flush=True)
         return
     walls, orthoimages = run.product("wall", "walls"), run.product("mosaic", "orthoimages")
     cameras = run.product("orient", "cameras")

@@ -19,6 +19,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.products import Intrinsics, Layer, LayerMask, Photos
 from tests import curved_scenes, ortho_scenes
 from tests.curved_scenes import Drum
+from tests.long_loops import long_only
 from tests.method_runs import run
 from tests.raster_scenes import cloud_of, context
 
@@ -70,7 +71,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ["vault", *long_only("spire")])
 def test_oriented_photos_are_unrolled_to_a_tenth_of_a_cell(name: str, tmp_path: Path) -> None:
     drum, poses = SCENES[name]
     random = np.random.default_rng(11)
