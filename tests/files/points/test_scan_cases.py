@@ -18,7 +18,7 @@ from tests.method_runs import Reader
 from tests.scan_cases import CASES, Case, Draw
 
 
-@pytest.mark.parametrize("seed", [*range(3), *long_only(3, 4, 5)])
+@pytest.mark.parametrize("seed", [0, 1, 2, 4, *long_only(3, 5)])
 @pytest.mark.parametrize("name", CASES)
 def test_scans_of_other_programs_are_read_right(name: str, seed: int, tmp_path: Path) -> None:
     case = CASES[name](Draw(seed, tmp_path))
