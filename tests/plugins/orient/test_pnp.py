@@ -46,6 +46,21 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known:
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
+def test_a_common_factor_of_all_sigmas_of_ties_changes_no_pose(tmp_path: Path) -> None:
+    """Ties deviate four times as much as stated: the weight of large residuals follows sigma0."""
+    camera = ms.camera_before()
+    ties = known_ties(camera, 3, n=300, wrong_share=0.0)
+    bold = replace(ties, sigma_px=ties.sigma_px / 4.0, sigma_m=ties.sigma_m / 4.0)
+    right, same = (
+        orient(given, calibrated(camera), context(tmp_path), rejection_sigma=20.0).cameras[0]
+        for given in (ties, bold)
+    )
+    away_m = ms.wall_error_m(tp.SCENE, same.viewing(), right.viewing())
+    # Iterations end when sigma0 has settled; with a limit in stated sigmas, the ratio is 0.4.
+    assert away_m < 0.2 * (right.sigma_wall_m or 0.0)
+    assert same.sigma_wall_m == pytest.approx(right.sigma_wall_m, rel=0.02)
+
+
 def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None:
     camera = ms.camera_before()
     ties = known_ties(camera, 5)
