@@ -205,7 +205,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
         "differs in a new process",
         """
         def lift_m(self, cloud, ctx):
-            return hash("floor") % 1000 / 1000.0
+            return hash("floor") / 2.0**56  # in -128 .. 128
         """,
     ),
     "counting_cores": (
