@@ -269,7 +269,7 @@ def flat_mesh(frame: WallFrame) -> WallMesh:
 
 
 def _strips(frame: WallFrame, bend: Bend) -> WallMesh:
-    size_m = frame.gsd_m * np.array([frame.width, frame.height])
+    size_m = frame.size_m
     count = max(2, math.ceil(bend.turn_rad(size_m) / _STRIP_RAD)) + 1
     ribs = bend.ribs_m(size_m, count) / size_m
     start, end = np.arange(len(ribs) - 1), np.arange(len(ribs) - 1) + len(ribs)

@@ -125,7 +125,7 @@ def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
     if (bend := frame.bend) is None:
         return {"chart": "plane"}
     if isinstance(bend, ConeBend):
-        own, local = bend.revolution, np.array([frame.u_world, frame.v_world, frame.normal_world])
+        own, local = bend.revolution, frame.axes_world
         zero, quarter, axis = own.axes @ local
         return {
             "chart": "cone",

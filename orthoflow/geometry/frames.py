@@ -184,11 +184,11 @@ RasterAxes = Literal["map", "wall", "level", "plane"]
 
 @dataclass(frozen=True, kw_only=True)
 class WallFrame:
-    """A raster on a plane, cylinder or cone: u to the right of the viewer, v down, n towards him.
+    """A raster on a plane, cylinder or cone; u points to the right of the viewer, n to the viewer.
 
-    On a plane, the world coordinates of a position (column, row) at a given depth are
-    `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`. The centre
-    of cell (row, column) is at (column + 0.5, row + 0.5); `u x v = -n`.
+    The axis v points down; `u x v = -n`. The centre of cell (row, column) is at (column + 0.5,
+    row + 0.5). On a plane, the world coordinates of a position (column, row) at a given depth are
+    `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`.
 
     On a curved surface, the axes depend on the position (see `axes_at`), and `u_world`, `v_world`
     and `normal_world` are those at the top-left corner. The surface is unrolled (see `bends`), and
@@ -247,6 +247,16 @@ class WallFrame:
                 )
         if self.bend is not None and self.map_crs is not None:
             raise GeometryError("a curved wall frame cannot be a map")
+
+    @property
+    def axes_world(self) -> NDArray[np.float64]:
+        """The vectors u, v and n, as rows (3, 3); on a curved surface, at the top-left corner."""
+        return np.array([self.u_world, self.v_world, self.normal_world])
+
+    @property
+    def size_m(self) -> NDArray[np.float64]:
+        """Width and height (2,) of the raster in metres."""
+        return np.array([self.gsd_m * self.width, self.gsd_m * self.height])
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -400,7 +410,7 @@ class WallFrame:
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         if self.bend is not None:
             local = self.bend.points(self.gsd_m * pixels, depths_m)
-            return np.asarray(self.origin_world + local @ self._axes)
+            return np.asarray(self.origin_world + local @ self.axes_world)
         in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
         lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels)), self.normal_world)
         points: NDArray[np.float64] = self.origin_world + in_plane + lifted
@@ -410,8 +420,8 @@ class WallFrame:
         """Return wall positions (n, 3) = (column, row, depth in metres) of world points (n, 3)."""
         relative = points_world - self.origin_world
         if self.bend is not None:
-            size_m = self.gsd_m * self._size[0]
-            on_wall = self.bend.places(relative @ self._axes.T, size_m)
+            size_m = self.size_m
+            on_wall = self.bend.places(relative @ self.axes_world.T, size_m)
             on_wall[:, :2] /= self.gsd_m
             return on_wall
         return np.column_stack(
@@ -426,14 +436,14 @@ class WallFrame:
         """Return the axes u, v and n, as rows (n, 3, 3), at positions (n, 2) = (column, row)."""
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         if self.bend is None:
-            return np.broadcast_to(self._axes, (len(pixels), 3, 3))
-        return np.asarray(self.bend.axes_at(self.gsd_m * pixels) @ self._axes)
+            return np.broadcast_to(self.axes_world, (len(pixels), 3, 3))
+        return np.asarray(self.bend.axes_at(self.gsd_m * pixels) @ self.axes_world)
 
     def outline_world(self, n_sides: int = 64) -> NDArray[np.float64]:
         """Return the closed outline (n, 3) of the surface, with points along its arcs."""
         if self.bend is None:
             return self.corners_world()[[0, 1, 2, 3, 0]]
-        ribs = self.bend.ribs_m(self.gsd_m * self._size[0], n_sides) / self.gsd_m
+        ribs = self.bend.ribs_m(self.size_m, n_sides) / self.gsd_m
         shares = np.linspace(0.0, 1.0, n_sides)[:, None]
         first, last = (rib[0] + shares * (rib[1] - rib[0]) for rib in (ribs[0], ribs[-1]))
         return self.world_from_wall(np.vstack([first, ribs[:, 1], last[::-1], ribs[::-1, 0]]))
@@ -445,12 +455,14 @@ class WallFrame:
             inside &= self.bend.contains(self.gsd_m * pixels_wall)
         return np.asarray(inside)
 
+    def cell_centres(self, rows: slice) -> NDArray[np.float64]:
+        """Return the centres (k * width, 2) = (column, row) of the cells of k rows."""
+        columns, rows_of = np.arange(self.width) + 0.5, np.arange(self.height)[rows] + 0.5
+        return np.stack(np.meshgrid(columns, rows_of), axis=-1).reshape(-1, 2)
+
     def shown_cells(self, rows: slice) -> NDArray[np.bool_]:
         """Return which cells (k, width) of k rows have their centres on the surface."""
-        places = np.stack(
-            np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height)[rows] + 0.5), axis=-1
-        )
-        return self.shows(places.reshape(-1, 2)).reshape(places.shape[:2])
+        return self.shows(self.cell_centres(rows)).reshape(-1, self.width)
 
     def met_by(
         self, start_world: NDArray[np.float64], rays: NDArray[np.float64]
@@ -479,7 +491,7 @@ class WallFrame:
         to_origin = self.origin_world - start_world
         if self.bend is None:
             return np.asarray((to_origin @ self.normal_world) / (rays @ self.normal_world))
-        return self.bend.met_lengths(-self._axes @ to_origin, rays @ self._axes.T)
+        return self.bend.met_lengths(-self.axes_world @ to_origin, rays @ self.axes_world.T)
 
     def metres_per_cell(
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64]
@@ -512,10 +524,6 @@ class WallFrame:
     @property
     def _size(self) -> NDArray[np.float64]:
         return np.array([[self.width, self.height]], dtype=np.float64)
-
-    @property
-    def _axes(self) -> NDArray[np.float64]:
-        return np.array([self.u_world, self.v_world, self.normal_world])
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert (n, 2) = (column, row) to (n, 2) = (X, Y), in metres as in files."""

@@ -220,8 +220,7 @@ def _picture(pickled: bytes) -> bytes:
     rays = camera.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
     gsd_m = scene.frame.gsd_m
     start = scene.frame.wall_from_world(camera.centre_world[None])[0] * [gsd_m, gsd_m, 1.0]
-    axes = np.vstack([scene.frame.u_world, scene.frame.v_world, scene.frame.normal_world])
-    local = rays @ axes.T
+    local = rays @ scene.frame.axes_world.T
     depth = np.zeros(len(rays))
     for _ in range(30):
         across, down = (start[i] + local[:, i] * (depth - start[2]) / local[:, 2] for i in range(2))

@@ -213,7 +213,7 @@ def _highest_m(
     """
     rays = centre - points
     if frame.bend is not None and frame.bend.is_concave:
-        axes = np.array([frame.u_world, frame.v_world, frame.normal_world]).T
+        axes = frame.axes_world.T
         highest = frame.bend.highest_shares((points - frame.origin_world) @ axes, rays @ axes)
         shares = np.minimum(shares, np.maximum(highest, 0.0)).astype(np.float32)
     return frame.wall_from_world(points + shares[:, None] * rays)[:, 2]

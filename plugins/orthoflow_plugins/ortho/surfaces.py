@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -66,11 +66,9 @@ class Surface:
     ) -> list[tuple[float, ...]]:
         """Return positions (u, v, n) in the axes of a `WallView` of (column, row) at a depth."""
         frame = self.frame
-        axes = np.array([frame.u_world, frame.v_world, frame.normal_world])
         if frame.bend is None:
             return [(u * frame.gsd_m, v * frame.gsd_m, depth_m) for u, v in places]
-        near = replace(frame, origin_world=np.zeros(3))
-        points = near.world_from_wall(np.array(places), depth_m) @ axes.T
+        points = frame.bend.points(frame.gsd_m * np.array(places), depth_m)
         return [tuple(point) for point in points.tolist()]
 
 
@@ -103,16 +101,13 @@ def surface_of(
 def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -> WallView:
     """Return a camera in the axes of a wall, with full precision for large world coordinates."""
     frame = surface.frame
-    axes = np.column_stack([frame.u_world, frame.v_world, frame.normal_world])
     near = camera.shifted(frame.origin_world)
-    flat = near.flat.copy()
-    flat[:9] = (near.rotation @ axes).ravel()
-    centre = axes.T @ near.centre_world
+    flat, (right_m, down_m, height_m) = _in_axes(near, frame.axes_world)
     return WallView(
         camera=flat,
-        column=float(centre[0]) / frame.gsd_m - 0.5,
-        row=float(centre[1]) / frame.gsd_m - 0.5,
-        height_m=float(centre[2]),
+        column=right_m / frame.gsd_m - 0.5,
+        row=down_m / frame.gsd_m - 0.5,
+        height_m=height_m,
         gsd_m=float(frame.gsd_m),
         front_m=float(surface.front_m),
         tolerance_m=float(surface.tolerance_m),
@@ -122,15 +117,19 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
     )
 
 
+def _in_axes(
+    camera: ViewingCamera, axes: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], list[float]]:
+    """Return the flat camera for points in other axes, rows (3, 3), and its centre in these."""
+    flat = camera.flat.copy()
+    flat[:9] = (camera.rotation @ axes.T).ravel()
+    return flat, (axes @ camera.centre_world).tolist()
+
+
 def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> dict[str, Any]:
     """Return a camera, relative to the corner of a raster, in the axes of its curved surface."""
-    own, axes = bend.revolution, np.array([frame.u_world, frame.v_world, frame.normal_world])
-    from_axis = own.axes @ axes
-    shifted = near.shifted(own.start @ axes)
-    flat = shifted.flat.copy()
-    flat[:9] = (shifted.rotation @ from_axis.T).ravel()
-    size_m = frame.gsd_m * np.array([frame.width, frame.height])
-    first, second, axial = (from_axis @ shifted.centre_world).tolist()
+    own, axes = bend.revolution, frame.axes_world
+    flat, (first, second, axial) = _in_axes(near.shifted(own.start @ axes), own.axes @ axes)
     about = AxisView(
         first=first,
         second=second,
@@ -139,7 +138,7 @@ def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> dict[str, 
         sine=own.sine,
         cosine=own.cosine,
         side=own.side,
-        middle_rad=bend.middle_rad(size_m),
+        middle_rad=bend.middle_rad(frame.size_m),
         place_x=float(own.place_m[0]),
         place_y=float(own.place_m[1]),
         along_x=float(own.along[0]),

@@ -111,7 +111,7 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
         on_wall = frame.wall_from_world(world + frame.origin_world)
         u, v, depth = frame.gsd_m * on_wall[:, 0], frame.gsd_m * on_wall[:, 1], on_wall[:, 2]
         normals = frame.axes_at(on_wall[:, :2])[:, 2]
-    size = frame.gsd_m * np.array([frame.width, frame.height])
+    size = frame.size_m
     inside = (u >= 0) & (u < size[0]) & (v >= 0) & (v < size[1])
     inside &= (depth >= -slab.behind_m) & (depth <= slab.front_m)
     if cloud.intensity is not None:

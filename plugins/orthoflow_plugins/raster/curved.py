@@ -35,12 +35,13 @@ class CurvedWalls:
         self.surfaces: dict[int, Surface] = {}
         self.frames: dict[int, WallFrame] = {}
         self._planes, self._params = planes, params
+        found = () if surfaces is None else surfaces.surfaces
         self._vaults = [
             surface
-            for surface in (surfaces.surfaces if surfaces is not None else ())
+            for surface in found
             if isinstance(surface.shape, Cylinder) and surface.shape.is_concave
         ]
-        for k, surface in enumerate(surfaces.surfaces if surfaces is not None else ()):
+        for k, surface in enumerate(found):
             index = len(planes) + k
             if not _is_chosen(surface, index, planes.up, params):
                 continue
@@ -146,8 +147,7 @@ def _is_inside(vault: Surface, frame: WallFrame, rows: slice) -> NDArray[np.bool
     A vault is the space between its axis and its arc.
     """
     shape = vault.shape
-    grid = np.stack(np.meshgrid(np.arange(frame.width), np.arange(rows.start, rows.stop)), axis=-1)
-    points = frame.world_from_wall(grid.reshape(-1, 2) + 0.5)
+    points = frame.world_from_wall(frame.cell_centres(rows))
     along = (points - vault.middle_world) @ shape.axis_world
     inside = np.abs(along) < 0.5 * (vault.along_m[1] - vault.along_m[0])
     inside &= shape.distances_m(points) > 0.0

@@ -627,8 +627,7 @@ def adjoining_bound(
 ) -> Bound | None:
     """Return how another plane bounds a wall; None if it is not beside, above or below the wall."""
     normal = planes.normal[other]
-    axes = np.array([rectangle.u_world, rectangle.v_world, rectangle.normal_world])
-    slopes = axes @ normal
+    slopes = rectangle.axes_world @ normal
     offset_m = float(normal @ rectangle.origin_world - planes.offset[other])
     across = float(np.hypot(slopes[0], slopes[1]))
     axis = int(np.argmax(np.abs(slopes[:2])))

@@ -225,7 +225,7 @@ def _fitted(
     slope = 0.0
     if not is_cone:
         slope = float(robust_solution(tiles.matrix, tiles.means, variances)[0][5])
-    own = _covariance(tiles, tiles.matrix[:, :n_own], change, weights)
+    own = _covariance(tiles, change, weights)
     rest = total / n - matrix[:, :n_own] @ change
     best = found.round.corrected(found.zero, change)
     zero = zero_direction(best.axis, cloud.up)
@@ -268,16 +268,14 @@ def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.fl
 
 
 def _covariance(
-    tiles: _Means,
-    matrix: NDArray[np.float64],
-    change: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    tiles: _Means, change: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Estimate the covariance of the parameters from the scatter between tiles.
 
     Neighbouring tiles have common errors, so clusters of several sizes are used, and the largest
     covariance is returned (White's estimator with clusters).
     """
+    matrix = tiles.matrix[:, : len(change)]
     rest = tiles.means - matrix @ change
     inverse = np.linalg.pinv(matrix.T @ (matrix * weights[:, None]), hermitian=True)
     leverage = weights * np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
