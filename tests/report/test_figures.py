@@ -218,7 +218,7 @@ def first_alike(*others: RecordedEnvironment) -> list[str]:
         (None, packages("e2", numpy="2.2"), False),
         ({"numpy"}, replace(FIRST, id="e2", cpu="other"), False),
     ],
-    ids=["unrelated", "one has it", "used", "unused", "nobody knows", "machine"],
+    ids=["unrelated", "one has it", "used", "unused", "not known", "machine"],
 )
 def test_only_what_methods_use_sets_environments_apart(
     monkeypatch: pytest.MonkeyPatch,

@@ -261,7 +261,7 @@ def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
     _, beside = drafted(scan, found("photos", "a.jpg", "a photo", 1))
     assert beside["photos"] == "a.jpg, a photo"
     assert "cameras" not in beside
-    # Of two scans nobody knows whose poses are meant.
+    # With two scans, it is ambiguous which poses are meant.
     _, two = drafted(scan, found("scan", "b.e57", "a scan", 1))
     assert two["photos"] == "2 files: hall.e57, b.e57"
     assert "cameras" not in two

@@ -173,7 +173,7 @@ def test_only_nodes_that_meet_the_box_are_read(
     found = read(path, PointQuery(box=np.array([[0.5, 4.5, 0.5], [3.5, 7.5, 3.5]])))
     expected = np.concatenate([NODES[0][0, 0, 0], NODES[1][0, 1, 0]])
     np.testing.assert_array_equal(sorted_points(found), sorted_points(expected))
-    # A box beside all nodes gives the root, which tells where the cloud is.
+    # If a box contains no node, the root is read, because it shows the position of the cloud.
     beside = read(path, PointQuery(box=np.array([[90.0, 0.0, 0.0], [91.0, 1.0, 1.0]])))
     np.testing.assert_array_equal(sorted_points(beside), sorted_points(NODES[0][0, 0, 0]))
 
