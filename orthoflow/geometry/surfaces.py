@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,16 @@ class Cone:
         outwards = radial * math.cos(self.half_angle_rad)
         outwards -= math.sin(self.half_angle_rad) * self.axis_world
         return np.asarray(-outwards if self.is_concave else outwards)
+
+
+def transformed(
+    shape: Cylinder | Cone, rotation: NDArray[np.float64], shift_m: NDArray[np.float64]
+) -> Cylinder | Cone:
+    """Return a surface after a rotation (3, 3) about the origin and then a translation (3,)."""
+    axis = rotation @ shape.axis_world
+    if isinstance(shape, Cylinder):
+        return replace(shape, point_world=rotation @ shape.point_world + shift_m, axis_world=axis)
+    return replace(shape, apex_world=rotation @ shape.apex_world + shift_m, axis_world=axis)
 
 
 def along_and_across(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 from pydantic import Field
 
-from orthoflow.geometry import Cylinder
+from orthoflow.geometry.surfaces import transformed
 from orthoflow.products import (
     Calibration,
     Cameras,
@@ -192,11 +192,7 @@ def _true_surfaces(building: Building, delivery: Delivery) -> Surfaces:
     surfaces = []
     for index, chosen in enumerate(np.argsort(-counts, kind="stable").tolist()):
         true = building.surfaces[chosen]
-        shape, shift = true.shape, delivery.shift_world_m
-        if isinstance(shape, Cylinder):
-            shape = replace(shape, point_world=shape.point_world + shift)
-        else:
-            shape = replace(shape, apex_world=shape.apex_world + shift)
+        shape = transformed(true.shape, np.eye(3), delivery.shift_world_m)
         surfaces.append(
             Surface(
                 name=f"{surface_kind(shape, delivery.up_world)} {index}",

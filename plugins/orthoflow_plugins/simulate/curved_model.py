@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Cone, Cylinder
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from orthoflow.geometry.surfaces import transformed
 from orthoflow_plugins.simulate.building import (
     Extent,
     Paint,
@@ -250,11 +251,7 @@ def build(subject: Subject, rng: np.random.Generator, *, relief: float, gap: flo
 
 
 def _turned(true: TrueSurface, turn: NDArray[np.float64]) -> TrueSurface:
-    shape, axis = true.shape, turn @ true.shape.axis_world
-    if isinstance(shape, Cylinder):
-        shape = replace(shape, point_world=turn @ shape.point_world, axis_world=axis)
-    else:
-        shape = replace(shape, apex_world=turn @ shape.apex_world, axis_world=axis)
+    shape = transformed(true.shape, turn, np.zeros(3))
     return replace(true, shape=shape, zero=turn @ true.zero)
 
 

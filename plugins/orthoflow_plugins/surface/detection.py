@@ -45,7 +45,7 @@ _LARGEST_SHIFT: Final = 1.0
 _CYLINDER_SLOPE: Final = math.radians(1.0)
 # Largest standard deviation of a radius, as a share of it. Flat strips between rounded corners have
 # 0.01 to 0.02; a vault of 3 m with an arc of 45 degrees and 1 cm of relief has 0.008.
-_LEAST_PRECISE: Final = 0.01
+_LARGEST_SIGMA_SHARE: Final = 0.01
 _OUTSIDE_RAD: Final = math.radians(200.0)
 
 
@@ -147,7 +147,7 @@ def detect(
             rejected.append(Rejected(reason="cone" if is_steep else "cylinder", evidence=evidence))
         elif fit.cell_scatter_m > largest_m:
             rejected.append(Rejected(reason="rough", evidence=evidence))
-        elif fit.surface.sigma_radius_m > _LEAST_PRECISE * fit.surface.radius_m:
+        elif fit.surface.sigma_radius_m > _LARGEST_SIGMA_SHARE * fit.surface.radius_m:
             rejected.append(Rejected(reason="uncertain radius", evidence=evidence))
         else:
             kept.append(index)
