@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Cone, Cylinder
 from orthoflow.products import PointCloud, Surface, surface_kind
-from orthoflow_plugins.surface.fit import fit_all
+from orthoflow_plugins.surface.fit import CYLINDER_SLOPE, fit_all
 from orthoflow_plugins.surface.parameters import DetectorParams
 from orthoflow_plugins.surface.search import (
     BLOCK_VOXELS,
@@ -40,12 +40,9 @@ _LEAST_POINTS: Final = 100
 # A surface found among voxels is rejected if the fit to all points moves it by more than the
 # tolerance times this factor.
 _LARGEST_SHIFT: Final = 1.0
-# A surface is a cylinder if its generatrices are parallel to its axis to within this angle, and
-# otherwise a cone.
-_CYLINDER_SLOPE: Final = math.radians(1.0)
-# Largest standard deviation of a radius, as a share of it. Flat strips between rounded corners have
-# 0.01 to 0.02; a vault of 3 m with an arc of 45 degrees and 1 cm of relief has 0.008.
-_LARGEST_SIGMA_SHARE: Final = 0.01
+# The profile of a surface is curved everywhere if its mean curvature is at least this many standard
+# deviations of the curvature along the arc (97.5 %, one-sided).
+_CURVED_SIGMAS: Final = 1.96
 _OUTSIDE_RAD: Final = math.radians(200.0)
 
 
@@ -55,7 +52,8 @@ class Detection:
 
     Attributes:
         surfaces: the surfaces, in descending order of their numbers of points.
-        accepted: the surfaces as found among voxels, in the same order.
+        accepted: the surfaces as found among voxels, in the same order, with the values of
+            all tests.
         labels: (n,) int16 index of the surface of each point; -1 for none.
         plane_tests: tests of the given planes.
         rejected: hypotheses that failed the tests.
@@ -127,7 +125,7 @@ def detect(
         cores=cores,
     )
     counts = np.array([item.surface.n_points for item in fitted], dtype=np.int64)
-    kept = []
+    kept: dict[int, Found] = {}
     for index in np.argsort(-counts, kind="stable").tolist():
         fit, evidence = fitted[index], dict(found[index].evidence)
         evidence |= {
@@ -136,30 +134,31 @@ def detect(
             "shift_mm": 1000.0 * fit.shift_m,
             "half_angle_deg": math.degrees(math.atan(abs(fit.slope))),
             "sigma_radius_mm": 1000.0 * fit.surface.sigma_radius_m,
+            "variation": fit.variation,
         }
         shape = fit.surface.shape
-        is_steep = abs(fit.slope) > _CYLINDER_SLOPE
-        is_straight = isinstance(shape, Cone) and shape.half_angle_rad < _CYLINDER_SLOPE
+        is_steep = abs(fit.slope) > CYLINDER_SLOPE
+        is_straight = isinstance(shape, Cone) and shape.half_angle_rad < CYLINDER_SLOPE
         largest_m = params.max_scatter_share * fit.surface.radius_m + noise_m
-        if counts[index] < _LEAST_POINTS or fit.shift_m > _LARGEST_SHIFT * limits.tolerance_m:
-            rejected.append(Rejected(reason="unstable", evidence=evidence))
-        elif is_steep or (is_cone and (is_straight or isinstance(shape, Cylinder))):
+        if is_steep or (is_cone and (is_straight or isinstance(shape, Cylinder))):
             rejected.append(Rejected(reason="cone" if is_steep else "cylinder", evidence=evidence))
+        elif counts[index] < _LEAST_POINTS or fit.shift_m > _LARGEST_SHIFT * limits.tolerance_m:
+            rejected.append(Rejected(reason="unstable", evidence=evidence))
+        elif _CURVED_SIGMAS * fit.variation > 1.0:
+            rejected.append(Rejected(reason="no circle", evidence=evidence))
         elif fit.cell_scatter_m > largest_m:
             rejected.append(Rejected(reason="rough", evidence=evidence))
-        elif fit.surface.sigma_radius_m > _LARGEST_SIGMA_SHARE * fit.surface.radius_m:
-            rejected.append(Rejected(reason="uncertain radius", evidence=evidence))
         else:
-            kept.append(index)
+            kept[index] = replace(found[index], evidence=evidence)
     rank = np.full(len(found) + 1, -1, dtype=np.int16)
-    rank[kept] = np.arange(len(kept))
+    rank[list(kept)] = np.arange(len(kept))
     return Detection(
         surfaces=tuple(
             _named(fitted[index].surface, place, cloud.up, is_oriented=is_oriented)
             for place, index in enumerate(kept)
         ),
-        accepted=tuple(found[index] for index in kept),
-        labels=rank[labels] if len(kept) < len(found) or kept != sorted(kept) else labels,
+        accepted=tuple(kept.values()),
+        labels=rank[labels] if len(kept) < len(found) or list(kept) != sorted(kept) else labels,
         plane_tests=tests,
         rejected=rejected,
         noise_m=noise_m,

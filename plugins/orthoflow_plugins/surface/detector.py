@@ -37,6 +37,13 @@ REJECTED: Final = DiagnosticSpec(
     "the normals divided by the angle {turning:.2f} (1 on a cylinder, 0 on flat parts)",
     rank_by="area_m2",
 )
+NO_CIRCLE: Final = DiagnosticSpec(
+    code="profile-no-circle",
+    severity="warning",
+    text="the profile of {subject} is no circle: along the arc, its radius of curvature differs "
+    "from {radius_m:.2f} m by {differs_mm:.0f} mm (RMS), which its stated error includes",
+    rank_by="differs_mm",
+)
 SIDE_GUESSED: Final = DiagnosticSpec(
     code="surface-sides-unknown",
     severity="warning",
@@ -64,7 +71,7 @@ class DetectorOut(Ports):
 class Detector(Method):
     """Base class of the detectors of curved surfaces."""
 
-    result_version = 3
+    result_version = 4
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = (
         MetricSpec("n_surfaces", label="curved surfaces found"),
@@ -151,7 +158,18 @@ class Detector(Method):
             item.reason: item for item in sorted(tested, key=lambda item: item.evidence["area_m2"])
         }
         for item in largest.values():
-            ctx.report(REJECTED, subject=what, reason=item.reason, **item.evidence)
+            varied = 100.0 * item.evidence.get("variation", 0.0)
+            reason = item.reason + (f", curvature differs by {varied:.0f} % RMS" if varied else "")
+            ctx.report(REJECTED, subject=what, reason=reason, **item.evidence)
+        for surface, accepted in zip(found.surfaces, found.accepted, strict=True):
+            if varied := accepted.evidence["variation"]:
+                differs_mm = 1000.0 * varied * surface.radius_m
+                ctx.report(
+                    NO_CIRCLE,
+                    subject=surface.name,
+                    radius_m=surface.radius_m,
+                    differs_mm=differs_mm,
+                )
         if found.surfaces and (cloud.stations is None or not len(cloud.stations)):
             ctx.report(SIDE_GUESSED, n=len(found.surfaces))
         if found.surfaces:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import linalg, ndimage, special
 
 from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.slabs import Offsets, read_only
@@ -17,7 +18,7 @@ from orthoflow.geometry.surfaces import zero_direction
 from orthoflow.geometry.threads import even_parts, in_threads
 from orthoflow.products import PointCloud, Surface
 from orthoflow_plugins.surface.kernels import Cells, sum_cells
-from orthoflow_plugins.surface.rounds import design, robust_solution
+from orthoflow_plugins.surface.rounds import Round, design, robust_solution
 from orthoflow_plugins.surface.search import Found, longest_gap
 
 # Minimum size and maximum number of the cells of a surface.
@@ -36,16 +37,32 @@ _LEAST_MEAN_POINTS: Final = 6.0
 _LEAST_AROUND: Final = 32
 # Size, in cells, of the tiles to whose means the surface is fitted. Tukey's weights detect smaller
 # deviations of tiles, such as those of tangential walls, than of cells.
-_TILE: Final = 4
-# Sizes, in tiles, of the clusters from whose scatter the covariance is estimated, and number of
-# sectors over the whole length, whose scatter is large if the profile is not a circle.
-_CLUSTERS: Final = ((1, 1), (4, 4))
-_SECTORS: Final = 18
+_TILES: Final = (4, 2, 1)
+_TILES_AROUND: Final = 72
+# Maximum number of tiles from which the correlation of the relief is estimated, correlation lengths
+# in tiles, and shares of the correlated part of the variance.
+_MOST_TILES: Final = 200
+_LENGTHS: Final = (1.0, 2.0, 4.0, 8.0)
+_CORRELATED: Final = (0.25, 0.5, 0.75, 0.95)
+# The profile is tested in sectors of at least this angle and this number of tiles.
+_SECTOR_RAD: Final = math.radians(15.0)
+_SECTOR_TILES: Final = 4
+_SECTORS: Final = (3, 12)
+# Minimum share of the tiles within the ends of the arc that are on the circle, if only the ends are
+# not.
+_LEAST_INNER: Final = 0.9
+# A profile is a circle if its variation has at least the first probability on circles, and is none
+# if it has less than the second.
+_LEVELS: Final = (0.05, 0.001)
 # Numbers of cells around surfaces are multiples of this number.
 _MULTIPLE: Final = 16
 _OPEN_SHARE: Final = 0.15
 # Cells adjacent to cells without weight are ignored if more than this share of all cells remains.
 _LEAST_USED: Final = 0.4
+# A surface is a cylinder if its generatrices are parallel to its axis to within this angle, and
+# otherwise a cone; 97.5 % probability, one-sided.
+CYLINDER_SLOPE: Final = math.radians(1.0)
+_SIGMAS: Final = 1.96
 # A cell belongs to the extent if its mean distance is within this many standard deviations plus a
 # tolerance.
 _EXTENT_SIGMAS: Final = 3.0
@@ -63,6 +80,8 @@ class FittedSurface:
         shift_m: maximum displacement from the surface found among voxels.
         slope: change of the radius per metre along the axis if a cone is fitted to a cylinder's
             cells; 0 for cones.
+        variation: deviation of the profile's curvature along the arc from the circle's, RMS, as a
+            share of the latter; 0 if it is insignificant.
     """
 
     surface: Surface
@@ -70,6 +89,7 @@ class FittedSurface:
     noise_m: float
     shift_m: float
     slope: float
+    variation: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +194,8 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
         around = _MULTIPLE * max(2, round(2.0 * math.pi * radius_m / size_m / _MULTIPLE))
         along = max(_LEAST_CELLS, round((high_m - low_m) / size_m))
         rounds.append(item.round.row(item.zero))
-        within_m = min(tolerance_m, max(_LEAST_SUM_M, _SUM_SIGMAS * noise_m))
+        scatter_m = max(noise_m, item.evidence["scatter_mm"] / 1000.0)
+        within_m = min(tolerance_m, max(_LEAST_SUM_M, _SUM_SIGMAS * scatter_m))
         bounds.append((low_m, high_m, tolerance_m, within_m))
         sizes.append((first, around, along, first_open))
         opens.append(item.is_open[np.arange(around) * len(item.is_open) // around])
@@ -201,36 +222,33 @@ def _fitted(
     within = np.maximum(square - total**2 / n, 0.0)
     many = n >= 2.0
     noise_m = math.sqrt(float(within[many].sum() / max(1.0, (n[many] - 1.0).sum())))
-    matrix = design(angles, places, found.round.steepness, is_cone=True)
     n_own = 6 if is_cone else 5
-    cells = _Means(i=i, j=j, n=n, means=total / n, matrix=matrix, n_around=around)
-    while cells.n.mean() < _LEAST_MEAN_POINTS and cells.n_around >= 2 * _LEAST_AROUND:
-        cells = cells.merged(2)
     variance = max(noise_m, 1e-5) ** 2
-    _, weights, extra_m = robust_solution(cells.matrix[:, :n_own], cells.means, variance / cells.n)
-    # Cells at edges also contain points of mouldings and of adjoining walls. Only at the sides of a
-    # surface seen from outside, there are none.
-    is_good = np.zeros((cells.n_around + 2, cells.j.max() + 1), dtype=np.bool_)
-    is_good[cells.i + 1, cells.j] = weights > 0.0
-    is_open = np.full_like(is_good, found.side < 0.0)
-    is_open[cells.i + 1, cells.j] = weights > 0.0
-    is_open[[0, -1]] = is_open[[-2, 1]]
-    is_in = ndimage.binary_erosion(is_open, np.ones((3, 3), dtype=np.bool_), border_value=1)
-    is_in &= ndimage.binary_erosion(is_good, np.ones((1, 3), dtype=np.bool_))
-    is_in = is_in[cells.i + 1, cells.j]
-    tiles = cells.take(is_in if is_in.mean() > _LEAST_USED else weights > 0.0)
-    tiles = tiles.merged(max(1, min(_TILE, tiles.n_around // _LEAST_AROUND)))
-    variances = variance / tiles.n
-    change, weights, _ = robust_solution(tiles.matrix[:, :n_own], tiles.means, variances)
-    slope = 0.0
-    if not is_cone:
-        slope = float(robust_solution(tiles.matrix, tiles.means, variances)[0][5])
-    own = _covariance(tiles, change, weights)
-    rest = total / n - matrix[:, :n_own] @ change
-    best = found.round.corrected(found.zero, change)
-    zero = zero_direction(best.axis, cloud.up)
+    points = found.round.points(angles, places, total / n, found.zero)
+
+    def cells_about(surface: Round, zero: NDArray[np.float64]) -> _Means:
+        matrix = design(*surface.places(points, zero), surface.steepness, is_cone=True)
+        means, _ = surface.outwards(points)
+        cells = _Means(i=i, j=j, n=n, means=means, matrix=matrix, n_around=around)
+        while cells.n.mean() < _LEAST_MEAN_POINTS and cells.n_around >= 2 * _LEAST_AROUND:
+            cells = cells.merged(2)
+        return cells
+
+    cells = cells_about(found.round, found.zero)
+    change, weights, extra_m = robust_solution(
+        cells.matrix[:, :n_own], cells.means, variance / cells.n
+    )
+    # The design is linear, so it is computed again about the new surface.
+    start = found.round.corrected(found.zero, change)
+    zero = zero_direction(start.axis, cloud.up)
+    tiles = _inside(cells_about(start, zero), weights, is_open_beside=found.side < 0.0)
+    change, own, variation, slope = _solution(tiles, variance, start.radius_m, n_own)
+    best = start.corrected(zero, change)
+    rest, _ = best.outwards(points)
     middle_m = float(n @ places / n.sum())
     best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
+    own = best.covariance(zero, own)
+    zero = zero_direction(best.axis, cloud.up)
     near = np.abs(rest) < bounds[3]
     rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[near].sum() / n[near].sum())))
     is_on = np.zeros((around, along), dtype=np.bool_)
@@ -242,7 +260,7 @@ def _fitted(
     surface = Surface(
         name="",
         shape=best.shape(cloud.origin, is_concave=found.side > 0.0),
-        covariance=best.covariance(zero, own),
+        covariance=own,
         n_points=n_points,
         rms_m=rms_m,
         zero_world=zero,
@@ -253,9 +271,74 @@ def _fitted(
         surface=surface,
         cell_scatter_m=extra_m,
         noise_m=noise_m,
-        shift_m=float(np.abs(matrix[:, :n_own] @ change).max()),
+        shift_m=float(np.abs(rest - total / n).max()),
         slope=slope,
+        variation=variation,
     )
+
+
+def _inside(cells: _Means, weights: NDArray[np.float64], *, is_open_beside: bool) -> _Means:
+    """Return tiles of the cells with weights that are not at edges.
+
+    Cells at edges also contain points of mouldings and of adjoining walls. Only at the sides of a
+    surface seen from outside, there are none.
+    """
+    is_good = np.zeros((cells.n_around + 2, cells.j.max() + 1), dtype=np.bool_)
+    is_good[cells.i + 1, cells.j] = weights > 0.0
+    is_open = np.full_like(is_good, is_open_beside)
+    is_open[cells.i + 1, cells.j] = weights > 0.0
+    is_open[[0, -1]] = is_open[[-2, 1]]
+    is_in = ndimage.binary_erosion(is_open, np.ones((3, 3), dtype=np.bool_), border_value=1)
+    is_in &= ndimage.binary_erosion(is_good, np.ones((1, 3), dtype=np.bool_))
+    is_in = is_in[cells.i + 1, cells.j]
+    inside = cells.take(is_in if is_in.mean() > _LEAST_USED else weights > 0.0)
+    fine = (side for side in _TILES if cells.n_around >= side * _TILES_AROUND)
+    return inside.merged(next(fine, 1))
+
+
+def _solution(
+    tiles: _Means, variance: float, radius_m: float, n_own: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
+    """Fit a surface to tiles, and test its profile.
+
+    Args:
+        tiles: the tiles.
+        variance: variance of points.
+        radius_m: the radius.
+        n_own: number of parameters of the surface, 5 for a cylinder and 6 for a cone.
+
+    Returns:
+        The change of the parameters (n_own,), their covariance, and the variation and the slope of
+        `FittedSurface`.
+    """
+    change, used = _solved(tiles, variance, n_own)
+    own = _covariance(used, n_own)
+    variation, chance = _variation(used, radius_m)
+    sector, _ = _sectors(tiles)
+    if len(np.unique(sector)) == sector.max() + 1 >= _SECTORS[0] + 2:
+        # The ends of the arc may be on walls that adjoin it without an edge. Then the radius
+        # without them differs significantly (Hausman 1978, doi:10.2307/1913827).
+        inner = tiles.take((sector > 0) & (sector < sector.max()))
+        again, kept = _solved(inner, variance, n_own)
+        if len(kept) > _LEAST_INNER * len(inner) and _variation(kept, radius_m)[1] > _LEVELS[0]:
+            theirs = _covariance(kept, n_own)
+            largest = _SIGMAS**2 * (theirs[4, 4] - own[4, 4])
+            if chance < _LEVELS[1] or (again[4] - change[4]) ** 2 > max(0.0, largest):
+                tiles, change, used, own, chance = inner, again, kept, theirs, 1.0
+    variation = variation if chance < _LEVELS[1] else 0.0
+    # If the radius of curvature varies, the centre does, too; the middle of the arc stays.
+    turn = np.zeros(n_own)
+    turn[:2], turn[4] = -used.n @ used.matrix[:, :2] / used.n.sum(), 1.0
+    own += (variation * radius_m) ** 2 * np.outer(turn, turn)
+    slope = 0.0
+    if n_own == 5:
+        steep, used = _solved(tiles, variance, 6)
+        slope = float(steep[5])
+        if abs(slope) > CYLINDER_SLOPE:
+            # Relief also causes a slope.
+            sigma = math.sqrt(_covariance(used, 6)[5, 5])
+            slope = math.copysign(max(0.0, abs(slope) - _SIGMAS * sigma), slope)
+    return change, own, variation, slope
 
 
 def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.float64]:
@@ -267,31 +350,99 @@ def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.fl
     return np.asarray(turn @ own @ turn.T)
 
 
-def _covariance(
-    tiles: _Means, change: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Estimate the covariance of the parameters from the scatter between tiles.
+def _solved(tiles: _Means, variance: float, n_own: int) -> tuple[NDArray[np.float64], _Means]:
+    """Fit a surface to tiles.
 
-    Neighbouring tiles have common errors, so clusters of several sizes are used, and the largest
-    covariance is returned (White's estimator with clusters).
+    Returns:
+        The change (n_own,), and the tiles with weights, their means reduced to the
+        remaining distances and their counts replaced by the weights.
     """
-    matrix = tiles.matrix[:, : len(change)]
-    rest = tiles.means - matrix @ change
-    inverse = np.linalg.pinv(matrix.T @ (matrix * weights[:, None]), hermitian=True)
-    leverage = weights * np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
-    scores = matrix * (weights * rest / (1.0 - np.minimum(leverage, 0.9)))[:, None]
-    best = np.zeros_like(inverse)
-    sector = max(1, math.ceil(len(np.unique(tiles.i)) / _SECTORS))
-    for around, along in (*_CLUSTERS, (sector, int(tiles.j.max()) + 1)):
-        cluster = (tiles.i // around) * (tiles.j.max() + 1) + tiles.j // along
-        n_clusters = len(np.unique(cluster[weights > 0.0]))
-        if n_clusters <= 2 * len(inverse):
-            continue
-        sums = np.column_stack([np.bincount(cluster, column) for column in scores.T])
-        factor = n_clusters / (n_clusters - len(inverse))
-        found = factor * inverse @ (sums.T @ sums) @ inverse
-        best = found if np.trace(found) > np.trace(best) else best
-    return np.asarray(best if best.any() else inverse)
+    matrix = tiles.matrix[:, :n_own]
+    change, weights, _ = robust_solution(matrix, tiles.means, variance / tiles.n)
+    used = replace(tiles, means=tiles.means - matrix @ change, n=weights).take(weights > 0.0)
+    return change, used
+
+
+def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
+    """Estimate the covariance of the parameters from the scatter of tiles and its correlation.
+
+    The scatter is white noise plus relief whose correlation decreases exponentially with the
+    distance. Their shares and the correlation length have the largest restricted likelihood
+    (Patterson and Thompson 1971, doi:10.1093/biomet/58.3.545), which allows for the relief that the
+    fit has absorbed.
+
+    Args:
+        tiles: the result of `_solved`.
+        n_own: number of parameters.
+    """
+    while len(tiles) > _MOST_TILES:
+        tiles = tiles.merged(2)
+    matrix = tiles.matrix[:, :n_own]
+    scale = np.linalg.norm(matrix, axis=0)
+    turn = math.pi / tiles.n_around * (tiles.i[:, None] - tiles.i)
+    apart = np.hypot(tiles.n_around / math.pi * np.sin(turn), tiles.j[:, None] - tiles.j)
+    white = np.diag(tiles.n.mean() / tiles.n)
+    columns = np.column_stack([matrix / scale, tiles.means])
+    best, least = white, math.inf
+    for length, share in [(1.0, 0.0), *itertools.product(_LENGTHS, _CORRELATED)]:
+        model = (1.0 - share) * white + share * np.exp(-apart / length)
+        root = np.linalg.cholesky(model)
+        whitened = linalg.solve_triangular(root, columns, lower=True)
+        triangle = np.asarray(np.linalg.qr(whitened, mode="r"))
+        logs = np.log(np.abs(np.diag(triangle)))
+        free = len(matrix) - n_own
+        score = np.log(np.diag(root)).sum() + logs[:-1].sum() + free * logs[-1]
+        if score < least:
+            best, least = triangle[-1, -1] ** 2 / free * model, score
+    weighted = matrix * tiles.n[:, None]
+    inverse = np.linalg.pinv(matrix.T @ weighted, hermitian=True)
+    return np.asarray(inverse @ weighted.T @ best @ weighted @ inverse)
+
+
+def _sectors(tiles: _Means) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the sector (m,) of each tile, and its angle (m,) from the middle of the sector."""
+    # Positions around the axis, from the end of the longest gap.
+    columns = np.unique(tiles.i)
+    gaps = np.diff(np.append(columns, columns[0] + tiles.n_around))
+    around = (tiles.i - columns[(int(np.argmax(gaps)) + 1) % len(columns)]) % tiles.n_around
+    width_rad = 2.0 * math.pi / tiles.n_around
+    n_around = int(around.max()) + 1
+    count = int(n_around / max(_SECTOR_TILES, _SECTOR_RAD / width_rad))
+    count = min(max(count, _SECTORS[0]), _SECTORS[1])
+    sector = around * count // n_around
+    return sector, (around + 0.5 - (sector + 0.5) * n_around / count) * width_rad
+
+
+def _variation(tiles: _Means, radius_m: float) -> tuple[float, float]:
+    """Return the variation of the curvature along the arc, and its probability on a circle.
+
+    Parabolas are fitted to the pieces of sectors. By an analysis of variance, the deviations of the
+    sectors' curvatures from the circle's are compared with the scatter between the pieces of a
+    sector, which differ in their positions along the axis.
+    """
+    sector, t = _sectors(tiles)
+    n_rows, n_sectors = int(tiles.j.max()) + 1, int(sector.max()) + 1
+    n_pieces = max(2, n_rows // _SECTOR_TILES)
+    piece = sector * n_pieces + tiles.j * n_pieces // n_rows
+    column = np.unique(piece * tiles.n_around + tiles.i)
+    full = np.bincount(column // tiles.n_around) >= _SECTOR_TILES - 1
+    powers = np.column_stack([np.bincount(piece, tiles.n * t**power)[full] for power in range(5)])
+    bulge = tiles.n * tiles.means / radius_m
+    right = [np.bincount(piece, bulge * t**power)[full] for power in range(3)]
+    normal = powers[:, np.add.outer(np.arange(3), np.arange(3))]
+    parabolas = np.linalg.solve(normal, np.stack(right, axis=1)[:, :, None])
+    curvatures = 1.0 - 2.0 * parabolas[:, 2, 0]
+    of = np.flatnonzero(full) // n_pieces
+    counts = np.bincount(of, minlength=n_sectors)
+    means = np.bincount(of, curvatures, n_sectors) / np.maximum(counts, 1)
+    n_between = np.count_nonzero(counts)
+    n_within = len(of) - n_between
+    if n_between < 2 or n_within < 1:
+        return 0.0, 1.0
+    within = float(((curvatures - means[of]) ** 2).sum()) / n_within
+    between = float((counts * (means - 1.0) ** 2).sum()) / n_between
+    chance = float(special.fdtrc(n_between, n_within, between / max(within, 1e-12)))
+    return math.sqrt(max(0.0, between - within) * n_between / len(of)), chance
 
 
 def _extent(

@@ -63,6 +63,18 @@ class Round:
         sine = relative @ cross(self.axis, zero)
         return np.arctan2(sine, relative @ zero), relative @ self.axis
 
+    def points(
+        self,
+        angles: NDArray[np.float64],
+        along: NDArray[np.float64],
+        distances: NDArray[np.float64],
+        zero: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return points (n, 3) at angles, positions along the axis and distances (n,) outwards."""
+        outwards = np.outer(np.cos(angles), zero) + np.outer(np.sin(angles), cross(self.axis, zero))
+        radius = self.radius_m + self.slope * along + distances / self.steepness
+        return np.asarray(self.point + np.outer(along, self.axis) + radius[:, None] * outwards)
+
     def corrected(self, zero: NDArray[np.float64], change: NDArray[np.float64]) -> Round:
         """Return the surface after a change of the parameters of `design`."""
         aside = cross(self.axis, zero)
