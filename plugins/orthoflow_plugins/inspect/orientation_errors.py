@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 _GRID: Final = (24, 18)
 # Surfaces that are not parallel to the wall, such as the sides of mouldings, are ignored.
 _LEAST_COSINE: Final = 0.9
+# So are surfaces seen at more oblique angles, as in predicted errors (`orient.gates`): at the
+# outline of a column, the error along the wall has no bound.
+_GRAZING_COSINE: Final = 0.1
 # An accepted orientation is wrong if its error exceeds this many predicted standard deviations.
 _WRONG_SIGMAS: Final = 5.0
 # A tie is wrong if its error exceeds this many cells of the wall.
@@ -276,9 +279,15 @@ def error_on_walls(
         return None
     points = seen.points[chosen]
     normal = scene.normals_at(seen.rectangle[chosen], points.T)
+    from_camera = points - (true.centre_world - scene.origin)
+    cosine = np.einsum("ij,ij->i", normal, from_camera) / np.linalg.norm(from_camera, axis=1)
+    is_facing = np.abs(cosine) >= _GRAZING_COSINE
+    points, normal, pixels = points[is_facing], normal[is_facing], grid[chosen][is_facing]
+    if not len(points):
+        return None
     camera = found.shifted(scene.origin)
     try:
-        rays = camera.rays_world(grid[chosen])
+        rays = camera.rays_world(pixels)
     except GeometryError:
         return math.inf
     facing = np.einsum("ij,ij->i", normal, rays)

@@ -121,9 +121,9 @@ def look_at_curved_cells(
             at_column = min(int(u / buffer.reduction), buffer.nearest.shape[1] - 1)
             leaves = _reaches(ray, about, view.front_m)
             leaves_m = (1.0 - leaves) * distance - view.tolerance_m
-            is_hidden = buffer.nearest[at_row, at_column] < leaves_m
+            is_hidden = buffer.nearest[at_row, at_column] < leaves_m or cosine <= view.cosine_least
             visible.mask[i, j] = OCCLUDED
-            if cosine <= view.cosine_least or is_hidden or _is_covered(view, relief, ray, depth):
+            if is_hidden or _is_covered(view, relief, ray, depth, distance):
                 continue
             width, height = view.camera[21], view.camera[22]
             inside = min(width - u, u, height - v, v) / view.border_px
@@ -219,11 +219,42 @@ def _crossing(
 
 
 @kernel_part
-def _is_covered(view: WallView, relief: Relief, ray: Ray, depth: float) -> bool:
-    """Return whether the relief of the wall, or its opposite side, hides a cell from the camera."""
+def _inside_m(ray: Ray, about: AxisView) -> float:
+    """Return the distance of a ray from the outline that the surface has in the photo.
+
+    Behind its cell, the ray continues inside a convex surface. Its largest distance below the
+    surface, at the minimum of the convex function of depth, is that by which it may be shifted
+    before it misses the surface. Concave surfaces have no such outline.
+    """
+    if about.side < 0.0:
+        return math.inf
+    across = math.hypot(ray.to_first, ray.to_second)
+    slope = about.sine * ray.to_axial
+    if not abs(slope) < about.cosine * across:
+        return math.inf
+    # Where the depth is least, the distance from the axis changes by `turn` per metre of `across`.
+    turn = slope / (about.cosine * across)
+    nearest = abs(ray.first * ray.to_second - ray.second * ray.to_first) / across
+    away = nearest / math.sqrt(1.0 - turn * turn)
+    foot = -(ray.first * ray.to_first + ray.second * ray.to_second) / across**2
+    share = foot + turn * away / across
+    change = math.hypot(ray.first, ray.second) - away
+    return about.cosine * change + slope * share
+
+
+@kernel_part
+def _is_covered(view: WallView, relief: Relief, ray: Ray, depth: float, distance: float) -> bool:
+    """Return whether the relief of the wall, or its opposite side, hides a cell from the camera.
+
+    Cells near the outline of the surface count as hidden. The distance is that along the optical
+    axis.
+    """
     about = view.about
     if relief.occluding.size == 0:
         return False
+    pixel_m = distance / min(view.camera[12], view.camera[13])
+    if _inside_m(ray, about) < view.outline_m + pixel_m:
+        return True
     if about.side < 0.0 and _is_behind_the_wall(view, relief, ray):
         return True
     top = _highest_in_the_way(view, relief, ray, depth)

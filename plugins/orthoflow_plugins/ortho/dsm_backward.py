@@ -37,8 +37,9 @@ class DsmBackward(Method):
     hides the cell. To find cells hidden by the relief of the wall, the ray from each cell to the
     camera is traced over the raster. To find cells hidden by objects in front of the depth range of
     the wall, a depth buffer of the cloud is computed for the photo; isolated points are ignored as
-    outliers. If the photo has a higher resolution than the wall, colours are averaged over the
-    cell.
+    outliers. Cells near the outline of a convex surface remain empty if errors of pose and depth,
+    or averaging over a cell and a pixel, could mix in what is behind the surface. If the photo has
+    a higher resolution than the wall, colours are averaged over the cell.
 
     The quality of a cell is the number of photo pixels that it covers, which is the cosine of the
     angle of incidence times the squared ratio of cell size to photo GSD. It decreases to 0 at the
@@ -47,7 +48,7 @@ class DsmBackward(Method):
 
     id: ClassVar[str] = "ortho.dsm-backward"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_layers", label="layers (one per photo and wall)"),
         MetricSpec("painted_share", label="covered cells"),
@@ -79,7 +80,7 @@ class DsmBackward(Method):
         footprints: list[CellFootprint] = []
 
         def project(photo: OpenedPhoto, surface: Surface, stack: LayerStack, wall: int) -> None:
-            view = view_of(photo.viewer, surface, params)
+            view = view_of(photo.viewer, surface, params, photo.sigma_m)
             if not is_before(view, surface):
                 return
             painting = paint(

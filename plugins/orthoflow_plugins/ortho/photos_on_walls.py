@@ -88,12 +88,14 @@ class OpenedPhoto:
     Attributes:
         pixels: (height, width, 3) uint8, or uint16 if any photo has more than 8 bits.
         buffer: depth buffer of objects in front of the camera.
+        sigma_m: standard deviation of its projection on the walls; 0 if unknown.
     """
 
     name: str
     pixels: Colours
     viewer: ViewingCamera
     buffer: DepthBuffer
+    sigma_m: float
 
 
 def project_photos(
@@ -139,7 +141,13 @@ def project_photos(
         free = nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
         buffer = before_masks(free, photo)
         looked = ctx.clock_s()
-        opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
+        opened = OpenedPhoto(
+            name=photo.name,
+            pixels=pixels,
+            viewer=viewer,
+            buffer=buffer,
+            sigma_m=camera.sigma_wall_m or 0.0,
+        )
         n_before = len(stack.painted)
         for index, surface in enumerate(surfaces):
             project(opened, surface, stack, index)

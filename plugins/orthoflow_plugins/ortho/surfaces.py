@@ -98,8 +98,17 @@ def surface_of(
     )
 
 
-def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -> WallView:
-    """Return a camera in the axes of a wall, with full precision for large world coordinates."""
+def view_of(
+    camera: ViewingCamera, surface: Surface, params: VisibilityParams, sigma_m: float = 0.0
+) -> WallView:
+    """Return a camera in the axes of a wall, with full precision for large world coordinates.
+
+    Args:
+        camera: the camera.
+        surface: the wall.
+        params: visibility of cells.
+        sigma_m: standard deviation of the camera's projection on the wall.
+    """
     frame = surface.frame
     near = camera.shifted(frame.origin_world)
     flat, (right_m, down_m, height_m) = _in_axes(near, frame.axes_world)
@@ -113,6 +122,8 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
         tolerance_m=float(surface.tolerance_m),
         cosine_least=math.cos(math.radians(params.incidence_max_deg)),
         border_px=max(1.0, _BORDER_SHARE * min(camera.width, camera.height)),
+        # Besides the tolerance of the depth, half a cell: colours are averaged over cells.
+        outline_m=surface.tolerance_m + 0.5 * frame.gsd_m + _TOLERANCE_SIGMAS * sigma_m,
         **({} if frame.bend is None else _about_axis(near, frame, frame.bend)),
     )
 

@@ -81,6 +81,8 @@ class WallView(NamedTuple):
         front_m: largest depth of the relief; the depth buffer contains only points in front of it.
         tolerance_m: minimum height above a ray at which the surface blocks that ray.
         cosine_least: smallest cosine of the angle of incidence of visible cells.
+        outline_m: distance from the outline of a curved surface, besides one pixel, within which a
+            photo may show what is behind the surface.
         border_px: width of the strip along the image border in which quality decreases to 0.
         about: the camera in the axes of a curved surface. The axes of the wall are then those at
             the top-left corner of its raster.
@@ -96,6 +98,7 @@ class WallView(NamedTuple):
     tolerance_m: float
     cosine_least: float
     border_px: float
+    outline_m: float = 0.0
     about: AxisView = _PLANE
     axial_camera: NDArray[np.float64] = _NO_CAMERA
 

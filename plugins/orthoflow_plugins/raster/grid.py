@@ -94,7 +94,7 @@ class RasterGrid(Method):
 
     id: ClassVar[str] = "raster.grid"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
         MetricSpec("omega_deg", label="direction of the first wall's normal (omega)"),
@@ -168,9 +168,10 @@ class RasterGrid(Method):
         for k, (index, slab) in enumerate(slabs.items()):
             name, is_curved = slab.frame.name, slab.frame.bend is not None
             ctx.progress(k / len(slabs), name)
+            rule = params.surface or ("denoised" if is_curved else "median")
             wall = rastered_wall(
                 *flattened(cloud, slab),
-                params,
+                params.model_copy(update={"surface": rule}),
                 index=index,
                 name=name,
                 allocate=partial(_allocated, ctx, k),
@@ -211,7 +212,7 @@ class RasterGrid(Method):
                     tuple(index for index, by in covered.items() if by == wall.plane_index)
                     for wall in walls
                 ),
-                details={"surface": params.surface, "scan_step_m": [*steps_m]},
+                details={"surface": params.surface or "median", "scan_step_m": [*steps_m]},
             )
         )
 

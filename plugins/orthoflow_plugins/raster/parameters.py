@@ -11,6 +11,7 @@ from orthoflow_plugins.raster.frames import Polygon, Rectangle, area_m2
 
 Constraint = Literal["vertical", "horizontal", "any"]
 Place = tuple[float, float, float]
+Surface = Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"]
 
 
 class RasterParams(MethodParams):
@@ -46,14 +47,15 @@ class RasterParams(MethodParams):
         "and pilasters, up to the nearest points of adjoining walls, floor and ceiling; "
         "points: the rectangle of the points on the plane.",
     )
-    surface: Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"] = Field(
-        default="median",
-        description="Depth of a cell. median: median of the layer with the most points (layers "
-        "are more than 2 cm apart), without outliers; denoised: the same after edge-preserving "
-        "smoothing; nearest: depth of the point nearest to the centre, also from neighbouring "
-        "cells (markiewicz2015); centre: the same, but only from points of the cell; topmost: "
-        "depth of the point nearest to the viewer (skarlatos2012); mean: mean of all points; tin: "
-        "a triangulation, which closes windows (for comparison).",
+    surface: Surface | None = Field(
+        default=None,
+        description="Depth of a cell. median (default on planes): median of the layer with the "
+        "most points (layers are more than 2 cm apart), without outliers; denoised (default on "
+        "curved surfaces, parts of which every photo sees obliquely): the same after "
+        "edge-preserving smoothing; nearest: depth of the point nearest to the centre, also from "
+        "neighbouring cells (markiewicz2015); centre: the same, but only from points of the cell; "
+        "topmost: depth of the point nearest to the viewer (skarlatos2012); mean: mean of all "
+        "points; tin: a triangulation, which closes windows (for comparison).",
     )
     percentiles: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(
         default=(),

@@ -482,9 +482,9 @@ def _find_specks(
         agree_m: maximum difference between depths that agree; the same for sparse cells; and the
             increase of this second value per row or column of distance, due to a slope.
         is_speck: (rows, cols) output. A known cell is an outlier if at least six cells in its 5 x 5
-            neighbourhood are known but fewer than two of them agree. A sparse cell is an outlier if
-            fewer than three cells in its 9 x 9 neighbourhood, or fewer than half of the known ones,
-            agree.
+            (or else 9 x 9) neighbourhood are known but fewer than two of them agree. A sparse cell
+            is an outlier if fewer than three cells in its 9 x 9 neighbourhood, or fewer than half
+            of the known ones, agree.
         first_row: first row to visit.
         end_row: the row after the last one.
     """
@@ -501,6 +501,11 @@ def _find_specks(
                 is_speck[row, column] = n_agreeing < max(_SPARSE_LEAST, 0.5 * n_known)
                 continue
             n_known, n_agreeing = _count_around(depth_m, row, column, _NEAR_CELLS, layer_m, 0.0)
+            if n_known < _KNOWN_LEAST:
+                # The points are several cells apart.
+                n_known, n_agreeing = _count_around(
+                    depth_m, row, column, _SPARSE_CELLS, layer_m, slope_m
+                )
             is_speck[row, column] = n_agreeing < _AGREEING_LEAST and n_known >= _KNOWN_LEAST
 
 

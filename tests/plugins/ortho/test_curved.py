@@ -16,7 +16,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.errors import OrthoflowError
 from orthoflow.geometry.bends import CylinderBend
-from orthoflow.products import LayerMask
+from orthoflow.products import Cameras, LayerMask
 from tests import curved_scenes, ortho_scenes
 from tests.curved_scenes import Drum
 from tests.method_runs import run
@@ -40,8 +40,13 @@ SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
 }
 
 
-def projected(name: str, folder: Path, method: Any = DsmBackward) -> tuple[Any, ...]:
-    """Layers of the photos of a scene, the drum, its cameras, its wall, and the metrics."""
+def projected(
+    name: str, folder: Path, method: Any = DsmBackward, sigma_m: float = 0.0
+) -> tuple[Any, ...]:
+    """Layers of the photos of a scene, the drum, its cameras, its wall, and the metrics.
+
+    The cameras are displaced by three standard deviations to the right.
+    """
     drum, poses = SCENES[name]
     cloud = drum.cloud(0.6 * GSD_M)
     found = {"cloud": cloud, "planes": curved_scenes.NO_PLANES, "surfaces": drum.surfaces()}
@@ -50,7 +55,11 @@ def projected(name: str, folder: Path, method: Any = DsmBackward) -> tuple[Any, 
     inputs = {"walls": walls, "cloud": cloud}
     if method is not PointcloudDirect:
         inputs["photos"] = ortho_scenes.photos(*map(drum.rendered, cameras))
-        inputs["cameras"] = ortho_scenes.cameras(*cameras)
+        off = [camera.shifted(-3.0 * sigma_m * camera.rotation[0]) for camera in cameras]
+        found = ortho_scenes.cameras(*off)
+        inputs["cameras"] = Cameras(
+            cameras=tuple(replace(camera, sigma_wall_m=sigma_m) for camera in found.cameras)
+        )
     ctx = context(folder)
     layers = run(method, ctx, inputs).layers.layers
     return layers, drum, cameras, walls.walls[0], numbers(ctx)
@@ -91,6 +100,27 @@ def test_photos_colour_what_they_see_of_a_curved_surface(name: str, tmp_path: Pa
         ratio = layer.quality.ravel()[some] / (np.abs(a * d - b * c) * 1e6 * rim)
         assert 0.85 < np.percentile(ratio, 1) < np.percentile(ratio, 99) < 1.05
     assert metrics["obliquity_deg"] < 60.0
+
+
+def test_no_cell_shows_what_is_behind_the_outline_of_a_column(tmp_path: Path) -> None:
+    sigma_m = 0.01
+    layers, drum, cameras, wall, _ = projected("column", tmp_path, sigma_m=sigma_m)
+    frame = wall.frame
+    cells = np.column_stack(cell_centres(frame.shape))
+    points = frame.world_from_wall(cells)
+    # The ends and the band have outlines of their own.
+    is_inside = np.abs(drum.places(points)[:, 1] + 0.4) < 0.5
+    for camera, layer in zip(cameras, layers, strict=True):
+        is_painted = layer.mask.ravel() == LayerMask.PAINTED
+        assert layer.rgb.reshape(-1, 3)[is_painted & is_inside].min() > 5
+        rays = camera.centre_world - points
+        cosines = np.einsum("ij,ij->i", rays, frame.axes_at(cells)[:, 2])
+        sines = np.sqrt(1.0 - (cosines / np.linalg.norm(rays, axis=1)) ** 2)
+        # Nothing else is left out: two cells and a pixel, and twice three standard deviations.
+        pixel_m = np.linalg.norm(rays, axis=1) / camera.fx
+        is_safe = drum.radius_m * (1.0 - sines) > 2.0 * GSD_M + pixel_m + 6.0 * sigma_m
+        is_seen = (cosines > 0.0) & camera.sees(camera.project(points)[:, :2])
+        assert is_painted[is_seen & is_safe].mean() > 0.9
 
 
 def test_points_colour_a_cylinder(tmp_path: Path) -> None:

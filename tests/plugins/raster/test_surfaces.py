@@ -259,6 +259,13 @@ def test_fewer_than_six_known_cells_say_nothing(n_known: int, is_speck: bool) ->
     assert specks(depth_m)[20, 20] == is_speck
 
 
+def test_an_outlier_among_points_three_cells_apart_is_a_speck() -> None:
+    depth_m = np.full((40, 40), np.nan, dtype=np.float32)
+    depth_m[::3, ::3] = flat()[::3, ::3]
+    depth_m[21, 21] = 0.2
+    np.testing.assert_array_equal(specks(depth_m), depth_m == np.float32(0.2))
+
+
 def test_cells_two_rows_or_columns_off_are_around_and_three_are_not() -> None:
     depth_m = flat()
     for row, column in ((20, 20), (22, 20), (20, 22)):
