@@ -1,4 +1,4 @@
-"""Textured vaults, towers and spires with a projecting band, known exactly, and photos of them."""
+"""Textured vaults, towers, spires and domes with a projecting band, and photos of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Cone, Cylinder
+from orthoflow.geometry import Cone, Cylinder, Sphere
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.surfaces import along_and_across, angles_around, zero_direction
 from orthoflow.products import PointCloud, Surface, Surfaces, surface_kind
@@ -39,6 +39,10 @@ class Drum:
         return zero_direction(self.shape.axis_world, UP)
 
     @property
+    def axis_world(self) -> NDArray[np.float64]:
+        return self.shape.axis_world
+
+    @property
     def half_rad(self) -> float:
         """Angle between the axis and the generatrices."""
         return self.shape.half_angle_rad if isinstance(self.shape, Cone) else 0.0
@@ -67,7 +71,7 @@ class Drum:
     def surfaces(self) -> Surfaces:
         shape, (low_m, high_m) = self.shape, self.along_m
         surface = Surface(
-            name=f"{surface_kind(shape, UP)} 0",
+            name=f"{surface_kind(shape, UP, self.zero_world)} 0",
             shape=shape,
             covariance=np.zeros((7, 7)),
             n_points=1000,
@@ -180,6 +184,81 @@ class Drum:
         return np.repeat(image[..., None], 3, axis=2)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Ball(Drum):
+    """A sphere around its pole, which is above; `along_m` and `band_m` are distances from it."""
+
+    shape: Sphere  # type: ignore[assignment]
+
+    @property
+    def zero_world(self) -> NDArray[np.float64]:
+        return UP
+
+    @property
+    def axis_world(self) -> NDArray[np.float64]:
+        return np.eye(3)[0]
+
+    @property
+    def radius_m(self) -> float:
+        return self.shape.radius_m
+
+    @property
+    def sides_m(self) -> tuple[float, float]:
+        return 2.0 * self.along_m[1], 2.0 * self.along_m[1]
+
+    def points(
+        self, arc_m: NDArray[np.float64], along_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        on_band = (along_m >= self.band_m[0]) & (along_m < self.band_m[1])
+        side = -1.0 if self.shape.is_concave else 1.0
+        radii_m = self.radius_m + side * self.height_m * on_band
+        angles, turns = arc_m / self.radius_m, along_m / self.radius_m
+        level = np.sin(turns)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+        outwards = np.column_stack([level, np.cos(turns)])
+        return self.shape.centre_world + radii_m[:, None] * outwards
+
+    def places(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        x, y, z = (points - self.shape.centre_world).T
+        return self.radius_m * np.column_stack([np.arctan2(y, x), np.arctan2(np.hypot(x, y), z)])
+
+    def texture(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        angles, along_m = places_m[:, 0] / self.radius_m, places_m[:, 1]
+        return texture(along_m[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
+
+    def met(self, start: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        relative, side = start - self.shape.centre_world, -1.0 if self.shape.is_concave else 1.0
+        top_m = self.radius_m + side * self.height_m
+        # Coefficients of squares of the height and of the distance from the centre, and their sum.
+        lines: list[tuple[float, float, float, bool | None]] = [
+            (0.0, 1.0, self.radius_m**2, False),
+            (0.0, 1.0, top_m**2, True),
+        ]
+        cosines = [math.cos(edge_m / self.radius_m) for edge_m in self.band_m if self.height_m]
+        lines += [(1.0, -(cosine**2), 0.0, None) for cosine in cosines]
+        best = np.full(len(rays), np.inf)
+        for of_height, of_square, total, is_band in lines:
+            one, other = (
+                of_height * part[:, 2:] * UP + of_square * part for part in (rays, relative)
+            )
+            a, b = (one * rays).sum(axis=1), (one * relative).sum(axis=1)
+            c = (other * relative).sum(axis=1) - total
+            for sign in (-1.0, 1.0):
+                with np.errstate(invalid="ignore"):
+                    t = (-b + sign * np.sqrt(b * b - a * c)) / a
+                points = start + t[:, None] * rays
+                along_m = self.places(points)[:, 1]
+                good = (t > 1e-6) & (along_m <= self.along_m[1])
+                on_band = (along_m >= self.band_m[0]) & (along_m < self.band_m[1])
+                if is_band is None:
+                    depths = self.shape.distances_m(points)
+                    good &= np.abs(along_m[:, None] - self.band_m).min(axis=1) < 1e-6
+                    good &= (depths > 0.0) & (depths < self.height_m)
+                elif self.height_m:
+                    good &= on_band == is_band
+                best = np.where(good & (t < best), t, best)
+        return best
+
+
 def texture(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Grey values 0..1 (n,), with detail of 2 to 40 cm that occurs nowhere twice."""
     rng = np.random.default_rng(23)
@@ -246,6 +325,17 @@ def spire(*, half_deg: float = 150.0, is_concave: bool = False, **band: object) 
     )
 
 
+def dome(*, most_deg: float = 80.0, is_concave: bool = True, **band: object) -> Ball:
+    """A dome of 1 m radius, seen from below or from above."""
+    sphere = Sphere(centre_world=np.array([10.0, 20.0, 3.0]), radius_m=1.0, is_concave=is_concave)
+    return Ball(
+        shape=sphere,
+        arc_rad=(-math.pi, math.pi),
+        along_m=(0.0, math.radians(most_deg)),
+        **band,  # type: ignore[arg-type]
+    )
+
+
 def camera(
     drum: Drum,
     arc_deg: float,
@@ -260,7 +350,7 @@ def camera(
     target = drum.points(arc_m, np.array([along_m + aim_m]))[0]
     foot = drum.points(arc_m, np.array([along_m]))
     centre = foot[0] + away_m * drum.shape.normals(foot)[0]
-    axis = drum.shape.axis_world
+    axis = drum.axis_world
     up = (
         np.sign(axis @ UP) * axis
         if abs(axis @ UP) > 0.7

@@ -18,7 +18,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.images import encode_jpeg, encode_png
 from orthoflow.files.sidecars import OrthoFile, chart_json, numbers, write_bytes
-from orthoflow.geometry import Bend, WallFrame
+from orthoflow.geometry import Bend, SphereBend, WallFrame
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import JsonValue
 from orthoflow.untrusted_text import json_bytes
@@ -237,7 +237,7 @@ def _columns(matrix: NDArray[np.float64]) -> JsonValue:
 # Number of nodes along a wall's longer side: at most about 500,000 triangles, which phones can
 # display.
 LONGEST_NODES: Final = 512
-# Arc of a flat strip of a cylinder; its middle is off by 0.03 % of the radius.
+# Arc of a flat facet of a curved wall; its middle is off by 0.03 % of the radius.
 _STRIP_RAD: Final = math.radians(2.9)
 
 
@@ -257,7 +257,7 @@ class WallMesh:
 
 
 def flat_mesh(frame: WallFrame) -> WallMesh:
-    """Return the rectangle of a wall, or strips along the arcs of a curved one."""
+    """Return the rectangle of a wall, or flat facets of a curved one."""
     if frame.bend is not None:
         return _strips(frame, frame.bend)
     places = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], dtype=np.float32)
@@ -272,12 +272,21 @@ def _strips(frame: WallFrame, bend: Bend) -> WallMesh:
     size_m = frame.size_m
     count = max(2, math.ceil(bend.turn_rad(size_m) / _STRIP_RAD)) + 1
     ribs = bend.ribs_m(size_m, count) / size_m
-    start, end = np.arange(len(ribs) - 1), np.arange(len(ribs) - 1) + len(ribs)
+    n_facets = 1
+    if isinstance(bend, SphereBend):
+        n_facets = math.ceil(bend.most_m / bend.radius_m / _STRIP_RAD)
+    shares = np.linspace(0.0, 1.0, n_facets + 1)[:, None, None]
+    nodes = (1.0 - shares) * ribs[:, 0] + shares * ribs[:, 1]
+    start = np.arange(nodes.shape[0] * nodes.shape[1]).reshape(nodes.shape[:2])[:-1, :-1].ravel()
+    end = start + len(ribs)
     corners = [start, end, end + 1, start + 1]
     if np.linalg.det([bend.revolution.along, bend.revolution.aside]) > 0.0:
         corners.reverse()
     triangles = np.concatenate([np.stack([corners[k] for k in (0, i, i + 1)], 1) for i in (1, 2)])
-    places = np.ascontiguousarray(np.vstack([ribs[:, 0], ribs[:, 1]]), dtype=np.float32)
+    places = np.ascontiguousarray(nodes.reshape(-1, 2), dtype=np.float32)
+    # Facets at a pole or apex have one triangle; the area of the other one is 0.
+    first, second, third = places[triangles.T]
+    triangles = triangles[np.abs(np.linalg.det(np.stack([second - first, third - first], 1))) > 0.0]
     return WallMesh(
         vertices=_lifted(frame, places, np.zeros(len(places))),
         places=places,

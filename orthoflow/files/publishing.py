@@ -44,7 +44,7 @@ from orthoflow.files.sidecars import (
     write_json,
     write_text,
 )
-from orthoflow.geometry import Cylinder, WallFrame, omega_phi_deg
+from orthoflow.geometry import Cylinder, Sphere, WallFrame, omega_phi_deg
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.cameras import opencv_matrix, to_opencv
 from orthoflow.geometry.levels import eight_bits
@@ -131,13 +131,15 @@ def publish_surfaces(product: Surfaces, folder: Path, digest: str) -> None:
     for surface in product.surfaces:
         shape = surface.shape
         entry: dict[str, JsonValue] = {
-            "chart": "cylinder" if isinstance(shape, Cylinder) else "cone",
+            "chart": type(shape).__name__.lower(),
             "label": surface.name,
-            "axis": numbers(shape.axis_world),
+            "axis": numbers(surface.axis_world),
             "is_concave": shape.is_concave,
         }
         if isinstance(shape, Cylinder):
             entry |= {"point": numbers(shape.point_world), "radius_m": shape.radius_m}
+        elif isinstance(shape, Sphere):
+            entry |= {"centre": numbers(shape.centre_world), "radius_m": shape.radius_m}
         else:
             half_angle_deg = math.degrees(shape.half_angle_rad)
             entry |= {"apex": numbers(shape.apex_world), "half_angle_deg": half_angle_deg}
@@ -152,7 +154,7 @@ def publish_surfaces(product: Surfaces, folder: Path, digest: str) -> None:
                 "along_from_m": surface.along_m[0],
                 "n_points": surface.n_points,
                 "rms_mm": 1000.0 * surface.rms_m,
-                "sigma_axis_deg": surface.sigma_axis_deg,
+                "sigma_axis_deg": number(surface.sigma_axis_deg),
                 "sigma_radius_mm": 1000.0 * surface.sigma_radius_m,
             }
         )

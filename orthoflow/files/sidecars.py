@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.geotiff import GridPlace, RasterParts, local_crs_name
 from orthoflow.files.wall_descriptions import ORTHO_FILE, WallDescription, described
-from orthoflow.geometry import Bend, ConeBend, CylinderBend, WallFrame
+from orthoflow.geometry import Bend, ConeBend, CylinderBend, SphereBend, WallFrame
 from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
@@ -76,6 +76,16 @@ _FROM_CONE: Final = (
     "s = sqrt(x^2 + y^2), t = (atan2(y, x) - zero_in_raster) / sin(h), with the difference between "
     "-180 and 180 deg, h = half_angle and d = {sign}depth_m"
 )
+_FROM_SPHERE: Final = (
+    "centre + (radius_m + d) * (sin(t) * (x * zero_direction + y * quarter_direction) / s + cos(t) "
+    "* pole_direction) with (x, y) = gsd_m * (column, row) - pole_in_raster_m, s = sqrt(x^2 + y^2),"
+    " t = s / radius_m in radians and d = {sign}depth_m"
+)
+_DISTORTION: Final = (
+    "a sphere cannot be unrolled: lengths along the meridians through the pole are to scale; "
+    "lengths across them, and areas, are t / sin(t) times those on the sphere, with the angle t "
+    "from the pole; largest_stretch is the value at the edge"
+)
 
 
 def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
@@ -92,6 +102,8 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         geotiff = geotiff.replace("in the plane", "on the unrolled surface")
     if isinstance(frame.bend, ConeBend):
         geotiff = "X and Y: metres on the unrolled cone from its apex, to the right and up"
+    if isinstance(frame.bend, SphereBend):
+        geotiff = "X and Y: metres on the developed sphere from its pole, to the right and up"
     return placed | {
         "origin_world": numbers(frame.origin_world),
         "u_world": numbers(frame.u_world),
@@ -119,8 +131,8 @@ def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
     """Return the shape of a raster's surface; if it is curved, also its axis and dimensions.
 
     The zero direction points from the axis to the edge of the raster, left or top, where the arc
-    begins, and on a cone to the middle of the arc. The frame's vectors u, v and normal are those at
-    its top-left corner.
+    begins, on a cone to the middle of the arc, and on a sphere to the right of the pole. The
+    frame's vectors u, v and normal are those at its top-left corner.
     """
     if (bend := frame.bend) is None:
         return {"chart": "plane"}
@@ -140,6 +152,23 @@ def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
             "slants_m": list(bend.slants_m),
             "sector_deg": math.degrees(2.0 * bend.half_sector_rad),
         }
+    if isinstance(bend, SphereBend):
+        own, local = bend.revolution, frame.axes_world
+        zero, quarter, inwards = own.axes @ local
+        return {
+            "chart": "sphere",
+            "centre": numbers(frame.origin_world + own.start @ local),
+            "radius_m": bend.radius_m,
+            "pole_direction": numbers(-inwards),
+            "zero_direction": numbers(zero),
+            "quarter_direction": numbers(quarter),
+            "concave": bend.is_inside,
+            "pole_in_raster_m": list(bend.pole_m),
+            "extent_m": bend.most_m,
+            "projection": "azimuthal equidistant",
+            "largest_stretch": bend.largest_stretch,
+            "distortion": _DISTORTION,
+        }
     along_u, zero = bend.along == "u", frame.normal_world * math.copysign(1.0, -bend.radius_m)
     return {
         "chart": "cylinder",
@@ -156,7 +185,8 @@ def _world_from_raster(bend: Bend | None) -> str:
     if bend is None:
         return _FROM_PLANE
     if not isinstance(bend, CylinderBend):
-        return _FROM_CONE.format(sign="-" if bend.is_concave else "")
+        formula = _FROM_SPHERE if bend.revolution.is_sphere else _FROM_CONE
+        return formula.format(sign="-" if bend.is_concave else "")
     bent, straight = ("column", "row") if bend.along == "u" else ("row", "column")
     tangent, axis = ("u_world", "v_world") if bend.along == "u" else ("v_world", "u_world")
     return _FROM_CYLINDER.format(
@@ -168,12 +198,14 @@ def _world_from_raster(bend: Bend | None) -> str:
     )
 
 
-def _bend_of(content: Mapping[str, object], name: str) -> CylinderBend | ConeBend | None:
+def _bend_of(
+    content: Mapping[str, object], name: str
+) -> CylinderBend | ConeBend | SphereBend | None:
     """Return the curvature given in a sidecar; None for a plane.
 
     Raises:
         InputError: the shape of the surface is unknown or incomplete.
-        GeometryError: the dimensions of a cone are impossible.
+        GeometryError: the dimensions of a cone or sphere are impossible.
     """
     chart = content.get("chart", "plane")
     if chart == "plane":
@@ -194,8 +226,20 @@ def _bend_of(content: Mapping[str, object], name: str) -> CylinderBend | ConeBen
             slants_m=(float(slants_m[0]), float(slants_m[1])),
             half_sector_rad=0.5 * sector_rad,
         )
+    if chart == "sphere":
+        pole_m = _vector(content.get("pole_in_raster_m"))
+        if pole_m.shape != (2,):
+            raise InputError(f"{name}: a sphere needs pole_in_raster_m, 2 numbers")
+        return SphereBend(
+            pole_m=(float(pole_m[0]), float(pole_m[1])),
+            radius_m=_number(content.get("radius_m")),
+            is_inside=content.get("concave") is True,
+            most_m=_number(content.get("extent_m")),
+        )
     if chart != "cylinder":
-        raise InputError(f"{name}: chart must be plane, cylinder or cone, got {shown_value(chart)}")
+        raise InputError(
+            f"{name}: chart must be plane, cylinder, cone or sphere, got {shown_value(chart)}"
+        )
     along, radius_m = content.get("arc_along"), _number(content.get("radius_m"))
     if along not in ("u", "v") or not radius_m > 0.0:
         raise InputError(

@@ -1,6 +1,6 @@
 """Geometry of planes, cameras, rasters and simulated scenes: pure array arithmetic."""
 
-from orthoflow.geometry.bends import Bend, ConeBend, CylinderBend
+from orthoflow.geometry.bends import Bend, ConeBend, CylinderBend, SphereBend
 from orthoflow.geometry.frames import (
     Plane,
     UpDirection,
@@ -14,15 +14,18 @@ from orthoflow.geometry.frames import (
     wall_axes,
 )
 from orthoflow.geometry.levels import eight_bits
-from orthoflow.geometry.surfaces import Cone, Cylinder
+from orthoflow.geometry.surfaces import Cone, CurvedShape, Cylinder, Sphere
 
 __all__ = [
     "Bend",
     "Cone",
     "ConeBend",
+    "CurvedShape",
     "Cylinder",
     "CylinderBend",
     "Plane",
+    "Sphere",
+    "SphereBend",
     "UpDirection",
     "WallFrame",
     "angle_between_deg",

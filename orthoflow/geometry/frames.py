@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.bends import ConeBend, CylinderBend
+from orthoflow.geometry.bends import ConeBend, CylinderBend, SphereBend
 
 UpDirection = Literal["z", "x", "-x", "y", "-y", "-z"]
 
@@ -208,7 +208,7 @@ class WallFrame:
         name: name of the wall, used in the name of the raster's coordinate system.
         left_m: distance along the wall from its left edge to the left edge of this raster, if the
             raster shows only part of the wall.
-        bend: curvature of a raster on a cylinder or cone; None for a raster on a plane.
+        bend: curvature of a raster on a cylinder, cone or sphere; None for a raster on a plane.
     """
 
     origin_world: NDArray[np.float64]
@@ -222,7 +222,7 @@ class WallFrame:
     up: tuple[float, float, float] | None = None
     name: str = ""
     left_m: float = 0.0
-    bend: CylinderBend | ConeBend | None = None
+    bend: CylinderBend | ConeBend | SphereBend | None = None
 
     def __post_init__(self) -> None:
         if not (self.gsd_m > 0.0 and self.width > 0 and self.height > 0):
@@ -272,12 +272,15 @@ class WallFrame:
         increases with the row number, so that the ceiling can be superimposed on the floor. For
         sloping planes, and if up is unknown, X and Y are distances from the top-left corner.
         Cylinders with a vertical axis are treated as walls, with the heights of the axis; other
-        cylinders are treated as sloping planes. On cones, X and Y are distances from the apex.
+        cylinders are treated as sloping planes. On cones and spheres, X and Y are distances from
+        the apex or pole.
         """
         if self.map_crs is not None:
             return "map"
         bend = self.bend
-        if self.up is None or isinstance(bend, ConeBend) or (bend and bend.along == "v"):
+        if self.up is None or (
+            bend is not None and not (isinstance(bend, CylinderBend) and bend.along == "u")
+        ):
             return "plane"
         if -float(self.v_world @ self.up) >= _LEAST_COSINE:
             return "wall"
@@ -293,8 +296,9 @@ class WallFrame:
         axes = self.raster_axes
         if axes == "map":
             return float(self.origin_world[0]), float(self.origin_world[1])
-        if isinstance(self.bend, ConeBend):
-            return -self.bend.apex_m[0], self.bend.apex_m[1]
+        if self.bend is not None and self.bend.revolution.fan > 0.0:
+            right_m, down_m = self.bend.revolution.place_m.tolist()
+            return -right_m, down_m
         if axes == "plane" or self.up is None:
             return 0.0, 0.0
         # If a tower leans, the height varies along a row of cells; the height of the axis does not.
@@ -329,10 +333,10 @@ class WallFrame:
         zero, axes = self.world_from_wall(at)[0], self.axes_at(at)[0, :2]
         # The position is rounded to millimetres, the axes to 1e-6.
         place = [*np.round(1e3 * zero), *np.round(1e6 * axes.ravel())]
-        if isinstance(self.bend, CylinderBend):
-            place.append(np.round(1e3 * self.bend.radius_m))
-        elif self.bend is not None:
+        if isinstance(self.bend, ConeBend):
             place.append(np.round(1e6 * self.bend.half_angle_rad))
+        elif self.bend is not None:
+            place.append(np.round(1e3 * self.bend.radius_m))
         digest = hashlib.sha256(",".join(f"{value:.0f}" for value in place).encode()).hexdigest()
         return f"{self.name or 'plane'} {digest[:8]}"
 
@@ -443,6 +447,10 @@ class WallFrame:
         """Return the closed outline (n, 3) of the surface, with points along its arcs."""
         if self.bend is None:
             return self.corners_world()[[0, 1, 2, 3, 0]]
+        if isinstance(self.bend, SphereBend):
+            # The whole turn about the pole has no edges along meridians.
+            rim = self.bend.ribs_m(self.size_m, 2 * n_sides)[:, 1] / self.gsd_m
+            return self.world_from_wall(rim)
         ribs = self.bend.ribs_m(self.size_m, n_sides) / self.gsd_m
         shares = np.linspace(0.0, 1.0, n_sides)[:, None]
         first, last = (rib[0] + shares * (rib[1] - rib[0]) for rib in (ribs[0], ribs[-1]))

@@ -268,7 +268,11 @@ def paint_points(
             for axis in range(3):
                 towards += (points[axis, i] - frames[index, axis]) * bends[index, 1 + axis]
             a, b = _unrolled(bends[index, 0], bends[index, 4], a, b, towards)
-            if bends[index, 4] != 0.0:
+            if math.isinf(bends[index, 4]):
+                # Around the pole, meridians are not parallel either.
+                turn = a * abs(bends[index, 0])
+                a, b = b * math.cos(turn), b * math.sin(turn)
+            elif bends[index, 4] != 0.0:
                 # On a plane, lines that meet in the apex are not parallel.
                 apart, turn = 1.0 / bends[index, 4], bends[index, 4] * a
                 a, b = (apart + b) * math.sin(turn), (apart + b) * math.cos(turn) - apart
@@ -293,6 +297,9 @@ def _unrolled(curvature: float, taper: float, x: float, y: float, z: float) -> t
     Returns:
         The position; b is minus infinity if the point is on the mirror image of a cone.
     """
+    if math.isinf(taper):
+        turn, across = abs(curvature), math.sqrt(x * x + y * y)
+        return math.atan2(y, x) / turn, math.atan2(turn * across, 1.0 - curvature * z) / turn
     square = curvature * curvature + taper * taper
     turn = math.sqrt(square)
     axial = 1.0 + taper * y - curvature * z
@@ -363,7 +370,7 @@ def _contains(
 def _bent_distance(
     r: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
-    """Like `_hit_distance`, but for a rectangle that is bent to a part of a cylinder or cone."""
+    """Like `_hit_distance`, but for a part of a cylinder, cone or sphere."""
     bend, taper = r[index, 18], r[index, 19]
     x, y, z = ray.x - r[index, 0], ray.y - r[index, 1], ray.z - r[index, 2]
     along = x * r[index, 3] + y * r[index, 4] + z * r[index, 5]
@@ -373,14 +380,17 @@ def _bent_distance(
     d_b = ray.dx * r[index, 6] + ray.dy * r[index, 7] + ray.dz * r[index, 8]
     d_towards = ray.dx * r[index, 9] + ray.dy * r[index, 10] + ray.dz * r[index, 11]
     # The equation of a circle is along^2 + towards^2 - 2 towards / bend = 0. That of a cone also
-    # has the terms -(ratio towards)^2 - 2 ratio b towards.
-    ratio = taper / bend
+    # has the terms -(ratio towards)^2 - 2 ratio b towards, and that of a sphere b^2.
+    is_round = math.isinf(taper)
+    ratio = 0.0 if is_round else taper / bend
     square = d_along * d_along + d_towards * d_towards
     square -= ratio * d_towards * (ratio * d_towards + 2.0 * d_b)
     half = along * d_along + (towards - 1.0 / bend) * d_towards
     half -= ratio * (ratio * towards * d_towards + towards * d_b + b * d_towards)
     start = along * along + towards * (towards - 2.0 / bend)
     start -= ratio * towards * (ratio * towards + 2.0 * b)
+    if is_round:
+        square, half, start = square + d_b * d_b, half + b * d_b, start + b * b
     root = half * half - square * start
     if abs(square) < 1e-24 or root < 0.0:
         return math.inf
@@ -683,8 +693,13 @@ class _BoxTree:
 
 def _enclosing_ring(scene: Scene, index: int) -> NDArray[np.float64]:
     """Return points (n, 3) whose bounding box contains a bent rectangle: corners of prisms."""
-    taper = float(scene.tapers_per_m[index])
-    turn = math.hypot(float(scene.curvatures_per_m[index]), taper)
+    taper, curvature = float(scene.tapers_per_m[index]), float(scene.curvatures_per_m[index])
+    if math.isinf(taper):
+        # The corners of a cube around the whole sphere.
+        middle = scene.centre[index] + scene.normal[index] / curvature
+        cube = np.stack(np.meshgrid(*3 * [[-1.0, 1.0]]), axis=-1).reshape(-1, 3)
+        return np.asarray(middle + cube / abs(curvature))
+    turn = math.hypot(curvature, taper)
     a = np.linspace(scene.extent[index, 0], scene.extent[index, 1], _RING_POINTS)
     # Between two adjacent points, the arc is inside the box around these points and their copies
     # shifted by the sagitta along each axis.

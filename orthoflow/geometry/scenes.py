@@ -1,7 +1,7 @@
 """Simulated scenes that consist of textured rectangles.
 
-Rectangles can be bent to parts of cylinders and cones, so that vaults, towers and spires consist of
-few rectangles.
+Rectangles can be bent to parts of cylinders, cones and spheres, so that vaults, towers, spires and
+domes consist of few rectangles.
 
 Random numbers are functions of a lattice cell, a seed and an index (`draw`), so they do not depend
 on the order of computation or the number of threads. The formulas are those of `scene_rays`,
@@ -83,7 +83,10 @@ class Scene:
         taper_per_m: (r,) float64, in 1 / metre, of rectangles that are bent to parts of cones.
             Lines along `axis_b` meet at b = -1 / taper. Along them, b is a length, and a is an arc
             length at b = 0, which is 1 + b taper times as long at b. The taper is 0 for cylinders
-            and flat rectangles. None if no rectangle is part of a cone.
+            and flat rectangles, and infinite for parts of spheres, whose meridians meet at b = 0:
+            there, b is the length along a meridian, and a the angle about the normal, from
+            `axis_a` to `axis_b`, divided by the curvature's absolute value. None if no rectangle
+            is part of a cone or sphere.
     """
 
     origin: NDArray[np.float64]
@@ -146,12 +149,19 @@ class Scene:
     ) -> NDArray[np.float64]:
         """Return the points (n, 3) at (a, b) of rectangles (n,), in metres from `origin`."""
         bent, taper = self.curvatures_per_m[rectangle], self.tapers_per_m[rectangle]
+        is_round = np.isinf(taper)
+        taper = np.where(is_round, 0.0, taper)
         turn = np.where(bent == 0.0, 1.0, np.hypot(bent, taper))
         radius = (1.0 + taper * b) / turn
         along = np.where(bent == 0.0, a, radius * np.sin(a * turn))
         lifted = np.where(bent == 0.0, 0.0, radius * (1.0 - np.cos(a * turn)))
+        upwards = b - lifted * taper / turn
+        across = radius * np.sin(b * turn)
+        along = np.where(is_round, across * np.cos(a * turn), along)
+        upwards = np.where(is_round, across * np.sin(a * turn), upwards)
+        lifted = np.where(is_round, radius * (1.0 - np.cos(b * turn)), lifted)
         points = self.centre[rectangle]
-        points += (b - lifted * taper / turn)[:, None] * self.axis_b[rectangle]
+        points += upwards[:, None] * self.axis_b[rectangle]
         points += along[:, None] * self.axis_a[rectangle]
         return points + (lifted * bent / turn)[:, None] * self.normal[rectangle]
 
@@ -173,11 +183,14 @@ class Scene:
                 for axes in (self.axis_a, self.axis_b, self.normal)
             )
             bends, tapers = bent[chosen], self.tapers_per_m[own]
+            is_round = np.isinf(tapers)
+            tapers = np.where(is_round, 0.0, tapers)
             # The width is that of the cone at the foot of a point, relative to b = 0.
             squares = bends**2 + tapers**2
             axial = 1.0 + tapers * y - bends * z
             reach = tapers * (np.sqrt(squares * x * x + axial**2) - 1.0 + bends * z)
             b = np.where(tapers == 0.0, y, (reach + bends**2 * y) / squares)
+            b = np.where(is_round, 0.0, b)
             offset -= b[:, None] * self.axis_b[own]
             normals[chosen] -= (bends / (1.0 + tapers * b))[:, None] * offset
         return normals

@@ -1,15 +1,20 @@
-"""Curved surfaces in the world: circular cylinders and cones, seen from inside or outside."""
+"""Curved surfaces in the world: cylinders, cones and spheres, seen from inside or outside."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.frames import basis_from_up
+
+# The middle of a dome of which windows or a part are missing is within this angle of the zenith.
+_ZENITH_COSINE: Final = math.cos(math.radians(20.0))
+_SHORTEST_MEAN: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,10 +95,47 @@ class Cone:
         return np.asarray(-outwards if self.is_concave else outwards)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Sphere:
+    """A sphere.
+
+    Attributes:
+        centre_world: (3,) float64 metres.
+        radius_m: radius in metres.
+        is_concave: whether the sphere is seen from inside, like a dome from below.
+    """
+
+    centre_world: NDArray[np.float64]
+    radius_m: float
+    is_concave: bool
+
+    def __post_init__(self) -> None:
+        if self.centre_world.shape != (3,) or not np.isfinite(self.centre_world).all():
+            raise GeometryError(f"a sphere needs a finite centre (3,), got {self.centre_world!r}")
+        if not 0.0 < self.radius_m < math.inf:
+            raise GeometryError(f"a sphere needs a positive radius, got {self.radius_m}")
+
+    def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return signed distances (n,) of points (n, 3) in metres, positive towards the viewer."""
+        outwards = np.linalg.norm(points_world - self.centre_world, axis=1) - self.radius_m
+        return np.asarray(-outwards if self.is_concave else outwards)
+
+    def normals(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return unit normals (n, 3), towards the viewer, at the places nearest to points."""
+        outwards = points_world - self.centre_world
+        outwards = outwards / np.linalg.norm(outwards, axis=1, keepdims=True)
+        return np.asarray(-outwards if self.is_concave else outwards)
+
+
+CurvedShape: TypeAlias = Cylinder | Cone | Sphere
+
+
 def transformed(
-    shape: Cylinder | Cone, rotation: NDArray[np.float64], shift_m: NDArray[np.float64]
-) -> Cylinder | Cone:
+    shape: CurvedShape, rotation: NDArray[np.float64], shift_m: NDArray[np.float64]
+) -> CurvedShape:
     """Return a surface after a rotation (3, 3) about the origin and then a translation (3,)."""
+    if isinstance(shape, Sphere):
+        return replace(shape, centre_world=rotation @ shape.centre_world + shift_m)
     axis = rotation @ shape.axis_world
     if isinstance(shape, Cylinder):
         return replace(shape, point_world=rotation @ shape.point_world + shift_m, axis_world=axis)
@@ -132,6 +174,20 @@ def zero_direction(axis_world: NDArray[np.float64], up: NDArray[np.float64]) -> 
     start = basis_from_up(up)[0] if is_steep else up
     perpendicular = start - (start @ axis_world) * axis_world
     return np.asarray(perpendicular / np.linalg.norm(perpendicular))
+
+
+def middle_direction(
+    directions: NDArray[np.float64], up: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the mean (3,) of unit vectors (n, 3), or `up` if it is within 20 degrees of it.
+
+    The mean of a whole sphere has no direction, and is also replaced by `up`.
+    """
+    mean = directions.mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    if float(mean @ up) >= _ZENITH_COSINE * length or length < _SHORTEST_MEAN:
+        return up
+    return np.asarray(mean / length)
 
 
 def angles_around(

@@ -11,27 +11,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
-from orthoflow.geometry.surfaces import Cone, Cylinder
+from orthoflow.geometry.surfaces import Cone, CurvedShape, Cylinder, Sphere
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
 # Kind of a surface, which is the first part of its name.
-SurfaceKind = Literal["vault", "apse", "tower", "column", "cylinder", "cone"]
+SurfaceKind = Literal["vault", "apse", "tower", "column", "cylinder", "cone", "dome", "sphere"]
 
 _VERTICAL_DEG: Final = 20.0
 _COLUMN_MOST_M: Final = 0.75
 _FULL_TURN: Final = 2.0 * math.pi
 
 
-def surface_kind(shape: Cylinder | Cone, up: NDArray[np.float64]) -> SurfaceKind:
+def surface_kind(
+    shape: CurvedShape, up: NDArray[np.float64], zero_world: NDArray[np.float64]
+) -> SurfaceKind:
     """Return the kind of a surface by the direction of its axis, its side and its radius.
 
+    A sphere is a dome if its middle is in the direction of `up` (see `Surface.zero_world`).
     A concave cylinder is an apse if its axis is within 20 degrees of vertical, and a vault if its
     axis is within 20 degrees of horizontal. A convex cylinder with a vertical axis is a column if
     its radius is at most 0.75 m, and otherwise a tower.
     """
     if isinstance(shape, Cone):
         return "cone"
+    if isinstance(shape, Sphere):
+        return "dome" if float(zero_world @ up) > 1.0 - 1e-9 else "sphere"
     incline_deg = math.degrees(math.asin(min(1.0, abs(float(shape.axis_world @ up)))))
     if incline_deg >= 90.0 - _VERTICAL_DEG:
         if shape.is_concave:
@@ -42,27 +47,30 @@ def surface_kind(shape: Cylinder | Cone, up: NDArray[np.float64]) -> SurfaceKind
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """A part of a cylinder or cone.
+    """A part of a cylinder, cone or sphere.
 
     Attributes:
         name: kind (`surface_kind`) and index of the surface, such as `vault 0` or `column 2`.
-        shape: the whole cylinder or cone. The point on a cylinder's axis is at the middle of the
-            surface's points. The axis of a cylinder points upwards if it is at most 45 degrees from
-            vertical, and otherwise towards e1 or e2 of `basis_from_up`, whichever is nearer.
+        shape: the whole cylinder, cone or sphere. The point on a cylinder's axis is at the middle
+            of the surface's points. The axis of a cylinder points upwards if it is at most 45
+            degrees from vertical, and otherwise towards e1 or e2 of `basis_from_up`, whichever is
+            nearer.
         covariance: (7, 7) float64 covariance of (point, axis, radius) or (apex, axis, half angle),
-            metres and radians.
+            metres and radians; for a sphere, of (centre, 0, 0, 0, radius).
         n_points: number of points on the surface.
         rms_m: root mean square distance of these points.
         zero_world: (3,) unit vector perpendicular to the axis, in the direction of angle 0 (see
-            `geometry.surfaces.zero_direction`).
+            `geometry.surfaces.zero_direction`). For a sphere, the direction from its centre to the
+            middle of its points (see `geometry.surfaces.middle_direction`).
         along_m: smallest and largest coordinate of the points along the axis, relative to the point
-            of the cylinder or the apex of the cone.
+            of the cylinder or the apex of the cone. On a sphere, arc lengths from the middle.
         arc_rad: smallest and largest angle of the points around the axis, counted from `zero_world`
-            by the right-hand rule; the range begins between -pi and pi and is at most one turn.
+            by the right-hand rule; the range begins between -pi and pi and is at most one turn. On
+            a sphere, the arc across its middle.
     """
 
     name: str
-    shape: Cylinder | Cone
+    shape: CurvedShape
     covariance: NDArray[np.float64]
     n_points: int
     rms_m: float
@@ -76,22 +84,31 @@ class Surface:
         return self.arc_rad[1] - self.arc_rad[0] >= _FULL_TURN - 1e-9
 
     @property
+    def axis_world(self) -> NDArray[np.float64]:
+        """Unit vector (3,) of the axis; on a sphere, from its centre to the middle."""
+        return self.zero_world if isinstance(self.shape, Sphere) else self.shape.axis_world
+
+    @property
     def middle_world(self) -> NDArray[np.float64]:
-        """Point (3,) of the axis at the middle of the surface."""
+        """Point (3,) of the axis at the middle of the surface; the centre of a sphere."""
         shape = self.shape
+        if isinstance(shape, Sphere):
+            return shape.centre_world
         start = shape.point_world if isinstance(shape, Cylinder) else shape.apex_world
         return start + 0.5 * (self.along_m[0] + self.along_m[1]) * shape.axis_world
 
     @property
     def radius_m(self) -> float:
-        """Radius of a cylinder; of a cone, at the middle of its points along the axis."""
-        if isinstance(self.shape, Cylinder):
+        """Radius of a cylinder or sphere; of a cone, at the middle of its points along the axis."""
+        if not isinstance(self.shape, Cone):
             return self.shape.radius_m
         return 0.5 * (self.along_m[0] + self.along_m[1]) * math.tan(self.shape.half_angle_rad)
 
     @property
     def sigma_axis_deg(self) -> float:
-        """Largest standard deviation of the axis direction."""
+        """Largest standard deviation of the axis direction; NaN for a sphere."""
+        if isinstance(self.shape, Sphere):
+            return math.nan
         largest = float(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1])
         return math.degrees(math.sqrt(max(0.0, largest)))
 
@@ -99,7 +116,7 @@ class Surface:
     def sigma_radius_m(self) -> float:
         """Standard deviation of the radius; for a cone, of its radius halfway along the points."""
         sigma = math.sqrt(max(0.0, float(self.covariance[6, 6])))
-        if isinstance(self.shape, Cylinder):
+        if not isinstance(self.shape, Cone):
             return sigma
         middle_m = 0.5 * (self.along_m[0] + self.along_m[1])
         return sigma * middle_m / math.cos(self.shape.half_angle_rad) ** 2
@@ -119,6 +136,7 @@ class Surfaces(Product):
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "point_world": Tolerance(limit=1e-4, unit="m"),
         "apex_world": Tolerance(limit=1e-3, unit="m"),
+        "centre_world": Tolerance(limit=1e-4, unit="m"),
         "axis_world": Tolerance(limit=1e-6, unit="1"),
         "zero_world": Tolerance(limit=1e-6, unit="1"),
         "covariance": Tolerance(limit=1e-6, unit="1"),
@@ -161,8 +179,9 @@ class Surfaces(Product):
         n_all = [len(other) for other in others.values() if isinstance(other, PointCloud)]
         for index, surface in enumerate(self.surfaces):
             start, end = surface.arc_rad
-            axis, zero = surface.shape.axis_world, surface.zero_world
-            is_perpendicular = abs(float(axis @ zero)) < 1e-9
+            axis, zero = surface.axis_world, surface.zero_world
+            is_sphere = isinstance(surface.shape, Sphere)
+            is_perpendicular = is_sphere or abs(float(axis @ zero)) < 1e-9
             variances = np.diagonal(surface.covariance)
             rules = {
                 "covariance must be finite, with variances of at least 0": bool(
@@ -171,7 +190,7 @@ class Surfaces(Product):
                 "zero_world must be a unit vector perpendicular to the axis": is_perpendicular
                 and abs(float(np.linalg.norm(zero)) - 1.0) < 1e-9,
                 "along_m must be an ascending range": surface.along_m[0] < surface.along_m[1],
-                "along_m of a cone must begin at its apex or beyond": isinstance(
+                "along_m of a cone or sphere must not begin before its apex or middle": isinstance(
                     surface.shape, Cylinder
                 )
                 or surface.along_m[0] >= 0.0,

@@ -36,6 +36,7 @@ _METHODS: Final = {
     "plane.given:GivenPlane": "a reference plane given by the user",
     "surface.cylinder:SurfaceCylinder": "vaults, apses, towers and columns, from pairs of normals",
     "surface.cone:SurfaceCone": "spires and tapering towers, by the same search",
+    "surface.sphere:SurfaceSphere": "domes and semi-domes, by the same search",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
     "match.sift:MatchSift": "match RootSIFT key points of photos with those of the walls, by "
     "mutual nearest neighbours and the ratio test",

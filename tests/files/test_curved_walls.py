@@ -21,7 +21,7 @@ from orthoflow.files.gltf import write_room
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.files.sidecars import OrthoFile, ortho_files
 from orthoflow.files.tiles.pyramid import PAGE, write_viewer
-from orthoflow.geometry import ConeBend, CylinderBend, WallFrame
+from orthoflow.geometry import ConeBend, CylinderBend, SphereBend, WallFrame
 from orthoflow.products import Orthoimages
 from orthoflow.report.pictures import Picture, cursor_places
 from tests import drawing_runs, samples
@@ -47,6 +47,11 @@ WALLS = {
             slants_m=(2.0, 4.0),
             half_sector_rad=math.pi * math.sin(0.2),
         ),
+    ),
+    "dome": replace(
+        FLAT,
+        height=100,
+        bend=SphereBend(pole_m=(2.5, 2.5), radius_m=1.6, is_inside=True, most_m=2.5),
     ),
 }
 
@@ -114,8 +119,13 @@ def test_drawings_unroll_and_place_walls(name: str, tmp_path: Path) -> None:
     assert any(
         len(ring) > 100 and np.abs(frame.wall_from_world(ring)[:, 2]).max() < 1e-6 for ring in rings
     )
-    unrolled = ("unrolled cylinder of radius 2.000 m", "unrolled cone with a half angle of 11.46°")
-    assert axes_of(frame).phrase.text().startswith(unrolled[name == "spire"])
+    unrolled = {
+        "spire": "unrolled cone with a half angle of 11.46°",
+        "dome": "development of a sphere of radius 1.600 m, which cannot be unrolled",
+    }
+    text = axes_of(frame).phrase.text()
+    assert text.startswith(unrolled.get(name, "unrolled cylinder of radius 2.000 m"))
+    assert name != "dome" or "up to 1.56 times" in text
     assert north_of(frame) is None
     assert key_plan(lines.planes, frame).arrow is None
     write_wall_geojson(tmp_path / "wall.geojson", wall, lines)

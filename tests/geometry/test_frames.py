@@ -18,8 +18,11 @@ from orthoflow.files.sidecars import frame_json, frame_of_raster
 from orthoflow.geometry import (
     Cone,
     ConeBend,
+    CurvedShape,
     Cylinder,
     CylinderBend,
+    Sphere,
+    SphereBend,
     basis_from_up,
     up_vector,
 )
@@ -88,14 +91,21 @@ BENDS: list[Any] = [
     CylinderBend(along="v", radius_m=-2.0),
     ConeBend(toward_rad=1.6, half_angle_rad=0.5, is_inside=False, **CONE),
     ConeBend(toward_rad=1.5, half_angle_rad=1.1, is_inside=True, **CONE),
+    SphereBend(pole_m=(2.0, -1.0), radius_m=3.0, is_inside=True, most_m=8.0),
+    SphereBend(pole_m=(0.0, 0.0), radius_m=4.0, is_inside=False, most_m=9.0),
 ]
+NAMES = ("inside", "outside", "vault", "above", "spire", "funnel", "dome", "ball")
 CURVED = [replace(turned(), gsd_m=0.1, width=60, height=50, bend=bend) for bend in BENDS]
 
 
-def shape_of(frame: WallFrame) -> Cylinder | Cone:
+def shape_of(frame: WallFrame) -> CurvedShape:
     """The surface of a frame, as its sidecar describes it."""
     chart: Any = frame_json(frame)
-    axis, is_concave = np.array(chart["axis"]), chart["concave"]
+    is_concave = chart["concave"]
+    if chart["chart"] == "sphere":
+        centre, radius_m = np.array(chart["centre"]), chart["radius_m"]
+        return Sphere(centre_world=centre, radius_m=radius_m, is_concave=is_concave)
+    axis = np.array(chart["axis"])
     axis /= np.linalg.norm(axis)
     if chart["chart"] == "cone":
         half = math.radians(chart["half_angle_deg"])
@@ -107,10 +117,9 @@ def shape_of(frame: WallFrame) -> Cylinder | Cone:
     )
 
 
-@pytest.mark.parametrize(
-    "frame", CURVED, ids=("inside", "outside", "vault", "above", "spire", "funnel")
-)
+@pytest.mark.parametrize("frame", CURVED, ids=NAMES)
 def test_curved_surfaces_are_unrolled_without_stretching(frame: WallFrame) -> None:
+    """A sphere is stretched across its meridians, by the angle from the pole over its sine."""
     random = np.random.default_rng(7)
     cells = random.uniform([0.0, 0.0], [frame.width, frame.height], (200, 2))
     depths_m = random.uniform(-0.15, 0.15, 200)
@@ -139,11 +148,19 @@ def test_curved_surfaces_are_unrolled_without_stretching(frame: WallFrame) -> No
     np.testing.assert_allclose(lengths_m, frame.metres_per_cell(cells, depths_m), atol=1e-9)
     # Between near positions on the surface, distances and angles are those on the raster.
     ends = cells[:, None] + 0.01 * np.array([[0.0, 0.0], [1.0, 0.0], [0.6, 0.8]])
+    stretches: dict[tuple[int, int], Any] = {(0, 1): 1.0, (0, 2): 1.0, (1, 2): 1.0}
+    if isinstance(frame.bend, SphereBend):
+        from_pole_m = 0.1 * cells - frame.bend.pole_m
+        away_m = np.linalg.norm(from_pole_m, axis=1)
+        along = from_pole_m / away_m[:, None]
+        ends = np.stack([cells, cells + 1e-3 * along[:, ::-1] * [-1, 1], cells + 1e-3 * along], 1)
+        angles = away_m / frame.bend.radius_m
+        stretches = {(0, 1): angles / np.sin(angles), (0, 2): 1.0}
     at = frame.world_from_wall(ends.reshape(-1, 2)).reshape(-1, 3, 3)
-    for first, second in ((0, 1), (0, 2), (1, 2)):
+    for (first, second), stretch in stretches.items():
         apart_m = np.linalg.norm(at[:, first] - at[:, second], axis=1)
-        on_raster = 0.1 * np.linalg.norm(ends[0, first] - ends[0, second])
-        np.testing.assert_allclose(apart_m, on_raster, rtol=1e-6)
+        on_raster = 0.1 * np.linalg.norm(ends[:, first] - ends[:, second], axis=1)
+        np.testing.assert_allclose(stretch * apart_m, on_raster, rtol=1e-5)
     # Rays from the viewer's side meet the positions on the surface that face them.
     start, places = points[0] + 0.3 * local[0, 2], frame.world_from_wall(cells)
     faces = np.einsum("ij,ij->i", start - places, local[:, 2]) > 0.05
@@ -152,9 +169,7 @@ def test_curved_surfaces_are_unrolled_without_stretching(frame: WallFrame) -> No
     np.testing.assert_allclose(met, places[faces], atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    "frame", CURVED, ids=("inside", "outside", "vault", "above", "spire", "funnel")
-)
+@pytest.mark.parametrize("frame", CURVED, ids=NAMES)
 def test_parts_of_a_curved_surface_have_its_cells(frame: WallFrame) -> None:
     part = frame.part((4.0, 7.0), width=11, height=20)
     cells = np.array([[0.0, 0.0], [3.0, 4.0], [11.0, 20.0]])

@@ -1,4 +1,4 @@
-"""Cylinders and cones: distances, normals and angles of points whose places are known."""
+"""Cylinders, cones and spheres: distances, normals and angles of points whose places are known."""
 
 from __future__ import annotations
 
@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.surfaces import Cone, Cylinder, angles_around, zero_direction
+from orthoflow.geometry.surfaces import (
+    Cone,
+    CurvedShape,
+    Cylinder,
+    Sphere,
+    angles_around,
+    zero_direction,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
@@ -16,16 +23,19 @@ PLACE = np.array([4e6, -2.0, 1.0])
 SHAPES = (
     Cylinder(point_world=PLACE, axis_world=AXIS, radius_m=3.0, is_concave=False),
     Cone(apex_world=PLACE, axis_world=AXIS, half_angle_rad=0.4, is_concave=False),
+    Sphere(centre_world=PLACE, radius_m=7.0, is_concave=False),
 )
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=("cylinder", "cone"))
+@pytest.mark.parametrize("shape", SHAPES, ids=("cylinder", "cone", "sphere"))
 @pytest.mark.parametrize("is_concave", [False, True])
-def test_points_along_a_normal_have_that_distance(shape: Cylinder | Cone, is_concave: bool) -> None:
+def test_points_along_a_normal_have_that_distance(shape: CurvedShape, is_concave: bool) -> None:
     """The places have angles around the axis that are also given back."""
     zero = zero_direction(AXIS, UP)
     angles, along = np.array([-3.0, -0.5, 0.0, 2.5]), np.array([3.0, 4.0, 5.0, 6.0])
     radius = 3.0 if isinstance(shape, Cylinder) else along * math.tan(0.4)
+    if isinstance(shape, Sphere):
+        radius = np.sqrt(49.0 - along**2)
     outwards = np.cos(angles)[:, None] * zero + np.sin(angles)[:, None] * np.cross(AXIS, zero)
     places = PLACE + along[:, None] * AXIS + np.reshape(radius, (-1, 1)) * outwards
     seen = type(shape)(**(vars(shape) | {"is_concave": is_concave}))
@@ -52,3 +62,5 @@ def test_impossible_shapes_are_refused(changed: dict[str, object]) -> None:
         Cylinder(**(vars(SHAPES[0]) | changed))
     with pytest.raises(GeometryError):
         Cone(apex_world=PLACE, axis_world=AXIS, half_angle_rad=1.6, is_concave=False)
+    with pytest.raises(GeometryError):
+        Sphere(centre_world=PLACE[:2], radius_m=1.0, is_concave=False)

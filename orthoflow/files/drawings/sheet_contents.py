@@ -21,7 +21,7 @@ from orthoflow.files.drawings.key_plans import KeyPlan, axis_words
 from orthoflow.files.drawings.pens import POINTS_PER_MM
 from orthoflow.files.drawings.words import Language, Phrase
 from orthoflow.files.images import decode_image
-from orthoflow.geometry import CylinderBend, WallFrame
+from orthoflow.geometry import CylinderBend, SphereBend, WallFrame
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.untrusted_text import open_file, reading, text_of_file
 
@@ -512,6 +512,12 @@ def axes_of(frame: WallFrame) -> Axes:
     if isinstance(frame.bend, CylinderBend):
         radius = f"{abs(frame.bend.radius_m):.3f}"
         phrase = Phrase(key="axes_unrolled", values={"radius": radius})
+    elif isinstance(frame.bend, SphereBend):
+        values = {
+            "radius": f"{frame.bend.radius_m:.3f}",
+            "stretch": f"{frame.bend.largest_stretch:.2f}",
+        }
+        phrase = Phrase(key="axes_developed_sphere", values=values)
     elif frame.bend is not None:
         angle = f"{math.degrees(frame.bend.half_angle_rad):.2f}"
         phrase = Phrase(key="axes_unrolled_cone", values={"angle": angle})

@@ -295,14 +295,16 @@
       const depth = known === null ? NaN : known / 1000;
       let [right, below, before] = [place.gsd * u, place.gsd * v, known === null ? 0 : depth];
       if (place.bend) {
-        // A cylinder or cone: the distance along a generatrix and the angle about the axis.
-        const { start, axes, place_m, along, aside, radius_m, sine, cosine, side } = place.bend;
+        // A curved wall: the distance along a generatrix and the angle about the axis.
+        const { start, axes, place_m, along, aside, radius_m, sine, cosine, side, fan, is_sphere } = place.bend;
         const [p, q] = [right - place_m[0], below - place_m[1]];
         const [straight, across] = [along, aside].map((way) => p * way[0] + q * way[1]);
-        const distance = sine ? Math.hypot(straight, across) : straight;
-        const angle = sine ? Math.atan2(across, straight) / sine : across / radius_m;
-        const radius = radius_m + sine * distance + side * cosine * before;
-        const about = [radius * Math.cos(angle), radius * Math.sin(angle), cosine * distance - side * sine * before];
+        const distance = fan ? Math.hypot(straight, across) : straight;
+        const angle = fan ? Math.atan2(across, straight) / fan : across / radius_m;
+        const outer = radius_m + side * before, turned = distance / radius_m;
+        const [radius, axial] = is_sphere ? [outer * Math.sin(turned), -outer * Math.cos(turned)]
+          : [radius_m + sine * distance + side * cosine * before, cosine * distance - side * sine * before];
+        const about = [radius * Math.cos(angle), radius * Math.sin(angle), axial];
         [right, below, before] = start.map((value, axis) => about.reduce((sum, part, k) => sum + part * axes[k][axis], value));
       }
       const world = [0, 1, 2].map((axis) => place.origin[axis]

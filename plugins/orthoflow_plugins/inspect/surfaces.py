@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from orthoflow.geometry import angle_between_deg
+from orthoflow.geometry import Sphere, angle_between_deg
 from orthoflow.geometry.surfaces import along_and_across
 from orthoflow.products import Finding, Inspection, Surface, Surfaces, Truth
 from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
@@ -20,10 +20,11 @@ _SAME_RADIUS_M: Final = 0.05
 
 
 class InspectSurfaces(Method):
-    """Compare curved surfaces with the cylinders of a simulated scene.
+    """Compare curved surfaces with those of a simulated scene.
 
-    A surface matches a true cylinder if their axes agree within 1 degree and 5 cm, and their radii
-    within 5 cm. The distance of the axes is measured at the middle of the detected surface.
+    A surface matches a true one of the same form if their axes agree within 1 degree and 5 cm, and
+    their radii within 5 cm. The distance of the axes is measured at the middle of the detected
+    surface; that of spheres is the distance of the centres.
     """
 
     id: ClassVar[str] = "inspect.surfaces"
@@ -111,10 +112,13 @@ class InspectSurfaces(Method):
 
 def _errors(found: Surface, true: Surface) -> tuple[float, float, float]:
     """Return errors of direction (degrees), position and radius (mm) of an axis."""
-    axis = true.shape.axis_world
-    angle_deg = angle_between_deg(found.shape.axis_world, axis)
+    axis = true.axis_world
+    angle_deg = angle_between_deg(found.axis_world, axis)
     middle = found.middle_world
     _, across = along_and_across(middle[None], true.middle_world, axis)
+    if isinstance(true.shape, Sphere):
+        # The axis of a sphere only states which part of it was found.
+        angle_deg, across = 0.0, middle - true.middle_world
     return (
         min(angle_deg, 180.0 - angle_deg),
         1000.0 * float(np.linalg.norm(across)),
@@ -124,5 +128,7 @@ def _errors(found: Surface, true: Surface) -> tuple[float, float, float]:
 
 def _is_same(found: Surface, true: Surface) -> bool:
     angle_deg, offset_mm, radius_mm = _errors(found, true)
+    if type(found.shape) is not type(true.shape):
+        return False
     is_near = max(offset_mm, radius_mm) <= 1000.0 * _SAME_RADIUS_M
     return angle_deg <= _SAME_ANGLE_DEG and is_near

@@ -1,4 +1,4 @@
-"""Compiled function that finds the cells of an unrolled cylinder or cone that a photo sees.
+"""Compiled function that finds the cells of a developed curved wall that a photo sees.
 
 In the axes of the surface, rays are straight lines, and depths are distances from the surface. A
 ray is followed over the relief in steps of at most one cell; the lengths of the steps change along
@@ -90,18 +90,16 @@ def look_at_curved_cells(
             x = (first_column + j + 0.5) * gsd_m - about.place_x
             y = (first_row + i + 0.5) * gsd_m - about.place_y
             along, aside = x * about.along_x + y * about.along_y, 0.0
-            if about.sine == 0.0:
+            if about.fan == 0.0:
                 k = j if is_along_u else i
                 towards_first, towards_second = directions[0, k], directions[1, k]
             else:
                 aside = x * about.aside_x + y * about.aside_y
-                angle = math.atan2(aside, along) / about.sine
+                angle = math.atan2(aside, along) / about.fan
                 along = math.sqrt(along * along + aside * aside)
                 towards_first, towards_second = math.cos(angle), math.sin(angle)
-            radius = about.radius_m + about.sine * along
-            from_axis = radius + about.side * about.cosine * depth
+            widened, from_axis, axial, sine, cosine = _profile_at(along, depth, about)
             first, second = from_axis * towards_first, from_axis * towards_second
-            axial = about.cosine * along - about.side * about.sine * depth
             u, v, distance = project_point(view.axial_camera, first, second, axial)
             visible.mask[i, j] = OUTSIDE
             if not (0.0 <= u < view.camera[21] and 0.0 <= v < view.camera[22]):
@@ -116,7 +114,7 @@ def look_at_curved_cells(
             )
             length = math.sqrt(ray.to_first**2 + ray.to_second**2 + ray.to_axial**2)
             outwards = towards_first * ray.to_first + towards_second * ray.to_second
-            cosine = about.side * (about.cosine * outwards - about.sine * ray.to_axial) / length
+            cosine = about.side * (cosine * outwards - sine * ray.to_axial) / length
             at_row = min(int(v / buffer.reduction), buffer.nearest.shape[0] - 1)
             at_column = min(int(u / buffer.reduction), buffer.nearest.shape[1] - 1)
             leaves = _reaches(ray, about, view.front_m)
@@ -127,17 +125,39 @@ def look_at_curved_cells(
                 continue
             width, height = view.camera[21], view.camera[22]
             inside = min(width - u, u, height - v, v) / view.border_px
-            area_here = area * from_axis / (radius * distance * distance)
+            area_here = area * widened / (distance * distance)
             visible.mask[i, j] = PAINTED
             visible.u[i, j], visible.v[i, j] = u, v
             visible.quality[i, j] = cosine * area_here * min(1.0, inside)
 
 
 @kernel_part
+def _profile_at(
+    along: float, depth: float, about: AxisView
+) -> tuple[float, float, float, float, float]:
+    """Return where a cell is, given its distance along a generatrix and its depth.
+
+    Returns:
+        Its area relative to that on the raster, its distance from the axis, its coordinate along
+        the axis, and sine and cosine of the angle between the axis and the generatrix.
+    """
+    if about.round != 0.0:
+        angle, from_centre = along / about.radius_m, about.radius_m + about.side * depth
+        sine, cosine = math.sin(angle), math.cos(angle)
+        widened = from_centre * from_centre / (about.radius_m * about.radius_m)
+        widened *= sine / angle if angle > 0.0 else 1.0
+        return widened, from_centre * sine, -from_centre * cosine, cosine, sine
+    radius = about.radius_m + about.sine * along
+    from_axis = radius + about.side * about.cosine * depth
+    axial = about.cosine * along - about.side * about.sine * depth
+    return from_axis / radius, from_axis, axial, about.sine, about.cosine
+
+
+@kernel_part
 def _directions(about: AxisView, gsd_m: float, first: int, n_cells: int) -> NDArray[np.float64]:
     """Return the cosines and sines (2, n) of the angles of rows or columns about a cylinder."""
     directions = np.zeros((2, n_cells))
-    if about.sine == 0.0:
+    if about.fan == 0.0:
         for k in range(n_cells):
             angle = (first + k + 0.5) * gsd_m / about.radius_m
             directions[0, k], directions[1, k] = math.cos(angle), math.sin(angle)
@@ -148,8 +168,9 @@ def _directions(about: AxisView, gsd_m: float, first: int, n_cells: int) -> NDAr
 def _depth_at(ray, share, about):  # type: ignore[no-untyped-def]  # numba infers the types
     """Return the depth of the ray at a share of its length."""
     first, second = ray.first + share * ray.to_first, ray.second + share * ray.to_second
-    outwards = math.sqrt(first * first + second * second) - about.radius_m
     axial = ray.axial + share * ray.to_axial
+    square = first * first + second * second + about.round * axial * axial
+    outwards = math.sqrt(square) - about.radius_m
     return about.side * (about.cosine * outwards - about.sine * axial)
 
 
@@ -159,18 +180,20 @@ def _position_at(ray: Ray, share: float, about: AxisView) -> tuple[float, float]
     first, second = ray.first + share * ray.to_first, ray.second + share * ray.to_second
     angle = math.atan2(second, first) - about.middle_rad
     angle = about.middle_rad + angle - math.tau * round(angle / math.tau)
-    outwards = math.sqrt(first * first + second * second) - about.radius_m
+    across = math.sqrt(first * first + second * second)
     axial = ray.axial + share * ray.to_axial
-    return about.sine * outwards + about.cosine * axial, angle
+    if about.round != 0.0:
+        return about.radius_m * math.atan2(across, -axial), angle
+    return about.sine * (across - about.radius_m) + about.cosine * axial, angle
 
 
 @kernel_part
 def _cell_at(distance: float, angle: float, about: AxisView, gsd_m: float) -> tuple[float, float]:
     """Return the row and column of a position on the surface; (0, 0) is the first centre."""
-    if about.sine == 0.0:
+    if about.fan == 0.0:
         along, aside = distance, about.radius_m * angle
     else:
-        turn = about.sine * angle
+        turn = about.fan * angle
         along, aside = distance * math.cos(turn), distance * math.sin(turn)
     x = about.place_x + along * about.along_x + aside * about.aside_x
     y = about.place_y + along * about.along_y + aside * about.aside_y
@@ -181,7 +204,8 @@ def _cell_at(distance: float, angle: float, about: AxisView, gsd_m: float) -> tu
 def _reaches(ray: Ray, about: AxisView, depth_m: float) -> float:
     """Return the share of a ray at which it first reaches a depth; 1 if it does not.
 
-    Positions of the same depth are on a cylinder or cone with the same axis and half angle.
+    Positions of the same depth are on a cylinder or cone with the same axis and half angle, or on a
+    sphere with the same centre.
     """
     share, c, least = _crossing(ray, about, depth_m, about.side)
     if share > 0.0:
@@ -210,6 +234,9 @@ def _crossing(
     a = square * (ray.to_first**2 + ray.to_second**2) - to_least**2
     b = square * (ray.first * ray.to_first + ray.second * ray.to_second) - least * to_least
     c = square * (ray.first**2 + ray.second**2) - least**2
+    a += about.round * ray.to_axial**2
+    b += about.round * ray.axial * ray.to_axial
+    c += about.round * ray.axial**2
     root = b * b - a * c
     if root < 0.0 or a == 0.0:
         return math.inf, c, least
@@ -228,6 +255,11 @@ def _inside_m(ray: Ray, about: AxisView) -> float:
     """
     if about.side < 0.0:
         return math.inf
+    if about.round != 0.0:
+        square = ray.first**2 + ray.second**2 + ray.axial**2
+        along = ray.first * ray.to_first + ray.second * ray.to_second + ray.axial * ray.to_axial
+        length_square = ray.to_first**2 + ray.to_second**2 + ray.to_axial**2
+        return math.sqrt(square) - math.sqrt(max(0.0, square - along * along / length_square))
     across = math.hypot(ray.to_first, ray.to_second)
     slope = about.sine * ray.to_axial
     if not abs(slope) < about.cosine * across:
@@ -276,13 +308,17 @@ def _is_covered(view: WallView, relief: Relief, ray: Ray, depth: float, distance
 def _cells_per_share(ray: Ray, share: float, about: AxisView, gsd_m: float) -> float:
     """Return the number of cells that a ray crosses per unit of its share."""
     first, second = ray.first + share * ray.to_first, ray.second + share * ray.to_second
-    square = first * first + second * second
+    square = max(first * first + second * second, 1e-12)
     turning = abs(first * ray.to_second - second * ray.to_first) / square
-    if about.sine == 0.0:
+    if about.fan == 0.0:
         return max(turning * about.radius_m, abs(ray.to_axial)) / gsd_m
-    away = math.sqrt(square)
-    distance = about.sine * away + about.cosine * (ray.axial + share * ray.to_axial)
+    away, axial = math.sqrt(square), ray.axial + share * ray.to_axial
     lifting = (first * ray.to_first + second * ray.to_second) / away
+    if about.round != 0.0:
+        tilting = (away * ray.to_axial - axial * lifting) / (square + axial * axial)
+        across = math.atan2(away, -axial) * turning
+        return about.radius_m * math.hypot(across, tilting) / gsd_m
+    distance = about.sine * away + about.cosine * axial
     lengthening = about.sine * lifting + about.cosine * ray.to_axial
     return math.hypot(about.sine * distance * turning, lengthening) / gsd_m
 
@@ -293,7 +329,7 @@ def _is_behind_the_wall(view: WallView, relief: Relief, ray: Ray) -> bool:
     about = view.about
     share, _, least = _crossing(ray, about, 0.0, 1.0)
     inwards = about.cosine**2 * (ray.first * ray.to_first + ray.second * ray.to_second)
-    inwards -= about.sine * least * ray.to_axial
+    inwards += about.round * ray.axial * ray.to_axial - about.sine * least * ray.to_axial
     if not (0.0 < share < 1.0 and inwards < 0.0):
         return False
     row, column = _cell_at(*_position_at(ray, share, about), about, view.gsd_m)
@@ -344,7 +380,7 @@ def _cells_along(
     end_row, end_column = _cell_at(far, angle, about, gsd_m)
     low_row, high_row = min(row, end_row), max(row, end_row)
     low_column, high_column = min(column, end_column), max(column, end_column)
-    if about.sine == 0.0:
+    if about.fan == 0.0:
         return low_row, high_row, low_column, high_column
     # The distance from the apex is a convex function of the share, so it is largest at an end. A
     # lower bound follows from the smallest distance from the axis and the lowest position along it.
@@ -360,7 +396,14 @@ def _cells_along(
     down, right = row - apex_row, column - apex_column
     end_down, end_right = end_row - apex_row, end_column - apex_column
     near, far = math.hypot(down, right), math.hypot(end_down, end_right)
+    near, far = max(near, 1e-9), max(far, 1e-9)
     most = max(near, far)
+    if about.round != 0.0:
+        # By the triangle inequality: on a sphere, no position between two ends is nearer to the
+        # pole, or farther from it, than their distances and that between them permit.
+        apart = _arc_along(ray, end) * about.radius_m / gsd_m
+        least = max(0.0, 0.5 * (near + far - apart))
+        most = max(most, 0.5 * (near + far + apart))
     # The box contains the points at both distances on both generatrices, and the arcs between them.
     for towards_down, towards_right in (
         (down / near, right / near),
@@ -374,6 +417,16 @@ def _cells_along(
     cosine = (down * end_down + right * end_right) / (near * far)
     beyond = most * (1.0 - math.sqrt(max(0.0, 0.5 + 0.5 * cosine)))
     return low_row - beyond, high_row + beyond, low_column - beyond, high_column + beyond
+
+
+@kernel_part
+def _arc_along(ray: Ray, end: float) -> float:
+    """Return the angle at the centre of a sphere between both ends of a part of a ray."""
+    start_square = ray.first**2 + ray.second**2 + ray.axial**2
+    along = ray.first * ray.to_first + ray.second * ray.to_second + ray.axial * ray.to_axial
+    square = ray.to_first**2 + ray.to_second**2 + ray.to_axial**2
+    across = math.sqrt(max(0.0, start_square * square - along * along))
+    return math.atan2(end * across, start_square + end * along)
 
 
 @inlined

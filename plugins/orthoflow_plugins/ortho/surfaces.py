@@ -156,6 +156,8 @@ def _about_axis(near: ViewingCamera, frame: WallFrame, bend: Bend) -> dict[str, 
         along_y=float(own.along[1]),
         aside_x=float(own.aside[0]),
         aside_y=float(own.aside[1]),
+        fan=own.fan,
+        round=float(own.is_sphere),
     )
     return {"about": about, "axial_camera": flat}
 

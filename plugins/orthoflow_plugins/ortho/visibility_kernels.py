@@ -29,14 +29,14 @@ NO_SURFACE: Final = 3
 
 
 class AxisView(NamedTuple):
-    """A camera in the axes of a cylinder or cone (see `bends.Revolution`).
+    """A camera in the axes of a cylinder, cone or sphere (see `bends.Revolution`).
 
     Attributes:
         first: coordinate of the projection centre towards angle 0.
         second: its coordinate towards an angle of 90 degrees.
         axial: its coordinate along the axis.
-        radius_m: radius of a cylinder; 0 for a cone.
-        sine: sine of the half angle of a cone; 0 for a cylinder.
+        radius_m: radius of a cylinder or sphere; 0 for a cone.
+        sine: sine of the half angle of a cone; 0 for a cylinder or sphere.
         cosine: cosine of the half angle.
         side: 1 if the surface is seen from outside, and -1 from inside; 0 for a plane.
         middle_rad: angle opposite of which the surface is cut.
@@ -46,6 +46,8 @@ class AxisView(NamedTuple):
         along_y: see `along_x`.
         aside_x: direction of increasing angles on the raster, perpendicular to it.
         aside_y: see `aside_x`.
+        fan: angle between two generatrices on the raster, per angle about the axis.
+        round: 1 for a sphere, whose distances are those from the centre; 0 for other surfaces.
     """
 
     first: float
@@ -62,9 +64,11 @@ class AxisView(NamedTuple):
     along_y: float
     aside_x: float
     aside_y: float
+    fan: float
+    round: float
 
 
-_PLANE: Final = AxisView(*(14 * (0.0,)))
+_PLANE: Final = AxisView(*(16 * (0.0,)))
 _NO_CAMERA: Final = np.zeros(25)
 
 

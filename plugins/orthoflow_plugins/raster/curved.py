@@ -1,4 +1,4 @@
-"""Walls on cylinders and cones: their grids and extents, and their points, unrolled."""
+"""Walls on cylinders, cones and spheres: their grids and extents, and their points, unrolled."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Cone, ConeBend, Cylinder, CylinderBend, WallFrame
+from orthoflow.geometry import (
+    Cone,
+    ConeBend,
+    Cylinder,
+    CylinderBend,
+    Sphere,
+    SphereBend,
+    WallFrame,
+    wall_axes,
+)
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.bends import NARROWEST
 from orthoflow.geometry.slabs import Slab
@@ -26,6 +35,8 @@ _UPRIGHT_COSINE: Final = math.sqrt(0.5)
 # cylinder's buffer.
 _COVERED_SHARE: Final = 0.8
 _PLACES: Final = 9
+# Largest angle from the pole of a developed sphere, where lengths are stretched by a factor of 5.
+_FARTHEST_RAD: Final = math.radians(149.0)
 
 
 class CurvedWalls:
@@ -124,8 +135,11 @@ def limits_m(frame: WallFrame) -> tuple[float, float]:
 
 
 def blank_beside(wall: Wall) -> None:
-    """Set the cells beside the sector of an unrolled cone to void; a cylinder fills its raster."""
-    if isinstance(wall.frame.bend, ConeBend):
+    """Set the cells beside the development of a cone or sphere to void.
+
+    A cylinder fills its raster.
+    """
+    if isinstance(wall.frame.bend, ConeBend | SphereBend):
         for rows in row_bands(wall.mask.shape):
             blank(wall, rows, ~wall.frame.shown_cells(rows))
 
@@ -146,12 +160,12 @@ def _is_inside(vault: Surface, frame: WallFrame, rows: slice) -> NDArray[np.bool
 
     A vault is the space between its axis and its arc.
     """
-    shape = vault.shape
+    axis = vault.axis_world
     points = frame.world_from_wall(frame.cell_centres(rows))
-    along = (points - vault.middle_world) @ shape.axis_world
+    along = (points - vault.middle_world) @ axis
     inside = np.abs(along) < 0.5 * (vault.along_m[1] - vault.along_m[0])
-    inside &= shape.distances_m(points) > 0.0
-    start = angles_around(points, vault.middle_world, shape.axis_world, vault.zero_world)
+    inside &= vault.shape.distances_m(points) > 0.0
+    start = angles_around(points, vault.middle_world, axis, vault.zero_world)
     start = (start - vault.arc_rad[0]) % math.tau
     inside &= start < vault.arc_rad[1] - vault.arc_rad[0]
     return inside.reshape(-1, frame.width)
@@ -160,7 +174,10 @@ def _is_inside(vault: Surface, frame: WallFrame, rows: slice) -> NDArray[np.bool
 def _is_chosen(surface: Surface, index: int, up: NDArray[np.float64], params: RasterParams) -> bool:
     if params.ranks:
         return index in params.ranks
-    is_upright = abs(float(surface.shape.axis_world @ up)) >= _UPRIGHT_COSINE
+    is_upright = abs(float(surface.axis_world @ up)) >= _UPRIGHT_COSINE
+    if isinstance(surface.shape, Sphere):
+        # Its middle is in the direction of its axis.
+        is_upright = not is_upright
     if params.constraint == "horizontal" or (params.constraint == "vertical" and not is_upright):
         return False
     start_rad, end_rad = surface.arc_rad
@@ -168,6 +185,9 @@ def _is_chosen(surface: Surface, index: int, up: NDArray[np.float64], params: Ra
     if isinstance(surface.shape, Cone):
         length_m /= math.cos(surface.shape.half_angle_rad)
     area_m2 = (end_rad - start_rad) * surface.radius_m * length_m
+    if isinstance(surface.shape, Sphere):
+        least, most = np.array(surface.along_m) / surface.radius_m
+        area_m2 = math.tau * surface.radius_m**2 * float(np.cos(least) - np.cos(most))
     return bool(params.near) or area_m2 >= params.min_area_m2
 
 
@@ -178,6 +198,8 @@ def _frame_of(
     shape, name = surface.shape, f"{surface.name.rsplit(' ', 1)[0]} {index}"
     if isinstance(shape, Cone):
         frame = _over_cone(surface, shape, up, params)
+    elif isinstance(shape, Sphere):
+        frame = _over_sphere(surface, shape, up, params)
     else:
         frame = _over_cylinder(surface, shape, up, params)
     return replace(frame, up=(east, north, top), name=name)
@@ -284,3 +306,31 @@ def _over_cone(
         width=n_across if is_upright else n_along,
         height=n_along if is_upright else n_across,
     )
+
+
+def _over_sphere(
+    surface: Surface, shape: Sphere, up: NDArray[np.float64], params: RasterParams
+) -> WallFrame:
+    """Return the grid around the middle of a sphere's points, widened on all sides.
+
+    At the middle, which is the pole, the axes are those of a plane: a dome is seen from below, like
+    a ceiling.
+    """
+    pole, radius_m, gsd_m = surface.axis_world, shape.radius_m, params.gsd_m
+    normal = -pole if shape.is_concave else pole
+    u, v = wall_axes(normal, up)
+    most_m = min(surface.along_m[1] + params.margin_m, _FARTHEST_RAD * radius_m)
+    half = math.ceil(most_m / gsd_m - 1e-6)
+    at_pole = WallFrame(
+        origin_world=shape.centre_world + radius_m * pole,
+        u_world=u,
+        v_world=v,
+        normal_world=normal,
+        gsd_m=gsd_m,
+        width=1,
+        height=1,
+        bend=SphereBend(
+            pole_m=(0.0, 0.0), radius_m=radius_m, is_inside=shape.is_concave, most_m=most_m
+        ),
+    )
+    return at_pole.part((-float(half), -float(half)), width=2 * half, height=2 * half)

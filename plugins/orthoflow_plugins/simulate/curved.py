@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 from pydantic import Field
 
-from orthoflow.geometry.surfaces import transformed
+from orthoflow.geometry import Sphere
+from orthoflow.geometry.surfaces import middle_direction, transformed
 from orthoflow.products import (
     Calibration,
     Cameras,
@@ -50,8 +51,9 @@ class SimulateCurved(Method):
     """Scan and photograph a building with curved walls and random dimensions.
 
     The building is a barrel vault, a cross vault, an apse, a round tower seen from outside, a
-    column of which half is hidden, or a conical spire. It has furniture, mouldings and painted
-    textures. Errors of the scanner and the photos are those of `simulate.room`.
+    column of which half is hidden, a conical spire, or a dome over an octagon. It has furniture,
+    mouldings and painted textures. Errors of the scanner and the photos are those of
+    `simulate.room`.
     """
 
     id: ClassVar[str] = "simulate.curved"
@@ -192,15 +194,17 @@ def _true_surfaces(building: Building, delivery: Delivery) -> Surfaces:
     surfaces = []
     for index, chosen in enumerate(np.argsort(-counts, kind="stable").tolist()):
         true = building.surfaces[chosen]
-        shape = transformed(true.shape, np.eye(3), delivery.shift_world_m)
+        shape, zero = transformed(true.shape, np.eye(3), delivery.shift_world_m), true.zero
+        if isinstance(shape, Sphere):
+            zero = middle_direction(zero[None], delivery.up_world)
         surfaces.append(
             Surface(
-                name=f"{surface_kind(shape, delivery.up_world)} {index}",
+                name=f"{surface_kind(shape, delivery.up_world, zero)} {index}",
                 shape=shape,
                 covariance=np.zeros((7, 7)),
                 n_points=int(counts[chosen]),
                 rms_m=0.0,
-                zero_world=true.zero,
+                zero_world=zero,
                 along_m=true.along_m,
                 arc_rad=true.arc_rad,
             )

@@ -1,4 +1,4 @@
-"""Simulated buildings with curved walls: barrel and cross vault, apse, tower, column and spire.
+"""Simulated buildings with curved walls: vaults, apse, tower, column, spire and dome.
 
 All dimensions are random. Coordinates in the frame of a building are in metres, with z upwards and
 the origin at eye level.
@@ -15,10 +15,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Cone, Cylinder
+from orthoflow.geometry import Cone, CurvedShape, Cylinder, Sphere
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
-from orthoflow.geometry.surfaces import transformed
+from orthoflow.geometry.surfaces import transformed, zero_direction
 from orthoflow_plugins.simulate.building import (
     Extent,
     Paint,
@@ -31,7 +31,7 @@ from orthoflow_plugins.simulate.building import (
     wall_side,
 )
 
-Subject = Literal["barrel-vault", "cross-vault", "apse", "tower", "column", "spire"]
+Subject = Literal["barrel-vault", "cross-vault", "apse", "tower", "column", "spire", "dome"]
 
 FLOOR_M: Final = -1.6
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -51,16 +51,17 @@ _STRIP_M: Final = 0.03
 
 @dataclass(frozen=True, kw_only=True)
 class TrueSurface:
-    """A cylinder or cone that a detector should find.
+    """A cylinder, cone or sphere that a detector should find.
 
     Attributes:
         shape: the surface; the point of a cylinder is at the middle of the surface's length.
-        zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
+        zero: (3,) unit vector perpendicular to the axis, the direction of angle 0; on a sphere,
+            that of its pole.
         arc_rad: smallest and largest angle.
-        along_m: smallest and largest position along the axis.
+        along_m: smallest and largest position along the axis; on a sphere, distance from its pole.
     """
 
-    shape: Cylinder | Cone
+    shape: CurvedShape
     zero: NDArray[np.float64]
     arc_rad: tuple[float, float]
     along_m: tuple[float, float]
@@ -98,15 +99,15 @@ class _Bend:
 
     Attributes:
         draft: the draft to which rectangles are added.
-        shape: the cylinder or cone.
-        zero: (3,) unit vector perpendicular to the axis, the direction of angle 0.
+        shape: the cylinder or cone; a sphere is a `_Dome`.
+        zero: see `TrueSurface`.
         slant_m: distance from the apex of a cone at b = 0; infinite for a cylinder.
         extents: extents of all parts of the wall, without mouldings and recesses.
         rows: indices of these parts in the draft.
     """
 
     draft: SceneDraft
-    shape: Cylinder | Cone
+    shape: CurvedShape
     zero: NDArray[np.float64]
     slant_m: float = math.inf
     extents: list[Extent] = field(default_factory=list)
@@ -120,9 +121,24 @@ class _Bend:
     @property
     def radius_m(self) -> float:
         """Radius at b = 0."""
-        if isinstance(self.shape, Cylinder):
+        if not isinstance(self.shape, Cone):
             return self.shape.radius_m
         return self.slant_m * math.sin(self.half_angle_rad)
+
+    @property
+    def axis(self) -> NDArray[np.float64]:
+        """Unit vector (3,) of the axis; from the centre of a sphere to its pole."""
+        return self.zero if isinstance(self.shape, Sphere) else self.shape.axis_world
+
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """Point (3,) of the axis at the height of b = 0; the centre of a sphere."""
+        if isinstance(self.shape, Cylinder):
+            return self.shape.point_world
+        if isinstance(self.shape, Sphere):
+            return self.shape.centre_world
+        along_m = self.slant_m * math.cos(self.half_angle_rad)
+        return self.shape.apex_world + along_m * self.shape.axis_world
 
     def place(
         self,
@@ -141,7 +157,7 @@ class _Bend:
         self.draft.surfaces.append(
             Surface(
                 centre,
-                sign * np.cross(self.shape.axis_world, self.zero),
+                sign * np.cross(self.axis, self.zero),
                 generatrix,
                 _scaled(extent, sign * scale),
                 paint,
@@ -175,21 +191,27 @@ class _Bend:
 
     def at(self, a: float, b: float, depth_m: float = 0.0) -> tuple[NDArray[np.float64], ...]:
         """Return the point at (a, b), the direction of increasing a, the normal, and that of b."""
-        axis, angle = self.shape.axis_world, a / self.radius_m
+        axis, angle = self.axis, a / self.radius_m
         depth_m = -depth_m if self.shape.is_concave else depth_m
         sine, cosine = math.sin(self.half_angle_rad), math.cos(self.half_angle_rad)
         aside = np.cross(axis, self.zero)
         outwards = math.cos(angle) * self.zero + math.sin(angle) * aside
         along = math.cos(angle) * aside - math.sin(angle) * self.zero
         generatrix = sine * outwards + cosine * axis
-        if isinstance(self.shape, Cylinder):
-            middle = self.shape.point_world
-        else:
-            middle = self.shape.apex_world + self.slant_m * cosine * axis
+        middle = self.middle
         point = middle + (self.radius_m + cosine * depth_m) * outwards + b * generatrix
         point -= sine * depth_m * axis
         normal = cosine * outwards - sine * axis
         return point, along, -normal if self.shape.is_concave else normal, generatrix
+
+    def targets(self) -> Iterator[tuple[float, float]]:
+        """Yield positions of photos: at least three along the arc and two along the axis."""
+        a0, a1, b0, b1 = np.array(self.extents).T
+        n_along = max(2, math.ceil(float(b1.max() - b0.min()) / 1.5))
+        n_around = max(3, math.ceil(float(a1.max() - a0.min()) / 1.8))
+        for b in np.linspace(b0.min(), b1.max(), 2 * n_along + 1)[1::2]:
+            for angle in np.linspace(*self.true_surface().arc_rad, 2 * n_around + 1)[1::2]:
+                yield float(angle * self.radius_m), float(b)
 
     def true_surface(self) -> TrueSurface:
         """Return the surface with the extent of the wall itself."""
@@ -203,6 +225,99 @@ class _Bend:
             zero=self.zero,
             arc_rad=(float(arc[0]), float(arc[1])),
             along_m=(float(along[0]), float(along[1])),
+        )
+
+
+@dataclass(kw_only=True)
+class _Dome(_Bend):
+    """A wall on a sphere under construction.
+
+    Positions are (a, b): the angle about the axis times the radius, and the distance from the pole
+    along a meridian.
+    """
+
+    def place(
+        self,
+        extent: Extent,
+        depth_m: float,
+        paint: Paint,
+        role: SurfaceRole,
+        holes: Sequence[Extent] = (),
+    ) -> None:
+        """See `_Bend.place`."""
+        pole, _, normal, meridian = self.at(0.0, 0.0, depth_m)
+        sign = -1.0 if self.shape.is_concave else 1.0
+        scale = 1.0 + sign * depth_m / self.radius_m
+        a0, a1, b0, b1 = extent
+        self.draft.surfaces.append(
+            Surface(
+                pole,
+                meridian,
+                np.cross(normal, meridian),
+                (*_scaled((a0, a1, 0.0, 0.0), sign * scale)[:2], scale * b0, scale * b1),
+                paint,
+                role,
+                holes=holes,
+                curvature_per_m=-sign / (scale * self.radius_m),
+                taper_per_m=math.inf,
+            )
+        )
+        if role == SurfaceRole.WALL:
+            self.extents.append(extent)
+            self.rows.append(len(self.draft.surfaces) - 1)
+
+    def box(self, extent: Extent, depths_m: tuple[float, float], paint: Paint) -> None:
+        """See `_Bend.box`."""
+        role = SurfaceRole.RELIEF if depths_m[1] > 0.0 else SurfaceRole.RECESS
+        self.place(extent, depths_m[1], paint, role)
+        a0, a1, b0, b1 = extent
+        depths = min(depths_m), max(depths_m)
+        piece_m = _PIECE_RAD * self.radius_m
+        n_around, n_down = (
+            math.ceil((end - start) / piece_m) for start, end in ((a0, a1), (b0, b1))
+        )
+        half_a, half_b = 0.5 * (a1 - a0) / n_around, 0.5 * (b1 - b0) / n_down
+        for b in (b0, b1):
+            reach_m = half_a * math.sin(b / self.radius_m)
+            for a in a0 + half_a * (2.0 * np.arange(n_around) + 1.0):
+                foot, along, normal, _ = self.at(float(a), b)
+                span = (-reach_m, reach_m, *depths)
+                self.draft.surfaces.append(Surface(foot, along, normal, span, paint, role))
+        for a in (a0, a1):
+            for b in b0 + half_b * (2.0 * np.arange(n_down) + 1.0):
+                foot, _, normal, meridian = self.at(a, float(b))
+                span = (-half_b, half_b, *depths)
+                self.draft.surfaces.append(Surface(foot, meridian, normal, span, paint, role))
+
+    def at(self, a: float, b: float, depth_m: float = 0.0) -> tuple[NDArray[np.float64], ...]:
+        """See `_Bend.at`."""
+        angle, down = a / self.radius_m, b / self.radius_m
+        start = zero_direction(self.zero, _UP)
+        aside = np.cross(self.zero, start)
+        radial = math.cos(angle) * start + math.sin(angle) * aside
+        along = math.cos(angle) * aside - math.sin(angle) * start
+        outwards = math.cos(down) * self.zero + math.sin(down) * radial
+        meridian = math.cos(down) * radial - math.sin(down) * self.zero
+        sign = -1.0 if self.shape.is_concave else 1.0
+        point = self.middle + (self.radius_m + sign * depth_m) * outwards
+        return point, along, sign * outwards, meridian
+
+    def targets(self) -> Iterator[tuple[float, float]]:
+        """See `_Bend.targets`; the photos are taken around rings."""
+        most_m = self.true_surface().along_m[1]
+        n_rings = math.ceil(most_m / 1.2)
+        for b in (np.arange(n_rings) + 0.5) * most_m / n_rings:
+            turn_m = math.tau * self.radius_m
+            n_around = max(3, math.ceil(turn_m * math.sin(b / self.radius_m) / 1.8))
+            for k in range(n_around):
+                yield turn_m * k / n_around, float(b)
+
+    def true_surface(self) -> TrueSurface:
+        """See `_Bend.true_surface`."""
+        most_m = max(b1 for _, _, _, b1 in self.extents)
+        most = most_m / self.radius_m
+        return TrueSurface(
+            shape=self.shape, zero=self.zero, arc_rad=(-most, most), along_m=(0.0, most_m)
         )
 
 
@@ -256,16 +371,11 @@ def _turned(true: TrueSurface, turn: NDArray[np.float64]) -> TrueSurface:
 
 
 def _targets(bend: _Bend) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
-    """Yield a grid of photo targets: at least three along the arc and two along the axis."""
-    a0, a1, b0, b1 = np.array(bend.extents).T
-    width_m, length_m = float(a1.max() - a0.min()), float(b1.max() - b0.min())
+    """Yield the photos' targets on a wall (see `Building.photographed`)."""
     distance_m = min(0.9 * bend.radius_m, 3.0) if bend.shape.is_concave else 3.0
-    n_along = max(2, math.ceil(length_m / 1.5))
-    n_around = max(3, math.ceil(width_m / 1.8))
-    for b in np.linspace(b0.min(), b1.max(), 2 * n_along + 1)[1::2]:
-        for angle in np.linspace(*bend.true_surface().arc_rad, 2 * n_around + 1)[1::2]:
-            point, _, normal, _ = bend.at(float(angle * bend.radius_m), float(b))
-            yield point, normal, distance_m
+    for a, b in bend.targets():
+        point, _, normal, _ = bend.at(a, b)
+        yield point, normal, distance_m
 
 
 def _wall(
@@ -501,6 +611,30 @@ def _spire(
     return [spire], away_m[:, None] * places
 
 
+def _dome(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    """Build a hemisphere over eight walls, whose edges meet its rim."""
+    radius_m, spring_m = rng.uniform(2.0, 3.0), rng.uniform(0.4, 1.0)
+    shape = Sphere(centre_world=spring_m * _UP, radius_m=radius_m, is_concave=True)
+    dome, turn_m = _Dome(draft=draft, shape=shape, zero=_UP), math.pi * radius_m
+    dome.place((-turn_m, turn_m, 0.0, 0.51 * turn_m), 0.0, _FRESCO, SurfaceRole.WALL)
+    if relief > 0.0:
+        ring_m = rng.uniform(0.3, 0.6) * radius_m
+        dome.box((-turn_m, turn_m, ring_m, ring_m + 0.15), (0.0, 0.05 * relief), _STUCCO)
+        for a, b in rng.uniform((-1.0, 0.8), (1.0, 1.2), (4, 2)) * (turn_m, radius_m):
+            panel = (a - 0.2, a + 0.2, b - 0.2, b + 0.2)
+            dome.box(panel, (0.0, 0.03 * relief), _STUCCO)
+    half_rad = 0.125 * math.pi
+    half_m, apothem_m = radius_m * math.sin(half_rad), radius_m * math.cos(half_rad)
+    for k in range(8):
+        extent = (-half_m, half_m, FLOOR_M, spring_m + half_m + 0.02)
+        _wall(draft, f"wall {k}", 45.0 * k, apothem_m, extent, _STUCCO)
+    _level(draft, "floor", FLOOR_M, (radius_m, radius_m))
+    _furniture(draft, rng, (apothem_m - 0.8, 0.0, 0.0, 0.8 - apothem_m))
+    return [dome], rng.uniform(-0.2, 0.2, (2, 3)) + np.array([[-0.6, 0.4, 0.0], [0.6, 0.2, 0.0]])
+
+
 _BUILDERS: Final = {
     "barrel-vault": _barrel_vault,
     "cross-vault": _cross_vault,
@@ -508,4 +642,5 @@ _BUILDERS: Final = {
     "tower": _tower,
     "column": _column,
     "spire": _spire,
+    "dome": _dome,
 }

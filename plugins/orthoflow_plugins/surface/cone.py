@@ -14,7 +14,7 @@ class SurfaceCone(Detector):
     """
 
     id = "surface.cone"
-    is_cone = True
+    form = "cone"
 
     class Params(DetectorParams):
         """Parameters of the search; the defaults suit scans of buildings."""

@@ -26,7 +26,7 @@ class SurfaceCylinder(Detector):
     """
 
     id = "surface.cylinder"
-    is_cone = False
+    form = "cylinder"
     citations = (
         "Rabbani and van den Heuvel 2005, cylinders by Hough transform (ISPRS Laser Scanning 2005)",
         "Schnabel, Wahl, Klein 2007, doi:10.1111/j.1467-8659.2007.01016.x",

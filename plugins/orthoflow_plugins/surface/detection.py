@@ -17,6 +17,7 @@ from orthoflow_plugins.surface.parameters import DetectorParams
 from orthoflow_plugins.surface.search import (
     BLOCK_VOXELS,
     MOST_RADIUS,
+    Form,
     Found,
     Limits,
     Rejected,
@@ -77,7 +78,7 @@ def detect(
     rng: np.random.Generator,
     progress: Callable[[float, str], None],
     *,
-    is_cone: bool,
+    form: Form,
     cores: int,
 ) -> Detection:
     """Detect the curved surfaces of a cloud.
@@ -88,7 +89,7 @@ def detect(
         params: parameters of the search.
         rng: random generator for pairs of voxels.
         progress: receives the completed share of the work, and a text.
-        is_cone: whether to search for cones instead of cylinders.
+        form: the form of the surfaces.
         cores: number of threads.
     """
     progress(0.0, "sample")
@@ -103,8 +104,9 @@ def detect(
         radius_m=(params.min_radius_m, params.max_radius_m),
         min_arc_rad=math.radians(params.min_arc_deg),
         min_area_m2=params.min_area_m2,
-        is_cone=is_cone,
+        form=form,
     )
+    is_cone = form == "cone"
     is_oriented = cloud.stations is not None and len(cloud.stations) > 0
     found, rejected = search(levels, limits, cloud.up, rng, progress, is_oriented=is_oriented)
     found = [with_bridged_gaps(item, _BRIDGED_RAD) for item in found[: params.max_surfaces]]
@@ -193,4 +195,5 @@ def _named(surface: Surface, index: int, up: NDArray[np.float64], *, is_oriented
     if not is_oriented:
         start, end = surface.arc_rad
         shape = replace(shape, is_concave=end - start < _OUTSIDE_RAD)
-    return replace(surface, shape=shape, name=f"{surface_kind(shape, up)} {index}")
+    kind = surface_kind(shape, up, surface.zero_world)
+    return replace(surface, shape=shape, name=f"{kind} {index}")

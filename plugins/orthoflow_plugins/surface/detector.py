@@ -21,6 +21,7 @@ from orthoflow_plugins.surface.parameters import DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.surface.detection import Detection
+    from orthoflow_plugins.surface.search import Form
 
 STRIP: Final = DiagnosticSpec(
     code="plane-is-curved",
@@ -34,7 +35,7 @@ REJECTED: Final = DiagnosticSpec(
     severity="note",
     text="{subject} of radius {radius_m:.2f} m was rejected ({reason}): arc {arc_deg:.0f} deg, "
     "area {area_m2:.2f} m2, scatter {scatter_mm:.1f} mm, sagitta {sagitta_mm:.0f} mm, rotation of "
-    "the normals divided by the angle {turning:.2f} (1 on a cylinder, 0 on flat parts)",
+    "the normals divided by the angle {turning:.2f} (1 on a round surface, 0 on flat parts)",
     rank_by="area_m2",
 )
 NO_CIRCLE: Final = DiagnosticSpec(
@@ -98,8 +99,7 @@ class Detector(Method):
     )
     In = DetectorIn
     Out = DetectorOut
-    # Whether the surfaces are cones.
-    is_cone: ClassVar[bool]
+    form: ClassVar[Form]
 
     def run(self, inputs: DetectorIn, params: DetectorParams, ctx: StepContext) -> DetectorOut:
         """Detect the curved surfaces of a cloud."""
@@ -115,7 +115,7 @@ class Detector(Method):
             params,
             ctx.rng,
             ctx.progress,
-            is_cone=self.is_cone,
+            form=self.form,
             cores=ctx.cores,
         )
         ctx.metric("detection_s", ctx.clock_s() - start_s, "s")
@@ -151,7 +151,6 @@ class Detector(Method):
                 sigma_mm=test.sigma_mm,
                 turn_deg=test.turn_deg,
             )
-        what = "a cone" if self.is_cone else "a cylinder"
         # For each reason, only the largest hypothesis is reported.
         tested = [item for item in found.rejected if "turning" in item.evidence]
         largest = {
@@ -160,7 +159,7 @@ class Detector(Method):
         for item in largest.values():
             varied = 100.0 * item.evidence.get("variation", 0.0)
             reason = item.reason + (f", curvature differs by {varied:.0f} % RMS" if varied else "")
-            ctx.report(REJECTED, subject=what, reason=reason, **item.evidence)
+            ctx.report(REJECTED, subject=f"a {self.form}", reason=reason, **item.evidence)
         for surface, accepted in zip(found.surfaces, found.accepted, strict=True):
             if varied := accepted.evidence["variation"]:
                 differs_mm = 1000.0 * varied * surface.radius_m
@@ -177,5 +176,6 @@ class Detector(Method):
             ctx.metric("radius_m", first.radius_m, "m")
             ctx.metric("arc_deg", math.degrees(first.arc_rad[1] - first.arc_rad[0]), "deg")
             ctx.metric("rms_mm", 1000.0 * first.rms_m, "mm")
-            ctx.metric("sigma_axis_deg", first.sigma_axis_deg, "deg")
+            if self.form != "sphere":
+                ctx.metric("sigma_axis_deg", first.sigma_axis_deg, "deg")
             ctx.metric("sigma_radius_mm", 1000.0 * first.sigma_radius_m, "mm")

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, ndimage, special
+from scipy.spatial.distance import cdist
 
 from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.slabs import Offsets, read_only
@@ -54,6 +55,8 @@ _LEAST_INNER: Final = 0.9
 # A profile is a circle if its variation has at least the first probability on circles, and is none
 # if it has less than the second.
 _LEVELS: Final = (0.05, 0.001)
+# Number of parameters of a sphere.
+_N_SPHERE: Final = 4
 # Numbers of cells around surfaces are multiples of this number.
 _MULTIPLE: Final = 16
 _OPEN_SHARE: Final = 0.15
@@ -222,12 +225,13 @@ def _fitted(
     within = np.maximum(square - total**2 / n, 0.0)
     many = n >= 2.0
     noise_m = math.sqrt(float(within[many].sum() / max(1.0, (n[many] - 1.0).sum())))
-    n_own = 6 if is_cone else 5
+    is_sphere = found.round.is_sphere
+    n_own = _N_SPHERE if is_sphere else 6 if is_cone else 5
     variance = max(noise_m, 1e-5) ** 2
     points = found.round.points(angles, places, total / n, found.zero)
 
     def cells_about(surface: Round, zero: NDArray[np.float64]) -> _Means:
-        matrix = design(*surface.places(points, zero), surface.steepness, is_cone=True)
+        matrix = design(surface, *surface.places(points, zero), is_cone=True)
         means, _ = surface.outwards(points)
         cells = _Means(i=i, j=j, n=n, means=means, matrix=matrix, n_around=around)
         while cells.n.mean() < _LEAST_MEAN_POINTS and cells.n_around >= 2 * _LEAST_AROUND:
@@ -242,10 +246,11 @@ def _fitted(
     start = found.round.corrected(found.zero, change)
     zero = zero_direction(start.axis, cloud.up)
     tiles = _inside(cells_about(start, zero), weights, is_open_beside=found.side < 0.0)
+    tiles = _along_meridians(tiles) if is_sphere else tiles
     change, own, variation, slope = _solution(tiles, variance, start.radius_m, n_own)
     best = start.corrected(zero, change)
     rest, _ = best.outwards(points)
-    middle_m = float(n @ places / n.sum())
+    middle_m = 0.0 if is_sphere else float(n @ places / n.sum())
     best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
     own = best.covariance(zero, own)
     zero = zero_direction(best.axis, cloud.up)
@@ -257,14 +262,19 @@ def _fitted(
     arc, ends = _extent(is_on, sums[:, :, 0])
     # Positions along the axis of a cone are measured from its apex.
     start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
+    along_m = float(start_m + size_m * ends[0]), float(start_m + size_m * ends[1])
+    if is_sphere:
+        # Rows of cells are between planes across the axis.
+        least, most = (math.acos(min(1.0, max(-1.0, at / best.radius_m))) for at in along_m[::-1])
+        along_m, arc = (best.radius_m * least, best.radius_m * most), (-most, most)
     surface = Surface(
         name="",
         shape=best.shape(cloud.origin, is_concave=found.side > 0.0),
         covariance=own,
         n_points=n_points,
         rms_m=rms_m,
-        zero_world=zero,
-        along_m=(float(start_m + size_m * ends[0]), float(start_m + size_m * ends[1])),
+        zero_world=best.axis if is_sphere else zero,
+        along_m=along_m,
         arc_rad=arc,
     )
     return FittedSurface(
@@ -296,6 +306,17 @@ def _inside(cells: _Means, weights: NDArray[np.float64], *, is_open_beside: bool
     return inside.merged(next(fine, 1))
 
 
+def _along_meridians(tiles: _Means) -> _Means:
+    """Return the tiles of a sphere with angles from its middle as positions around the axis.
+
+    The profile of a dome is tested along its meridians; positions along the axis are the angles
+    about it.
+    """
+    angles = np.arccos(np.clip(tiles.matrix[:, 2], -1.0, 1.0))
+    i = (angles / (2.0 * math.pi) * tiles.n_around).astype(np.int64)
+    return replace(tiles, i=i, j=tiles.i)
+
+
 def _solution(
     tiles: _Means, variance: float, radius_m: float, n_own: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
@@ -305,12 +326,15 @@ def _solution(
         tiles: the tiles.
         variance: variance of points.
         radius_m: the radius.
-        n_own: number of parameters of the surface, 5 for a cylinder and 6 for a cone.
+        n_own: number of parameters of the surface: 4 for a sphere, 5 for a cylinder and 6 for a
+            cone.
 
     Returns:
         The change of the parameters (n_own,), their covariance, and the variation and the slope of
         `FittedSurface`.
     """
+    # Numbers of parameters that move the centre, and index of the radius.
+    n_centre, radius = (3, 3) if n_own == _N_SPHERE else (2, 4)
     change, used = _solved(tiles, variance, n_own)
     own = _covariance(used, n_own)
     variation, chance = _variation(used, radius_m)
@@ -322,13 +346,15 @@ def _solution(
         again, kept = _solved(inner, variance, n_own)
         if len(kept) > _LEAST_INNER * len(inner) and _variation(kept, radius_m)[1] > _LEVELS[0]:
             theirs = _covariance(kept, n_own)
-            largest = _SIGMAS**2 * (theirs[4, 4] - own[4, 4])
-            if chance < _LEVELS[1] or (again[4] - change[4]) ** 2 > max(0.0, largest):
+            largest = _SIGMAS**2 * (theirs[radius, radius] - own[radius, radius])
+            differs = (again[radius] - change[radius]) ** 2
+            if chance < _LEVELS[1] or differs > max(0.0, largest):
                 tiles, change, used, own, chance = inner, again, kept, theirs, 1.0
     variation = variation if chance < _LEVELS[1] else 0.0
     # If the radius of curvature varies, the centre does, too; the middle of the arc stays.
     turn = np.zeros(n_own)
-    turn[:2], turn[4] = -used.n @ used.matrix[:, :2] / used.n.sum(), 1.0
+    turn[:n_centre] = -used.n @ used.matrix[:, :n_centre] / used.n.sum()
+    turn[radius] = 1.0
     own += (variation * radius_m) ** 2 * np.outer(turn, turn)
     slope = 0.0
     if n_own == 5:
@@ -344,6 +370,8 @@ def _solution(
 def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.float64]:
     """Return the covariance after the surface's point has moved along the axis."""
     turn = np.eye(len(own))
+    if len(own) < 5:
+        return own
     turn[0, 2] = turn[1, 3] = along_m
     if len(own) > 5:
         turn[4, 5] = along_m
@@ -381,6 +409,8 @@ def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
     scale = np.linalg.norm(matrix, axis=0)
     turn = math.pi / tiles.n_around * (tiles.i[:, None] - tiles.i)
     apart = np.hypot(tiles.n_around / math.pi * np.sin(turn), tiles.j[:, None] - tiles.j)
+    if n_own == _N_SPHERE:
+        apart = cdist(matrix[:, :3], matrix[:, :3]) * tiles.n_around / (2.0 * math.pi)
     white = np.diag(tiles.n.mean() / tiles.n)
     columns = np.column_stack([matrix / scale, tiles.means])
     best, least = white, math.inf

@@ -1,7 +1,8 @@
 """Kernels of the detectors: voxels and their normals, votes for hypotheses, and cells of surfaces.
 
-A surface of revolution is a row of 12 numbers: point of the axis (3), axis (3), the direction of
-angle 0 (3), radius at the point, change of the radius along the axis, and 1 / sqrt(1 + change^2).
+A surface of revolution is a row of 13 numbers: point of the axis (3), axis (3), the direction of
+angle 0 (3), radius at the point, change of the radius along the axis, 1 / sqrt(1 + change^2), and
+1, or 0 for a sphere, whose point is the centre, and whose radius is that of the sphere.
 """
 
 from __future__ import annotations
@@ -164,7 +165,8 @@ def count_votes(
     """Count for each hypothesis (h, 8) the hypotheses that agree with it.
 
     Args:
-        guesses: point of the axis (3), axis (3), radius, side (1, -1 or 0) of each hypothesis.
+        guesses: point of the axis (3), axis (3), radius, side (1, -1 or 0) of each hypothesis; a
+            sphere has an axis of 0, 0, 0.
         max_turn: maximum sine of the angle between two axes.
         max_ratio: maximum difference between two radii, as a share of the larger one.
         max_miss: maximum distance of a point from the other axis, as a share of the radius.
@@ -205,7 +207,7 @@ def near_voxels(
     """Find the voxels near a surface whose normals agree with it; return their number.
 
     Args:
-        row: (12,) the surface.
+        row: (13,) the surface.
         side: 1 if normals point to the axis, -1 if they point away from it, 0 for both.
         points: (v, 3) the voxels.
         normals: (v, 3) their normals.
@@ -216,11 +218,12 @@ def near_voxels(
     for v in range(points.shape[0]):
         dx, dy, dz = points[v, 0] - row[0], points[v, 1] - row[1], points[v, 2] - row[2]
         along = dx * row[3] + dy * row[4] + dz * row[5]
-        radius = math.sqrt(max(1e-24, dx * dx + dy * dy + dz * dz - along * along))
+        straight = row[12] * along
+        radius = math.sqrt(max(1e-24, dx * dx + dy * dy + dz * dz - straight * along))
         if abs(radius - row[9] - row[10] * along) * row[11] >= limits[0]:
             continue
         tilt = normals[v, 0] * row[3] + normals[v, 1] * row[4] + normals[v, 2] * row[5]
-        cosine = dx * normals[v, 0] + dy * normals[v, 1] + dz * normals[v, 2] - along * tilt
+        cosine = dx * normals[v, 0] + dy * normals[v, 1] + dz * normals[v, 2] - straight * tilt
         cosine = row[11] * (cosine / radius - row[10] * tilt)
         if (-side * cosine if side != 0.0 else abs(cosine)) > limits[1]:
             near[count] = v
@@ -331,7 +334,7 @@ class Cells(NamedTuple):
     """The grids of cells on the surfaces.
 
     Attributes:
-        rounds: (s, 12) the surfaces.
+        rounds: (s, 13) the surfaces.
         bounds: (s, 4) float64 smallest and largest position along the axis, tolerance for the
             labels, tolerance for the sums.
         sizes: (s, 4) int64 first cell of the surface, cells around, cells along, and the first
@@ -451,7 +454,7 @@ def _may_have_points(cells: Cells, s: int, middle: NDArray[np.float64], half: fl
     r = cells.rounds
     dx, dy, dz = middle[0] - r[s, 0], middle[1] - r[s, 1], middle[2] - r[s, 2]
     along = dx * r[s, 3] + dy * r[s, 4] + dz * r[s, 5]
-    across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - along * along))
+    across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - r[s, 12] * along * along))
     distance = (across - r[s, 9] - r[s, 10] * along) * r[s, 11]
     is_beside = along < cells.bounds[s, 0] - half or along > cells.bounds[s, 1] + half
     return not is_beside and abs(distance) <= cells.bounds[s, 2] + half
@@ -479,6 +482,16 @@ def _compare_planes(
 
 
 @kernel_part
+def _move_to_sphere(
+    along: NDArray[np.float64], off: NDArray[np.float64], radius: float, count: int
+) -> None:
+    """Change positions along the axis to those of the nearest points of a sphere."""
+    # Cells of a sphere then depend on the direction only, so noise does not affect them.
+    for p in range(count):
+        along[p] *= radius / max(1e-12, off[p] + radius)
+
+
+@kernel_part
 def _compare(
     block: Offsets,
     cells: Cells,
@@ -493,13 +506,14 @@ def _compare(
     best, cell, chosen = index[0], index[1], index[2]
     r, bounds, sizes = cells.rounds, cells.bounds, cells.sizes
     px, py, pz, ax, ay, az = r[s, 0], r[s, 1], r[s, 2], r[s, 3], r[s, 4], r[s, 5]
-    radius, slope, steepness = r[s, 9], r[s, 10], r[s, 11]
+    radius, slope, steepness, straight = r[s, 9], r[s, 10], r[s, 11], r[s, 12]
     least, most, reach = bounds[s, 0], bounds[s, 1], bounds[s, 2]
     for p in range(x.shape[0]):
         dx, dy, dz = float(x[p]) - px, float(y[p]) - py, float(z[p]) - pz
         at = dx * ax + dy * ay + dz * az
-        across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - at * at))
+        across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - straight * at * at))
         along[p], off[p] = at, (across - radius - slope * at) * steepness
+    _move_to_sphere(along, off, radius, 0 if straight != 0.0 else x.shape[0])
     count = 0
     for p in range(x.shape[0]):
         chosen[count] = p

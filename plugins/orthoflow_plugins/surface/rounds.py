@@ -1,4 +1,4 @@
-"""Surfaces of revolution with straight generatrices: cylinders and cones."""
+"""Surfaces of revolution: cylinders, cones and spheres."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Cone, Cylinder, basis_from_up
-from orthoflow.geometry.surfaces import along_and_across, zero_direction
+from orthoflow.geometry import Cone, CurvedShape, Cylinder, Sphere, basis_from_up
+from orthoflow.geometry.surfaces import along_and_across, middle_direction, zero_direction
 from orthoflow_plugins.surface.kernels import solve_robustly
 
 # Tukey's constant, in standard deviations.
@@ -21,19 +21,22 @@ _MOST_VOXELS: Final = 3_000
 
 @dataclass(frozen=True, kw_only=True)
 class Round:
-    """A cylinder or, if the radius changes along the axis, a cone.
+    """A cylinder, a cone (if the radius changes along the axis), or a sphere.
 
     Attributes:
-        point: (3,) float64 point of the axis, metres from the cloud's origin.
-        axis: (3,) float64 unit vector.
-        radius_m: radius at the point.
+        point: (3,) float64 point of the axis or centre of the sphere, metres from the cloud's
+            origin.
+        axis: (3,) float64 unit vector; that of a sphere points to the middle of its points.
+        radius_m: radius at the point, or of the sphere.
         slope: change of the radius per metre along the axis.
+        is_sphere: whether the surface is a sphere.
     """
 
     point: NDArray[np.float64]
     axis: NDArray[np.float64]
     radius_m: float
     slope: float = 0.0
+    is_sphere: bool = False
 
     @property
     def steepness(self) -> float:
@@ -41,8 +44,8 @@ class Round:
         return 1.0 / math.hypot(1.0, self.slope)
 
     def row(self, zero: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the row (12,) for kernels; angles are measured from the direction `zero` (3,)."""
-        numbers = (self.radius_m, self.slope, self.steepness)
+        """Return the row (13,) for kernels; angles are measured from the direction `zero` (3,)."""
+        numbers = (self.radius_m, self.slope, self.steepness, 0.0 if self.is_sphere else 1.0)
         return np.concatenate([self.point, self.axis, zero, numbers])
 
     def outwards(
@@ -50,6 +53,8 @@ class Round:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return distances (n,), positive outside, and outward normals (n, 3) of points."""
         along, across = along_and_across(points, self.point, self.axis)
+        if self.is_sphere:
+            across = points - self.point
         radius = np.linalg.norm(across, axis=1)
         distances = (radius - self.radius_m - self.slope * along) * self.steepness
         normals = across / np.maximum(radius, 1e-12)[:, None] - self.slope * self.axis
@@ -58,8 +63,14 @@ class Round:
     def places(
         self, points: NDArray[np.float64], zero: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return angles (n,), -pi to pi, and positions along the axis (n,) of points."""
+        """Return angles (n,), -pi to pi, and positions along the axis (n,) of points.
+
+        Points are first moved to the surface of a sphere.
+        """
         relative = points - self.point
+        if self.is_sphere:
+            lengths = np.maximum(np.linalg.norm(relative, axis=1, keepdims=True), 1e-12)
+            relative = relative * self.radius_m / lengths
         sine = relative @ cross(self.axis, zero)
         return np.arctan2(sine, relative @ zero), relative @ self.axis
 
@@ -72,12 +83,19 @@ class Round:
     ) -> NDArray[np.float64]:
         """Return points (n, 3) at angles, positions along the axis and distances (n,) outwards."""
         outwards = np.outer(np.cos(angles), zero) + np.outer(np.sin(angles), cross(self.axis, zero))
+        if self.is_sphere:
+            axial = np.clip(along / self.radius_m, -1.0, 1.0)
+            outwards = np.sqrt(1.0 - axial**2)[:, None] * outwards + np.outer(axial, self.axis)
+            return np.asarray(self.point + (self.radius_m + distances)[:, None] * outwards)
         radius = self.radius_m + self.slope * along + distances / self.steepness
         return np.asarray(self.point + np.outer(along, self.axis) + radius[:, None] * outwards)
 
     def corrected(self, zero: NDArray[np.float64], change: NDArray[np.float64]) -> Round:
         """Return the surface after a change of the parameters of `design`."""
         aside = cross(self.axis, zero)
+        if self.is_sphere:
+            moved = self.point + change[:3] @ np.array([zero, aside, self.axis])
+            return replace(self, point=moved, radius_m=self.radius_m + float(change[3]))
         axis = self.axis + change[2] * zero + change[3] * aside
         return Round(
             point=self.point + change[0] * zero + change[1] * aside,
@@ -87,18 +105,26 @@ class Round:
         )
 
     def moved(self, along_m: float) -> Round:
-        """Return the same surface with its point moved along the axis."""
+        """Return the same surface with its point moved along the axis, except the centre."""
+        if self.is_sphere:
+            return self
         return replace(
             self,
             point=self.point + along_m * self.axis,
             radius_m=self.radius_m + self.slope * along_m,
         )
 
+    def aimed(self, points: NDArray[np.float64], up: NDArray[np.float64]) -> Round:
+        """Return the same sphere with the axis to the middle of its points (n, 3)."""
+        return replace(self, axis=middle_direction(self.outwards(points)[1], up))
+
     def directed(self, up: NDArray[np.float64]) -> Round:
         """Return the same surface with the axis in the direction that `Surface.shape` requires.
 
         The axis of a cone points from its apex to its wider end.
         """
+        if self.is_sphere:
+            return self
         along = basis_from_up(up) @ self.axis
         steep = abs(along[2]) >= math.sqrt(0.5)
         sign = along[2] if steep else along[int(np.argmax(np.abs(along[:2])))]
@@ -106,8 +132,11 @@ class Round:
             return replace(self, axis=-self.axis, slope=-self.slope)
         return self
 
-    def shape(self, origin: NDArray[np.float64], *, is_concave: bool) -> Cylinder | Cone:
+    def shape(self, origin: NDArray[np.float64], *, is_concave: bool) -> CurvedShape:
         """Return the surface in world coordinates: a cylinder if the radius does not increase."""
+        if self.is_sphere:
+            centre = origin + self.point
+            return Sphere(centre_world=centre, radius_m=self.radius_m, is_concave=is_concave)
         if self.slope <= 0.0:
             return Cylinder(
                 point_world=origin + self.point,
@@ -128,6 +157,10 @@ class Round:
         """Return the covariance (7, 7) of a `Surface` from that of the parameters of `design`."""
         aside = cross(self.axis, zero)
         turn = np.zeros((7, len(own)))
+        if self.is_sphere:
+            turn[:3, :3] = np.array([zero, aside, self.axis]).T
+            turn[6, 3] = 1.0
+            return np.asarray(turn @ own @ turn.T)
         turn[:3, 0], turn[:3, 1] = zero, aside
         turn[3:6, 2], turn[3:6, 3] = zero, aside
         if self.slope <= 0.0:
@@ -148,14 +181,18 @@ def cross(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def design(
-    angles: NDArray[np.float64], along: NDArray[np.float64], steepness: float, *, is_cone: bool
+    found: Round, angles: NDArray[np.float64], along: NDArray[np.float64], *, is_cone: bool
 ) -> NDArray[np.float64]:
-    """Return the derivatives (n, 5 or 6) of the surface's displacement along its normal.
+    """Return the derivatives (n, 4, 5 or 6) of the surface's displacement along its normal.
 
     The parameters are the displacement of the axis (2), its tilt (2), the radius, and, for cones,
-    the slope.
+    the slope; for spheres, the displacement of the centre (3) and the radius.
     """
-    cosine, sine = np.cos(angles), np.sin(angles)
+    cosine, sine, steepness = np.cos(angles), np.sin(angles), found.steepness
+    if found.is_sphere:
+        axial = np.clip(along / found.radius_m, -1.0, 1.0)
+        across = np.sqrt(1.0 - axial**2)
+        return np.column_stack([across * cosine, across * sine, axial, np.ones_like(along)])
     columns = [cosine, sine, along * cosine, along * sine, np.ones_like(along)]
     if is_cone:
         columns.append(along)
@@ -197,10 +234,12 @@ def fitted(
         found = found.moved(float(np.mean((points - found.point) @ found.axis)))
         zero = zero_direction(found.axis, up)
         distances, _ = found.outwards(points)
-        matrix = design(*found.places(points, zero), found.steepness, is_cone=is_cone)
+        matrix = design(found, *found.places(points, zero), is_cone=is_cone)
         change, _, _ = robust_solution(matrix, distances, variances)
-        change[:2] = np.clip(change[:2], -0.3 * found.radius_m, 0.3 * found.radius_m)
-        change[2:4] = np.clip(change[2:4], -0.3, 0.3)
-        change[4] = np.clip(change[4], -0.5 * found.radius_m, found.radius_m)
+        n_shifts, of_radius = (3, 3) if found.is_sphere else (2, 4)
+        most_m = 0.3 * found.radius_m
+        change[:n_shifts] = np.clip(change[:n_shifts], -most_m, most_m)
+        change[n_shifts:of_radius] = np.clip(change[n_shifts:of_radius], -0.3, 0.3)
+        change[of_radius] = np.clip(change[of_radius], -0.5 * found.radius_m, found.radius_m)
         found = found.corrected(zero, change)
     return found

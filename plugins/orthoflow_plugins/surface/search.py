@@ -1,10 +1,10 @@
-"""Search for cylinders and cones among voxels, from coarse to fine.
+"""Search for cylinders, cones and spheres among voxels, from coarse to fine.
 
 Two normals that are not parallel give an axis, perpendicular to both, and the circle around it on
 which both points lie with their normals. This combines the search for a great circle on the Gauss
 sphere with the votes for a circle. Hypotheses of pairs from one surface agree with each other;
 those across edges and clutter do not. The hypothesis with the most votes is fitted to all voxels
-and tested.
+and tested. For spheres, the pair gives the centre on both normals at the same distance.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from orthoflow.geometry.surfaces import zero_direction
 from orthoflow_plugins.surface.kernels import count_votes, near_voxels
 from orthoflow_plugins.surface.rounds import Round, cross, fitted
 from orthoflow_plugins.surface.voxels import Voxels, keys_of
+
+Form = Literal["cylinder", "cone", "sphere"]
 
 # Size of a block, in voxels. The two voxels of a pair are in the same block or in adjacent ones.
 BLOCK_VOXELS: Final = 6
@@ -70,6 +72,8 @@ _SECTOR_VOXELS: Final = 8
 # Flat sectors, such as walls below a vault, are ignored unless most voxels are in such sectors.
 _MOST_FLAT: Final = 0.7
 _STEEPEST: Final = 1.5
+# Directions in which the radii of a sphere rotate by less than this share are not compared.
+_LEAST_SHARE: Final = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +86,7 @@ class Limits:
         radius_m: smallest and largest radius.
         min_arc_rad: shortest arc.
         min_area_m2: smallest area.
-        is_cone: whether to search for cones instead of cylinders.
+        form: the form of the surfaces.
     """
 
     tolerance_m: float
@@ -90,7 +94,7 @@ class Limits:
     radius_m: tuple[float, float]
     min_arc_rad: float
     min_area_m2: float
-    is_cone: bool
+    form: Form
 
     def tolerance_at(self, radius_m: float) -> float:
         """Return the tolerance for a surface; it is smaller for narrow columns."""
@@ -159,12 +163,21 @@ def search(
         is_free = np.ones(len(voxels), dtype=np.bool_)
         for item in found:
             is_free &= ~claimed(item, voxels, limits)
-        guesses, ends = _hypotheses(voxels, is_free, voxel_m, radii, rng, is_oriented=is_oriented)
+        guesses, ends = _hypotheses(
+            voxels,
+            is_free,
+            voxel_m,
+            radii,
+            rng,
+            is_oriented=is_oriented,
+            is_sphere=limits.form == "sphere",
+        )
         is_live = np.ones(len(guesses), dtype=np.bool_)
         for _ in range(_MOST_TRIES):
             chosen = np.flatnonzero(is_live)
             votes = np.zeros(len(chosen), dtype=np.int64)
-            count_votes(guesses[chosen], _SAME_AXIS, _SAME_RADIUS, _SAME_PLACE, votes)
+            same_axis = 1.0 if limits.form == "sphere" else _SAME_AXIS
+            count_votes(guesses[chosen], same_axis, _SAME_RADIUS, _SAME_PLACE, votes)
             least = max(_LEAST_VOTES, _LEAST_VOTE_SHARE * len(guesses))
             if not len(chosen) or votes.max() < least:
                 break
@@ -199,14 +212,15 @@ def _suited(levels: list[tuple[float, Voxels]], radius_m: float) -> tuple[float,
 
 def _is_fringe(new: Found, old: Found) -> bool:
     """Return whether a surface consists of noise or relief near another surface."""
-    row = [np.append(item.round.point, item.round.axis) for item in (new, old)]
+    is_sphere = new.round.is_sphere
+    row = [np.append(item.round.point, item.round.axis * (not is_sphere)) for item in (new, old)]
     ends = [np.append(item.round.radius_m, item.side) for item in (new, old)]
     one, other = (np.concatenate(pair) for pair in zip(row, ends, strict=True))
     along_m = float((new.round.point - old.round.point) @ old.round.axis)
     is_beside = (
         along_m + new.along_m[1] < old.along_m[0] or along_m + new.along_m[0] > old.along_m[1]
     )
-    return bool(_agreeing(one[None], other)[0]) and not is_beside
+    return bool(_agreeing(one[None], other)[0]) and (is_sphere or not is_beside)
 
 
 def claimed(found: Found, voxels: Voxels, limits: Limits) -> NDArray[np.bool_]:
@@ -233,6 +247,7 @@ def _hypotheses(
     rng: np.random.Generator,
     *,
     is_oriented: bool,
+    is_sphere: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return hypotheses (h, 8) of pairs of voxels (see `count_votes`), and the pairs (h, 2)."""
     first, second = _pairs(voxels, np.flatnonzero(is_free), rng)
@@ -250,7 +265,7 @@ def _hypotheses(
     sine = np.linalg.norm(axis, axis=1)
     keep = sine > _LEAST_TURN
     first, second, p, q, n, m = (part[keep] for part in (first, second, p, q, n, m))
-    axis = axis[keep] / sine[keep, None]
+    axis = axis[keep] / sine[keep, None] * (not is_sphere)
     chord = q - p
     chord -= np.einsum("ij,ij->i", chord, axis)[:, None] * axis
     turn = m - n
@@ -338,10 +353,11 @@ def _agreeing(guesses: NDArray[np.float64], best: NDArray[np.float64]) -> NDArra
     along = apart @ best[3:6]
     miss = np.linalg.norm(apart - along[:, None] * best[3:6], axis=1)
     cosine = np.abs(guesses[:, 3:6] @ best[3:6])
+    is_sphere = not best[3:6].any()
     return np.asarray(
         (np.abs(guesses[:, 6] - best[6]) <= _SAME_RADIUS * radius)
         & (guesses[:, 7] == best[7])
-        & (1.0 - cosine**2 <= _SAME_AXIS**2)
+        & (is_sphere | (1.0 - cosine**2 <= _SAME_AXIS**2))
         & (miss <= _SAME_PLACE * radius)
     )
 
@@ -350,10 +366,13 @@ def _mean_of(guesses: NDArray[np.float64], best: NDArray[np.float64]) -> tuple[R
     """Return the mean surface of hypotheses, and their side."""
     signs = np.where(guesses[:, 3:6] @ best[3:6] < 0.0, -1.0, 1.0)
     axis = (guesses[:, 3:6] * signs[:, None]).mean(axis=0)
+    is_sphere = not axis.any()
     mean = Round(
         point=np.median(guesses[:, :3], axis=0),
-        axis=axis / np.linalg.norm(axis),
+        # The direction to the middle of a sphere's points is not known yet.
+        axis=np.eye(3)[2] if is_sphere else axis / np.linalg.norm(axis),
         radius_m=float(np.median(guesses[:, 6])),
+        is_sphere=is_sphere,
     )
     return mean, float(best[7])
 
@@ -379,6 +398,9 @@ def _tested(
         limits_on = np.array([within_m, math.cos(math.radians(angle_deg))])
         count = near_voxels(found.row(zero), side, voxels.points, voxels.normals, limits_on, near)
         on = near[:count]
+        if found.is_sphere and count:
+            found = found.aimed(voxels.points[on], up)
+            zero = zero_direction(found.axis, up)
         if len(on) >= _LEAST_VOXELS:
             on = on[_connected(*found.places(voxels.points[on], zero), found, voxel_m)]
             is_flat = _turning(found, zero, voxels.take(on), voxel_m)[1]
@@ -388,7 +410,7 @@ def _tested(
         if step == _ITERATIONS:
             break
         sigma_m = max(limits.noise_m / 2.0, 1e-3)
-        is_cone = limits.is_cone and step > 0
+        is_cone = limits.form == "cone" and step > 0
         found = fitted(found, voxels.points[on], sigma_m, up, is_cone=is_cone)
         is_far = not limits.radius_m[0] <= found.radius_m <= 1.5 * limits.radius_m[1]
         if is_far or abs(found.slope) > _STEEPEST:
@@ -457,6 +479,8 @@ def _judged(
     low_m = float(along.min()) + size_m * float(ends[0])
     high_m = float(along.min()) + size_m * float(ends[-1] + 1)
     arc_rad = 2.0 * math.pi * (1.0 - longest_gap(is_open) / len(is_open))
+    if found.is_sphere:
+        arc_rad = 2.0 * math.acos(min(1.0, max(-1.0, low_m / found.radius_m)))
     distances, _ = found.outwards(voxels.points)
     cells = occupied[is_open][:, ends[0] : ends[-1] + 1]
     # The rise of the middle of the surface above its ends distinguishes a dome from a cylinder.
@@ -482,7 +506,7 @@ def _judged(
         "incomplete": evidence["filled_share"] < _FILLED_LEAST,
         "flat parts": evidence["turning"] < _LEAST_TURNING,
         "rough": evidence["scatter_mm"] > rough_mm,
-        "dome": is_long and evidence["curvature_ratio"] > _DOUBLY_CURVED,
+        "dome": is_long and not found.is_sphere and evidence["curvature_ratio"] > _DOUBLY_CURVED,
     }
     for reason, is_met in reasons.items():
         if is_met:
@@ -502,16 +526,19 @@ def _turning(
 ) -> tuple[float, NDArray[np.bool_]]:
     """Return the rotation of normals per angle in narrow sectors: 1 on circles, 0 on facets.
 
-    The second result is a mask (v,) of the voxels in sectors that are flat.
+    On a sphere, it is the rotation in the direction of the least, which is 0 on a cylinder. The
+    second result is a mask (v,) of the voxels in sectors that are flat.
     """
     angles, _ = found.places(voxels.points, zero)
     _, outwards = found.outwards(voxels.points)
     aside = cross(found.axis, zero)
     signs = np.sign(np.einsum("ij,ij->i", voxels.normals, outwards))
     normals = voxels.normals * signs[:, None]
+    width = min(max(_FACET_VOXELS * voxel_m / found.radius_m, _FACET_RAD[0]), _FACET_RAD[1])
+    if found.is_sphere:
+        return _turning_of_sphere(normals, outwards, width)
     turned = np.arctan2(normals @ aside, normals @ zero) - angles
     turned = (turned + math.pi) % (2.0 * math.pi) - math.pi
-    width = min(max(_FACET_VOXELS * voxel_m / found.radius_m, _FACET_RAD[0]), _FACET_RAD[1])
     sector = ((angles + math.pi) / width).astype(np.int64)
     counts = np.maximum(np.bincount(sector), 1)
     x = angles - (np.bincount(sector, angles) / counts)[sector]
@@ -520,6 +547,28 @@ def _turning(
     turning = 1.0 + products / np.maximum(squares, 1e-12)
     is_flat = (turning < _LEAST_TURNING) & (counts >= _SECTOR_VOXELS)
     return 1.0 + float(products.sum() / max(1e-12, squares.sum())), is_flat[sector]
+
+
+def _turning_of_sphere(
+    normals: NDArray[np.float64], outwards: NDArray[np.float64], width_rad: float
+) -> tuple[float, NDArray[np.bool_]]:
+    """Return the results of `_turning` from normals and radii (v, 3), unit vectors."""
+    columns = np.floor(outwards / width_rad).astype(np.int64)
+    sector = np.unique(columns, axis=0, return_inverse=True)[1].ravel()
+    counts = np.bincount(sector)
+    x, y = (
+        values - np.column_stack([np.bincount(sector, one) / counts for one in values.T])[sector]
+        for values in (outwards, normals)
+    )
+    products = np.bincount(sector, (x * y).sum(axis=1))
+    squares = np.bincount(sector, (x * x).sum(axis=1))
+    is_flat = (products < _LEAST_TURNING * squares) & (counts >= _SECTOR_VOXELS)
+    # On a small part of a sphere, radii hardly rotate towards its middle.
+    sizes, directions = np.linalg.eigh(x.T @ x)
+    scaled = directions[:, sizes > _LEAST_SHARE * sizes[2]]
+    scaled /= np.sqrt(sizes[sizes > _LEAST_SHARE * sizes[2]])
+    rotation = scaled.T @ x.T @ y @ scaled
+    return float(np.linalg.eigvalsh(0.5 * (rotation + rotation.T))[0]), is_flat[sector]
 
 
 def longest_gap(is_open: NDArray[np.bool_]) -> int:

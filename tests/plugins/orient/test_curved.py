@@ -1,4 +1,4 @@
-"""Photos matched with an unrolled vault and spire and oriented, judged by the truth."""
+"""Photos matched with an unrolled vault, spire and dome and oriented, judged by the truth."""
 
 from __future__ import annotations
 
@@ -68,10 +68,14 @@ SCENES = {
         curved_scenes.spire(half_deg=60.0, band_m=(3.2, 3.35), height_m=0.08),
         [(-40.0, 3.3, 2.4), (0.0, 3.7, 2.5), (40.0, 3.3, 2.4)],
     ),
+    "dome": (
+        curved_scenes.dome(most_deg=60.0, band_m=(0.5, 0.6), height_m=0.05),
+        [(-40.0, 0.5, 0.9), (90.0, 0.4, 0.9), (200.0, 0.5, 0.9)],
+    ),
 }
 
 
-@pytest.mark.parametrize("name", ["vault", *long_only("spire")])
+@pytest.mark.parametrize("name", ["vault", *long_only("spire", "dome")])
 def test_oriented_photos_are_unrolled_to_a_tenth_of_a_cell(name: str, tmp_path: Path) -> None:
     drum, poses = SCENES[name]
     random = np.random.default_rng(11)

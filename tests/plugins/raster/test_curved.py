@@ -1,4 +1,4 @@
-"""Cylinders and cones in `raster.grid`: exact depths in unrolled rasters, as a viewer sees them."""
+"""Curved surfaces in `raster.grid`: exact depths in their developments, as a viewer sees them."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ DRUMS = {
     # A whole turn is 188.5 cells wide.
     "column": curved_scenes.tower(radius_m=0.6, half_deg=180.0, **BAND),
     "cone": curved_scenes.spire(band_m=(3.2, 3.5), height_m=0.1),
+    "dome": curved_scenes.dome(band_m=(0.5, 0.8), height_m=0.1),
 }
 
 
@@ -74,6 +75,11 @@ def test_depths_are_distances_from_the_surface(name: str, tmp_path: Path) -> Non
         assert frame.raster_axes == "plane"
         slants_m = np.linalg.norm(frame.raster_from_wall(cells), axis=1)
         np.testing.assert_allclose(slants_m, places[:, 1], atol=1e-9)
+    elif name == "dome":
+        # East is to the right, and south up, as one who looks up sees them.
+        np.testing.assert_allclose(middle, [[1, 0, 0], [0, 1, 0], [0, 0, -1]], atol=1e-9)
+        from_pole_m = np.linalg.norm(frame.raster_from_wall(cells), axis=1)
+        np.testing.assert_allclose(from_pole_m, places[:, 1], atol=1e-9)
     else:
         assert float(frame.v_world @ UP) < -0.99
         assert frame.raster_axes == "wall"

@@ -11,7 +11,7 @@ from orthoflow_plugins.simulate.curved import SimulateCurved
 from orthoflow_plugins.simulate.curved_model import Subject
 
 from orthoflow.geometry.scene_views import SceneCameras
-from orthoflow.geometry.surfaces import Cylinder, angles_around
+from orthoflow.geometry.surfaces import Cylinder, Sphere, angles_around
 from orthoflow.testing import Trial, run_trial
 
 
@@ -25,11 +25,15 @@ def test_exact_points_are_on_the_true_surfaces(subject: Subject, tmp_path: Path)
     on_any = np.zeros(len(points), dtype=np.bool_)
     for surface in truth.surfaces.surfaces:
         shape = surface.shape
-        start = shape.point_world if isinstance(shape, Cylinder) else shape.apex_world
         on = np.abs(shape.distances_m(points)) < 1e-4
-        frame = start, shape.axis_world
-        angles = angles_around(points[on], *frame, surface.zero_world)
-        along = (points[on] - frame[0]) @ frame[1]
+        if isinstance(shape, Sphere):
+            angles = np.zeros(np.count_nonzero(on))
+            cosines = (points[on] - shape.centre_world) @ surface.axis_world / shape.radius_m
+            along = shape.radius_m * np.arccos(np.clip(cosines, -1.0, 1.0))
+        else:
+            start = shape.point_world if isinstance(shape, Cylinder) else shape.apex_world
+            angles = angles_around(points[on], start, shape.axis_world, surface.zero_world)
+            along = (points[on] - start) @ shape.axis_world
         inside = (angles > surface.arc_rad[0] - 1e-6) & (angles < surface.arc_rad[1] + 1e-6)
         inside &= (along > surface.along_m[0] - 1e-3) & (along < surface.along_m[1] + 1e-3)
         assert surface.n_points <= np.count_nonzero(inside) <= 1.02 * surface.n_points + 5
