@@ -160,7 +160,8 @@ def _machine() -> Iterator[Finding]:
     else:
         yield Finding("platform", "limited", found, "only Linux on x86-64 is tested")
     yield Finding("cores", "ok", str(usable_cores()))
-    with contextlib.suppress(ImportError):  # reported with the libraries
+    # A missing library is reported with the others; without /proc, the memory is unknown.
+    with contextlib.suppress(ImportError, OSError):
         import psutil
 
         cost = "scans with many millions of points will not fit"

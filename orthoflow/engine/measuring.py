@@ -42,9 +42,13 @@ def memory_shortage() -> int:
     """Return the required free memory in bytes if less is available, otherwise 0.
 
     The required free memory is 512 MiB, or 3 % of the total if this is more, but at most one
-    eighth of the total. With less, programs fail unpredictably.
+    eighth of the total. With less, programs fail unpredictably. Without /proc, the free memory is
+    unknown, and the result is 0.
     """
-    memory = psutil.virtual_memory()
+    try:
+        memory = psutil.virtual_memory()
+    except OSError:
+        return 0
     floor = min(max(512 * MIB, memory.total * 3 // 100), memory.total // 8)
     return floor if memory.available <= floor else 0
 

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from orthoflow.engine.store import digest_of
-from orthoflow.errors import CancelledStepError, OrthoflowError
-from orthoflow.products import Cameras, PointCloud
+from orthoflow.errors import CancelledStepError, OrthoflowError, ProductError
+from orthoflow.products import Cameras, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.sdk.units import UNITS
 from orthoflow.testing.examples import example_room
@@ -99,8 +99,12 @@ def parameters_round_trip(subject: Subject) -> None:
 
 
 def outputs_are_valid(subject: Subject) -> None:
-    """Outputs have the declared types and can be stored; metrics are declared, with units."""
+    """Outputs have the declared types, fit each other and the inputs, and can be stored.
+
+    Metrics are declared.
+    """
     run = subject.first
+    given = {name: one for name, one in subject.trial.inputs.items() if isinstance(one, Product)}
     for name, port in port_specs(subject.method.Out).items():
         product = run.outputs.get(name)
         require(product is not None or not port.required, f"output {name} is missing")
@@ -110,12 +114,16 @@ def outputs_are_valid(subject: Subject) -> None:
             product.type_name == port.type_name,
             f"output {name} is a {product.type_name}, but {port.type_name} is declared",
         )
+        others = {port: other for port, other in run.outputs.items() if port != name}
+        try:
+            product.check_against(others | given)
+        except ProductError as error:
+            raise AssertionError(f"output {name} is invalid: {error}") from error
         unknown = sorted(set(product.tolerances) - _field_names(type(product), set()))
         require(not unknown, f"tolerances of {name} name no field: {', '.join(unknown)}")
         again = type(product).from_payload(product.to_payload())
         require(digest_of(again) == run.digests[name], f"storing changes output {name}")
     for metric in run.metrics:
-        require(metric.unit, f"metric {metric.name} has no unit (`1` for counts and shares)")
         require(
             subject.method.may_report(metric.name),
             f"metric {metric.name} is not declared by the method (`metrics`)",

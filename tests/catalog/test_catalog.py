@@ -213,6 +213,7 @@ def test_methods_of_a_kind_claimed_twice_have_the_ports_of_their_own_plugin(
     source = CLASS.replace("cloud: PointCloud", "pass").replace("        labels: PointLabels\n", "")
     catalog = with_plugin("two", text, tmp_path, monkeypatch, two_class=source)
     assert "kind plane is declared by laboratory 1.0 and two 1.0" in catalog.kinds["plane"].problem
+    assert catalog.kinds["plane"].state == "fine"  # for methods of a third plugin
     for name in ("plane.mine", "plane.ransac"):
         assert catalog.method(name).load().id == name
 

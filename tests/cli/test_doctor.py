@@ -127,6 +127,13 @@ def test_broken_and_disabled_plugins_cost_their_methods(monkeypatch: pytest.Monk
     assert findings()["plugin odd"]["found"] == "disabled"
     unknown = asked("plugins", "show", "plane.odd", code=2)
     assert "ORTHOFLOW_DISABLED_PLUGINS disables odd" in unknown.output
+    monkeypatch.delenv("ORTHOFLOW_DISABLED_PLUGINS")
+    announced = (
+        "hookimpl(lambda: [MethodSpec(id='plane.odd', target='odd_hooks:Odd', summary='-')])"
+    )
+    lines = ("from orthoflow.sdk import MethodSpec, hookimpl", f"orthoflow_methods = {announced}")
+    (packages / "odd_hooks.py").write_text("\n".join(lines))
+    assert "has no attribute 'Odd'" in findings()["plugins"]["cost"]
 
     def fail() -> None:
         raise ImportError("no pluggy")

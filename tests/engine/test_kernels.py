@@ -13,6 +13,7 @@ from orthoflow.cli import plugins, warm
 from orthoflow.engine import kernels
 from orthoflow.engine.kernels import VARIABLE, all_kernels, is_private, kernel_folder
 from orthoflow.workflow.source import shipped_workflow
+from tests.optional import skip_unless
 from tests.studios import asked
 from tests.workshop_runs import WORKSHOP, orthoflow, write_studio
 
@@ -102,6 +103,13 @@ def test_a_folder_that_others_may_write_to_is_not_used(
         assert is_private(folder)
     monkeypatch.setenv(VARIABLE, "relative")
     assert tmp_path not in all_kernels().parents
+
+
+@skip_unless(os.geteuid() == 0, "right", "only root can give folders away")
+def test_a_folder_of_another_user_is_not_used(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    os.chown(tmp_path, 65534, -1)
+    assert not is_private(tmp_path)
 
 
 def test_old_states_of_the_code_are_removed(

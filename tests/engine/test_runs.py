@@ -92,6 +92,7 @@ for k in range(12):
 
 THREADS = """
 names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
+assert "NUMBA_DISABLE_JIT" not in os.environ
 print(os.environ["NUMBA_CACHE_DIR"], os.getcwd(), ctx.scratch)
 values = np.array([ctx.cores, *[float(os.environ[name]) for name in names]])
 """
@@ -102,6 +103,7 @@ def test_threads_are_fixed_before_any_library_loads(
     world: World, monkeypatch: pytest.MonkeyPatch, jobs: int, cores: int
 ) -> None:
     monkeypatch.setattr("orthoflow.engine.scheduler.usable_cores", lambda: 4)
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     outcome = world.run(doing(THREADS), jobs=jobs)
     assert world.values(outcome, "b") == [float(cores)] * 5
     numba, where, scratch = outcome.results["b"].log.split()
@@ -152,8 +154,22 @@ STEPS = (
     "steps: {{a: {{use: make.range}}, b: {{use: work.{0}, in: {{numbers: a.numbers}}, "
     "params: {1}}}}}"
 )
+# Reading the input takes half a second of the processor.
+BURNS = """
+def burn():
+    end_s = time.thread_time() + 0.5
+    while time.thread_time() < end_s:
+        pass
+
+def read(cls, payload, plain=Numbers.from_payload):
+    burn()
+    return plain(payload)
+
+import time
+Numbers.from_payload = classmethod(read)
+"""
 # A library that takes a second to load, a kernel that takes 1.5 s to compile, half of it computing,
-# and a library that a daemon thread loads.
+# a library that a daemon thread loads, and a figure that takes half a second of the processor.
 LOADS = """
 thread = threading.Thread(target=lambda: __import__("toy_plugin.aside"), daemon=True)
 started, started_cpu = ctx.clock_s(), ctx.processor_s()
@@ -173,9 +189,7 @@ def typed(values):
     if not waited:
         waited.append(True)
         time.sleep(1.0)
-        end_s = time.thread_time() + 0.5
-        while time.thread_time() < end_s:
-            pass
+        products.burn()
     return lambda values: values
 
 @numba.njit(nogil=True)
@@ -186,11 +200,14 @@ kernel(values)
 time.sleep(0.2)
 ctx.metric("own_s", ctx.clock_s() - started, "s")
 ctx.metric("own_cpu_s", ctx.processor_s() - started_cpu, "s")
+ctx.figure("dot", lambda: products.burn() or b"\\x89PNG\\r\\n\\x1a\\n0123")
 """
 
 
 def test_loading_and_compiling_show_in_compile_s_only(world: World) -> None:
     package = world.site / "toy_plugin"
+    with (package / "products.py").open("a") as file:
+        file.write(BURNS)
     (package / "heavy.py").write_text("import time\ntime.sleep(1)\n")
     (package / "aside.py").write_text("import time\ntime.sleep(0.3)\n")
     steps = STEPS.format("does", json.dumps({"code": LOADS}))

@@ -20,6 +20,13 @@ def ties(**more: object) -> Ties:
     return samples.ties(np.ones((2, 2)), photo_names=("a.jpg", "b.jpg"), **known, **more)
 
 
+@pytest.mark.parametrize("value", [np.nan, -1.0])
+def test_impossible_ties_are_refused(value: float) -> None:
+    ties().check_against({})
+    with pytest.raises(ProductError, match=r"ties\.sigma_px"):
+        replace(ties(), sigma_px=np.full(2, value)).check_against({})
+
+
 def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:
     frame = samples.facing_south(0.01, 4, 3, (1.0, 2.0, 3.0))
     raster = np.zeros(frame.shape, np.float32)

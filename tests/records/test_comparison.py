@@ -162,6 +162,14 @@ def test_what_was_skipped_has_no_versions_to_differ_in() -> None:
     assert not row.is_same
 
 
+def test_other_code_under_the_same_version_is_a_difference() -> None:
+    texts = (f'{{"code": {{"plugin": "{letter * 64}"}}}}' for letter in "ab")
+    runs = (run_of(replace(cell("plane"), key_preimage=text)) for text in texts)
+    (row,) = compare_runs(*runs).cells
+    assert not row.is_same
+    assert "code of plugin bbbbbbbb" in str(row.right)
+
+
 def _swept(**values: float) -> HeldRun:
     """A run of a step whose variants have a parameter each."""
     return run_of(*(cell(f"plane@plane={name}", params={"x": x}) for name, x in values.items()))
@@ -335,3 +343,5 @@ def test_times_are_left_out_but_for_a_number_that_one_side_calls_a_time() -> Non
     assert reported(measured(hidden), measured(replace(hidden, value=2.0)), IDENTICAL) == ()
     [found] = reported(measured(hidden), measured(number), IDENTICAL)
     assert (found.recorded_unit, found.replayed_unit, found.verdict) == ("s", "1", "different")
+    [found] = reported(measured(), measured(number), IDENTICAL)
+    assert (found.replayed, found.verdict) == (1.0, "not in the record")

@@ -134,6 +134,17 @@ CHEATS: dict[str, tuple[str, str, str]] = {
             ctx.metric("n_walls", 1.0, "1")
         """,
     ),
+    "mislabelling": (
+        "outputs-are-valid",
+        "output labels is invalid: labels.plane_index must be -1 or the index of one of 1 planes",
+        """
+        def run(self, inputs, params, ctx):
+            made = super().run(inputs, params, ctx)
+            return self.Out(
+                planes=made.planes, labels=PointLabels(plane_index=made.labels.plane_index + 5)
+            )
+        """,
+    ),
     "lenient": (
         "parameters-round-trip",
         "an unknown parameter is accepted",
@@ -149,6 +160,14 @@ CHEATS: dict[str, tuple[str, str, str]] = {
         """
         def covariance(self):
             return 1e-16 * np.eye(4)[np.newaxis]
+        """,
+    ),
+    "timid": (
+        "stated-errors-of-planes-hold",
+        "distances of true corners from planes are",
+        """
+        def covariance(self):
+            return np.eye(4)[np.newaxis]
         """,
     ),
     "meddling": (

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Any, Final, cast
 
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
@@ -49,7 +49,7 @@ def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None
     """
     sizes = [frame.width * frame.height for frame in frames]
     needed = bytes_needed([frame.shape for frame in frames], is_tin=is_tin)
-    memory = psutil.virtual_memory().total
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     # Indices of cells have 32 bits.
     if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
         largest = frames[int(np.argmax(sizes))]

@@ -204,3 +204,4 @@ def test_a_station_may_stand_anywhere(far_m: float) -> None:
     assert screened((4.0 * far_m, 0.3, far_m)) == 0.0
     # Distant stray points do not enlarge the voxels.
     assert screened((0.3, 0.3, 5.0), (far_m, far_m, far_m)) == pytest.approx(1.0)
+    assert screened((20.0, 0.3, 5.0), (far_m, far_m, far_m)) == 0.0

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import mmap
+import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
-import psutil
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
@@ -167,8 +166,8 @@ def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path)
 
 def test_walls_may_take_three_quarters_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     def give_memory(n_bytes: float) -> None:
-        memory = SimpleNamespace(total=int(n_bytes))
-        monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+        pages = {"SC_PHYS_PAGES": int(n_bytes), "SC_PAGE_SIZE": 1}
+        monkeypatch.setattr(os, "sysconf", pages.__getitem__)
 
     one = samples.facing_south(0.01, 3000, 2000)
     give_memory(1.01 * bytes_needed([one.shape]) / 0.75)
