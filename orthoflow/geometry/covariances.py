@@ -41,6 +41,8 @@ _COARSER: Final = 1.15
 # remains of such a component mostly comes from the other observations (ties between photos, priors
 # of lenses), whose systematic errors would look like a large, smooth error of the positions.
 _ABSORBED: Final = 0.1
+# Block size of LAPACK's routines.
+_BLOCK: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,13 +230,28 @@ class _Residuals:
             left: (r, r) covariance of the residuals due to the common error.
             spread: (r,) variances due to the other errors.
         """
+        from scipy.linalg import lapack  # noqa: PLC0415 - loads slowly, and here alone
+
+        # A tridiagonal matrix suffices, and takes half the time of an eigendecomposition. The
+        # transformation leaves the first component as it is.
         scale = 1.0 / np.sqrt(spread)
-        values, vectors = np.linalg.eigh(scale[:, None] * left * scale)
-        ratios = 1.0 + _RATIOS[:, None] ** 2 * np.maximum(values, 0.0)
-        squares = ((vectors.T @ (scale * self._white)) ** 2 / ratios).sum(axis=1) + self._scatter
+        white, matrix = scale * self._white, scale[:, None] * left * scale
+        if len(white) < 2:  # LAPACK needs two components.
+            white, matrix = (np.pad(values, (0, 2 - len(spread))) for values in (white, matrix))
+        reduced, diagonal, beside, factors, _ = lapack.dsytrd(
+            matrix.T, lower=1, lwork=_BLOCK * len(white), overwrite_a=1
+        )
+        turned = lapack.dormqr("L", "T", reduced[1:, :-1], factors, white[1:, None], _BLOCK)[0]
+        white[1:] = turned.ravel()
+        logarithms = np.full(len(_RATIOS), np.log(spread).sum())
+        squares = np.full(len(_RATIOS), self._scatter)
+        for index, variance in enumerate(_RATIOS**2):
+            shifted = 1.0 + variance * diagonal
+            pivots, _, solution, _ = lapack.dptsv(shifted, variance * beside, white)
+            logarithms[index] += np.log(pivots).sum()
+            squares[index] += white @ solution
         # Avoid the logarithm of 0 for points without any error.
         squares = np.maximum(squares, np.finfo(np.float64).tiny)
-        logarithms = np.log(spread).sum() + np.log(ratios).sum(axis=1)
         likelihood = -0.5 * logarithms - 0.5 * self.n_free * np.log(squares)
         return likelihood, squares / max(self.n_free - 2, 1)
 
