@@ -256,11 +256,11 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
         raise RecordError(f"{finding}; changed records are not exported: use an unchanged copy")
-    with whole_folder(folder) as aside, working_on(f"writing {name}"):
+    with whole_folder(folder) as aside, working_on(f"writing {name}"), opened.held_open() as held:
         if target:
-            summary = _export_to(FORMATS[target], opened, aside, chosen)
+            summary = _export_to(FORMATS[target], held, aside, chosen)
         else:
-            summary = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
+            summary = (_export_split if chosen.split else _export_embedded)(held, aside, chosen)
     echo(f"{name}: {folder}: {summary}")
     return code_for([finding], f"do not use the files in {folder}")
 

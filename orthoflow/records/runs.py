@@ -279,6 +279,9 @@ class Run:
         Raises:
             RecordError: the record is damaged or missing.
         """
+        if self.output is not None:
+            yield self
+            return
         with ExitStack() as stack:
             with record_errors(self.path):
                 opened = stack.enter_context(open_record(self.path))
