@@ -539,14 +539,19 @@ def _contradicted_calibration(found: Estimate, control: SeenPoints) -> str:
     camera = found.resection.camera
     if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
         return ""
-    try:
-        free = adjust(control, camera, lens=_OTHER_LENS, independent=False, soft_limit=SOFT_LIMIT)
-    except GeometryError:
-        return ""
-    off = abs(math.log(free.camera.fx / camera.fx))
-    sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
-    if off < max(_MIN_FOCAL_OFF, _FOCAL_OFF_SIGMAS * sigma):
-        return ""
+    # Common errors are estimated only if the focal length would be significant without them, since
+    # this takes longer and only increases its standard deviation.
+    for independent in (True, False):
+        try:
+            free = adjust(
+                control, camera, lens=_OTHER_LENS, independent=independent, soft_limit=SOFT_LIMIT
+            )
+        except GeometryError:
+            return ""
+        off = abs(math.log(free.camera.fx / camera.fx))
+        sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
+        if off < max(_MIN_FOCAL_OFF, _FOCAL_OFF_SIGMAS * sigma):
+            return ""
     return (
         f"its ties give a focal length of {free.camera.fx:.0f} px +- "
         f"{sigma * free.camera.fx:.0f} px, but its calibration has {camera.fx:.0f} px: the "
