@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import multiprocessing.util
 import os
+import signal
 import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, ExitStack, suppress
@@ -77,6 +78,9 @@ def pytest_xdist_auto_num_workers() -> int | None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Write into memory; the processes that tests are spread over write where this one does."""
+    # Where a shell has started the tests in the background, interrupts are ignored.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     # What servers of steps need lies elsewhere: they end later than the folder in memory.
     multiprocessing.util.get_temp_dir()
     config.pluginmanager.register(_Examples())  # a hook of this module sees files beside it only

@@ -253,14 +253,16 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    finding = broken_seal(opened, of_all=hands_on)
-    if finding and hands_on:
-        raise RecordError(f"{finding}; changed records are not exported: use an unchanged copy")
-    with whole_folder(folder) as aside, working_on(f"writing {name}"), opened.held_open() as held:
-        if target:
-            summary = _export_to(FORMATS[target], held, aside, chosen)
-        else:
-            summary = (_export_split if chosen.split else _export_embedded)(held, aside, chosen)
+    with opened.held_open() as held:
+        finding = broken_seal(held, of_all=hands_on)
+        if finding and hands_on:
+            raise RecordError(f"{finding}; changed records are not exported: use an unchanged copy")
+        with whole_folder(folder) as aside, working_on(f"writing {name}"):
+            if target:
+                summary = _export_to(FORMATS[target], held, aside, chosen)
+            else:
+                export_all = _export_split if chosen.split else _export_embedded
+                summary = export_all(held, aside, chosen)
     echo(f"{name}: {folder}: {summary}")
     return code_for([finding], f"do not use the files in {folder}")
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -204,6 +205,10 @@ def read_whole(dataset: h5py.Dataset) -> object:
     return value
 
 
+# Number of handles of each open file whose objects have been checked.
+_CHECKED: Final[Counter[int]] = Counter()
+
+
 class FileSink:
     """A file object for HDF5 whose write operations never raise an error.
 
@@ -323,6 +328,8 @@ def create_group(parent: h5py.Group, name: str) -> h5py.Group:
 def safe_open(path: Path, format_name: str) -> Iterator[h5py.File]:
     """Open a file with a given format for reading, after checking all objects in it.
 
+    A file that is open already is not checked again.
+
     Raises:
         UnknownFormatError: the file is not an HDF5 file, or it has another format or another
             version of the format.
@@ -339,8 +346,17 @@ def safe_open(path: Path, format_name: str) -> Iterator[h5py.File]:
         file = h5py.File(path, "r", locking=False)
     try:
         _require_format(file, path.name, format_name)
-        _Inspection(file, path).run()
-        yield file
+        # HDF5 gives this number to a file until all its handles are closed.
+        number = int(h5py.h5o.get_info(file.id).fileno)
+        if number not in _CHECKED:
+            _Inspection(file, path).run()
+        _CHECKED[number] += 1
+        try:
+            yield file
+        finally:
+            _CHECKED[number] -= 1
+            if _CHECKED[number] <= 0:
+                _CHECKED.pop(number, None)
     finally:
         file.close()
 
