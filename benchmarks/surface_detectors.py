@@ -1,5 +1,7 @@
 """Measure accuracy and time of `surface.cylinder`, and of other programs, on simulated buildings.
 
+Domes are found by `surface.sphere`; they have no axis, and `place` is the error of their centre.
+
     python benchmarks/surface_detectors.py                        # 10 drawn buildings of each kind
     python benchmarks/surface_detectors.py --rooms 50             # rooms of planes: no cylinders
     python benchmarks/surface_detectors.py --points 10000000      # time in F
@@ -24,8 +26,10 @@ from orthoflow_plugins.simulate.curved import SimulateCurved
 from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow_plugins.surface.cylinder import SurfaceCylinder
 from orthoflow_plugins.surface.detection import Detection, detect
+from orthoflow_plugins.surface.search import Form
 from plane_detectors import pass_s
 
+from orthoflow.geometry import Sphere
 from orthoflow.products import PointCloud, Surface, Truth
 from orthoflow.sdk import Method, StepContext
 
@@ -39,14 +43,19 @@ def simulated(method: type[Method], seed: int, **params: object) -> tuple[PointC
     return made.cloud, made.truth
 
 
-def detected(cloud: PointCloud, seed: int = 0, **params: object) -> Detection:
+def detected(
+    cloud: PointCloud, seed: int = 0, *, form: Form = "cylinder", **params: object
+) -> Detection:
     known = SurfaceCylinder.Params.model_validate(params)
     rng = np.random.default_rng(seed)
-    return detect(cloud, None, known, rng, lambda *_: None, is_cone=False, cores=2)
+    return detect(cloud, None, known, rng, lambda *_: None, form=form, cores=2)
 
 
 def errors(found: Surface, true: Surface) -> tuple[float, float, float]:
     """Return errors of axis (degrees), radius and place of the axis (mm) at the found point."""
+    if isinstance(true.shape, Sphere):
+        off = float(np.linalg.norm(found.middle_world - true.middle_world))
+        return 0.0, 1000.0 * (found.radius_m - true.radius_m), 1000.0 * off
     axis = true.shape.axis_world
     turn = math.degrees(math.asin(float(np.linalg.norm(np.cross(found.shape.axis_world, axis)))))
     apart = found.shape.point_world - true.shape.point_world
@@ -67,7 +76,8 @@ def report_accuracy(options: argparse.Namespace) -> None:
                 scan_step_m=options.step,
                 noise_m=options.noise_mm / 1000.0,
             )
-            found = list(detected(cloud, seed).surfaces)
+            form: Form = "sphere" if subject == "dome" else "cylinder"
+            found = list(detected(cloud, seed, form=form).surfaces)
             for true in truth.surfaces.surfaces:
                 n_true += 1
                 own = [item for item in found if errors(item, true)[0] < 1.0]
@@ -76,7 +86,8 @@ def report_accuracy(options: argparse.Namespace) -> None:
                     found = [item for item in found if item is not best]
                     measured = errors(best, true)
                     ratio = abs(measured[1]) / (1000.0 * best.sigma_radius_m)
-                    rows.append((*measured, ratio, measured[0] / best.sigma_axis_deg))
+                    turn_ratio = measured[0] / best.sigma_axis_deg if measured[0] else 0.0
+                    rows.append((*measured, ratio, turn_ratio))
             n_more += len(found)
         if not rows:
             print(f"| {subject} | {options.seeds} | 0 of {n_true}, {n_more} | | | | |")
@@ -183,7 +194,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--subject", choices=SUBJECTS, action="append")
+    parser.add_argument("--subject", choices=(*SUBJECTS, "dome"), action="append")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--step", type=float, default=0.01, help="point spacing at 3 m, metres")
     parser.add_argument("--noise-mm", type=float, default=2.0)

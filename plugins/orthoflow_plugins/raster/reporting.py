@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import omega_phi_deg
+from orthoflow.geometry import SphereBend, omega_phi_deg
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.levels import plain_tone
 from orthoflow.geometry.robust import depth_noise_m
@@ -91,6 +91,14 @@ COVERED: Final = DiagnosticSpec(
     text="{subject} shows {included} as relief, so these planes have no orthoimages of their own",
     remedy="set {step}.skip_covered=false to create one for each plane",
 )
+DISTORTED: Final = DiagnosticSpec(
+    code="sphere-distorted",
+    severity="note",
+    text="{subject} is a sphere of radius {radius_m:.3f} m, which cannot be unrolled: lengths from "
+    "its middle are to scale, and lengths across them are t / sin(t) times those on the sphere, "
+    "with the angle t from the middle: up to {stretch:.2f} times at the edge",
+    rank_by="stretch",
+)
 NO_INTENSITY: Final = DiagnosticSpec(
     code="scan-without-intensity",
     severity="warning",
@@ -130,7 +138,7 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 def warn(
     ctx: StepContext, walls: Sequence[Wall], steps_m: Sequence[float], intensity_source: str
 ) -> None:
-    """Report missing data of walls, and cells that are finer than the point spacing."""
+    """Report missing data and distortion of walls, and cells finer than the point spacing."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
@@ -140,6 +148,13 @@ def warn(
         if not wall.count.any():
             ctx.report(NO_POINT, subject=wall.name)
             continue
+        if isinstance(bend := wall.frame.bend, SphereBend):
+            ctx.report(
+                DISTORTED,
+                subject=wall.name,
+                radius_m=bend.radius_m,
+                stretch=bend.largest_stretch,
+            )
         is_close = step_m > _STEP_MOST_CELLS * gsd_m
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
