@@ -55,8 +55,10 @@ _LEAST_INNER: Final = 0.9
 # A profile is a circle if its variation has at least the first probability on circles, and is none
 # if it has less than the second.
 _LEVELS: Final = (0.05, 0.001)
-# Number of parameters of a sphere.
+# Number of parameters of a sphere, and angle by which it may extend beyond its voxels: pendentives
+# are so near walls that they may be labelled as parts of these.
 _N_SPHERE: Final = 4
+_PENDENTIVE_RAD: Final = math.radians(15.0)
 # Numbers of cells around surfaces are multiples of this number.
 _MULTIPLE: Final = 16
 _OPEN_SHARE: Final = 0.15
@@ -192,6 +194,9 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
     for item, tolerance_m in zip(found, tolerances_m, strict=True):
         low_m, high_m = item.along_m
         radius_m = item.round.radius_m
+        if item.round.is_sphere:
+            farthest = math.acos(min(1.0, max(-1.0, low_m / radius_m))) + _PENDENTIVE_RAD
+            low_m = radius_m * math.cos(min(math.pi, farthest))
         area_m2 = 2.0 * math.pi * radius_m * (high_m - low_m) * float(item.is_open.mean())
         size_m = max(min(_CELL_M, _CELL_RAD * radius_m), math.sqrt(area_m2 / _MOST_CELLS))
         around = _MULTIPLE * max(2, round(2.0 * math.pi * radius_m / size_m / _MULTIPLE))
@@ -230,10 +235,13 @@ def _fitted(
     variance = max(noise_m, 1e-5) ** 2
     points = found.round.points(angles, places, total / n, found.zero)
 
+    core = places >= found.along_m[0]
+
     def cells_about(surface: Round, zero: NDArray[np.float64]) -> _Means:
-        matrix = design(surface, *surface.places(points, zero), is_cone=True)
-        means, _ = surface.outwards(points)
-        cells = _Means(i=i, j=j, n=n, means=means, matrix=matrix, n_around=around)
+        matrix = design(surface, *surface.places(points[core], zero), is_cone=True)
+        means, _ = surface.outwards(points[core])
+        at = {"i": i[core], "j": j[core], "n": n[core]}
+        cells = _Means(**at, means=means, matrix=matrix, n_around=around)
         while cells.n.mean() < _LEAST_MEAN_POINTS and cells.n_around >= 2 * _LEAST_AROUND:
             cells = cells.merged(2)
         return cells
@@ -259,7 +267,7 @@ def _fitted(
     is_on = np.zeros((around, along), dtype=np.bool_)
     largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
     is_on[i, j] = np.abs(rest) < largest_m
-    arc, ends = _extent(is_on, sums[:, :, 0])
+    arc, ends = _extent(is_on, sums[:, :, 0], best.least_row_share)
     # Positions along the axis of a cone are measured from its apex.
     start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
     along_m = float(start_m + size_m * ends[0]), float(start_m + size_m * ends[1])
@@ -476,7 +484,7 @@ def _variation(tiles: _Means, radius_m: float) -> tuple[float, float]:
 
 
 def _extent(
-    is_full: NDArray[np.bool_], counts: NDArray[np.float64]
+    is_full: NDArray[np.bool_], counts: NDArray[np.float64], least_share: float
 ) -> tuple[tuple[float, float], tuple[int, int]]:
     """Return the ranges of angles and of cells along the axis (end exclusive) with points.
 
@@ -488,7 +496,7 @@ def _extent(
     count = len(is_open)
     wide = ndimage.binary_opening(np.tile(is_open, 3), np.ones(3, dtype=np.bool_))
     is_open = wide[count : 2 * count] if wide.any() else is_open
-    rows = np.flatnonzero(is_full[is_open].sum(axis=0) >= 0.1 * is_open.sum())
+    rows = np.flatnonzero(is_full[is_open].sum(axis=0) >= least_share * is_open.sum())
     ends = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, is_full.shape[1])
     gap = longest_gap(is_open)
     step = 2.0 * math.pi / count

@@ -43,6 +43,14 @@ class Round:
         """Cosine of the angle between axis and generatrices."""
         return 1.0 / math.hypot(1.0, self.slope)
 
+    @property
+    def least_row_share(self) -> float:
+        """Smallest occupied share of a row of cells around the axis that belongs to the surface.
+
+        Rows with less are clutter. Of a sphere, pendentives may reach into rows.
+        """
+        return 0.02 if self.is_sphere else 0.1
+
     def row(self, zero: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the row (13,) for kernels; angles are measured from the direction `zero` (3,)."""
         numbers = (self.radius_m, self.slope, self.steepness, 0.0 if self.is_sphere else 1.0)

@@ -473,7 +473,8 @@ def _judged(
     is_open = occupied.sum(axis=1) >= _OPEN_SHARE * length
     if not is_open.any():
         return Rejected(reason="few points", evidence={})
-    ends = np.flatnonzero(occupied[is_open].sum(axis=0) >= 0.1 * is_open.sum())
+    in_row = occupied[is_open].sum(axis=0)
+    ends = np.flatnonzero(in_row >= found.least_row_share * is_open.sum())
     if not len(ends):
         return Rejected(reason="few points", evidence={})
     low_m = float(along.min()) + size_m * float(ends[0])
