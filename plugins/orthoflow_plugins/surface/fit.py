@@ -45,9 +45,12 @@ _TILES_AROUND: Final = 72
 _MOST_TILES: Final = 200
 _LENGTHS: Final = (1.0, 2.0, 4.0, 8.0)
 _CORRELATED: Final = (0.25, 0.5, 0.75, 0.95)
-# The profile is tested in sectors of at least this angle and this number of tiles.
+# The profile is tested in sectors of at least this angle and this number of tiles, which are divided
+# into pieces of this number of tiles along the axis. There are at least three sectors if there are
+# enough tiles, and at most twelve.
 _SECTOR_RAD: Final = math.radians(15.0)
-_SECTOR_TILES: Final = 4
+_SECTOR_TILES: Final = 3
+_PIECE_TILES: Final = 4
 _SECTORS: Final = (3, 12)
 # Minimum share of the tiles within the ends of the arc that are on the circle, if only the ends are
 # not.
@@ -446,7 +449,8 @@ def _sectors(tiles: _Means) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     width_rad = 2.0 * math.pi / tiles.n_around
     n_around = int(around.max()) + 1
     count = int(n_around / max(_SECTOR_TILES, _SECTOR_RAD / width_rad))
-    count = min(max(count, _SECTORS[0]), _SECTORS[1])
+    count = max(1, count, min(_SECTORS[0], n_around // _SECTOR_TILES))
+    count = min(count, _SECTORS[1])
     sector = around * count // n_around
     return sector, (around + 0.5 - (sector + 0.5) * n_around / count) * width_rad
 
@@ -460,10 +464,10 @@ def _variation(tiles: _Means, radius_m: float) -> tuple[float, float]:
     """
     sector, t = _sectors(tiles)
     n_rows, n_sectors = int(tiles.j.max()) + 1, int(sector.max()) + 1
-    n_pieces = max(2, n_rows // _SECTOR_TILES)
+    n_pieces = max(2, n_rows // _PIECE_TILES)
     piece = sector * n_pieces + tiles.j * n_pieces // n_rows
     column = np.unique(piece * tiles.n_around + tiles.i)
-    full = np.bincount(column // tiles.n_around) >= _SECTOR_TILES - 1
+    full = np.bincount(column // tiles.n_around) >= _SECTOR_TILES
     powers = np.column_stack([np.bincount(piece, tiles.n * t**power)[full] for power in range(5)])
     bulge = tiles.n * tiles.means / radius_m
     right = [np.bincount(piece, bulge * t**power)[full] for power in range(3)]
@@ -476,7 +480,8 @@ def _variation(tiles: _Means, radius_m: float) -> tuple[float, float]:
     n_between = np.count_nonzero(counts)
     n_within = len(of) - n_between
     if n_between < 2 or n_within < 1:
-        return 0.0, 1.0
+        # There are too few tiles for a test.
+        return 1.0, 0.0
     within = float(((curvatures - means[of]) ** 2).sum()) / n_within
     between = float((counts * (means - 1.0) ** 2).sum()) / n_between
     chance = float(special.fdtrc(n_between, n_within, between / max(within, 1e-12)))
