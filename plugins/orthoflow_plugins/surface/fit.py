@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import linalg, ndimage, special
 from scipy.spatial.distance import cdist
 
-from orthoflow.geometry.rows import Rows
+from orthoflow.geometry.rows import Rows, spread_index
 from orthoflow.geometry.slabs import Offsets, read_only
 from orthoflow.geometry.surfaces import zero_direction
 from orthoflow.geometry.threads import even_parts, in_threads
@@ -35,7 +35,7 @@ _LEAST_SUM_M: Final = 0.012
 # Cells are merged until they contain this many points on average; cells and tiles become no larger
 # than this share of a circle, because their curvature would be lost.
 _LEAST_MEAN_POINTS: Final = 6.0
-_LEAST_AROUND: Final = 32
+_LEAST_AROUND: Final = 64
 # Size, in cells, of the tiles to whose means the surface is fitted. Tukey's weights detect smaller
 # deviations of tiles, such as those of tangential walls, than of cells.
 _TILES: Final = (4, 2, 1)
@@ -45,9 +45,9 @@ _TILES_AROUND: Final = 72
 _MOST_TILES: Final = 200
 _LENGTHS: Final = (1.0, 2.0, 4.0, 8.0)
 _CORRELATED: Final = (0.25, 0.5, 0.75, 0.95)
-# The profile is tested in sectors of at least this angle and this number of tiles, which are divided
-# into pieces of this number of tiles along the axis. There are at least three sectors if there are
-# enough tiles, and at most twelve.
+# The profile is tested in sectors of at least this angle and this number of tiles, which are
+# divided into pieces of this number of tiles along the axis. There are at least three sectors if
+# there are enough tiles, and at most twelve.
 _SECTOR_RAD: Final = math.radians(15.0)
 _SECTOR_TILES: Final = 3
 _PIECE_TILES: Final = 4
@@ -71,6 +71,14 @@ _LEAST_USED: Final = 0.4
 # otherwise a cone; 97.5 % probability, one-sided.
 CYLINDER_SLOPE: Final = math.radians(1.0)
 _SIGMAS: Final = 1.96
+# Step by which the effect of noise is differentiated, as a share of the radius, and least cosine of
+# the angle of incidence.
+_NOISE_STEP: Final = 0.01
+_LEAST_INCIDENCE: Final = 0.05
+# Number of points from which displacements between scans are estimated, and minimum number of
+# points of a scan on a surface.
+_SCAN_SAMPLE: Final = 100_000
+_LEAST_SCAN_POINTS: Final = 100
 # A cell belongs to the extent if its mean distance is within this many standard deviations plus a
 # tolerance.
 _EXTENT_SIGMAS: Final = 3.0
@@ -182,12 +190,18 @@ def fit_all(
 
     in_threads([partial(run, part) for part in range(_PARTS)], threads=cores)
     total = sums.sum(axis=0)
+    sample = spread_index(len(cloud), min(_SCAN_SAMPLE, len(cloud)))
+    sample = sample if cloud.scan is not None else sample[:0]
+    labelled = labels[sample]
     fitted = []
     for index, item in enumerate(found):
         first, around, along, _ = cells.sizes[index].tolist()
         own = total[first : first + around * along].reshape(around, along, 3)
         n_points = int(counts[:, index].sum())
-        fitted.append(_fitted(item, own, cells.bounds[index], n_points, cloud, is_cone=is_cone))
+        near = sample[labelled == index]
+        fitted.append(
+            _fitted(item, own, cells.bounds[index], n_points, cloud, near, is_cone=is_cone)
+        )
     return fitted, labels
 
 
@@ -221,6 +235,7 @@ def _fitted(
     bounds: NDArray[np.float64],
     n_points: int,
     cloud: PointCloud,
+    sample: NDArray[np.int64],
     *,
     is_cone: bool,
 ) -> FittedSurface:
@@ -257,9 +272,14 @@ def _fitted(
     start = found.round.corrected(found.zero, change)
     zero = zero_direction(start.axis, cloud.up)
     tiles = _inside(cells_about(start, zero), weights, is_open_beside=found.side < 0.0)
-    tiles = _along_meridians(tiles) if is_sphere else tiles
+    tiles = (
+        _along_meridians(tiles)
+        if is_sphere
+        else _without_noise_effect(tiles, start, zero, found.side, variance, cloud)
+    )
     change, own, variation, slope = _solution(tiles, variance, start.radius_m, n_own)
     best = start.corrected(zero, change)
+    own += _scan_effect(best, zero, n_own, cloud, sample)
     rest, _ = best.outwards(points)
     middle_m = 0.0 if is_sphere else float(n @ places / n.sum())
     best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
@@ -357,9 +377,10 @@ def _solution(
         again, kept = _solved(inner, variance, n_own)
         if len(kept) > _LEAST_INNER * len(inner) and _variation(kept, radius_m)[1] > _LEVELS[0]:
             theirs = _covariance(kept, n_own)
-            largest = _SIGMAS**2 * (theirs[radius, radius] - own[radius, radius])
+            largest = theirs[radius, radius] - own[radius, radius]
+            largest = special.chdtri(1.0, _LEVELS[1]) * max(0.0, largest)
             differs = (again[radius] - change[radius]) ** 2
-            if chance < _LEVELS[1] or differs > max(0.0, largest):
+            if chance < _LEVELS[1] or differs > largest:
                 tiles, change, used, own, chance = inner, again, kept, theirs, 1.0
     variation = variation if chance < _LEVELS[1] else 0.0
     # If the radius of curvature varies, the centre does, too; the middle of the arc stays.
@@ -369,13 +390,118 @@ def _solution(
     own += (variation * radius_m) ** 2 * np.outer(turn, turn)
     slope = 0.0
     if n_own == 5:
-        steep, used = _solved(tiles, variance, 6)
+        steep, parts = _solved(tiles, variance, 6)
         slope = float(steep[5])
         if abs(slope) > CYLINDER_SLOPE:
             # Relief also causes a slope.
-            sigma = math.sqrt(_covariance(used, 6)[5, 5])
+            sigma = math.sqrt(_covariance(parts, 6)[5, 5])
             slope = math.copysign(max(0.0, abs(slope) - _SIGMAS * sigma), slope)
     return change, own, variation, slope
+
+
+def _without_noise_effect(
+    tiles: _Means,
+    surface: Round,
+    zero: NDArray[np.float64],
+    side: float,
+    variance: float,
+    cloud: PointCloud,
+) -> _Means:
+    """Subtract the expected distances of tiles from their surface due to noise of the points.
+
+    Noise along the ray displaces points across the surface and also along it, from places where
+    their density and the incidence of rays differ. With the density d and the components r, t and
+    z of the noise across the surface, around the axis and along it, the expected distance is
+    E[t^2] / 2R - (d/ds (d E[rt]) + d/dz (d E[rz])) / d, where s is the arc length. Without
+    stations, noise is assumed to be the same in all directions.
+
+    Args:
+        tiles: the tiles.
+        surface: the surface.
+        zero: (3,) direction of angle 0.
+        side: 1 if the surface is seen from the axis, -1 if from outside.
+        variance: variance of the points across the surface.
+        cloud: the cloud, for the stations.
+    """
+    cosine, sine, _, _, _, along = (tiles.matrix / surface.steepness).T
+    radius_m, angles = surface.radius_m, np.arctan2(sine, cosine)
+    if cloud.stations is None or not len(cloud.stations):
+        return replace(tiles, means=tiles.means - variance / (2.0 * radius_m))
+    stations = cloud.stations - cloud.origin
+
+    def moments(turn: float, step_m: float) -> NDArray[np.float64]:
+        """Return density, and density times E[rr], E[rt], E[rz] and E[tt], beside the tiles."""
+        points = surface.points(angles + turn, along + step_m, np.zeros(len(along)), zero)
+        _, outwards = surface.outwards(points)
+        rays = points - stations[:, None]
+        lengths = np.linalg.norm(rays, axis=2)
+        r = np.einsum("smi,mi->sm", rays, outwards) / lengths
+        t = np.einsum("smi,mi->sm", rays, np.cross(surface.axis, outwards)) / lengths
+        density = np.maximum(side * r, _LEAST_INCIDENCE) / lengths**2
+        z = rays @ surface.axis / lengths
+        return np.stack(
+            [(density * part).sum(axis=0) for part in (1.0 + 0.0 * r, r * r, r * t, r * z, t * t)]
+        )
+
+    turn, step_m = _NOISE_STEP, _NOISE_STEP * radius_m
+    density, across, _, _, aside = moments(0.0, 0.0)
+    around = (moments(turn, 0.0)[2] - moments(-turn, 0.0)[2]) / (2.0 * turn * radius_m)
+    upwards = (moments(0.0, step_m)[3] - moments(0.0, -step_m)[3]) / (2.0 * step_m)
+    along_ray = variance * tiles.n.sum() / float(tiles.n @ (across / density))
+    effect = along_ray * (aside / (2.0 * radius_m) - around - upwards) / density
+    return replace(tiles, means=tiles.means - effect)
+
+
+def _scan_effect(
+    surface: Round,
+    zero: NDArray[np.float64],
+    n_own: int,
+    cloud: PointCloud,
+    sample: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return the covariance of the parameters due to displacements between scans.
+
+    A displacement is fitted for each scan, together with the surface; that of a cylinder is across
+    its axis. Zeros are returned if the displacements are not significant.
+
+    Args:
+        surface: the surface.
+        zero: (3,) direction of angle 0.
+        n_own: number of parameters.
+        cloud: the cloud.
+        sample: indices of points on the surface; empty if their scans are unknown.
+    """
+    nothing = np.zeros((n_own, n_own))
+    if cloud.scan is None:
+        return nothing
+    _, scan, counts = np.unique(cloud.scan[sample], return_inverse=True, return_counts=True)
+    is_many = counts >= _LEAST_SCAN_POINTS
+    sample, scan = sample[is_many[scan]], (np.cumsum(is_many) - 1)[scan[is_many[scan]]]
+    n_scans = np.count_nonzero(is_many)
+    if n_scans < 2:
+        return nothing
+    points = np.column_stack([cloud.x[sample], cloud.y[sample], cloud.z[sample]]).astype(np.float64)
+    distances, _ = surface.outwards(points)
+    matrix = design(surface, *surface.places(points, zero), is_cone=True)[:, :n_own]
+    n_centre = 3 if surface.is_sphere else 2
+    start = np.full(len(distances), 1e-10)
+    _, weights, scatter_m = robust_solution(matrix, distances, start)
+    weights = (weights > 0.0) / scatter_m**2
+    # Displacements are relative to the first scan.
+    is_of = scan[:, None] == np.arange(n_scans)
+    columns = [is_of[:, number, None] * matrix[:, :n_centre] for number in range(n_scans)]
+    rows = np.column_stack([matrix, *columns[1:]])
+    normal = (rows.T * weights) @ rows
+    inverse = np.linalg.pinv(normal, hermitian=True)
+    apart = (inverse @ (rows.T * weights) @ distances)[n_own:]
+    alone = np.linalg.inv(normal[:n_own, :n_own])
+    square = apart @ np.linalg.solve(inverse[n_own:, n_own:], apart)
+    if special.chdtrc(len(apart), square) > _LEVELS[1]:
+        return nothing
+    apart = np.vstack([np.zeros(n_centre), apart.reshape(-1, n_centre)])
+    variance = float(apart.var(axis=0, ddof=1).mean())
+    effects = [alone @ (matrix.T * weights) @ column for column in columns]
+    return np.asarray(variance * np.sum([effect @ effect.T for effect in effects], axis=0))
 
 
 def _moved_covariance(own: NDArray[np.float64], along_m: float) -> NDArray[np.float64]:
@@ -479,9 +605,9 @@ def _variation(tiles: _Means, radius_m: float) -> tuple[float, float]:
     means = np.bincount(of, curvatures, n_sectors) / np.maximum(counts, 1)
     n_between = np.count_nonzero(counts)
     n_within = len(of) - n_between
-    if n_between < 2 or n_within < 1:
+    if n_within < 1:
         # There are too few tiles for a test.
-        return 1.0, 0.0
+        return 0.0, 1.0
     within = float(((curvatures - means[of]) ** 2).sum()) / n_within
     between = float((counts * (means - 1.0) ** 2).sum()) / n_between
     chance = float(special.fdtrc(n_between, n_within, between / max(within, 1e-12)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -185,6 +186,33 @@ def test_the_error_of_a_short_arc_with_relief_is_as_stated(tmp_path: Path) -> No
         (found,) = run.outputs["surfaces"].surfaces
         ratios.append((found.radius_m - 3.0) / found.sigma_radius_m)
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 2.0
+
+
+def test_a_displacement_between_scans_is_part_of_the_stated_errors(tmp_path: Path) -> None:
+    cloud, truth = scanned("barrel-vault")
+    assert truth.surfaces is not None
+    assert cloud.scan is not None
+    moved = np.where(cloud.scan == 1, np.array([[0.003], [-0.0025], [0.003]]), 0.0)
+    x, y, z = (np.array([cloud.x, cloud.y, cloud.z]) + moved).astype(np.float32)
+    run = found_in(tmp_path, replace(cloud, x=x, y=y, z=z))
+    (found,) = run.outputs["surfaces"].surfaces
+    turn_deg, _, across_m = off(found, truth.surfaces.surfaces[0])
+    assert 0.4 < turn_deg / found.sigma_axis_deg < 2.5
+    assert 0.4 < across_m / math.sqrt(np.trace(found.covariance[:3, :3])) < 2.5
+
+
+def test_noise_along_the_rays_does_not_shorten_the_radius_of_a_column(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    ratios = []
+    for case in range(3):
+        azimuth, elevation = rng.uniform([[-0.0832], [-0.3]], [[0.0832], [0.3]], (2, 40_000))
+        level = 3.0 * np.cos(azimuth) - np.sqrt(0.25**2 - (3.0 * np.sin(azimuth)) ** 2)
+        level += rng.normal(scale=0.01, size=len(level)) * np.cos(elevation)
+        points = level * np.stack([-np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+        run = found_in(tmp_path / str(case), few_points(points.T))
+        (found,) = run.outputs["surfaces"].surfaces
+        ratios.append((found.radius_m - 0.25) / found.sigma_radius_m)
+    assert np.sqrt(np.mean(np.square(ratios))) < 2.0
 
 
 @pytest.mark.parametrize(
