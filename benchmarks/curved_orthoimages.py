@@ -1,7 +1,8 @@
 """Measure orthoimages of curved walls that `photos-on-scan.yaml` makes from simulated files.
 
-    python benchmarks/curved_orthoimages.py FOLDER --subjects apse column tower
-        [--seed 7] [--photos 9] [--scan-step-m 0.005] [--gsd-m 0.004] [--only-curved] [--exif]
+    python benchmarks/curved_orthoimages.py FOLDER --subjects barrel-vault apse
+        [--seed 7] [--photos 9] [--stations 1] [--scan-step-m 0.005] [--gsd-m 0.004]
+        [--only-curved] [--exif]
 
 For each subject, `simulate.curved` makes a scan (E57, with rows and columns) and photos of which
 only those nearest to the middle of the curved surface are kept. The recipe reads these files, finds
@@ -42,9 +43,11 @@ SHOWN = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--subjects", nargs="+", default=["apse", "column", "tower"])
+    subjects = ["barrel-vault", "apse", "column", "tower"]
+    parser.add_argument("--subjects", nargs="+", default=subjects)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--photos", type=int, default=9)
+    parser.add_argument("--stations", type=int)
     parser.add_argument("--scan-step-m", type=float, default=0.005)
     parser.add_argument("--photo-gsd-m", type=float, default=0.003)
     parser.add_argument("--gsd-m", type=float, default=0.004)
@@ -62,6 +65,7 @@ def made(folder: Path, subject: str, options: argparse.Namespace) -> None:
         {
             "subject": subject,
             "scan_step_m": options.scan_step_m,
+            "max_stations": options.stations,
             "photo_gsd_m": options.photo_gsd_m,
         }
     )

@@ -54,6 +54,11 @@ _LIMIT: Final = 3.5
 # Poses that differ by more than this angle are distinct. From different initial values, the same
 # pose differs by far less.
 _ONE_POSE_RAD: Final = math.radians(2.0)
+# Two poses are at different places if they displace the ties in the photo by more than this share
+# of its longer side.
+_APART_SHARE: Final = 0.1
+# Two numbers of ties differ if their difference exceeds this many standard deviations (Poisson).
+_COUNT_SIGMAS: Final = 3.0
 BY_HAND: Final = DiagnosticSpec(
     code="photo-oriented-by-hand",
     severity="warning",
@@ -499,7 +504,44 @@ def by_itself(
     estimate = reason or estimator(tied, params)
     if isinstance(estimate, str):
         return refused(tied, estimate if alone is None else alone.camera.status)
+    if alone is None and (n := _ties_of_another_pose(tied, ties, params, estimator, estimate)):
+        return refused(
+            tied,
+            f"two poses agree with its ties equally well ({estimate.agreeing.sum()} and {n} "
+            "ties), as in front of identical walls: measure ties by hand, or take a photo that "
+            "also shows what distinguishes the walls",
+        )
     return Trusted(tied=tied, estimate=estimate, by_hand=alone, kept=kept)
+
+
+def _ties_of_another_pose(
+    tied: TiedPhoto, ties: Ties, params: OrientParams, estimator: Estimator, estimate: Estimate
+) -> int:
+    """Count the ties of another pose that fits as well, and passes the same tests; 0 if none."""
+    rest, n_first = ~estimate.agreeing, int(estimate.agreeing.sum())
+    if _is_fewer(int(rest.sum()), n_first):
+        return 0
+    others = replace(
+        tied,
+        chosen=tied.chosen[rest],
+        seen=tied.seen.take(rest),
+        is_check=tied.is_check[rest],
+        by_hand=tied.by_hand[rest],
+    )
+    other = estimator(others, params)
+    if isinstance(other, str) or _is_fewer(n_other := int(other.agreeing.sum()), n_first):
+        return 0
+    if refusal(candidate_of(others, ties, params, other), GATES_BEFORE_BLOCK) is not None:
+        return 0
+    own = tied.seen.take(estimate.agreeing)
+    off_px = other.resection.camera.project(own.points_world)[:, :2] - own.pixels_photo
+    apart_px = float(np.median(np.nan_to_num(np.linalg.norm(off_px, axis=1), nan=np.inf)))
+    return n_other if apart_px > _APART_SHARE * max(tied.photo.width, tied.photo.height) else 0
+
+
+def _is_fewer(n_ties: int, n_first: int) -> bool:
+    """Return whether a number of ties is smaller than another one by more than chance."""
+    return n_first - n_ties > _COUNT_SIGMAS * math.sqrt(n_first + n_ties)
 
 
 def oriented_by_hand(

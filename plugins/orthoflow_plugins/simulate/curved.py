@@ -58,6 +58,7 @@ class SimulateCurved(Method):
 
     id: ClassVar[str] = "simulate.curved"
     determinism: ClassVar[Determinism] = "seeded"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_points", label="points"),
         MetricSpec("n_photos", label="photos"),
@@ -89,6 +90,9 @@ class SimulateCurved(Method):
         )
         relief_scale: float = Field(
             1.0, ge=0.0, le=2.0, description="Scale of the mouldings; 1 gives 3 to 6 cm."
+        )
+        max_stations: int | None = Field(
+            None, ge=1, description="Maximum number of stations; by default, two to four."
         )
         photo_gsd_m: float | None = Field(
             None, gt=0.0, le=0.1, description="Photo pixel size on the wall; by default no photos."
@@ -140,7 +144,7 @@ class SimulateCurved(Method):
                 n_rows=max(1, math.floor((_HIGHEST_RAD - _LOWEST_RAD) / step)),
                 seed=int(scan_rng.integers(0, 2**62)),
             )
-            for station in building.stations
+            for station in building.stations[: params.max_stations]
         ]
         errors = Errors(
             noise_m=params.noise_m,

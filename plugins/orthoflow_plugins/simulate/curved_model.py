@@ -388,6 +388,8 @@ def _wall(
     holes: Sequence[Extent] = (),
 ) -> Side:
     """Add a vertical wall, given the azimuth of its outward normal."""
+    # Without a texture of its own, a wall could not be told from others of the same size.
+    paint = replace(paint, seed=paint.seed + 100 + round(omega_deg))
     wall = wall_side(draft, omega_deg=omega_deg, phi_deg=0.0, distance_m=distance_m)
     plane = wall.true_plane(name, extent)
     wall.place(extent, 0.0, paint, SurfaceRole.WALL, plane=plane, holes=holes)

@@ -61,6 +61,21 @@ def test_a_common_factor_of_all_sigmas_of_ties_changes_no_pose(tmp_path: Path) -
     assert same.sigma_wall_m == pytest.approx(right.sigma_wall_m, rel=0.02)
 
 
+@pytest.mark.parametrize(("n_other", "is_refused"), [(190, True), (60, False)])
+def test_photos_of_one_of_two_identical_walls_are_refused(
+    tmp_path: Path, n_other: int, is_refused: bool
+) -> None:
+    camera = ms.camera_before()
+    own = known_ties(camera, 3)
+    # The same content is on a wall 5 m to the right; with few ties there, it is a repeated motif.
+    other = known_ties(camera, 4, n=n_other)
+    away_m = np.array([5.0, 0.0, 0.0])
+    both = tp.joined(own, replace(other, points_world=other.points_world + away_m))
+    found = orient(both, calibrated(camera), context(tmp_path)).cameras[0]
+    assert ("two poses" in found.status) == is_refused
+    assert (found.status == "ok") != is_refused
+
+
 def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None:
     camera = ms.camera_before()
     ties = known_ties(camera, 5)
