@@ -24,6 +24,7 @@ from orthoflow_provenance.document import (
 from orthoflow_provenance.record import write_record
 
 from orthoflow.errors import ArgumentError, RecordError
+from orthoflow.files.geotiff import local_crs_name
 from orthoflow.products import Planes
 from orthoflow.products.inspections import Finding
 from orthoflow.records.open import open_run
@@ -174,7 +175,7 @@ def test_published_files_come_by_number_and_replace_older_ones(run_folder: Path)
     store = run_folder / "store"
     store.mkdir()
     for name in ("wall_10.tif", "wall_2.tif", "2.tif", "a.txt"):
-        (store / name).write_text(name)
+        (store / name).write_text(local_crs_name(name))
     first = as_stored(*store.iterdir())
     files = {"cloud": {"cloud": first, "more": as_stored(store / "wall_10.tif")}}
     (run_folder / "products" / "old").touch()
@@ -186,7 +187,8 @@ def test_published_files_come_by_number_and_replace_older_ones(run_folder: Path)
     paths = [file.path for file in found]
     assert paths == sorted((*(f"products/cloud/{name}" for name in there), "products/metrics.csv"))
     sizes = {file.path: file.size_bytes for file in found}
-    assert sizes["products/cloud/wall_2.tif"] == len("wall_2.tif")
+    assert sizes["products/cloud/wall_2.tif"] == len(local_crs_name("wall_2.tif"))
+    assert (run_folder / "products/cloud/wall_2.tif").read_text().startswith("run r__")
 
 
 def test_what_a_run_does_not_have_is_said(run: Run) -> None:

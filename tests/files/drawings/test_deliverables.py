@@ -13,6 +13,7 @@ import pytest
 import rasterio
 from PIL import Image
 
+from orthoflow.files.drawings.geojson import ProjectLayer, write_project
 from orthoflow.files.drawings.printed_pictures import (
     NOTHING,
     ElevationWall,
@@ -169,6 +170,18 @@ def test_a_qgis_project_shifts_x_alone(run: Path, tmp_path: Path) -> None:
             assert shifted.transform.a == pytest.approx(GSD_M)
             assert np.array_equal(shifted.read(), raster.read())
             assert np.array_equal(shifted.dataset_mask(), raster.dataset_mask())
+
+
+def test_walls_of_a_qgis_project_stand_side_by_side(run: Path, tmp_path: Path) -> None:
+    raster = next((run / "products").rglob("*_ortho.tif"))
+    about = {"kind": "ortho", "raster": raster, "about": "", "is_shown": True}
+    write_project(tmp_path, "walls", [ProjectLayer(wall=name, **about) for name in "ab"])
+    bounds = []
+    for path in sorted(tmp_path.glob("*.vrt")):
+        with rasterio.open(path) as placed:
+            bounds.append(placed.bounds)
+    assert bounds[1].left == pytest.approx(bounds[0].right + 1.0)
+    assert bounds[1].top == bounds[0].top
 
 
 def test_every_export_states_the_same_of_a_wall(tmp_path: Path) -> None:

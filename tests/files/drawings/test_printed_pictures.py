@@ -40,6 +40,9 @@ def test_cells_of_a_part_are_kept_as_they_are_where_print_shows_them(tmp_path: P
     assert picture.shape == (20, 30, 3)
     np.testing.assert_array_equal(picture[5:], rgb[15:30, 20:50])
     assert (picture[:5] == 255).all()
+    # The rows of a ceiling go up the paper; its parts are measured from the paper's upper edge.
+    flipped = encode_part(tmp_path / "a.tif", part, scale=20, is_flipped=True)
+    np.testing.assert_array_equal(decode_image(flipped), rgb[39:19:-1, 20:50])
 
 
 def test_finer_cells_than_print_shows_are_averaged_to_400_per_inch(tmp_path: Path) -> None:

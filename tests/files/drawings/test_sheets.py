@@ -12,6 +12,7 @@ from io import BytesIO
 from pathlib import Path
 
 import cv2
+import ezdxf
 import numpy as np
 import pdfplumber
 import pytest
@@ -22,7 +23,8 @@ from PIL import Image
 from orthoflow.cli.exports.sheets import usual_scale
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings import pens
-from orthoflow.files.drawings.key_plans import key_plan
+from orthoflow.files.drawings.dxf import write_wall_dxf
+from orthoflow.files.drawings.key_plans import DrawnWall, key_plan
 from orthoflow.files.drawings.printed_pictures import encode_part, label_place
 from orthoflow.files.drawings.sheet_contents import (
     FOOT_M,
@@ -43,6 +45,7 @@ from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.products import OrthoMask
 from orthoflow.records.open import open_run
+from orthoflow.records.walls import room_results
 from tests import samples
 from tests.drawing_runs import (
     GAP_M,
@@ -444,9 +447,39 @@ def test_a_reflected_ceiling_lies_over_its_floor(tmp_path: Path) -> None:
             pytest.approx((2.0, -1.0), abs=1e-9),
         )
         assert north_of(frame) == pytest.approx((0.0, 1.0), abs=1e-9)
+        wall = DrawnWall(number=0, name=name, plane_index=None, frame=frame, image="a.png")
+        write_wall_dxf(tmp_path / "a.dxf", wall, None)
+        (image,) = ezdxf.readfile(tmp_path / "a.dxf").modelspace().query("IMAGE")
+        top_m = image.dxf.insert.y + frame.height * image.dxf.v_pixel.y
+        assert top_m == pytest.approx(frame.raster_corner_m[1], abs=1e-9)
     np.testing.assert_array_equal(seen["floor"], seen["ceiling"])
     assert seen["floor"][5, 5] == 255
     assert seen["floor"][-5, 5] == seen["floor"][5, -5] == 0
+
+
+def test_a_sheet_of_a_floor_has_a_mark_of_orientation(tmp_path: Path) -> None:
+    planes = box_planes()
+    frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=0.02)
+    frame = replace(frame, up=(0.0, 0.0, 1.0))
+    rgb = np.full((*frame.shape, 3), 90, np.uint8)
+    floor = samples.orthoimage(frame, name="floor 0", rgb=rgb, plane_index=0)
+    run = write_drawing_run(tmp_path / "run", others=(floor,))
+    export(run, "sheet", tmp_path / "out", "--wall", 0, code=0)
+    with page_of(tmp_path / "out" / "wall_0_sheet_1.pdf") as page:
+        assert "axis of the scan; north unknown" in words_of(page)
+
+
+def test_grey_of_colours_is_not_called_intensity(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = write_drawing_run(tmp_path / "run")
+    found = room_results(open_run(run))
+    walls = tuple(replace(wall, intensity_source="luminance") for wall in found.walls)
+    changed = replace(found, walls=walls)
+    monkeypatch.setattr("orthoflow.cli.exports.sheets.room_results", lambda *_: changed)
+    export(run, "sheet", tmp_path / "out", "--scale", 50, "--beside", "intensity", code=0)
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        assert "grey of the scan's colours" in words_of(page)
 
 
 def cell_centres(shape: tuple[int, int]) -> np.ndarray:

@@ -125,6 +125,7 @@ def test_what_one_photo_alone_shows_stays_in_a_class_of_its_own(tmp_path: Path) 
     assert (image.source[is_alone] == 0).all()
     assert is_shown(image.mask).all()
     assert numbers(ctx)["contradicted_share"] == pytest.approx(is_alone.mean())
+    assert "photo-against-scan" in [one.code for one in ctx.diagnostics]
     clean = [photo("a.jpg", levels, seed=1), photos[1]]
     *_, nothing = found(clean, scanned(levels))
     assert nothing is not None

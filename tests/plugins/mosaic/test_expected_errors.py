@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,23 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.agreement import Overlaps
 from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
+from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.geometry.bands import in_memory
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.frames import cross_matrix, rotation_from_vector
-from orthoflow.products import Camera, Cameras, Intrinsics, TieRole
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Intrinsics,
+    LayerMask,
+    Layers,
+    Product,
+    TieRole,
+)
 from tests import samples
+from tests.method_runs import run
+from tests.raster_scenes import context
 
 SURVEY = np.array([4_512_345.25, 5_300_210.5, 187.125])
 GSD_M = 0.02
@@ -155,6 +167,24 @@ def test_nothing_is_stated_of_cells_whose_photo_is_not_known() -> None:
     errors = stated_m(known, replace(known, photo="b.jpg", covariance=None), source=source)
     assert np.isfinite(errors[:10]).all()
     assert np.isnan(errors[10:]).all()
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_only_a_wall_with_ties_states_errors(tmp_path: Path, number: int) -> None:
+    known = {"points_world": np.zeros((1, 3)), "sigma_px": np.ones(1), "sigma_m": np.zeros(1)}
+    ties = samples.ties(np.zeros((1, 2)), wall=np.array([number], np.int32), **known)
+    layer = samples.layer(
+        np.full(FRAME.shape, LayerMask.PAINTED, np.uint8), frame=FRAME, source="a.jpg"
+    )
+    ctx = context(tmp_path)
+    inputs: dict[str, Product] = {
+        "layers": Layers(layers=(layer,)),
+        "walls": samples.walls(samples.wall(FRAME)),
+        "cameras": Cameras(cameras=(camera(oblique()),), ties=ties),
+    }
+    (image,) = run(MosaicSeams, ctx, inputs).orthoimages.images
+    assert bool(np.isfinite(image.error_m).any()) == (number == 0)
+    assert ("accuracy-not-checked" in [one.code for one in ctx.diagnostics]) == (number == 1)
 
 
 def test_ties_are_counted_on_their_own_wall() -> None:
