@@ -9,6 +9,7 @@ from functools import partial
 from typing import Final
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 from scipy import linalg, ndimage, special
 from scipy.spatial.distance import cdist
@@ -16,7 +17,7 @@ from scipy.spatial.distance import cdist
 from orthoflow.geometry.rows import Rows, spread_index
 from orthoflow.geometry.slabs import Offsets, read_only
 from orthoflow.geometry.surfaces import zero_direction
-from orthoflow.geometry.threads import even_parts, in_threads
+from orthoflow.geometry.threads import even_parts, in_order, in_threads
 from orthoflow.products import PointCloud, Surface
 from orthoflow_plugins.surface.kernels import Cells, sum_cells
 from orthoflow_plugins.surface.rounds import Round, design, robust_solution
@@ -77,7 +78,7 @@ _NOISE_STEP: Final = 0.01
 _LEAST_INCIDENCE: Final = 0.05
 # Number of points from which displacements between scans are estimated, and minimum number of
 # points of a scan on a surface.
-_SCAN_SAMPLE: Final = 100_000
+_SCAN_SAMPLE: Final = 50_000
 _LEAST_SCAN_POINTS: Final = 100
 # A cell belongs to the extent if its mean distance is within this many standard deviations plus a
 # tolerance.
@@ -193,15 +194,17 @@ def fit_all(
     sample = spread_index(len(cloud), min(_SCAN_SAMPLE, len(cloud)))
     sample = sample if cloud.scan is not None else sample[:0]
     labelled = labels[sample]
-    fitted = []
-    for index, item in enumerate(found):
+
+    def fit(index: int) -> FittedSurface:
         first, around, along, _ = cells.sizes[index].tolist()
         own = total[first : first + around * along].reshape(around, along, 3)
-        n_points = int(counts[:, index].sum())
-        near = sample[labelled == index]
-        fitted.append(
-            _fitted(item, own, cells.bounds[index], n_points, cloud, near, is_cone=is_cone)
-        )
+        n_points, near = int(counts[:, index].sum()), sample[labelled == index]
+        bounds = cells.bounds[index]
+        return _fitted(found[index], own, bounds, n_points, cloud, near, is_cone=is_cone)
+
+    # Threads of the linear algebra library would cost more than they save for such small systems.
+    with threadpoolctl.threadpool_limits(1):
+        fitted = list(in_order(fit, range(len(found)), threads=cores))
     return fitted, labels
 
 

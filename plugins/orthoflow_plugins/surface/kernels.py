@@ -387,7 +387,7 @@ def sum_cells(
         labels: (n,) output, -1 for points on no surface.
         counts: (s,) output, number of points of each surface.
     """
-    lanes, middle = np.empty((2, _LANES), dtype=np.float32), np.empty(3)
+    lanes, middle, half = np.empty((2, _LANES), dtype=np.float32), np.empty(3), np.empty(3)
     work, index = np.empty((7, _BLOCK)), np.empty((3, _BLOCK), dtype=np.int64)
     nearest, second, best, cell = work[0], work[1], index[0], index[1]
     for first in range(0, offsets.x.shape[0], _BLOCK):
@@ -396,8 +396,9 @@ def sum_cells(
         own = labels[first:end]
         for p in range(end - first):
             own[p] = -1
-        half = _reach(block.x, 0, lanes, middle) + _reach(block.y, 1, lanes, middle)
-        half = math.sqrt(half + _reach(block.z, 2, lanes, middle))
+        half[0] = _reach(block.x, 0, lanes, middle)
+        half[1] = _reach(block.y, 1, lanes, middle)
+        half[2] = _reach(block.z, 2, lanes, middle)
         is_empty = True
         for s in range(cells.rounds.shape[0]):
             if _may_have_points(cells, s, middle, half):
@@ -426,7 +427,7 @@ def _reach(
     lanes: NDArray[np.float32],
     middle: NDArray[np.float64],
 ) -> float:
-    """Set the middle of a block along an axis; return the square of half its length."""
+    """Set the middle of a block along an axis; return half its length."""
     low, high = lanes[0], lanes[1]
     n_lanes = min(_LANES, values.shape[0])
     for lane in range(n_lanes):
@@ -444,20 +445,32 @@ def _reach(
     for lane in range(1, n_lanes):
         least, most = min(least, low[lane]), max(most, high[lane])
     middle[axis] = 0.5 * (float(least) + float(most))
-    half = 0.5 * (float(most) - float(least))
-    return half * half
+    return 0.5 * (float(most) - float(least))
 
 
 @kernel_part
-def _may_have_points(cells: Cells, s: int, middle: NDArray[np.float64], half: float) -> bool:
-    """Return whether a sphere with radius `half` reaches a surface and its tolerance."""
+def _may_have_points(
+    cells: Cells, s: int, middle: NDArray[np.float64], half: NDArray[np.float64]
+) -> bool:
+    """Return whether a box with half lengths `half` (3,) may reach a surface and its tolerance.
+
+    The distance from an axis or a centre is convex, so it is not below its tangent plane, and at a
+    displacement d, it is at most d^2 / 2R above.
+    """
     r = cells.rounds
     dx, dy, dz = middle[0] - r[s, 0], middle[1] - r[s, 1], middle[2] - r[s, 2]
     along = dx * r[s, 3] + dy * r[s, 4] + dz * r[s, 5]
-    across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - r[s, 12] * along * along))
+    across = math.sqrt(max(1e-24, dx * dx + dy * dy + dz * dz - r[s, 12] * along * along))
     distance = (across - r[s, 9] - r[s, 10] * along) * r[s, 11]
-    is_beside = along < cells.bounds[s, 0] - half or along > cells.bounds[s, 1] + half
-    return not is_beside and abs(distance) <= cells.bounds[s, 2] + half
+    length, reach, square = 0.0, 0.0, 0.0
+    for axis in range(3):
+        off = middle[axis] - r[s, axis] - r[s, 12] * along * r[s, 3 + axis]
+        length += half[axis] * abs(r[s, 3 + axis])
+        reach += half[axis] * abs(off / across - r[s, 10] * r[s, 3 + axis]) * r[s, 11]
+        square += half[axis] * half[axis]
+    is_beside = along < cells.bounds[s, 0] - length or along > cells.bounds[s, 1] + length
+    within = cells.bounds[s, 2] + reach + 1e-6
+    return not is_beside and -within - 0.5 * square / across * r[s, 11] <= distance <= within
 
 
 @kernel_part
