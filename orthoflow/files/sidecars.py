@@ -136,6 +136,12 @@ def chart_json(frame: WallFrame) -> dict[str, JsonValue]:
     """
     if (bend := frame.bend) is None:
         return {"chart": "plane"}
+    return {**_curved_json(frame, bend), "middle_world": numbers(frame.middle_world)}
+
+
+def _curved_json(
+    frame: WallFrame, bend: CylinderBend | ConeBend | SphereBend
+) -> dict[str, JsonValue]:
     if isinstance(bend, ConeBend):
         own, local = bend.revolution, frame.axes_world
         zero, quarter, axis = own.axes @ local

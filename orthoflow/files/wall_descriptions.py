@@ -152,7 +152,7 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
         expected_mm_p95=high,
         n_withheld_ties=int(_number(accuracy.get("n_check_points")) or 0),
         errors=errors,
-        near=_centre(sidecar.get("corners_world")),
+        near=_centre(sidecar.get("middle_world", sidecar.get("corners_world"))),
         orthoimage=path.name,
     )
 
@@ -167,9 +167,9 @@ def _number(value: object) -> float | None:
     return float(str(value)) if is_number and abs(float(str(value))) < 1e15 else None
 
 
-def _centre(corners: object) -> tuple[float, float, float] | None:
+def _centre(points: object) -> tuple[float, float, float] | None:
     try:
-        x, y, z = np.array(corners, dtype=np.float64).reshape(4, 3).mean(axis=0).round(2).tolist()
+        x, y, z = np.array(points, dtype=np.float64).reshape(-1, 3).mean(axis=0).round(2).tolist()
     except (TypeError, ValueError):
         return None
     return x, y, z

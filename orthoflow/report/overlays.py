@@ -143,7 +143,8 @@ def residuals_on_wall(
     jacobian = np.stack(along, axis=2)
     found = np.full((len(points), 2), np.nan)
     # There is no solution if the wall is seen edge-on.
-    solvable = np.isfinite(jacobian).all(axis=(1, 2)) & (np.linalg.det(jacobian) != 0.0)
+    solvable = np.asarray(np.isfinite(jacobian).all(axis=(1, 2)))
+    solvable[solvable] = np.linalg.det(jacobian[solvable]) != 0.0
     found[solvable] = np.linalg.solve(jacobian[solvable], residual_px[solvable, :, None])[..., 0]
     return found
 

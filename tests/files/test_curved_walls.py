@@ -19,8 +19,9 @@ from orthoflow.files.drawings.sheet_contents import axes_of, north_of
 from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.files.gltf import write_room
 from orthoflow.files.publishing import publish_orthoimages
-from orthoflow.files.sidecars import OrthoFile, ortho_files
+from orthoflow.files.sidecars import OrthoFile, ortho_files, read_sidecar
 from orthoflow.files.tiles.pyramid import PAGE, write_viewer
+from orthoflow.files.wall_descriptions import described
 from orthoflow.geometry import ConeBend, CylinderBend, SphereBend, WallFrame
 from orthoflow.products import Orthoimages
 from orthoflow.report.pictures import Picture, cursor_places
@@ -73,6 +74,10 @@ def test_models_bend_walls(name: str, depth_m: float | None, tmp_path: Path) -> 
     ortho = published(frame, tmp_path / "files")
     assert ortho.frame.has_cells_of(frame)
     assert ortho.frame.raster_axes == frame.raster_axes
+    # The mean of the corners of a dome is far below it.
+    raster = tmp_path / "files" / ortho.path
+    near = described(raster, read_sidecar(raster.with_suffix(".json"))).near
+    assert near == pytest.approx(frame.middle_world.tolist(), abs=0.006)
     depths = None
     if depth_m is not None:
         depths = {ortho.wall: tmp_path / "depth.tif"}
