@@ -16,7 +16,6 @@ from syrupy.assertion import SnapshotAssertion
 from orthoflow.cli.browsing import (
     RunSummary,
     differing_facts,
-    key_metrics,
     run_folders,
     summaries,
 )
@@ -195,16 +194,6 @@ def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path
         ArgumentError, match=r"b/run\.h5 is not a folder: pass folders that contain runs"
     ):
         run_folders([tmp_path, tmp_path / "b" / "run.h5"])
-
-
-def test_the_headlines_that_most_runs_have_come_first() -> None:
-    runs = [
-        RunSummary(folder=Path(), status="ok", headlines=tuple(names))
-        for names in ("ab", "bc", "b", "ca")
-    ]
-    assert key_metrics(runs, most=4) == ["a", "b", "c"]
-    # Of equals the first; shown in the order of all.
-    assert key_metrics(runs, most=2) == ["a", "b"]
 
 
 def written(folder: Path, *cells: object, **more: object) -> Path:

@@ -32,13 +32,6 @@ def test_bands_hold_each_row_once_and_a_reach_about_it(cells_most: int, reach_ro
         assert around[band.inner] == list(range(37))[band.rows]
 
 
-def test_bands_are_of_about_equal_height_and_stay_within_their_cells() -> None:
-    bands = list(bands_with_reach((101, 10), cells_most=300, reach_rows=5))
-    heights = [band.rows.stop - band.rows.start for band in bands]
-    assert heights == [17] * 5 + [16]
-    assert max(band.around.stop - band.around.start for band in bands) * 10 <= 300
-
-
 def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     mask = rng.integers(0, 4, (103, 37), dtype=np.uint8)

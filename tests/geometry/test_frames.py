@@ -32,8 +32,6 @@ from orthoflow.geometry.frames import (
     UpDirection,
     WallFrame,
     angle_between_deg,
-    cross_matrices,
-    cross_matrix,
     frame_over,
     omega_phi_deg,
     plane_through,
@@ -333,24 +331,6 @@ def test_a_plane_is_turned_towards_who_looks() -> None:
     assert turned.offset_m == -2.0
 
 
-@pytest.mark.parametrize(
-    ("normal", "is_plane"),
-    [
-        ([0.0, 0.0, 1.0], True),
-        ([0.0, 0.0, 1.0 + 0.9e-9], True),
-        ([0.0, 0.0, 1.0 + 1.1e-9], False),
-        ([0.0, 0.0, 1.0 - 1.1e-9], False),
-        ([0.0, 1.0], False),
-    ],
-)
-def test_a_normal_is_a_unit_vector(normal: list[float], is_plane: bool) -> None:
-    if is_plane:
-        Plane(normal=np.array(normal), offset_m=0.0)
-        return
-    with pytest.raises(GeometryError, match=r"needs a unit normal of shape \(3,\)"):
-        Plane(normal=np.array(normal), offset_m=0.0)
-
-
 @pytest.mark.parametrize("seed", seeds(3))
 def test_a_plane_runs_through_its_three_points_by_the_right_hand_rule(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -425,13 +405,6 @@ def test_rotation_vectors_turn_about_themselves(angle: float) -> None:
     vector = angle * np.array([0.48, -0.6, 0.64])
     expected = Rotation.from_rotvec(vector).as_matrix()
     np.testing.assert_allclose(rotation_from_vector(vector), expected, atol=1e-15)
-
-
-def test_cross_matrices_multiply_like_the_cross_product() -> None:
-    first, second = np.random.default_rng(0).normal(size=(2, 7, 3))
-    found = np.einsum("nij,nj->ni", cross_matrices(first), second)
-    np.testing.assert_allclose(found, np.cross(first, second), atol=1e-14)
-    np.testing.assert_array_equal(cross_matrix(first[3]), cross_matrices(first)[3])
 
 
 @pytest.mark.parametrize("direction", UP_VECTORS, ids=str)

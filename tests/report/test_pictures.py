@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from orthoflow.report.overlays import magnification_for, overlays, residuals_on_
 from orthoflow.report.pictures import (
     DIVERGING,
     Picture,
-    coarse_depths,
     cursor_places,
     depth_colours,
     embedded_products,
@@ -290,19 +289,6 @@ def test_a_bar_is_as_long_as_it_says(width_m: float) -> None:
     assert 10 <= percent <= 30
 
 
-@pytest.mark.parametrize("shape", [(400, 800), (1, 7000)])
-def test_many_depths_are_told_at_about_eight_thousand_places(shape: tuple[int, int]) -> None:
-    few_m = np.array([[0.0014, -0.0016, np.nan], [1.2344, 0.0, np.inf]], dtype=np.float32)
-    few = {"columns": 3, "rows": 2, "mm": [1, -2, None, 1234, 0, None]}
-    assert coarse_depths(few_m) == few
-    columns = np.arange(shape[1], dtype=np.float32)
-    # A depth tells its column, in millimetres.
-    found: Any = coarse_depths(np.broadcast_to(columns / np.float32(1000.0), shape).copy())
-    assert len(found["mm"]) == found["columns"] * found["rows"] <= 8_400
-    middles = (np.arange(found["columns"]) + 0.5) * shape[1] / found["columns"]
-    assert found["mm"][: found["columns"]] == middles.astype(int).tolist()
-
-
 def test_an_orthoimage_has_the_depths_of_the_wall_with_its_cells() -> None:
     def picture(name: str, gsd_m: float = 0.5, depths: Any = None) -> Picture:
         frame = samples.facing_east(gsd_m, 4, 2, (1.0, 2.0, 3.0))
@@ -380,23 +366,6 @@ def test_ties_and_displacements_are_drawn_on_the_wall_of_their_cell(tmp_path: Pa
     mark_px = min(*tall, *wide)
     assert max(tall) - 0.5 * mark_px == pytest.approx(long_px, abs=4.0)
     assert max(wide) - 0.5 * mark_px == pytest.approx(long_px, abs=4.0)
-
-
-def test_marks_are_left_out_evenly_where_there_are_many(tmp_path: Path) -> None:
-    run = compared_run(tmp_path)
-    place = ("orient@plane=fine", "cameras")
-    cameras = run.products[place]
-    ties = cameras.ties
-    repeated = {
-        field.name: np.concatenate([value] * 30)
-        for field in fields(ties)
-        if isinstance(value := getattr(ties, field.name), np.ndarray)
-        and len(value) == len(ties.photo)
-    }
-    many = replace(cameras, ties=replace(ties, **repeated))
-    crowded = replace(run, products={**run.products, place: many})
-    found = next(overlays(crowded, list(wall_pictures(run))))
-    assert found.caption.endswith(", 600 of them shown")
 
 
 @pytest.mark.parametrize("seed", seeds(4))

@@ -141,9 +141,10 @@ WAYS = [
 ]
 
 
-# Each layout in one way, and each way in the layout that takes less paper.
-LAID_OUT = [("column", WAYS[0]), ("strip", WAYS[0]), *((None, way) for way in WAYS)]
-OTHERS = [(layout, way) for layout in ("column", "strip") for way in WAYS[1:]]
+# Each way in one layout, by turns; None takes less paper.
+LAID_OUT = [*zip(itertools.cycle(("column", "strip", None)), WAYS, strict=False)]
+ALL = itertools.product(("column", "strip"), WAYS)
+OTHERS = [each for each in ALL if each not in LAID_OUT]
 
 
 @pytest.mark.parametrize(("layout", "more"), [*LAID_OUT, *long_only(*OTHERS)], ids=str)

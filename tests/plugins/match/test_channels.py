@@ -130,23 +130,6 @@ def test_where_steps_are_everywhere_they_are_compared(every: int, is_kept: bool)
     assert np.isfinite(grey_of((0.03 * columns).astype(np.float32))).all()
 
 
-def test_places_are_the_strongest_five_cells_around() -> None:
-    strength = np.zeros((40, 60), dtype=np.float32)
-    for row, column, value in ((10, 10, 3.0), (10, 12, 2.0), (10, 13, 1.5), (30, 50, 1.0)):
-        strength[row, column] = value
-    usable = np.ones((40, 60), dtype=np.bool_)
-    found = channels.textured_places(strength, usable, 10)
-    # The second place is within two cells of the first; the third is only within two cells of the
-    # second.
-    assert {tuple(place) for place in found.tolist()} == {(10, 10), (50, 30)}
-    usable[10, 10] = False
-    found = channels.textured_places(strength, usable, 10)
-    assert {tuple(place) for place in found.tolist()} == {(12, 10), (50, 30)}
-    assert channels.textured_places(strength, usable, 1).tolist() == [[12, 10]]
-    nothing = channels.textured_places(np.zeros((5, 5), np.float32), np.ones((5, 5), bool), 10)
-    assert nothing.shape == (0, 2)
-
-
 SHAPE = (301, 350)
 FINE_M = 0.002
 STEP_M = 0.05

@@ -362,19 +362,6 @@ def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(lens: int | None)
             assert logs[row, column, channel] == pytest.approx(wanted, abs=1e-9)
 
 
-@pytest.mark.parametrize(("n_shared", "n_taken"), [(3, 0), (4, 4), (200, 200), (300, 200)])
-def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_taken: int) -> None:
-    one = light(slice(0, 1), slice(0, n_shared), 1)
-    other = light(slice(0, 1), slice(0, n_shared + 5), 2)
-    overlaps = balancing.overlaps_of([one, other])
-    assert sum(len(item.apart) for item in overlaps) == n_taken
-    if n_taken:
-        columns = overlaps[0].places[0][:, 1]
-        # Evenly distributed from end to end.
-        assert (columns[0], columns[-1]) == (0, n_shared - 1)
-        assert set(np.diff(columns)) <= {n_shared // n_taken, -(-n_shared // n_taken)}
-
-
 SMALL_SHAPE = (40, 60)
 BLOCKS = Blocks.over(SMALL_SHAPE, 10)
 

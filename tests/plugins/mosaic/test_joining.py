@@ -302,23 +302,6 @@ def test_blocks_have_the_balanced_mean_of_painted_cells(dtype: type[np.unsignedi
         np.testing.assert_allclose(balanced[k, row, column], wanted, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("shape", "small"), [((100, 300), (100, 300)), ((200, 300), (100, 150)), ((8, 9), (8, 9))]
-)
-def test_cuts_are_made_on_some_ten_thousand_cells_that_a_layer_paints(
-    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], small: tuple[int, int]
-) -> None:
-    monkeypatch.setattr(graph_cut, "expanded", lambda _scene, labels, _alpha: labels)
-    layers = two_layers(shape)
-    for each in layers:
-        each.mask[:, -2:] = LayerMask.OUTSIDE
-    labels = graph_cut.cut_labels(layers, None)
-    assert labels.small.shape == small
-    # If no cell changes, the better layer is used everywhere, and none where none is painted.
-    assert not labels.small[:, :-2].any()
-    assert (labels.in_rows(slice(0, 2)).shape, labels.small[0, -1]) == ((2, shape[1]), -1)
-
-
 PATCHED = (150, 210)
 
 
@@ -403,13 +386,6 @@ def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
     assert sources == {"fifth": 1, "tenth": 0}
 
 
-def test_two_hundred_patches_are_enough() -> None:
-    row = np.tile(np.rint(texture(30.0)[:, :64]), (1, 240))
-    found = agreement.overlaps_of([plain_layer(grey=row, mask=(64, 64 * 240))] * 2).shifts_cells
-    assert len(found) == 200
-    np.testing.assert_allclose(found, 0.0, atol=0.05)
-
-
 @pytest.mark.parametrize("at_once", [1, 3, 1024])
 @pytest.mark.parametrize("seed", seeds(2))
 def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
@@ -431,10 +407,3 @@ def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
     n_edges = np.count_nonzero(seam & depth_edges(depth_m))
     assert agreement.count_seams(source, depth_m) == (seam.sum(), n_edges)
     assert agreement.count_seams(source, None) == (seam.sum(), 0)
-
-
-def test_black_and_white_are_a_hundred_apart() -> None:
-    pair = [plain_layer(grey=value, mask=(1, 2)) for value in (0, 255)]
-    grey, delta_e = agreement.seam_steps(np.array([[0, 1]], dtype=np.int16), pair)
-    assert grey.tolist() == pytest.approx([-255.0])
-    assert delta_e.tolist() == pytest.approx([100.0], abs=1e-3)

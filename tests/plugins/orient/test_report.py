@@ -138,18 +138,6 @@ def test_ties_are_marked_on_a_dimmed_photo_in_the_colour_of_their_role(
             assert tuple(shown[v + dv, u + du]) == (140, 140, 140)
 
 
-def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
-    tmp_path: Path,
-) -> None:
-    ctx, image = context(tmp_path), np.zeros((4, 6, 3), dtype=np.uint8)
-    names = ["a.jpg", "a.tif", "noending", *(f"{k}.jpg" for k in range(30))]
-    for name in names:
-        report.draw_ties(ctx, photo_of(image, name), np.empty((0, 2)), np.empty(0, np.uint8), "ok")
-    found = [figure.name for figure in ctx.figures]
-    assert found[:3] == ["ties_a", "ties_a-1", "ties_noending"]
-    assert len(found) == 24
-
-
 # --- predicted errors ---
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane import cloud as clouds
-from orthoflow_plugins.plane.cloud import PreparedCloud, draw_sample, robust_box
+from orthoflow_plugins.plane.cloud import PreparedCloud, draw_sample
 from orthoflow_plugins.plane.hough import (
     best_bins,
     sharpest,
@@ -378,34 +378,6 @@ def test_one_point_of_each_of_200000_stretches_is_drawn_at_places_of_the_golden_
     golden = np.modf(ordinal * (np.sqrt(5.0) - 1.0) / 2.0)[0]
     np.testing.assert_array_less(np.abs(sample.index / stretch - ordinal - golden), 1.0 / stretch)
     np.testing.assert_array_equal(sample.offsets_m, points[sample.index].astype(np.float32))
-
-
-def boxed_scene(
-    low: tuple[float, float, float], high: tuple[float, float, float]
-) -> NDArray[np.float64]:
-    """Return points in a box, including its corners."""
-    points = np.random.default_rng(2).uniform(low, high, (4_000, 3))
-    points[0], points[1] = low, high
-    return points
-
-
-def box_of(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return robust_box(draw_sample(cloud_of(points)), np.eye(3), 0.0)
-
-
-def test_a_box_has_a_margin_of_250_cm_and_a_fiftieth_about_the_scene() -> None:
-    low_m, extent_m = box_of(boxed_scene((-2.0, 1.0, 0.0), (4.0, 4.0, 2.0)))
-    np.testing.assert_allclose(low_m, [-4.62, -1.56, -2.54], atol=1e-6)
-    np.testing.assert_allclose(extent_m, [11.24, 8.12, 7.08], atol=1e-6)
-    # Points farther away than the length of the scene do not enlarge the box. Nine tenths of the
-    # points are within 9 m.
-    points = boxed_scene((0.0, 0.0, 0.0), (10.0, 4.0, 2.0))
-    for beyond_m, length_m in ((8.0, 26.0), (10.5, 10.0)):
-        points[2:4] = [[10.0 + beyond_m, 2.0, 1.0], [-beyond_m, 2.0, 1.0]]
-        first_m = -8.0 if length_m == 26.0 else 0.0
-        low_m, extent_m = box_of(points)
-        assert low_m[0] == pytest.approx(first_m - 2.5 - 0.02 * length_m, abs=1e-6)
-        assert extent_m[0] == pytest.approx(1.04 * length_m + 5.0, abs=0.02)
 
 
 def test_a_point_that_is_no_place_is_refused_though_the_sample_misses_it(

@@ -106,26 +106,6 @@ def test_points_before_or_behind_the_rectangle_tell_the_side() -> None:
     assert side_by([(0, 1.96, 0)] * 9 + [(0, 2.2, 0)]) == -1
 
 
-def test_parallel_planes_are_asked_last() -> None:
-    behind = [(0.0, 2.5, 0.0)] * 5
-    assert side_by([*behind, (0, 1, 0)], [True] * 5 + [False]) == 1
-    assert side_by([*behind, (0, 1, 0)]) == -1
-    assert side_by(behind, [True] * 5) == -1
-    # Points of parallel planes in front of or behind the rectangle count more than other points
-    # beside it.
-    assert side_by([*behind, (9, 1, 0)], [True] * 5 + [False]) == -1
-    assert side_by([(9, 3, 0), (9, 1, 0), (9, 1, 0)], [False, True, True]) == -1
-
-
-def test_a_small_difference_decides_nothing() -> None:
-    """The limit is a hundredth of the sum if all points were just off the plane."""
-    bare = [(0.0, 2.0, 0.0)] * 1_999
-    # The limit is 0.01 * 2000 * 0.05 m, one metre.
-    assert side_by([*bare, (0, 1.01, 0)]) == 0
-    assert side_by([*bare[:-1], (0, 1.5, 0), (0, 1.48, 0)]) == 1
-    assert side_by([*bare[:-1], (0, 2.5, 0), (0, 2.52, 0)]) == -1
-
-
 # --- products ---
 
 ORIGIN = (300.0, -200.0, 40.0)

@@ -266,17 +266,6 @@ def test_an_outlier_among_points_three_cells_apart_is_a_speck() -> None:
     np.testing.assert_array_equal(specks(depth_m), depth_m == np.float32(0.2))
 
 
-def test_cells_two_rows_or_columns_off_are_around_and_three_are_not() -> None:
-    depth_m = flat()
-    for row, column in ((20, 20), (22, 20), (20, 22)):
-        depth_m[row, column] = 0.3
-    assert not specks(depth_m)[20, 20]
-    apart = flat()
-    for row, column in ((20, 20), (23, 20), (20, 23)):
-        apart[row, column] = 0.3
-    assert specks(apart)[20, 20]
-
-
 def shadow(*, agree: int, n: int = 6) -> NDArray[np.float32]:
     """Return a dense wall with a shadow of 10 columns that contains a few cells."""
     depth_m = flat(40, 60)
@@ -305,28 +294,6 @@ def test_sparse_cells_agree_but_for_a_slope_of_one_in_two() -> None:
             depth_m[row, column] = 0.5 + slope * GSD_M * (column - 30)
         # The farthest cell is four columns away.
         assert specks(depth_m)[20, 30] == is_speck, slope
-
-
-@pytest.mark.parametrize(("sigmas", "is_speck"), [(3.2, False), (5.5, True)])
-def test_sparse_cells_agree_within_four_sigmas(sigmas: float, is_speck: bool) -> None:
-    depth_m = flat(80, 80, noise_m=0.001)
-    depth_m[:, 25:35] = np.nan
-    depth_m[20, 30] = 0.5
-    for row, column in ((20, 28), (20, 32), (18, 30), (22, 30)):
-        depth_m[row, column] = 0.5 + 0.001 * sigmas
-    # Cells are so small that the slope of a surface has no effect.
-    cleaned = without_specks(depth_m, gsd_m=1e-9, layer_m=LAYER_M, threads=1)
-    assert np.isnan(cleaned[20, 30]) == is_speck
-
-
-def test_noise_of_less_than_a_fiftieth_of_a_millimetre_is_left() -> None:
-    quiet, noisy = flat(noise_m=1.6e-5), flat(noise_m=2.6e-5)
-    assert denoised(quiet) is quiet
-    assert denoised(noisy) is not noisy
-    noisy[10:20, 20:30] = np.nan
-    np.testing.assert_array_equal(np.isnan(denoised(noisy)), np.isnan(noisy))
-    nothing = np.full((20, 20), np.nan, dtype=np.float32)
-    assert denoised(nothing) is nothing
 
 
 def weighed(depth_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
