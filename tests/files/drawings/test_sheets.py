@@ -127,6 +127,15 @@ def overlapping(page: pdfplumber.page.Page) -> list[tuple[str, str]]:
         down = min(one[3], other[3]) - max(one[1], other[1])
         if across > 0.3 and down > 0.3:
             found.append((text, other_text))
+    # Words that lie on each other in a row are read as one.
+    for is_upright, row, begin, end in ((True, "top", "x0", "x1"), (False, "x0", "top", "bottom")):
+        letters = [one for one in page.chars if bool(one["upright"]) is is_upright]
+        letters.sort(key=lambda one, row=row, begin=begin: (round(one[row], 1), one[begin]))
+        found += [
+            (one["text"], other["text"])
+            for one, other in itertools.pairwise(letters)
+            if abs(one[row] - other[row]) < 0.05 and one[end] - other[begin] > 0.3
+        ]
     return found
 
 
@@ -136,7 +145,7 @@ WAYS = [
     ("--scale", 50, "--grid", 0.1),
     ("--scale", 20, "--paper", "A4"),
     ("--units", "ft"),
-    ("--language", "de"),
+    ("--scale", 500, "--language", "de"),
     ("--language", "pl", "--beside", "intensity"),
 ]
 
