@@ -157,6 +157,18 @@ def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> Non
     )
 
 
+def test_walls_of_an_elevation_stand_at_their_heights(tmp_path: Path) -> None:
+    image = box_image()
+    corner = image.frame.origin_world + 5.0 * image.frame.u_world - [0.0, 0.0, 0.5]
+    frame = replace(image.frame, origin_world=corner)
+    lower = replace(image, name="wall 3", plane_index=3, frame=frame)
+    run = write_drawing_run(tmp_path / "run", others=(lower,))
+    export(run, "elevation", tmp_path / "out", "--scale", 50, code=0)
+    with pdfplumber.open(tmp_path / "out" / "elevation_1.pdf") as pdf:
+        first, second = sorted(one["top"] for one in pdf.pages[0].images)
+    assert (second - first) * 25.4 / 72.0 == pytest.approx(10.0, abs=0.1)
+
+
 def test_a_qgis_project_shifts_x_alone(run: Path, tmp_path: Path) -> None:
     export(run, "qgis", tmp_path / "out", code=0)
     project = (tmp_path / "out" / "walls.qgs").read_text()

@@ -81,6 +81,9 @@ def test_a_section_has_heights_and_the_first_place_on_the_left() -> None:
     left, bottom, right, top = section.bounds_m
     assert (bottom, top) == pytest.approx((CORNER[2], CORNER[2] + SIZE_M[2]), abs=1e-6)
     assert (left, right) == pytest.approx((0.5, 0.5 + SIZE_M[0]), abs=1e-6)
+    # Beyond the cut are the four edges of the far wall, as long as their points reach.
+    lengths_m = np.linalg.norm(section.beyond_m[:, 1] - section.beyond_m[:, 0], axis=1)
+    assert sorted(lengths_m) == pytest.approx([SIZE_M[2] - 0.2] * 2 + [SIZE_M[0] - 0.2] * 2)
     # The wall at x = 0 is left of the room: what is behind it lies to the left.
     (wall,) = [line for line in section.lines if abs(line.ends_m[:, 0] - 0.5).max() < 1e-6]
     assert wall.behind == pytest.approx([-1.0, 0.0], abs=1e-9)
