@@ -48,8 +48,10 @@ _LENGTHS: Final = (1.0, 2.0, 4.0, 8.0)
 _CORRELATED: Final = (0.25, 0.5, 0.75, 0.95)
 # The profile is tested in sectors of at least this angle and this number of tiles, which are
 # divided into pieces of this number of tiles along the axis. There are at least three sectors if
-# there are enough tiles, and at most twelve.
-_SECTOR_RAD: Final = math.radians(15.0)
+# there are enough tiles, and at most twelve. The sagitta of a sector is 3.4 % of the radius, i.e.
+# several times the scatter of relief that is accepted. The ends of an arc are narrower sectors.
+_SECTOR_RAD: Final = math.radians(30.0)
+_END_RAD: Final = math.radians(15.0)
 _SECTOR_TILES: Final = 3
 _PIECE_TILES: Final = 4
 _SECTORS: Final = (3, 12)
@@ -98,7 +100,7 @@ class FittedSurface:
         slope: change of the radius per metre along the axis if a cone is fitted to a cylinder's
             cells; 0 for cones.
         variation: deviation of the profile's curvature along the arc from the circle's, RMS, as a
-            share of the latter; 0 if it is insignificant.
+            share of its mean; 0 if it is insignificant.
     """
 
     surface: Surface
@@ -372,7 +374,7 @@ def _solution(
     change, used = _solved(tiles, variance, n_own)
     own = _covariance(used, n_own)
     variation, chance = _variation(used, radius_m)
-    sector, _ = _sectors(tiles)
+    sector, _ = _sectors(tiles, _END_RAD)
     if len(np.unique(sector)) == sector.max() + 1 >= _SECTORS[0] + 2:
         # The ends of the arc may be on walls that adjoin it without an edge. Then the radius
         # without them differs significantly (Hausman 1978, doi:10.2307/1913827).
@@ -569,15 +571,20 @@ def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
     return np.asarray(inverse @ weighted.T @ best @ weighted @ inverse)
 
 
-def _sectors(tiles: _Means) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the sector (m,) of each tile, and its angle (m,) from the middle of the sector."""
+def _sectors(tiles: _Means, least_rad: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the sector (m,) of each tile, and its angle (m,) from the middle of the sector.
+
+    Args:
+        tiles: the tiles.
+        least_rad: least angle of a sector.
+    """
     # Positions around the axis, from the end of the longest gap.
     columns = np.unique(tiles.i)
     gaps = np.diff(np.append(columns, columns[0] + tiles.n_around))
     around = (tiles.i - columns[(int(np.argmax(gaps)) + 1) % len(columns)]) % tiles.n_around
     width_rad = 2.0 * math.pi / tiles.n_around
     n_around = int(around.max()) + 1
-    count = int(n_around / max(_SECTOR_TILES, _SECTOR_RAD / width_rad))
+    count = int(n_around / max(_SECTOR_TILES, least_rad / width_rad))
     count = max(1, count, min(_SECTORS[0], n_around // _SECTOR_TILES))
     count = min(count, _SECTORS[1])
     sector = around * count // n_around
@@ -591,7 +598,7 @@ def _variation(tiles: _Means, radius_m: float) -> tuple[float, float]:
     sectors' curvatures from the circle's are compared with the scatter between the pieces of a
     sector, which differ in their positions along the axis.
     """
-    sector, t = _sectors(tiles)
+    sector, t = _sectors(tiles, _SECTOR_RAD)
     n_rows, n_sectors = int(tiles.j.max()) + 1, int(sector.max()) + 1
     n_pieces = max(2, n_rows // _PIECE_TILES)
     piece = sector * n_pieces + tiles.j * n_pieces // n_rows
@@ -614,7 +621,9 @@ def _variation(tiles: _Means, radius_m: float) -> tuple[float, float]:
     within = float(((curvatures - means[of]) ** 2).sum()) / n_within
     between = float((counts * (means - 1.0) ** 2).sum()) / n_between
     chance = float(special.fdtrc(n_between, n_within, between / max(within, 1e-12)))
-    return math.sqrt(max(0.0, between - within) * n_between / len(of)), chance
+    # In sectors without tiles, nothing shows that the surface is curved.
+    mean = n_between / n_sectors
+    return math.sqrt(max(0.0, between - within) * n_between / len(of)) / mean, chance
 
 
 def _extent(
