@@ -232,9 +232,10 @@ def test_every_export_states_the_same_of_a_wall(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("default")  # the models of iiif_prezi3
 def test_an_iiif_manifest_has_a_scale_and_its_tiles_are_the_picture(
-    run: Path, tmp_path: Path
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "out"
+    monkeypatch.setattr("orthoflow.files.tiles.iiif.TILE_PX", 256)
     export(run, "iiif", folder, "--base-url", "https://example.org/room/", code=0)
     text = (folder / "manifest.json").read_text()
     manifest = json.loads(text)
@@ -248,9 +249,9 @@ def test_an_iiif_manifest_has_a_scale_and_its_tiles_are_the_picture(
         wanted = np.moveaxis(raster.read(), 0, 2)[:, :, :3].astype(int)
         shown = raster.dataset_mask() > 0
     made = np.zeros_like(wanted)
-    for top in range(0, info["height"], 512):
-        for left in range(0, info["width"], 512):
-            wide, high = min(512, info["width"] - left), min(512, info["height"] - top)
+    for top in range(0, info["height"], 256):
+        for left in range(0, info["width"], 256):
+            wide, high = min(256, info["width"] - left), min(256, info["height"] - top)
             tile = folder / stem / f"{left},{top},{wide},{high}" / f"{wide},{high}" / "0"
             made[top : top + high, left : left + wide] = np.asarray(
                 Image.open(tile / "default.jpg")

@@ -20,7 +20,7 @@ from PIL import Image
 from orthoflow.cli.export import export as command
 from orthoflow.errors import RecordError
 from orthoflow.files.drawings import geojson
-from orthoflow.files.drawings.dxf import regular_opening
+from orthoflow.files.drawings.dxf import LAYERS, regular_opening
 from orthoflow.records.open import open_run
 from orthoflow.records.walls import room_results
 from tests import samples
@@ -263,7 +263,12 @@ def test_the_picture_lies_on_its_wall_to_scale(drawn: Path) -> None:
 
 
 def test_a_wall_has_its_edges_points_grid_and_heights_in_metres(drawn: Path) -> None:
-    space = ezdxf.readfile(drawn / f"wall_{WALL}.dxf").modelspace()
+    document = ezdxf.readfile(drawn / f"wall_{WALL}.dxf")
+    layers = [
+        (one.dxf.name, one.description, one.color, one.dxf.lineweight) for one in document.layers
+    ]
+    assert {(name, *stated) for name, stated in LAYERS.items()} <= {*layers}
+    space = document.modelspace()
     edges = [
         np.array([line.dxf.start, line.dxf.end])[:, :2]
         for line in space.query('LINE[layer=="A-ELEV-EDGE"]')

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.drawings import printed_pictures
 from orthoflow.files.drawings.printed_pictures import (
+    Stretch,
     contours,
     encode_part,
     stretch_of,
@@ -139,4 +140,5 @@ def test_noise_of_a_flat_wall_draws_no_contours(tmp_path: Path, depth_m: float) 
     assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.05) == []
     stretch = stretch_of(tmp_path / "a.tif")
     assert stretch.noise == pytest.approx(0.002, rel=0.05)
+    assert Stretch(low=0.0, high=0.0, noise=0.002).interval == pytest.approx(0.01)
     assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=stretch.interval) == []
