@@ -45,7 +45,8 @@ class LayerMask(IntEnum):
     Attributes:
         OUTSIDE: the cell is outside the source.
         PAINTED: the cell has a colour.
-        OCCLUDED: an object hides the cell from the camera.
+        OCCLUDED: an object hides the cell from the camera, or the cell is seen too obliquely, or is
+            too near the outline of a curved surface.
         NO_SURFACE: the depth is unknown.
     """
 
