@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
+import pytest
 from orthoflow_provenance.document import RecordedCell
 from orthoflow_provenance.record import open_record, write_record
 from syrupy.assertion import SnapshotAssertion
 
+from orthoflow.cli.tables import echo_diagnostics
 from tests.provenance_records import write_sample
-from tests.report_runs import cell, compared_run, metrics, record
+from tests.report_runs import cell, compared_run, metrics, record, warned
 from tests.studios import said
 
 
@@ -89,3 +91,10 @@ def test_over_datasets_medians_are_shown(tmp_path: Path, snapshot: SnapshotAsser
         for name, better in (("a", 1.0), ("b", 0.5))
     ]
     assert shown(tmp_path, cells, '{"datasets": {"r0": {}, "r1": {}, "r2": {}}}') == snapshot
+
+
+def test_five_warnings_are_shown_and_the_others_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    echo_diagnostics([cell("wall", **warned(*map(str, range(7))))], Path("run"))
+    *shown, last = capsys.readouterr().out.splitlines()
+    assert len(shown) == 5
+    assert last == "and 2 more warnings: orthoflow show run --all"

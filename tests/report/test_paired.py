@@ -24,6 +24,7 @@ from orthoflow.records.write import NOT_YET
 from orthoflow.report import write_page, write_report
 from orthoflow.report.comparisons import dataset_table
 from orthoflow.report.paired import (
+    MeanRanks,
     MetricOverDatasets,
     Paired,
     mean_ranks,
@@ -473,3 +474,9 @@ def test_pages_are_not_written_through_a_link(rooms: Run, tmp_path: Path) -> Non
     with pytest.raises(StoreError, match="'pages' is a link"):
         write_page(rooms, tmp_path / "report.html")
     assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_no_method_leads_where_friedman_s_test_shows_no_difference() -> None:
+    ranks = {"a": 1.0, "b": 2.0, "c": 3.0}
+    for p, leading in (0.2, ("a", "b", "c")), (0.01, ("a",)):
+        assert MeanRanks(n=6, ranks=ranks, p=p, critical_difference=0.5).leading == leading
