@@ -354,12 +354,14 @@ def test_a_list_says_which_classes_are_missing_and_how_they_are_mended(
         ("plane.case", "named.method:Minee"),
         ("plane.lost", "named.methods:Mine"),
         ("plane.indented", "named.odd:Odd"),
+        ("plane.stopped", "named.stop:Stop"),
     )
     sources = {
         "named_hooks.py": hooks(methods=", ".join(method(*one) for one in announced)),
         "named/__init__.py": "",
         "named/method.py": CLASS,
         "named/odd.py": "class Odd:\npass\n",
+        "named/stop.py": "raise KeyboardInterrupt",
     }
     folder = write_distribution(tmp_path, "named", sources)
     (folder / "named-1.0.dist-info" / "direct_url.json").write_text("{}")
@@ -367,7 +369,7 @@ def test_a_list_says_which_classes_are_missing_and_how_they_are_mended(
     listed = asked("plugins", "list", code=0).stdout
     rows = [line.split() for line in listed.splitlines()]
     states = {row[0]: row[1] for row in rows if len(row) > 1}
-    assert [states[name] for name, _ in announced] == ["fine", "broken", "broken", "broken"]
+    assert [states[name] for name, _ in announced] == ["fine", *["broken"] * 4]
     for said in (
         "from named.method:Minee: AttributeError: module 'named.method' has no attribute 'Minee'; ",
         "ModuleNotFoundError: No module named 'named.methods'; install missing packages or an",

@@ -181,6 +181,11 @@ def test_an_input_option_must_exist_even_when_the_input_is_optional(
 ) -> None:
     with pytest.raises(InputError, match=r"there is no file a\.jpg in the working directory"):
         names(project, catalog, "{optional: true}", "photos=a.jpg")
+    Path("b.jpg").symlink_to("nowhere.jpg")
+    with pytest.raises(
+        InputError, match=r"b\.jpg .*is a link to nowhere\.jpg, which does not exist"
+    ):
+        names(project, catalog, "{optional: true}", "photos=b.jpg")
 
 
 def test_cells_that_cannot_be_meant_are_told(catalog: Catalog, tmp_path: Path) -> None:
