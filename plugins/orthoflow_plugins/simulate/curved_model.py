@@ -154,7 +154,8 @@ class _Bend:
         # Distances from the axis along the normal, at the depth and on the wall.
         to_axis_m = self.radius_m / math.cos(self.half_angle_rad)
         scale = (to_axis_m + sign * depth_m) / to_axis_m
-        self.draft.surfaces.append(
+        self._add(
+            extent,
             Surface(
                 centre,
                 sign * np.cross(self.axis, self.zero),
@@ -165,9 +166,13 @@ class _Bend:
                 holes=[_scaled(hole, sign * scale) for hole in holes],
                 curvature_per_m=-sign / (to_axis_m + sign * depth_m),
                 taper_per_m=1.0 / (scale * self.slant_m),
-            )
+            ),
         )
-        if role == SurfaceRole.WALL:
+
+    def _add(self, extent: Extent, surface: Surface) -> None:
+        """Add a surface, and note its extent if it is a part of the wall itself."""
+        self.draft.surfaces.append(surface)
+        if surface.role == SurfaceRole.WALL:
             self.extents.append(extent)
             self.rows.append(len(self.draft.surfaces) - 1)
 
@@ -249,7 +254,8 @@ class _Dome(_Bend):
         sign = -1.0 if self.shape.is_concave else 1.0
         scale = 1.0 + sign * depth_m / self.radius_m
         a0, a1, b0, b1 = extent
-        self.draft.surfaces.append(
+        self._add(
+            extent,
             Surface(
                 pole,
                 meridian,
@@ -260,11 +266,8 @@ class _Dome(_Bend):
                 holes=holes,
                 curvature_per_m=-sign / (scale * self.radius_m),
                 taper_per_m=math.inf,
-            )
+            ),
         )
-        if role == SurfaceRole.WALL:
-            self.extents.append(extent)
-            self.rows.append(len(self.draft.surfaces) - 1)
 
     def box(self, extent: Extent, depths_m: tuple[float, float], paint: Paint) -> None:
         """See `_Bend.box`."""
@@ -388,7 +391,7 @@ def _wall(
     holes: Sequence[Extent] = (),
 ) -> Side:
     """Add a vertical wall, given the azimuth of its outward normal."""
-    # Without a texture of its own, a wall could not be told from others of the same size.
+    # With the same texture, walls of the same size could not be distinguished.
     paint = replace(paint, seed=paint.seed + 100 + round(omega_deg))
     wall = wall_side(draft, omega_deg=omega_deg, phi_deg=0.0, distance_m=distance_m)
     plane = wall.true_plane(name, extent)
