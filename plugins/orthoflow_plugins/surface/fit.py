@@ -556,8 +556,9 @@ def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
     white = np.diag(tiles.n.mean() / tiles.n)
     columns = np.column_stack([matrix / scale, tiles.means])
     best, least = white, math.inf
-    for length, share in [(1.0, 0.0), *itertools.product(_LENGTHS, _CORRELATED)]:
-        model = (1.0 - share) * white + share * np.exp(-apart / length)
+    relief = [np.exp(-apart / length) for length in _LENGTHS]
+    for correlation, share in [(relief[0], 0.0), *itertools.product(relief, _CORRELATED)]:
+        model = (1.0 - share) * white + share * correlation
         root = np.linalg.cholesky(model)
         whitened = linalg.solve_triangular(root, columns, lower=True)
         triangle = np.asarray(np.linalg.qr(whitened, mode="r"))
