@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from orthoflow import products
-from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.distributions import DistributionInfo
+from orthoflow.catalog.catalog import Catalog, KindEntry
 from orthoflow.errors import PluginError
 from orthoflow.sdk import port_specs
 from orthoflow.sdk.hooks import FILES
@@ -63,46 +62,21 @@ def kind_ports(
     Raises:
         PluginError: the kind cannot be used.
     """
-    if kind not in catalog.kinds:
-        return _kind_ports(catalog, {one: one for one in takes}, {one: one for one in gives}, [])
-    entry = catalog.kinds[kind]
-    if entry.state != "fine":
-        raise PluginError(entry.problem)
-    taken, given = entry.spec.inputs, entry.spec.outputs
-    for other in catalog.methods.values():
-        if other.spec.kind == kind:
-            try:
-                method = other.load()
-            except PluginError:
-                continue
-            ports = port_specs(method.In).values()
-            required = {port.name: port.type_name for port in ports if port.required}
-            if entry.spec.is_source:
-                outputs = port_specs(method.Out).values()
-                taken, given = required, {port.name: port.type_name for port in outputs}
-            elif required:
-                taken = {name: type_name for name, type_name in taken.items() if name in required}
-            break
-    return _kind_ports(catalog, taken, given, [entry.distribution])
-
-
-def _kind_ports(
-    catalog: Catalog,
-    taken: Mapping[str, str],
-    given: Mapping[str, str],
-    besides: Sequence[DistributionInfo],
-) -> KindPorts:
+    taken, given = {one: one for one in takes}, {one: one for one in gives}
+    if kind in catalog.kinds:
+        taken, given = _declared_ports(catalog, catalog.kinds[kind])
     types = dict.fromkeys((*taken.values(), *given.values()))
     classes = {type_name: _class_of(catalog, type_name) for type_name in types}
     imports: dict[str, set[str]] = {}
     for module, name in classes.values():
         imports.setdefault(module, set()).add(name)
     handed_on = {type_name: name for name, type_name in taken.items()}
-    of_types = [catalog.products[name].distribution for name in types if name != FILES]
+    providers = [catalog.products[name].distribution for name in types if name != FILES]
+    providers += [catalog.kinds[kind].distribution] if kind in catalog.kinds else []
     # A version after `>=` must not contain a local part.
     needs = {
         f"{one.name}>={one.version.partition('+')[0]}"
-        for one in (*of_types, *besides)
+        for one in providers
         if one.name != DISTRIBUTION
     }
     return KindPorts(
@@ -114,6 +88,26 @@ def _kind_ports(
         imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
         needs=tuple(sorted(needs)),
     )
+
+
+def _declared_ports(catalog: Catalog, kind: KindEntry) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the product types of inputs and outputs of an installed kind by port."""
+    if kind.state != "fine":
+        raise PluginError(kind.problem)
+    taken, given = dict(kind.spec.inputs), dict(kind.spec.outputs)
+    for other in catalog.methods.values():
+        if other.spec.kind == kind.spec.name:
+            try:
+                method = other.load()
+            except PluginError:
+                continue
+            ports = port_specs(method.In).values()
+            required = {port.name: port.type_name for port in ports if port.required}
+            if kind.spec.is_source:
+                outputs = port_specs(method.Out).values()
+                return required, {port.name: port.type_name for port in outputs}
+            return {name: taken[name] for name in taken if name in required or not required}, given
+    return taken, given
 
 
 def _class_of(catalog: Catalog, type_name: str) -> tuple[str, str]:

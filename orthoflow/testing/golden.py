@@ -110,9 +110,8 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
             # changed.
             stream.write(re.sub(r"\[[^\[\]]+\]", lambda it: " ".join(it[0].split()), text) + "\n")
             return ""
-    numbers_stated = before.inputs == now.inputs
-    changes = _changes(before.outputs, now.outputs, outputs, numbers_stated=numbers_stated)
-    for port, moved in changes:
+    is_equal = before.inputs == now.inputs
+    for port, moved in _changes(before.outputs, now.outputs, outputs, numbers_stated=is_equal):
         return (
             f"output {port} differs from {file.name} ({moved}), but result_version is still "
             f"{now.result_version}: increment it, or find out why the result has changed"
@@ -128,13 +127,9 @@ def _changes(
     numbers_stated: bool = True,
 ) -> Iterator[tuple[str, str]]:
     for port in sorted({*before, *after}):
-        moved = "one of them has none"
-        if port in before and port in after:
-            tolerances = products[port].tolerances
-            moved = sample_problem(
-                before[port], after[port], tolerances, numbers_stated=numbers_stated
-            )
-        if moved:
+        tolerances = products[port].tolerances if port in products else {}
+        pair = before.get(port, {}), after.get(port, {})
+        if moved := sample_problem(*pair, tolerances, numbers_stated=numbers_stated):
             yield port, moved
 
 

@@ -285,13 +285,11 @@ PHOTOGRAPHING: Final[Mapping[str, ViewingCamera]] = {
 }
 
 
-@cache
 def _photos() -> Photos:
     scene = textured_wall()
     return photos(*(photo_of(scene, view, name=name) for name, view in PHOTOGRAPHING.items()))
 
 
-@cache
 def _cameras() -> Cameras:
     views = PHOTOGRAPHING.items()
     return cameras(*(oriented(settled_camera(view), name=name) for name, view in views))
@@ -303,12 +301,10 @@ def settled_camera(camera: ViewingCamera) -> ViewingCamera:
     return replace(camera, rotation=rotation, translation=translation)
 
 
-@cache
 def _calibration() -> Calibration:
     return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(PHOTOGRAPHING["a.png"]),))
 
 
-@cache
 def _checkpoints() -> CheckPoints:
     frame = textured_wall().frame
     pixels = np.array([[50.0, 60.0], [440.0, 70.0], [250.0, 170.0], [60.0, 280.0], [430.0, 270.0]])
@@ -371,12 +367,12 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
 
 
 PHOTOGRAPHED: Final[Mapping[str, Callable[[], Product]]] = {
-    "photos": _photos,
-    "cameras": _cameras,
-    "calibration": _calibration,
+    "photos": cache(_photos),
+    "cameras": cache(_cameras),
+    "calibration": cache(_calibration),
     "ties": example_ties,
     "walls": cache(lambda: walls_of(textured_wall())),
     "layers": cache(lambda: two_halves(textured_wall())),
     "cloud": cache(lambda: cloud_of(textured_wall(), spacing_m=0.01)),
-    "checkpoints": _checkpoints,
+    "checkpoints": cache(_checkpoints),
 }

@@ -17,7 +17,7 @@ from typing import Final, TypeVar
 
 from orthoflow.engine.kernels import VARIABLE
 from orthoflow.engine.store import digest_of
-from orthoflow.products import InputFiles, Product
+from orthoflow.products import Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.examples import example_inputs
 from orthoflow.testing.trials import Trial, TrialRun, run_trial
@@ -56,10 +56,10 @@ class Subject:
     @cached_property
     def first(self) -> TrialRun:
         """The first run, on a copy of the inputs, so that later runs have unchanged inputs."""
-        copies = deepcopy(dict(self.trial.inputs))
-        run = _run(replace(self.trial, inputs=copies))
-        before, after = (_digests(inputs) for inputs in (self.trial.inputs, copies))
-        self.changed_inputs += [name for name in before if after[name] != before[name]]
+        given = {k: one for k, one in self.trial.inputs.items() if isinstance(one, Product)}
+        copies = deepcopy(given)
+        run = _run(replace(self.trial, inputs={**self.trial.inputs, **copies}))
+        self.changed_inputs += [k for k in given if digest_of(copies[k]) != digest_of(given[k])]
         return run
 
     @cached_property
@@ -103,10 +103,6 @@ class Subject:
     def run_cancelled(self) -> TrialRun:
         """Run the method in a step that is cancelled before it starts."""
         return _run(self.trial, is_cancelled=True)
-
-
-def _digests(inputs: Mapping[str, Product | InputFiles]) -> dict[str, str]:
-    return {name: digest_of(one) for name, one in inputs.items() if isinstance(one, Product)}
 
 
 def _run(trial: Trial, *, is_cancelled: bool = False) -> TrialRun:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,24 +71,14 @@ def _room() -> tuple[PointCloud, Truth]:
     )
 
 
-@cache
 def _planes() -> Planes:
     true = _room()[1].planes
-    chosen = slice(0, _N_PLANES)
-    return Planes(
-        normal=true.normal[chosen],
-        offset=true.offset[chosen],
-        corners=true.corners[chosen],
-        covariance=np.tile(1e-8 * np.eye(4), (_N_PLANES, 1, 1)),
-        n_points=true.n_points[chosen],
-        rms_m=true.rms_m[chosen],
-        up=true.up,
-        names=true.names[chosen],
-        viewpoint=true.viewpoint,
-    )
+    per_plane = ("normal", "offset", "corners", "n_points", "rms_m", "names")
+    # Any, because the fields have various types.
+    first: dict[str, Any] = {name: getattr(true, name)[:_N_PLANES] for name in per_plane}
+    return replace(true, covariance=np.tile(1e-8 * np.eye(4), (_N_PLANES, 1, 1)), **first)
 
 
-@cache
 def _labels() -> PointLabels:
     true = _room()[1].labels
     return PointLabels(plane_index=np.where(true < _N_PLANES, true, -1).astype(np.int16))
@@ -97,6 +87,6 @@ def _labels() -> PointLabels:
 SURVEYED: Final[Mapping[str, Callable[[], Product]]] = {
     "cloud": lambda: _room()[0],
     "truth": lambda: _room()[1],
-    "planes": _planes,
-    "labels": _labels,
+    "planes": cache(_planes),
+    "labels": cache(_labels),
 }

@@ -601,5 +601,5 @@ def test_a_mosaic_paints_what_its_layers_show(hidden: float, passes: bool) -> No
     if passes:
         physics.mosaics_show_cells_in_place(subject)
         return
-    with pytest.raises(AssertionError, match=r"wall 0 at 0\.006 m: 95% of the cells are covered"):
+    with pytest.raises(AssertionError, match=r"wall 0 at 0\.006 m: only 95% of the wall is"):
         physics.mosaics_show_cells_in_place(subject)

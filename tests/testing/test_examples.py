@@ -217,7 +217,7 @@ def test_what_other_numbers_went_into_is_held_to_its_tolerances_alone(tmp_path: 
 
 def test_an_output_that_appears_and_another_file_are_noticed(file: Path) -> None:
     problem = golden_problem(file, trial(), {"planes": planes(), "walls": planes()})
-    assert problem.startswith("output walls differs from golden.json (one of them has")
+    assert problem.startswith("output walls differs from golden.json (only one of the results")
     file.write_text('{"plane.mine": {"1": {}}}')
     with pytest.raises(InputError, match=r"is not a valid file of golden results .*: remove it"):
         golden_problem(file, trial(), {"planes": planes()})
