@@ -82,6 +82,9 @@ def test_a_strangers_distribution_is_found_by_its_metadata(
     assert catalog.broken == ()
 
 
+LIMITING = "import os, sys\nos.chdir('/')\nsys.setrecursionlimit(900)"
+
+
 @pytest.mark.parametrize(
     ("name", "text", "error"),
     [
@@ -98,12 +101,7 @@ def test_a_strangers_distribution_is_found_by_its_metadata(
         ("speechless", SPEECHLESS, "Speechless: a Speechless without a message"),
         ("long", "raise ValueError('x' * 10**6)", "... (1000000 characters)"),
         ("interrupting", "raise KeyboardInterrupt", "KeyboardInterrupt"),
-        ("limiting", "import sys\nsys.setrecursionlimit(900)", "lowers Python's recursion limit"),
-        (
-            "numbered",
-            hooks(methods="MethodSpec(id=5, target='a:B', summary='-')"),
-            "TypeError: expected string",
-        ),
+        ("limiting", LIMITING, "lowers Python's recursion limit"),
         (
             "portless",
             hooks(kinds="KindSpec(name='a', summary='-', inputs=None)"),
@@ -122,8 +120,9 @@ def test_a_plugin_that_fails_is_listed_and_harms_nobody(
     name: str, text: str, error: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limit = sys.getrecursionlimit()
+    monkeypatch.chdir(tmp_path)
     catalog = with_plugin(name, text, tmp_path, monkeypatch)
-    assert sys.getrecursionlimit() == limit
+    assert (sys.getrecursionlimit(), Path.cwd()) == (limit, tmp_path)
     (broken,) = catalog.broken
     assert (broken.entry_point, broken.module) == (name, f"{name}_hooks")
     assert error in broken.error

@@ -285,6 +285,8 @@ def test_p_is_corrected_for_all_comparisons_of_a_run() -> None:
     assert alone is not None
     assert among is not None
     assert (alone.p_holm, among.p_holm) == (alone.p, pytest.approx(3 * alone.p))
+    # In four rooms, no p is small enough.
+    assert ["not" in leading(1, 0, n_rooms).lead for n_rooms in (12, 4)] == [False, True]
 
 
 def test_methods_are_ranked_where_all_have_a_value() -> None:

@@ -168,6 +168,19 @@ def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended(tmp_path:
     assert limiting == [("orient",), ("first",)]
 
 
+def test_errors_come_first_and_five_limits_are_on_the_first_screen(tmp_path: Path) -> None:
+    codes = ("unlit", "hidden", "far", "dark", "small", "worst")
+    *others, last = (warned(code, code=code, subject="wall 0")["diagnostics"][0] for code in codes)
+    # Of a plane that has no orthoimage, unlike wall 0.
+    worst = replace(last, severity="error", subject="wall 7")
+    image = PublishedFile(path="products/x/wall_0_ortho.tif", size_bytes=2, sha256="0" * 64)
+    run = run_of(cell("wall", diagnostics=(*others, worst)), published=(image,))
+    assert ["worst" in limit.text for limit in limits(run)] == [True] + [False] * 5
+    write_report([run], tmp_path / "report.html")
+    _, _, screen = (tmp_path / "report.html").read_text().partition("Limitations of the result")
+    assert [part.count("<li>") for part in screen.split("</ul>")[:2]] == [5, 1]
+
+
 def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
     whole_run = run_of(
         cell("wall"),

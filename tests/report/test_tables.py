@@ -68,7 +68,7 @@ def test_latex_and_markdown_have_the_same_numbers(files: dict[str, str]) -> None
     assert r"1.10 $\pm$ 0.10" in files["results.tex"]
     # Names to the left, numbers to the right.
     assert r"\begin{tabular}{llrrr}" in files["results.tex"]
-    assert "1.10 ± 0.10" in files["results.md"]
+    assert "RMS / mm | lower | 1.10 ± 0.10 |" in files["results.md"]
     body = files["results.tex"].partition(r"\midrule")[2].partition(r"\bottomrule")[0]
     assert {line.count("&") for line in body.splitlines() if line} == {4}
     # The name of the run is `toy <run>`, and a record may hold anything.

@@ -98,6 +98,9 @@ def test_equal_depths_before_and_behind_the_plane_have_equally_strong_colours(
     # A quarter of the depth is a pale red beside a full blue.
     assert common[-1] < 0.2
     assert common[1] > 0.6
+    # What lies on the plane is grey, shaded as it is.
+    grey = (np.ptp(colours, axis=1) < 4) & (colours.max(axis=1) < 250)
+    assert counts[grey].sum() > 0.2 * counts[colours.max(axis=1) < 250].sum()
 
 
 def test_relief_lies_where_the_depths_do(run: Path, tmp_path: Path) -> None:
@@ -242,6 +245,8 @@ def test_an_iiif_manifest_has_a_scale_and_its_tiles_are_the_picture(
     (canvas,) = manifest["items"]
     assert canvas["service"][0]["physicalScale"] == pytest.approx(1000 * GSD_M)
     stem = f"wall_{WALL}_ortho"
+    layers = {one["id"].split("/")[4] for one in canvas["items"][0]["items"][0]["body"]["items"]}
+    assert layers == {stem, *(f"wall_{WALL}_{kind}" for kind in ("intensity", "depth", "relief"))}
     info = json.loads((folder / stem / "info.json").read_text())
     assert info["id"] == f"https://example.org/room/{stem}"
     with rasterio.open(next((run / "products").rglob(f"{stem}.tif"))) as raster:
