@@ -23,9 +23,8 @@ MOMENTS: Final = 10
 _ROUNDS: Final = 12
 _SETTLED: Final = 1e-8
 _SCATTER_SAMPLE: Final = 4_000
-# Number of points of a block of `sum_cells`, and of points compared at a time to find its bounds.
+# Number of points of a block of `sum_cells`.
 _BLOCK: Final = 128
-_LANES: Final = 16
 # A voxel at (i, j, k) has the key i << 40 | j << 20 | k.
 KEY_BITS: Final = 20
 
@@ -387,18 +386,17 @@ def sum_cells(
         labels: (n,) output, -1 for points on no surface.
         counts: (s,) output, number of points of each surface.
     """
-    lanes, middle, half = np.empty((2, _LANES), dtype=np.float32), np.empty(3), np.empty(3)
-    work, index = np.empty((7, _BLOCK)), np.empty((3, _BLOCK), dtype=np.int64)
-    nearest, second, best, cell = work[0], work[1], index[0], index[1]
+    middle, half, work = np.empty(3), np.empty(3), np.empty((5, _BLOCK))
+    index = np.empty((2, _BLOCK), dtype=np.int64)
     for first in range(0, offsets.x.shape[0], _BLOCK):
         end = min(first + _BLOCK, offsets.x.shape[0])
         block = Offsets(offsets.x[first:end], offsets.y[first:end], offsets.z[first:end])
         own = labels[first:end]
         for p in range(end - first):
             own[p] = -1
-        half[0] = _reach(block.x, 0, lanes, middle)
-        half[1] = _reach(block.y, 1, lanes, middle)
-        half[2] = _reach(block.z, 2, lanes, middle)
+        half[0] = _reach(block.x, 0, middle)
+        half[1] = _reach(block.y, 1, middle)
+        half[2] = _reach(block.z, 2, middle)
         is_empty = True
         for s in range(cells.rounds.shape[0]):
             if _may_have_points(cells, s, middle, half):
@@ -409,43 +407,25 @@ def sum_cells(
         if is_empty:
             continue
         for p in range(end - first):
-            s, distance = best[p], nearest[p]
+            s, distance, cell = index[0, p], work[0, p], index[1, p]
             if s < 0:
                 continue
             own[p] = s
             counts[s] += 1
-            if abs(distance) < cells.bounds[s, 3] <= second[p]:
-                sums[cell[p], 0] += 1.0
-                sums[cell[p], 1] += distance
-                sums[cell[p], 2] += distance * distance
+            if abs(distance) < cells.bounds[s, 3] <= work[1, p]:
+                sums[cell, 0] += 1.0
+                sums[cell, 1] += distance
+                sums[cell, 2] += distance * distance
 
 
 @kernel_part
-def _reach(
-    values: NDArray[np.float32],
-    axis: int,
-    lanes: NDArray[np.float32],
-    middle: NDArray[np.float64],
-) -> float:
+def _reach(values: NDArray[np.float32], axis: int, middle: NDArray[np.float64]) -> float:
     """Set the middle of a block along an axis; return half its length."""
-    low, high = lanes[0], lanes[1]
-    n_lanes = min(_LANES, values.shape[0])
-    for lane in range(n_lanes):
-        low[lane] = values[lane]
-        high[lane] = values[lane]
-    for start in range(n_lanes, values.shape[0], _LANES):
-        # The last part overlaps the one before it.
-        begin = min(start, values.shape[0] - _LANES)
-        part = values[begin : begin + _LANES]
-        # Without branches, loops are vectorised.
-        for lane in range(_LANES):
-            low[lane] = min(low[lane], part[lane])
-            high[lane] = max(high[lane], part[lane])
-    least, most = low[0], high[0]
-    for lane in range(1, n_lanes):
-        least, most = min(least, low[lane]), max(most, high[lane])
-    middle[axis] = 0.5 * (float(least) + float(most))
-    return 0.5 * (float(most) - float(least))
+    low, high = values[0], values[0]
+    for p in range(values.shape[0]):
+        low, high = min(low, values[p]), max(high, values[p])
+    middle[axis] = 0.5 * (float(low) + float(high))
+    return 0.5 * (float(high) - float(low))
 
 
 @kernel_part
@@ -495,16 +475,6 @@ def _compare_planes(
 
 
 @kernel_part
-def _move_to_sphere(
-    along: NDArray[np.float64], off: NDArray[np.float64], radius: float, count: int
-) -> None:
-    """Change positions along the axis to those of the nearest points of a sphere."""
-    # Cells of a sphere then depend on the direction only, so noise does not affect them.
-    for p in range(count):
-        along[p] *= radius / max(1e-12, off[p] + radius)
-
-
-@kernel_part
 def _compare(
     block: Offsets,
     cells: Cells,
@@ -514,42 +484,33 @@ def _compare(
 ) -> None:
     """Compare the distances of a block's points from a surface with those from the others."""
     x, y, z = block.x, block.y, block.z
-    nearest, second, along, off = work[0], work[1], work[2], work[3]
-    sine, cosine, angle = work[4], work[5], work[6]
-    best, cell, chosen = index[0], index[1], index[2]
     r, bounds, sizes = cells.rounds, cells.bounds, cells.sizes
     px, py, pz, ax, ay, az = r[s, 0], r[s, 1], r[s, 2], r[s, 3], r[s, 4], r[s, 5]
-    radius, slope, steepness, straight = r[s, 9], r[s, 10], r[s, 11], r[s, 12]
-    least, most, reach = bounds[s, 0], bounds[s, 1], bounds[s, 2]
-    for p in range(x.shape[0]):
-        dx, dy, dz = float(x[p]) - px, float(y[p]) - py, float(z[p]) - pz
-        at = dx * ax + dy * ay + dz * az
-        across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - straight * at * at))
-        along[p], off[p] = at, (across - radius - slope * at) * steepness
-    _move_to_sphere(along, off, radius, 0 if straight != 0.0 else x.shape[0])
-    count = 0
-    for p in range(x.shape[0]):
-        chosen[count] = p
-        count += (abs(off[p]) <= reach) & (along[p] >= least) & (along[p] <= most)
     zx, zy, zz = r[s, 6], r[s, 7], r[s, 8]
     sx, sy, sz = ay * zz - az * zy, az * zx - ax * zz, ax * zy - ay * zx
-    for q in range(count):
-        p = chosen[q]
+    radius, slope, steepness, straight = r[s, 9], r[s, 10], r[s, 11], r[s, 12]
+    least, reach, around, rows = bounds[s, 0], bounds[s, 2], sizes[s, 1], sizes[s, 2]
+    columns_per_rad, rows_per_m = around / (2.0 * math.pi), rows / (bounds[s, 1] - least)
+    # The loop is vectorised, as it has no branches, and as it writes to one array only: for more,
+    # LLVM would need too many tests whether the arrays overlap.
+    for p in range(x.shape[0]):
         dx, dy, dz = float(x[p]) - px, float(y[p]) - py, float(z[p]) - pz
-        sine[q], cosine[q] = dx * sx + dy * sy + dz * sz, dx * zx + dy * zy + dz * zz
-    for q in range(count):
-        angle[q] = _quick_angle(sine[q], cosine[q])
-    around, rows = sizes[s, 1], sizes[s, 2]
-    columns_per_rad, rows_per_m = around / (2.0 * math.pi), rows / (most - least)
-    for q in range(count):
-        p = chosen[q]
-        i = min(int((angle[q] + math.pi) * columns_per_rad), around - 1)
-        if not cells.is_open[sizes[s, 3] + i]:
+        along = dx * ax + dy * ay + dz * az
+        across = math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - straight * along * along))
+        off = (across - radius - slope * along) * steepness
+        # Cells of a sphere depend on the direction only, so noise does not affect them.
+        along *= 1.0 if straight != 0.0 else radius / max(1e-12, across)
+        angle = _quick_angle(dx * sx + dy * sy + dz * sz, dx * zx + dy * zy + dz * zz)
+        row = (along - least) * rows_per_m
+        work[2, p], work[3, p] = off, (angle + math.pi) * columns_per_rad
+        work[4, p] = row if (abs(off) <= reach) & (row >= 0.0) & (row <= rows) else -1.0
+    for p in range(x.shape[0]):
+        off, column = work[2, p], min(int(work[3, p]), around - 1)
+        if work[4, p] < 0.0 or not cells.is_open[sizes[s, 3] + column]:
             continue
-        if abs(off[p]) < abs(nearest[p]):
-            second[p] = abs(nearest[p]) if best[p] >= 0 else math.inf
-            nearest[p], best[p] = off[p], s
-            j = min(int((along[p] - least) * rows_per_m), rows - 1)
-            cell[p] = sizes[s, 0] + i * rows + j
-        elif best[p] >= 0:
-            second[p] = min(second[p], abs(off[p]))
+        if abs(off) < abs(work[0, p]):
+            work[1, p] = abs(work[0, p]) if index[0, p] >= 0 else math.inf
+            work[0, p], index[0, p] = off, s
+            index[1, p] = sizes[s, 0] + column * rows + min(int(work[4, p]), rows - 1)
+        elif index[0, p] >= 0:
+            work[1, p] = min(work[1, p], abs(off))

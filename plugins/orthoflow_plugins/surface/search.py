@@ -36,7 +36,7 @@ _SUITED_RADIUS: Final = 24.0
 _PAIRS: Final = 30_000
 _PAIRS_PER_VOXEL: Final = 4
 _HYPOTHESES: Final = 1_500
-_LEAST_TURN: Final = math.sin(math.radians(12.0))
+_LEAST_TURN_RAD: Final = math.radians(12.0)
 # Largest disagreement between hypotheses of one surface: sine of the angle between the axes, and
 # shares of the radius.
 _SAME_AXIS: Final = math.sin(math.radians(9.0))
@@ -55,6 +55,8 @@ _MOST_TRIES: Final = 10
 # iterations.
 _NORMAL_DEG: Final = (28.0, 15.0)
 _ITERATIONS: Final = 4
+# A surface found among coarse voxels is near its place, so among finer ones it needs fewer.
+_AGAIN_FROM: Final = 2
 _LEAST_VOXELS: Final = 30
 # Parts of a surface are clutter if they have fewer voxels than this share of the largest part.
 _PART_SHARE: Final = 0.2
@@ -190,7 +192,7 @@ def search(
                 small_m, small = _suited(levels, result.round.radius_m)
                 if small_m < voxel_m:
                     start = result.round, result.side
-                    result = _tested(start, small, small_m, limits, up)
+                    result = _tested(start, small, small_m, limits, up, first_step=_AGAIN_FROM)
             if isinstance(result, Found) and any(_is_fringe(result, item) for item in found):
                 result = Rejected(reason="part of another surface", evidence=result.evidence)
             if isinstance(result, Rejected):
@@ -251,23 +253,22 @@ def _hypotheses(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return hypotheses (h, 8) of pairs of voxels (see `count_votes`), and the pairs (h, 2)."""
     first, second = _pairs(voxels, np.flatnonzero(is_free), rng)
-    p, q = voxels.points[first], voxels.points[second]
     n, m = voxels.normals[first], voxels.normals[second]
+    is_turned = np.abs(np.einsum("ij,ij->i", n, m)) < math.cos(_LEAST_TURN_RAD)
+    first, second, n, m = first[is_turned], second[is_turned], n[is_turned], m[is_turned]
+    p, q = voxels.points[first], voxels.points[second]
+    chord = q - p
     if not is_oriented:
         # The signs of the normals are arbitrary. Normals of a circle are symmetric about the chord.
-        chord = q - p
         outwards = np.sign(np.einsum("ij,ij->i", n, chord))
         inwards = np.sign(np.einsum("ij,ij->i", m, chord))
         m = m * np.where(outwards == inwards, -1.0, 1.0)[:, None]
         flip = np.where(outwards < 0.0, -1.0, 1.0)[:, None]
         n, m = n * flip, m * flip
     axis = np.cross(n, m)
-    sine = np.linalg.norm(axis, axis=1)
-    keep = sine > _LEAST_TURN
-    first, second, p, q, n, m = (part[keep] for part in (first, second, p, q, n, m))
-    axis = axis[keep] / sine[keep, None] * (not is_sphere)
-    chord = q - p
-    chord -= np.einsum("ij,ij->i", chord, axis)[:, None] * axis
+    axis *= (not is_sphere) / np.linalg.norm(axis, axis=1, keepdims=True)
+    along = np.einsum("ij,ij->i", chord, axis)
+    chord -= along[:, None] * axis
     turn = m - n
     reach = -np.einsum("ij,ij->i", chord, turn) / np.einsum("ij,ij->i", turn, turn)
     miss = np.linalg.norm(chord + reach[:, None] * turn, axis=1)
@@ -281,8 +282,7 @@ def _hypotheses(
     sagittas = radius[kept] * (1.0 - np.sqrt(0.5 + 0.5 * np.einsum("ij,ij->i", n, m)[kept]))
     middles = -(n + m)[kept] * towards[kept, None]
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    along = np.einsum("ij,ij->i", (q - p)[kept], axis[kept])
-    places = centre[kept] + radius[kept, None] * middles + 0.5 * along[:, None] * axis[kept]
+    places = centre[kept] + radius[kept, None] * middles + 0.5 * along[kept, None] * axis[kept]
     largest = _MIDDLE_SHARE * sagittas + _MIDDLE_SLACK * voxel_m
     tree = cKDTree(voxels.points, balanced_tree=False, compact_nodes=False)
     parts: list[NDArray[np.int64]] = []
@@ -383,6 +383,8 @@ def _tested(
     voxel_m: float,
     limits: Limits,
     up: NDArray[np.float64],
+    *,
+    first_step: int = 0,
 ) -> Found | Rejected:
     """Fit a surface to voxels and test it."""
     found, side = start
@@ -390,7 +392,7 @@ def _tested(
     first_m = max(2.0 * last_m, 0.15 * found.radius_m)
     evidence: dict[str, float] = {"radius_m": found.radius_m}
     near = np.empty(len(voxels), dtype=np.int64)
-    for step in range(_ITERATIONS + 1):
+    for step in range(first_step, _ITERATIONS + 1):
         share = min(1.0, step / (_ITERATIONS - 1))
         within_m = first_m ** (1.0 - share) * last_m**share
         angle_deg = _NORMAL_DEG[0] + share * (_NORMAL_DEG[1] - _NORMAL_DEG[0])
