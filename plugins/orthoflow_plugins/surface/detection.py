@@ -15,7 +15,6 @@ from orthoflow.products import PointCloud, Surface, surface_kind
 from orthoflow_plugins.surface.fit import CYLINDER_SLOPE, fit_all
 from orthoflow_plugins.surface.parameters import DetectorParams
 from orthoflow_plugins.surface.search import (
-    BLOCK_VOXELS,
     MOST_RADIUS,
     Form,
     Found,
@@ -93,7 +92,7 @@ def detect(
         cores: number of threads.
     """
     progress(0.0, "sample")
-    sample = draw_sample(cloud, plane_index)
+    sample = draw_sample(cloud, plane_index, cores=cores)
     tests = [] if plane_index is None else tested_planes(sample)
     flat = [test.index for test in tests if not test.is_strip]
     searched = sample.take(~np.isin(sample.label, flat)) if flat else sample
@@ -176,7 +175,7 @@ def _levels(
         return [], 0.0
     every = max(1, len(sample) // _FIRST_POINTS)
     first = in_voxels(sample.take(slice(None, None, every)), _FIRST_VOXEL_M)
-    noise_m = noise_of(first.voxels(cloud, BLOCK_VOXELS, cores=cores))
+    noise_m = noise_of(first.voxels(cloud, cores=cores))
     # On a surface, the points of a voxel cover an area of about the square of its size.
     per_voxel = max(1.0, every * float(first.moments[:, 0].mean()))
     spacing_m = _FIRST_VOXEL_M / math.sqrt(per_voxel)
@@ -184,7 +183,7 @@ def _levels(
     levels: list[tuple[float, Voxels]] = []
     # Voxels of the next size are used to find radii up to twice as large.
     while not levels or MOST_RADIUS * levels[-1][0] < params.max_radius_m:
-        levels.append((grid.size_m, grid.voxels(cloud, BLOCK_VOXELS, noise_m, cores=cores)))
+        levels.append((grid.size_m, grid.voxels(cloud, noise_m, cores=cores)))
         grid = grid.coarser()
     return levels[::-1], noise_m
 

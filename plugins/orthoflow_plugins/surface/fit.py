@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from scipy import linalg, ndimage, special
 from scipy.spatial.distance import cdist
 
+from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.rows import Rows, spread_index
 from orthoflow.geometry.slabs import Offsets, read_only
 from orthoflow.geometry.surfaces import zero_direction
 from orthoflow.geometry.threads import even_parts, in_order, in_threads
 from orthoflow.products import PointCloud, Surface
 from orthoflow_plugins.surface.kernels import Cells, sum_cells
-from orthoflow_plugins.surface.rounds import Round, design, robust_solution
+from orthoflow_plugins.surface.rounds import TUKEY, Round, design, robust_solution
 from orthoflow_plugins.surface.search import Found, longest_gap
 
 # Minimum size and maximum number of the cells of a surface.
@@ -260,23 +261,24 @@ def _fitted(
 
     core = places >= found.along_m[0]
 
-    def cells_about(surface: Round, zero: NDArray[np.float64]) -> _Means:
-        matrix = design(surface, *surface.places(points[core], zero), is_cone=True)
-        means, _ = surface.outwards(points[core])
-        at = {"i": i[core], "j": j[core], "n": n[core]}
-        cells = _Means(**at, means=means, matrix=matrix, n_around=around)
+    def cells_of(
+        surface: Round, at: tuple[NDArray[np.float64], ...], means: NDArray[np.float64]
+    ) -> _Means:
+        matrix = design(surface, *at, is_cone=True)
+        cells = _Means(i=i, j=j, n=n, means=means, matrix=matrix, n_around=around).take(core)
         while cells.n.mean() < _LEAST_MEAN_POINTS and cells.n_around >= 2 * _LEAST_AROUND:
             cells = cells.merged(2)
         return cells
 
-    cells = cells_about(found.round, found.zero)
+    cells = cells_of(found.round, (angles, places), total / n)
     change, weights, extra_m = robust_solution(
         cells.matrix[:, :n_own], cells.means, variance / cells.n
     )
     # The design is linear, so it is computed again about the new surface.
     start = found.round.corrected(found.zero, change)
     zero = zero_direction(start.axis, cloud.up)
-    tiles = _inside(cells_about(start, zero), weights, is_open_beside=found.side < 0.0)
+    cells = cells_of(start, start.places(points, zero), start.outwards(points)[0])
+    tiles = _inside(cells, weights, is_open_beside=found.side < 0.0)
     tiles = (
         _along_meridians(tiles)
         if is_sphere
@@ -489,9 +491,8 @@ def _scan_effect(
     distances, _ = surface.outwards(points)
     matrix = design(surface, *surface.places(points, zero), is_cone=True)[:, :n_own]
     n_centre = 3 if surface.is_sphere else 2
-    start = np.full(len(distances), 1e-10)
-    _, weights, scatter_m = robust_solution(matrix, distances, start)
-    weights = (weights > 0.0) / scatter_m**2
+    scatter_m = max(1e-6, median_deviation(distances, 0.0))
+    weights = (np.abs(distances) < TUKEY * scatter_m) / scatter_m**2
     # Displacements are relative to the first scan.
     is_of = scan[:, None] == np.arange(n_scans)
     columns = [is_of[:, number, None] * matrix[:, :n_centre] for number in range(n_scans)]
@@ -561,8 +562,8 @@ def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
         model = (1.0 - share) * white + share * correlation
         root = np.linalg.cholesky(model)
         whitened = linalg.solve_triangular(root, columns, lower=True)
-        triangle = np.asarray(np.linalg.qr(whitened, mode="r"))
-        logs = np.log(np.abs(np.diag(triangle)))
+        triangle = np.linalg.cholesky(whitened.T @ whitened)
+        logs = np.log(np.diag(triangle))
         free = len(matrix) - n_own
         score = np.log(np.diag(root)).sum() + logs[:-1].sum() + free * logs[-1]
         if score < least:

@@ -82,6 +82,7 @@ def find_normals(
     keys: NDArray[np.int64],
     moments: NDArray[np.float64],
     part: tuple[int, int],
+    least_points: int,
     normals: NDArray[np.float64],
     spreads: NDArray[np.float64],
 ) -> None:
@@ -92,6 +93,7 @@ def find_normals(
             of the list, which all move forwards from one voxel to the next.
         moments: (v, 10) sums over the points of each voxel.
         part: first voxel, and last voxel (exclusive).
+        least_points: least number of points for a normal.
         normals: output (v, 3), unit vectors.
         spreads: output (v, 4): standard deviations along the normal and along the two principal
             directions of the surface, ascending, and the number of points.
@@ -109,8 +111,9 @@ def find_normals(
                 for m in range(MOMENTS):
                     total[m] += moments[other, m]
                 other += 1
-        _principal(total, normals[v], spreads[v])
         spreads[v, 3] = total[0]
+        if total[0] >= least_points:
+            _principal(total, normals[v], spreads[v])
 
 
 @kernel_part

@@ -14,7 +14,7 @@ from orthoflow.geometry.surfaces import along_and_across, middle_direction, zero
 from orthoflow_plugins.surface.kernels import solve_robustly
 
 # Tukey's constant, in standard deviations.
-_TUKEY: Final = 4.685
+TUKEY: Final = 4.685
 # Maximum number of voxels in a fit.
 _MOST_VOXELS: Final = 3_000
 
@@ -222,7 +222,7 @@ def robust_solution(
     """
     solution, weights = np.zeros(matrix.shape[1]), np.empty(len(matrix))
     matrix = np.ascontiguousarray(matrix)
-    extra = solve_robustly(matrix, distances, variances, _TUKEY, solution, weights)
+    extra = solve_robustly(matrix, distances, variances, TUKEY, solution, weights)
     return solution, weights, extra
 
 

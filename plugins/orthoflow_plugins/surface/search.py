@@ -17,7 +17,6 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from orthoflow.geometry.surfaces import zero_direction
 from orthoflow_plugins.surface.kernels import count_votes, near_voxels
@@ -27,7 +26,7 @@ from orthoflow_plugins.surface.voxels import Voxels, keys_of
 Form = Literal["cylinder", "cone", "sphere"]
 
 # Size of a block, in voxels. The two voxels of a pair are in the same block or in adjacent ones.
-BLOCK_VOXELS: Final = 6
+_BLOCK_VOXELS: Final = 6
 # Range, in voxels, of the radii searched with one voxel size.
 LEAST_RADIUS: Final = 3.5
 MOST_RADIUS: Final = 30.0
@@ -42,9 +41,8 @@ _LEAST_TURN_RAD: Final = math.radians(12.0)
 _SAME_AXIS: Final = math.sin(math.radians(9.0))
 _SAME_RADIUS: Final = 0.15
 _SAME_PLACE: Final = 0.2
-# The middle of the arc between a pair has a voxel within this distance. Its distance from the arc
-# is at most a share of the sagitta and of the voxel, and its normal agrees.
-_MIDDLE_VOXELS: Final = 1.2
+# The middle of the arc between a pair is in a voxel. The distance of its points from the arc is at
+# most a share of the sagitta and of the voxel, and its normal agrees.
 _MIDDLE_SHARE: Final = 0.4
 _MIDDLE_SLACK: Final = 0.06
 _MIDDLE_COSINE: Final = math.cos(math.radians(14.0))
@@ -274,7 +272,7 @@ def _hypotheses(
     miss = np.linalg.norm(chord + reach[:, None] * turn, axis=1)
     radius = np.abs(reach)
     keep = (radius > radii[0]) & (radius < radii[1]) & (miss < 0.1 * radius + 0.5 * voxel_m)
-    kept = np.flatnonzero(keep)
+    kept = rng.permutation(np.flatnonzero(keep))
     towards = np.where(reach > 0.0, 1.0, -1.0)
     side = towards if is_oriented else np.zeros(len(reach))
     centre = p + reach[:, None] * n
@@ -284,14 +282,13 @@ def _hypotheses(
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
     places = centre[kept] + radius[kept, None] * middles + 0.5 * along[kept, None] * axis[kept]
     largest = _MIDDLE_SHARE * sagittas + _MIDDLE_SLACK * voxel_m
-    tree = cKDTree(voxels.points, balanced_tree=False, compact_nodes=False)
     parts: list[NDArray[np.int64]] = []
     for start in range(0, len(kept), _HYPOTHESES):
         if sum(map(len, parts)) >= _HYPOTHESES:
             break
         part = slice(start, start + _HYPOTHESES)
         own = guesses[part], places[part], middles[part], largest[part]
-        parts.append(start + np.flatnonzero(_have_middles(*own, tree, voxels, voxel_m)))
+        parts.append(start + np.flatnonzero(_have_middles(*own, voxels)))
     sure = np.concatenate([np.zeros(0, dtype=np.int64), *parts])[:_HYPOTHESES]
     ends = np.column_stack([first, second])[kept]
     return np.ascontiguousarray(guesses[sure]), ends[sure]
@@ -302,9 +299,7 @@ def _have_middles(
     places: NDArray[np.float64],
     outwards: NDArray[np.float64],
     largest: NDArray[np.float64],
-    tree: cKDTree,
     voxels: Voxels,
-    voxel_m: float,
 ) -> NDArray[np.bool_]:
     """Return a mask (h,) of hypotheses with a voxel in the middle of the arc between their pair.
 
@@ -315,30 +310,27 @@ def _have_middles(
         places: (h, 3) middles of the arcs.
         outwards: (h, 3) directions of the radii there.
         largest: (h,) largest distance of the voxel from the circle.
-        tree: tree of the points of all voxels.
         voxels: all voxels.
-        voxel_m: their size.
     """
-    apart, nearest = tree.query(places, distance_upper_bound=_MIDDLE_VOXELS * voxel_m)
-    is_near = np.isfinite(apart)
-    nearest = np.where(is_near, nearest, 0)
+    nearest = voxels.at(places)
     relative = voxels.points[nearest] - guesses[:, :3]
     axis, radius = guesses[:, 3:6], guesses[:, 6]
     relative -= np.einsum("ij,ij->i", relative, axis)[:, None] * axis
     off = np.abs(np.linalg.norm(relative, axis=1) - radius)
     cosine = np.abs(np.einsum("ij,ij->i", voxels.normals[nearest], outwards))
-    return np.asarray(is_near & (off < largest) & (cosine > _MIDDLE_COSINE))
+    return np.asarray((nearest >= 0) & (off < largest) & (cosine > _MIDDLE_COSINE))
 
 
 def _pairs(
     voxels: Voxels, free: NDArray[np.int64], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Draw pairs of voxels in the same block or in adjacent ones."""
-    keys = keys_of(voxels.block[free] + 1)
+    keys = keys_of(voxels.places[free] // _BLOCK_VOXELS + 1)
     order = np.argsort(keys, kind="stable")
-    blocks, starts = np.unique(keys[order], return_index=True)
-    starts = np.append(starts, len(keys))
-    seeds = rng.integers(0, max(1, len(free)), min(_PAIRS, _PAIRS_PER_VOXEL * len(free)))
+    starts = np.append(np.flatnonzero(np.diff(keys[order], prepend=-1)), len(keys))
+    blocks = keys[order[starts[:-1]]]
+    # Memory is read faster in order.
+    seeds = np.sort(rng.integers(0, max(1, len(free)), min(_PAIRS, _PAIRS_PER_VOXEL * len(free))))
     wanted = keys[seeds] + keys_of(rng.integers(-1, 2, (len(seeds), 3)))
     block = np.minimum(np.searchsorted(blocks, wanted), len(blocks) - 1)
     start, end = starts[block], np.where(blocks[block] == wanted, starts[block + 1], 0)
@@ -439,10 +431,9 @@ def _connected(
 ) -> NDArray[np.bool_]:
     """Return a mask (n,) of positions in large connected parts; gaps of two cells are bridged."""
     column, row, (n_around, n_along), _ = _grid(angles, along, found, voxel_m)
-    counts = np.zeros((n_around, n_along), dtype=np.int64)
-    np.add.at(counts, (column, row), 1)
     # Repeat the circle, so that parts across angle -pi are connected.
-    wide = np.concatenate([counts, counts]) > 0
+    wide = np.zeros((2 * n_around, n_along), dtype=np.bool_)
+    wide[column, row] = wide[column + n_around, row] = True
     parts, _ = ndimage.label(
         ndimage.binary_dilation(wide, np.ones((3, 3), dtype=np.bool_), iterations=1)
     )

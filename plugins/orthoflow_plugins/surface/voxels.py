@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from orthoflow.geometry.rows import Rows, spread_index
-from orthoflow.geometry.threads import in_parts
+from orthoflow.geometry.threads import in_order, in_parts
 from orthoflow.products import PointCloud
 from orthoflow_plugins.surface.kernels import KEY_BITS, MOMENTS, fill_voxels, find_normals
 
@@ -51,20 +52,32 @@ class Voxels(Rows):
         points: (v, 3) float64 mean of the points of each voxel, metres from the cloud's origin.
         normals: (v, 3) float64 unit vectors, towards the viewer if stations are known.
         spread_m: (v,) float64 standard deviation of the points along the normal.
-        block: (v, 3) int64 position of each voxel in a coarser grid.
+        places: (v, 3) int64 position of each voxel in the grid, in ascending order.
+        low: (3,) point from which positions are counted, metres from the cloud's origin.
+        size_m: size of a voxel.
     """
 
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     spread_m: NDArray[np.float64]
-    block: NDArray[np.int64]
+    places: NDArray[np.int64]
+    low: tuple[float, ...]
+    size_m: float
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the index (m,) of the voxel of each point (m, 3), -1 for none."""
+        keys = keys_of(self.places)
+        wanted = keys_of(np.floor((points - self.low) / self.size_m).astype(np.int64) + 1)
+        found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        return np.where(keys[found] == wanted, found, -1)
 
 
-def draw_sample(cloud: PointCloud, labels: NDArray[np.int16] | None) -> Sample:
+def draw_sample(cloud: PointCloud, labels: NDArray[np.int16] | None, *, cores: int) -> Sample:
     """Draw one point from each of `SAMPLE_POINTS` equal parts of a cloud (see `spread_index`)."""
     count = min(SAMPLE_POINTS, len(cloud))
     index = spread_index(len(cloud), count)
-    offsets = np.column_stack([cloud.x[index], cloud.y[index], cloud.z[index]])
+    columns = in_order(lambda values: values[index], (cloud.x, cloud.y, cloud.z), threads=cores)
+    offsets = np.column_stack(list(columns))
     label = np.full(count, -1, dtype=np.int16) if labels is None else np.asarray(labels[index])
     return Sample(index=index, offsets_m=offsets.astype(np.float64), label=label)
 
@@ -93,22 +106,20 @@ class VoxelGrid:
         keys = keys_of(places)
         order = np.argsort(keys, kind="stable")
         starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+        ones = np.ones(len(order))
         return VoxelGrid(
             places=places[order[starts]],
-            moments=np.add.reduceat(self.moments[order], starts),
+            moments=sparse.csr_array((ones, order, np.append(starts, len(order)))) @ self.moments,
             first=self.first[order[starts]],
             size_m=2.0 * self.size_m,
             low=self.low,
         )
 
-    def voxels(
-        self, cloud: PointCloud, block_voxels: int, noise_m: float | None = None, *, cores: int
-    ) -> Voxels:
+    def voxels(self, cloud: PointCloud, noise_m: float | None = None, *, cores: int) -> Voxels:
         """Return the voxels that have a normal, i.e. enough points close to a plane.
 
         Args:
             cloud: the cloud, for the stations.
-            block_voxels: size of a block of voxels.
             noise_m: standard deviation of the points normal to surfaces, if known; voxels with much
                 more scatter are at edges and are omitted.
             cores: number of threads.
@@ -117,7 +128,7 @@ class VoxelGrid:
         keys = keys_of(self.places)
 
         def find(first: int, end: int) -> None:
-            find_normals(keys, self.moments, (first, end), normals, spreads)
+            find_normals(keys, self.moments, (first, end), _NORMAL_POINTS, normals, spreads)
 
         in_parts(find, len(keys), threads=cores)
         is_flat = (spreads[:, 3] >= _NORMAL_POINTS) & (spreads[:, 0] < _FLATNESS * spreads[:, 1])
@@ -137,7 +148,9 @@ class VoxelGrid:
             points=means,
             normals=normals,
             spread_m=spreads[chosen, 0],
-            block=self.places[chosen] // block_voxels,
+            places=self.places[chosen],
+            low=tuple(self.low.tolist()),
+            size_m=self.size_m,
         )
 
 
