@@ -377,7 +377,7 @@ class Camera:
     Attributes:
         photo: name of the photo.
         status: `ok`, or one sentence with the reason why the photo is not oriented; all following
-            fields are then None.
+            fields but the last are then None.
         intrinsics: interior orientation.
         rotation_camera_from_world: (3, 3) float64, det +1; x right, y down, z forward.
         translation_camera_from_world: (3,) float64 metres.
@@ -389,6 +389,8 @@ class Camera:
             are correct.
         sigma_wall_m: standard deviation on the wall due to `covariance` (including that of an
             estimated lens), metres.
+        is_ambiguous: whether the photo is not oriented because its ties agree equally well with
+            several poses, so that another match of the same content would not be evidence.
     """
 
     photo: str
@@ -399,6 +401,7 @@ class Camera:
     covariance: NDArray[np.float64] | None = None
     sigma0_px: float | None = None
     sigma_wall_m: float | None = None
+    is_ambiguous: bool = False
 
     def viewing(self) -> ViewingCamera:
         """Return the camera model for projections.

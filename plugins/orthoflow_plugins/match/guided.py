@@ -42,6 +42,13 @@ NOTHING_AGREES: Final = DiagnosticSpec(
     text="photo {subject} matches no part of the walls at its given pose",
     remedy="check its pose, or remove the photo",
 )
+AMBIGUOUS: Final = DiagnosticSpec(
+    code="photo-ambiguous",
+    severity="warning",
+    text="photo {subject} is not matched again, since photos of identical walls match each of them"
+    ": {reason}",
+    remedy="measure ties by hand",
+)
 
 
 class MatchGuided(Method):
@@ -54,12 +61,13 @@ class MatchGuided(Method):
     Cells finer than the point spacing are joined. Patches at relief steps are excluded, as are
     patches hidden by objects in front of the walls if the cloud is connected. The pose is estimated
     and the photo projected repeatedly, until held-out ties no longer improve. Photos without a pose
-    are first matched with the other photos, projected onto the walls; if that fails, they get no
-    ties.
+    are first matched with the other photos, projected onto the walls; if that fails, or if their
+    pose was ambiguous, they get no ties.
     """
 
     id: ClassVar[str] = "match.guided"
     determinism: ClassVar[Determinism] = "exact"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_ties", label="ties"),
         MetricSpec("rejected_share", label="share of rejected ties"),
@@ -199,7 +207,12 @@ def _traced(
             ctx.report(NOTHING_AGREES, subject=name)
     if len(indices) == len(photos):
         return traces
-    recovered = recovered_traces(inputs.photos, oriented, setup, list(traces.values()))
+    ambiguous = {each.photo: each.status for each in inputs.cameras.cameras if each.is_ambiguous}
+    for name, reason in ambiguous.items():
+        ctx.report(AMBIGUOUS, subject=name, reason=reason)
+    recovered = recovered_traces(
+        inputs.photos, oriented, setup, list(traces.values()), ambiguous.keys()
+    )
     for name in recovered:
         ctx.log(f"photo {name}: found by matching with other photos projected onto the walls")
     return traces | recovered

@@ -9,7 +9,7 @@ with the scan like any other photo, so that its ties depend only on the scan.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -460,6 +460,7 @@ def recovered_traces(
     oriented: Mapping[str, Camera],
     setup: Setup,
     traces: Sequence[Trace],
+    ambiguous: Set[str] = frozenset(),
 ) -> dict[str, Trace]:
     """Match photos without a pose, starting from poses computed with the matched photos.
 
@@ -468,6 +469,8 @@ def recovered_traces(
         oriented: cameras of the photos with a pose, by name.
         setup: the walls, and parameters of the matching.
         traces: results of the oriented photos.
+        ambiguous: names of photos that are not matched, since they show one of several identical
+            walls.
 
     Returns:
         Results of the photos whose pose was found, by name.
@@ -475,7 +478,8 @@ def recovered_traces(
     recovered: dict[str, Trace] = {}
     known = [trace for trace in traces if trace.n_ties]
     settled = _settled(photos, oriented, known)
-    missing = [k for k, photo in enumerate(photos.photos) if photo.name not in oriented]
+    left_out = oriented.keys() | ambiguous
+    missing = [k for k, photo in enumerate(photos.photos) if photo.name not in left_out]
     views = [_view(trace, photos, setup) for trace in known] if missing else []
     is_new = bool(known)
     while is_new and missing:

@@ -121,7 +121,7 @@ class OrientColmapBundle(Method):
 
     id: ClassVar[str] = "orient.colmap-bundle"
     determinism: ClassVar[Determinism] = "seeded"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,
         MetricSpec("n_photo_points", label="tie points visible in several photos"),

@@ -510,6 +510,7 @@ def by_itself(
             f"two poses agree with its ties equally well ({estimate.agreeing.sum()} and {n} "
             "ties), as in front of identical walls: measure ties by hand, or take a photo that "
             "also shows what distinguishes the walls",
+            is_ambiguous=True,
         )
     return Trusted(tied=tied, estimate=estimate, by_hand=alone, kept=kept)
 
@@ -616,11 +617,11 @@ def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
     )
 
 
-def refused(tied: TiedPhoto, reason: str) -> Oriented:
+def refused(tied: TiedPhoto, reason: str, *, is_ambiguous: bool = False) -> Oriented:
     """Return the result for a photo that is not oriented."""
     n_ties = len(tied.chosen)
     return Oriented(
-        camera=Camera(photo=tied.photo.name, status=reason),
+        camera=Camera(photo=tied.photo.name, status=reason, is_ambiguous=is_ambiguous),
         chosen=tied.chosen,
         role=np.full(n_ties, TieRole.REJECTED, dtype=np.uint8),
         residuals_px=np.full((n_ties, 2), np.nan),
