@@ -31,8 +31,8 @@ from orthoflow_plugins.surface.voxels import Sample, Voxels, draw_sample, in_vox
 _VOXEL_M: Final = 0.04
 _VOXEL_NOISES: Final = 3.0
 _VOXEL_SPACINGS: Final = 2.0
-# Size of the voxels in which noise and spacing are measured.
-_FIRST_VOXEL_M: Final = 0.1
+# Size of the voxels in which spacing is measured, and minimum size of those in which noise is.
+_NOISE_VOXEL_M: Final = 0.1
 _FIRST_POINTS: Final = 60_000
 # Gaps up to this angle, such as windows, belong to the arc of a surface.
 _BRIDGED_RAD: Final = math.radians(15.0)
@@ -163,29 +163,30 @@ def detect(
         plane_tests=tests,
         rejected=rejected,
         noise_m=noise_m,
-        voxel_m=levels[-1][0] if levels else 0.0,
+        voxel_m=levels[-1].size_m if levels else 0.0,
     )
 
 
 def _levels(
     sample: Sample, cloud: PointCloud, params: DetectorParams, *, cores: int
-) -> tuple[list[tuple[float, Voxels]], float]:
+) -> tuple[list[Voxels], float]:
     """Return voxels of several sizes, largest first, and the noise of the cloud."""
     if len(sample) < _LEAST_POINTS:
         return [], 0.0
     every = max(1, len(sample) // _FIRST_POINTS)
-    first = in_voxels(sample.take(slice(None, None, every)), _FIRST_VOXEL_M)
-    noise_m = noise_of(first.voxels(cloud, cores=cores))
+    first = in_voxels(sample.take(slice(None, None, every)), _NOISE_VOXEL_M)
     # On a surface, the points of a voxel cover an area of about the square of its size.
     per_voxel = max(1.0, every * float(first.moments[:, 0].mean()))
-    spacing_m = _FIRST_VOXEL_M / math.sqrt(per_voxel)
-    grid = in_voxels(sample, max(_VOXEL_M, _VOXEL_NOISES * noise_m, _VOXEL_SPACINGS * spacing_m))
-    levels: list[tuple[float, Voxels]] = []
+    spacing_m = _NOISE_VOXEL_M / math.sqrt(per_voxel)
+    grid = in_voxels(sample, max(_VOXEL_M, _VOXEL_SPACINGS * spacing_m))
+    levels = [grid.voxels(cloud, cores=cores)]
     # Voxels of the next size are used to find radii up to twice as large.
-    while not levels or MOST_RADIUS * levels[-1][0] < params.max_radius_m:
-        levels.append((grid.size_m, grid.voxels(cloud, noise_m, cores=cores)))
+    while grid.size_m < max(_NOISE_VOXEL_M, params.max_radius_m / MOST_RADIUS):
         grid = grid.coarser()
-    return levels[::-1], noise_m
+        levels.append(grid.voxels(cloud, cores=cores))
+    noise_m = noise_of(next(it for it in levels if it.size_m >= _NOISE_VOXEL_M))
+    fine = [it for it in levels if it.size_m >= _VOXEL_NOISES * noise_m] or levels[-1:]
+    return [it.without_edges(noise_m) for it in fine[::-1]], noise_m
 
 
 def _named(surface: Surface, index: int, up: NDArray[np.float64], *, is_oriented: bool) -> Surface:

@@ -132,7 +132,7 @@ class Rejected:
 
 
 def search(
-    levels: list[tuple[float, Voxels]],
+    levels: list[Voxels],
     limits: Limits,
     up: NDArray[np.float64],
     rng: np.random.Generator,
@@ -143,7 +143,7 @@ def search(
     """Find surfaces in voxels of several sizes.
 
     Args:
-        levels: voxels of several sizes, each with its size, largest first.
+        levels: voxels of several sizes, largest first.
         limits: limits of the search.
         up: (3,) unit vector.
         rng: random generator for the pairs.
@@ -152,7 +152,8 @@ def search(
     """
     found: list[Found] = []
     rejected: list[Rejected] = []
-    for number, (voxel_m, voxels) in enumerate(levels):
+    for number, voxels in enumerate(levels):
+        voxel_m = voxels.size_m
         progress(0.2 + 0.6 * number / len(levels), f"voxels of {voxel_m:.2f} m")
         radii = (
             max(limits.radius_m[0], LEAST_RADIUS * voxel_m),
@@ -166,7 +167,6 @@ def search(
         guesses, ends = _hypotheses(
             voxels,
             is_free,
-            voxel_m,
             radii,
             rng,
             is_oriented=is_oriented,
@@ -184,13 +184,13 @@ def search(
             best = guesses[chosen[int(np.argmax(votes))]]
             agree = chosen[_agreeing(guesses[chosen], best)]
             free = voxels.take(is_free)
-            result = _tested(_mean_of(guesses[agree], best), free, voxel_m, limits, up)
+            result = _tested(_mean_of(guesses[agree], best), free, limits, up)
             is_live[agree] = False
             if isinstance(result, Found):
-                small_m, small = _suited(levels, result.round.radius_m)
-                if small_m < voxel_m:
+                small = _suited(levels, result.round.radius_m)
+                if small.size_m < voxel_m:
                     start = result.round, result.side
-                    result = _tested(start, small, small_m, limits, up, first_step=_AGAIN_FROM)
+                    result = _tested(start, small, limits, up, first_step=_AGAIN_FROM)
             if isinstance(result, Found) and any(_is_fringe(result, item) for item in found):
                 result = Rejected(reason="part of another surface", evidence=result.evidence)
             if isinstance(result, Rejected):
@@ -202,12 +202,9 @@ def search(
     return found, rejected
 
 
-def _suited(levels: list[tuple[float, Voxels]], radius_m: float) -> tuple[float, Voxels]:
+def _suited(levels: list[Voxels], radius_m: float) -> Voxels:
     """Return the largest voxels that are small relative to a radius, otherwise the smallest."""
-    for voxel_m, voxels in levels:
-        if voxel_m <= radius_m / _SUITED_RADIUS:
-            return voxel_m, voxels
-    return levels[-1]
+    return next((it for it in levels if it.size_m <= radius_m / _SUITED_RADIUS), levels[-1])
 
 
 def _is_fringe(new: Found, old: Found) -> bool:
@@ -242,7 +239,6 @@ def claimed(found: Found, voxels: Voxels, limits: Limits) -> NDArray[np.bool_]:
 def _hypotheses(
     voxels: Voxels,
     is_free: NDArray[np.bool_],
-    voxel_m: float,
     radii: tuple[float, float],
     rng: np.random.Generator,
     *,
@@ -271,7 +267,7 @@ def _hypotheses(
     reach = -np.einsum("ij,ij->i", chord, turn) / np.einsum("ij,ij->i", turn, turn)
     miss = np.linalg.norm(chord + reach[:, None] * turn, axis=1)
     radius = np.abs(reach)
-    keep = (radius > radii[0]) & (radius < radii[1]) & (miss < 0.1 * radius + 0.5 * voxel_m)
+    keep = (radius > radii[0]) & (radius < radii[1]) & (miss < 0.1 * radius + 0.5 * voxels.size_m)
     kept = rng.permutation(np.flatnonzero(keep))
     towards = np.where(reach > 0.0, 1.0, -1.0)
     side = towards if is_oriented else np.zeros(len(reach))
@@ -281,7 +277,7 @@ def _hypotheses(
     middles = -(n + m)[kept] * towards[kept, None]
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
     places = centre[kept] + radius[kept, None] * middles + 0.5 * along[kept, None] * axis[kept]
-    largest = _MIDDLE_SHARE * sagittas + _MIDDLE_SLACK * voxel_m
+    largest = _MIDDLE_SHARE * sagittas + _MIDDLE_SLACK * voxels.size_m
     parts: list[NDArray[np.int64]] = []
     for start in range(0, len(kept), _HYPOTHESES):
         if sum(map(len, parts)) >= _HYPOTHESES:
@@ -372,7 +368,6 @@ def _mean_of(guesses: NDArray[np.float64], best: NDArray[np.float64]) -> tuple[R
 def _tested(
     start: tuple[Round, float],
     voxels: Voxels,
-    voxel_m: float,
     limits: Limits,
     up: NDArray[np.float64],
     *,
@@ -396,8 +391,8 @@ def _tested(
             found = found.aimed(voxels.points[on], up)
             zero = zero_direction(found.axis, up)
         if len(on) >= _LEAST_VOXELS:
-            on = on[_connected(*found.places(voxels.points[on], zero), found, voxel_m)]
-            is_flat = _turning(found, zero, voxels.take(on), voxel_m)[1]
+            on = on[_connected(*found.places(voxels.points[on], zero), found, voxels.size_m)]
+            is_flat = _turning(found, zero, voxels.take(on))[1]
             on = on if is_flat.mean() > _MOST_FLAT else on[~is_flat]
         if len(on) < _LEAST_VOXELS:
             return Rejected(reason="few points", evidence=evidence)
@@ -412,7 +407,7 @@ def _tested(
     found = found.directed(up)
     found = found.moved(float(np.mean((voxels.points[on] - found.point) @ found.axis)))
     zero = zero_direction(found.axis, up)
-    return _judged(found, zero, side, voxels.take(on), voxel_m, limits)
+    return _judged(found, zero, side, voxels.take(on), limits)
 
 
 def _grid(
@@ -453,12 +448,11 @@ def _judged(
     zero: NDArray[np.float64],
     side: float,
     voxels: Voxels,
-    voxel_m: float,
     limits: Limits,
 ) -> Found | Rejected:
     """Test a fitted surface on its own voxels."""
     angles, along = found.places(voxels.points, zero)
-    column, row, shape, size_m = _grid(angles, along, found, voxel_m)
+    column, row, shape, size_m = _grid(angles, along, found, voxels.size_m)
     occupied = np.zeros(shape, dtype=np.bool_)
     occupied[column, row] = True
     rows = np.flatnonzero(occupied.sum(axis=1) >= 1)
@@ -489,7 +483,7 @@ def _judged(
         "filled_share": float(cells.mean()),
         "scatter_mm": 1000.0 * 1.4826 * float(np.median(np.abs(distances))),
         "sagitta_mm": 1000.0 * found.radius_m * (1.0 - math.cos(min(arc_rad, math.pi) / 2.0)),
-        "turning": _turning(found, zero, voxels, voxel_m)[0],
+        "turning": _turning(found, zero, voxels)[0],
         "curvature_ratio": abs(2.0 * bend * found.radius_m),
     }
     rough_mm = 1000.0 * (_ROUGHEST_SHARE * found.radius_m + limits.noise_m)
@@ -516,7 +510,7 @@ def _judged(
 
 
 def _turning(
-    found: Round, zero: NDArray[np.float64], voxels: Voxels, voxel_m: float
+    found: Round, zero: NDArray[np.float64], voxels: Voxels
 ) -> tuple[float, NDArray[np.bool_]]:
     """Return the rotation of normals per angle in narrow sectors: 1 on circles, 0 on facets.
 
@@ -528,7 +522,7 @@ def _turning(
     aside = cross(found.axis, zero)
     signs = np.sign(np.einsum("ij,ij->i", voxels.normals, outwards))
     normals = voxels.normals * signs[:, None]
-    width = min(max(_FACET_VOXELS * voxel_m / found.radius_m, _FACET_RAD[0]), _FACET_RAD[1])
+    width = min(max(_FACET_VOXELS * voxels.size_m / found.radius_m, _FACET_RAD[0]), _FACET_RAD[1])
     if found.is_sphere:
         return _turning_of_sphere(normals, outwards, width)
     turned = np.arctan2(normals @ aside, normals @ zero) - angles

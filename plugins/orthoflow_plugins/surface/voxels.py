@@ -64,6 +64,11 @@ class Voxels(Rows):
     low: tuple[float, ...]
     size_m: float
 
+    def without_edges(self, noise_m: float) -> Voxels:
+        """Return the voxels with little more scatter than the noise of points."""
+        thickest_m = _THICKEST_NOISES * noise_m + _THICKEST_VOXELS * self.size_m
+        return self.take(self.spread_m < thickest_m)
+
     def at(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the index (m,) of the voxel of each point (m, 3), -1 for none."""
         keys = keys_of(self.places)
@@ -115,13 +120,11 @@ class VoxelGrid:
             low=self.low,
         )
 
-    def voxels(self, cloud: PointCloud, noise_m: float | None = None, *, cores: int) -> Voxels:
+    def voxels(self, cloud: PointCloud, *, cores: int) -> Voxels:
         """Return the voxels that have a normal, i.e. enough points close to a plane.
 
         Args:
             cloud: the cloud, for the stations.
-            noise_m: standard deviation of the points normal to surfaces, if known; voxels with much
-                more scatter are at edges and are omitted.
             cores: number of threads.
         """
         normals, spreads = np.zeros((len(self.first), 3)), np.zeros((len(self.first), 4))
@@ -132,8 +135,6 @@ class VoxelGrid:
 
         in_parts(find, len(keys), threads=cores)
         is_flat = (spreads[:, 3] >= _NORMAL_POINTS) & (spreads[:, 0] < _FLATNESS * spreads[:, 1])
-        if noise_m is not None:
-            is_flat &= spreads[:, 0] < _THICKEST_NOISES * noise_m + _THICKEST_VOXELS * self.size_m
         chosen = np.flatnonzero(is_flat)
         moments = self.moments[chosen]
         means = moments[:, 1:4] / moments[:, :1] + self.low
