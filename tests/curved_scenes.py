@@ -155,17 +155,22 @@ class Drum:
             (cosine, -sine, cosine * base_m + side * self.height_m, True),
             *((sine, cosine, edge_m, None) for edge_m in (self.band_m if self.height_m else ())),
         ]
+        # Squared distance from the axis: a polynomial of t.
+        squares = [
+            (one * other).sum(axis=1)
+            for one, other in ((across, across), (across, beside), (beside, beside))
+        ]
         for of_radius, of_axial, total, is_band in lines:
             rest, slopes = total - of_axial * axial, of_axial * slope
-            a = of_radius**2 * (beside**2).sum(axis=1) - slopes**2
-            b = of_radius**2 * (across * beside).sum(axis=1) + rest * slopes
-            c = of_radius**2 * (across**2).sum(axis=1) - rest**2
+            a = of_radius**2 * squares[2] - slopes**2
+            b = of_radius**2 * squares[1] + rest * slopes
+            c = of_radius**2 * squares[0] - rest**2
             for sign in (-1.0, 1.0):
                 with np.errstate(invalid="ignore", divide="ignore"):
                     root = b * b - a * c
                     t = (-b + sign * np.sqrt(np.maximum(root, 0.0))) / a
                     t[root < -1e-9 * b * b] = np.nan
-                    radii = np.linalg.norm(across + t[:, None] * beside, axis=1)
+                    radii = np.sqrt(squares[0] + t * (2.0 * squares[1] + t * squares[2]))
                     t[np.abs(of_radius * radii - (rest - t * slopes)) > 1e-6] = np.nan
                     depths = side * (cosine * (radii - base_m) - sine * (axial + t * slope))
                 if is_band is None:

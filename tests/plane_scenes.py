@@ -100,7 +100,7 @@ def detect(
     folder: Path,
     *,
     seed: int = 0,
-    cores: int = 2,
+    cores: int = 1,
     **params: Any,
 ) -> tuple[Any, StepContext]:
     """What a detector finds in a cloud, and the context that it reported to."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from base64 import b64decode
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -43,6 +44,7 @@ def blank_charts(request: pytest.FixtureRequest, patch: pytest.MonkeyPatch) -> N
     """
     if not {"charts", "drawings"} & {*request.fixturenames}:
         patch.setattr("matplotlib.figure.Figure", Blank)
+        patch.setattr("orthoflow.files.drawing.styled", nullcontext)
 
 
 class Blank:

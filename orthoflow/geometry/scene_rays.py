@@ -714,7 +714,7 @@ def _enclosing_ring(scene: Scene, index: int) -> NDArray[np.float64]:
 
 def _surfaces_m2(sides: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return half the surface areas (...) of boxes with sides (..., 3)."""
-    x, y, z = np.moveaxis(sides, -1, 0)
+    x, y, z = sides[..., 0], sides[..., 1], sides[..., 2]
     surfaces: NDArray[np.float64] = x * y + y * z + z * x
     return surfaces
 

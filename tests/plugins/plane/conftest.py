@@ -13,7 +13,7 @@ _ALL_PLACES = cloud.NOISE_SEEDS
 @pytest.fixture(autouse=True)
 def _few_places(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measure the noise of clouds at few places, because it took a third of each detection."""
-    monkeypatch.setattr(cloud, "NOISE_SEEDS", 200)
+    monkeypatch.setattr(cloud, "NOISE_SEEDS", 100)
 
 
 @pytest.fixture
