@@ -131,7 +131,7 @@ def room(cloud: str, seed: int, folder: str) -> Oriented:
     cameras = (
         OrientColmapBundle()
         .run(
-            OrientColmapBundle.In(ties=ties, photos=unknown),
+            OrientColmapBundle.In(ties=ties, photos=unknown, cloud=built.cloud),
             OrientColmapBundle.Params.model_validate(wide),
             context(folder, 1),
         )

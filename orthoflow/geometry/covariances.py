@@ -63,6 +63,7 @@ class AdjustedPoints:
         towards: (n, 3) unit normals of the surface. In this direction, the errors of a cloud are
             largest.
         cofactors: (p, p) inverse of the normal matrix.
+        scan_errors: see `SeenPoints`.
     """
 
     photo: NDArray[np.intp]
@@ -74,6 +75,7 @@ class AdjustedPoints:
     follows: NDArray[np.float64]
     towards: NDArray[np.float64]
     cofactors: NDArray[np.float64]
+    scan_errors: NDArray[np.float64] | None = None
 
     @property
     def extent_m(self) -> float:
@@ -121,7 +123,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     seen = _Residuals(points)
     if not seen.n_free:
         # Without residuals, the magnitude of an error common to all points is unknown.
-        return sigma0**2 * points.cofactors
+        return sigma0**2 * points.cofactors + seen.of_scans
     apart = np.linalg.norm(seen.places[:, None] - seen.places, axis=2)
     correlations = [np.exp(-apart / length) for length in _ROUGH]
     correlations += [np.exp(-0.5 * (apart / length) ** 2) for length in _SMOOTH]
@@ -149,7 +151,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     shares_of = [float(f"{value:.4g}") for value in (*of_fields, of_short)]
     errors = [*(error for _, error in fields), error_of_short]
     common = sum(share * error for share, error in zip(shares_of, errors, strict=True))
-    return sigma0**2 * points.cofactors + _stable(np.asarray(common))
+    return sigma0**2 * points.cofactors + _stable(np.asarray(common) + seen.of_scans)
 
 
 class _Residuals:
@@ -159,6 +161,7 @@ class _Residuals:
         n_free: number of independent residuals.
         places: (n, 3) positions, in units of the extent of the points of a photo.
         photo: (n,) index of the photo that shows a cell.
+        of_scans: (p, p) mean square errors of the unknowns due to the registration of the scans.
     """
 
     def __init__(self, points: AdjustedPoints) -> None:
@@ -198,6 +201,26 @@ class _Residuals:
         follows = points.follows[self.photo] / np.bincount(self.photo)[self.photo][:, None, None]
         self._effects = pulls.transpose(2, 0, 1) @ points.cofactors
         self._effects -= follows.transpose(2, 0, 1) / unit
+        self.of_scans = np.zeros_like(points.cofactors)
+        if points.scan_errors is not None:
+            self._measure(unit * means(points.scan_errors))
+
+    def _measure(self, scan_errors: NDArray[np.float64]) -> None:
+        """Subtract errors of scans (n, 3, q) from the residuals, and set `of_scans`.
+
+        The residuals show the uncertain ones, too, unless they have other causes.
+        """
+        # Residuals are observed minus computed, so they decrease by what an error leaves.
+        left = np.einsum("drn,ndq->rq", self._remains, scan_errors)
+        moved = np.einsum("dnp,ndq->pq", self._effects, scan_errors)
+        self._white += left[:, 0]
+        variance = max(float((self._white**2).mean()), 1e-12) if len(self._white) else 1.0
+        shown = left[:, 1:].T / variance
+        covariance = np.linalg.inv(np.eye(len(shown)) + shown @ left[:, 1:])
+        sizes = covariance @ (shown @ -self._white)
+        self._white += left[:, 1:] @ sizes
+        known = moved[:, 0] + moved[:, 1:] @ sizes
+        self.of_scans = np.outer(known, known) + moved[:, 1:] @ covariance @ moved[:, 1:].T
 
     def covariances(
         self, shared: NDArray[np.float64], *, in_depth: bool

@@ -52,12 +52,16 @@ class SeenPoints(Rows):
         points_world: (n, 3) float64 metres.
         sigma_px: (n,) float64, standard deviation of each pixel coordinate.
         sigma_m: (n,) float64, standard deviation of each world coordinate.
+        scan_errors: (n, 3, q) metres, errors of the positions due to the registration of the scans:
+            the most probable one, followed by one for each direction in which it is uncertain, with
+            the size of its standard deviation. None if unknown.
     """
 
     pixels_photo: NDArray[np.float64]
     points_world: NDArray[np.float64]
     sigma_px: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
+    scan_errors: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,6 +342,7 @@ class _Problem:
                 outwards(self._seen.points_world, camera.centre_world), (len(self._seen), 1)
             ),
             cofactors=cofactors,
+            scan_errors=self._seen.scan_errors,
         )
 
     def normal(self, errors: _Errors) -> NDArray[np.float64]:

@@ -124,7 +124,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(
             name="orient",
             summary="orient the photos to the scan",
-            inputs=_ports("ties photos cameras walls"),
+            inputs=_ports("ties photos cameras walls cloud"),
             outputs=_ports("cameras"),
         ),
         KindSpec(

@@ -55,9 +55,7 @@ def test_colmap_opens_the_model_and_sees_the_same_residuals(tmp_path: Path) -> N
             found.append(point.xy - pixel)
     expected = ties.residual_px[kept]
     np.testing.assert_allclose(
-        np.sort(np.linalg.norm(found, axis=1)),
-        np.sort(np.linalg.norm(expected, axis=1)),
-        atol=1e-9,
+        np.sort(np.linalg.norm(found, axis=1)), np.sort(np.linalg.norm(expected, axis=1)), atol=1e-9
     )
 
 

@@ -58,9 +58,7 @@ def read(path: Path) -> tuple[Photos, Cameras]:
 def e57_pixels(points_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """E2807: x right, y up, the camera looks along -z; rows count downwards."""
     x, y, z = points_camera.T
-    return np.column_stack(
-        [33.5 - x / z * (0.03 / 5e-4), 22.25 + y / z * (0.03 / 6e-4)],
-    )
+    return np.column_stack([33.5 - x / z * (0.03 / 5e-4), 22.25 + y / z * (0.03 / 6e-4)])
 
 
 def test_a_pinhole_image_becomes_a_photo_with_lens_and_pose(tmp_path: Path) -> None:

@@ -17,12 +17,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.cube_faces import FACES, FisheyeLens, PanoramaLens, face_lenses
-from orthoflow.files.given_cameras import (
-    MAX_LEFT_OUT_PX,
-    NEGLIGIBLE_PX,
-    CentredLens,
-    GivenCamera,
-)
+from orthoflow.files.given_cameras import MAX_LEFT_OUT_PX, NEGLIGIBLE_PX, CentredLens, GivenCamera
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.products import Camera, Cameras, Intrinsics
 from tests import scenes

@@ -12,11 +12,7 @@ import numpy as np
 import pytest
 
 from orthoflow.files.geotiff import GridPlace, read_raster, write_raster
-from orthoflow.files.polygons import (
-    filled,
-    read_polygons,
-    write_features,
-)
+from orthoflow.files.polygons import filled, read_polygons, write_features
 from orthoflow.files.publishing import publish_openings
 from tests.drawing_runs import WALL, box_openings
 
@@ -77,10 +73,7 @@ def test_what_is_written_lies_where_rasters_lie(tmp_path: Path, crs: str) -> Non
         "features": [area],
     }
     write_raster(
-        tmp_path / "a.tif",
-        np.zeros((2, 2), np.uint8),
-        place=GridPlace(gsd_m=1.0, crs=crs),
-        tags={},
+        tmp_path / "a.tif", np.zeros((2, 2), np.uint8), place=GridPlace(gsd_m=1.0, crs=crs), tags={}
     )
     # As GDAL reads it; without a name it takes metres for degrees.
     raster = CRS.from_wkt(read_raster(tmp_path / "a.tif").crs_wkt)

@@ -50,10 +50,7 @@ def lenders_of(
 def offset(
     row: int, column: int, cell: tuple[int, int], places: NDArray[np.float32]
 ) -> tuple[float, float]:
-    return (
-        cell[1] - column + float(places[cell][0]),
-        cell[0] - row + float(places[cell][1]),
-    )
+    return (cell[1] - column + float(places[cell][0]), cell[0] - row + float(places[cell][1]))
 
 
 def regressed(

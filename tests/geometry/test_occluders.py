@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.occluders import (
-    Box,
-    Occluders,
-    depth_buffer,
-    occluders_in,
-)
+from orthoflow.geometry.occluders import Box, Occluders, depth_buffer, occluders_in
 from tests import samples, scenes
 from tests.long_loops import seeds
 from tests.plane_scenes import cloud_of

@@ -206,9 +206,7 @@ def test_a_scene_with_arrays_that_disagree_is_refused() -> None:
         replace(scene, extent=scene.extent[:2])
     with pytest.raises(GeometryError, match="hole_rectangle must be in ascending"):
         replace(
-            scene,
-            hole_rectangle=np.array([1, 0], dtype=np.int32),
-            hole_extent=np.zeros((2, 4)),
+            scene, hole_rectangle=np.array([1, 0], dtype=np.int32), hole_extent=np.zeros((2, 4))
         )
 
 

@@ -54,8 +54,7 @@ def test_angles_count_from_the_crown_of_a_vault_and_from_e1_of_a_tower() -> None
 
 
 @pytest.mark.parametrize(
-    "changed",
-    [{"axis_world": 2.0 * AXIS}, {"point_world": PLACE * np.nan}, {"radius_m": 0.0}],
+    "changed", [{"axis_world": 2.0 * AXIS}, {"point_world": PLACE * np.nan}, {"radius_m": 0.0}]
 )
 def test_impossible_shapes_are_refused(changed: dict[str, object]) -> None:
     with pytest.raises(GeometryError):

@@ -89,11 +89,13 @@ class Points(Rows):
             scan.
         sigma_m: (k,) standard deviation of each coordinate of `known`, infinite for points that are
             not in the scan.
+        scan_errors: as in `SeenPoints`, zero for points that are not in the scan.
     """
 
     now: NDArray[np.float64]
     known: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
+    scan_errors: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -392,6 +394,7 @@ def _adjusted_points(
         follows=follows,
         towards=towards,
         cofactors=cofactors,
+        scan_errors=None if at_scan.scan_errors is None else at_scan.scan_errors[seen.point],
     )
 
 

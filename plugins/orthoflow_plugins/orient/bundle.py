@@ -52,6 +52,7 @@ from orthoflow_plugins.orient.photos import (
     looked_at,
     refused,
     require,
+    scan_errors_of,
     tied_photo,
     with_believable_priors,
 )
@@ -167,7 +168,8 @@ class OrientColmapBundle(Method):
         ties = inputs.ties
         require(ties, inputs.photos)
         photos = with_believable_priors(inputs.photos.photos, ties, params, ctx)
-        tied = [tied_photo(photo, ties, params, ctx.rng) for photo in photos]
+        scan_errors = scan_errors_of(inputs, ctx)
+        tied = [tied_photo(photo, ties, params, ctx.rng, scan_errors) for photo in photos]
         looks = looked_at(
             tied, lambda one: _by_itself(one, ties, params), ctx, share=_SHARE_BY_ITSELF
         )
@@ -462,7 +464,10 @@ def _block(
     sigma_m = np.zeros(len(first))
     np.maximum.at(sigma_m, place, units * scan.sigma_m)
     points = np.vstack([scan.points_world[first] - middle, positions])
-    active = weights.tie_active
+    active, scan_errors = weights.tie_active, None
+    if scan.scan_errors is not None:
+        n_more = [(0, len(positions)), (0, 0), (0, 0)]
+        scan_errors = np.pad(scan.scan_errors[first], n_more)
     return Block(
         cameras=cameras,
         lens_of=groups[0],
@@ -471,6 +476,7 @@ def _block(
             now=points,
             known=points,
             sigma_m=np.concatenate([sigma_m, np.full(len(positions), np.inf)]),
+            scan_errors=scan_errors,
         ),
         seen=Observations(
             photo=np.concatenate([np.repeat(np.arange(len(photos)), counts), ties.photo[active]]),

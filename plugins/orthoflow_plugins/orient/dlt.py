@@ -131,7 +131,7 @@ class OrientDlt(Method):
         def estimator(tied: TiedPhoto, _: OrientParams) -> Estimate | str:
             return estimate_dlt(tied, params)
 
-        found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
+        found = each_by_itself(inputs, params, ctx, estimator)
         return OrientOut(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod

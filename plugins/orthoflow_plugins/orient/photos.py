@@ -31,6 +31,7 @@ from orthoflow_plugins.orient.pose import (
     Estimator,
     Lens,
     Note,
+    OrientIn,
     OrientParams,
     Start,
     TiedPhoto,
@@ -42,6 +43,7 @@ from orthoflow_plugins.orient.pose import (
     undistorted_pixels,
 )
 from orthoflow_plugins.orient.report import Oriented, numbers_json
+from orthoflow_plugins.orient.scan_errors import measured_scan_errors
 
 MIN_TIES: Final = 6
 _MAX_WRONG: Final = 2
@@ -307,8 +309,34 @@ def require(ties: Ties, photos: Photos) -> None:
         )
 
 
+def scan_errors_of(inputs: OrientIn, ctx: StepContext) -> NDArray[np.float64] | None:
+    """Return `SeenPoints.scan_errors` of all ties; None if the cloud does not show them."""
+    cloud, found = inputs.cloud, None
+    if cloud is None:
+        return None
+    cloud.require_points(3)
+    if cloud.scan is not None:
+        stations = cloud.stations if cloud.stations_source == "file" else None
+        found = measured_scan_errors(
+            (cloud.x, cloud.y, cloud.z), cloud.scan, cloud.origin, stations
+        )
+    if found is None:
+        ctx.log(
+            "the cloud does not show how well scans are registered, since it has one scan, no "
+            "numbers of scans, no surface in several of them, or more than 100 scans: expected "
+            "errors include errors of registration only as far as residuals show them"
+        )
+        return None
+    ctx.metric("scan_registration_mm", 1e3 * float(found.sigma_m[0]), "mm")
+    return found.at(inputs.ties.points_world)
+
+
 def tied_photo(
-    photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
+    photo: Photo,
+    ties: Ties,
+    params: OrientParams,
+    rng: np.random.Generator,
+    scan_errors: NDArray[np.float64] | None = None,
 ) -> TiedPhoto:
     """Select the ties of a photo, and split them into control and check points."""
     # Draw one seed per photo, so that its samples do not depend on the ties of other photos.
@@ -320,6 +348,7 @@ def tied_photo(
         points_world=ties.points_world[chosen],
         sigma_px=ties.sigma_px[chosen],
         sigma_m=ties.sigma_m[chosen],
+        scan_errors=None if scan_errors is None else scan_errors[chosen],
     )
     by_hand = np.zeros(len(chosen), dtype=np.bool_)
     if ties.by_hand is not None:
@@ -401,14 +430,15 @@ def with_believable_priors(
 
 
 def each_by_itself(
-    ties: Ties, photos: Photos, params: OrientParams, ctx: StepContext, estimator: Estimator
+    inputs: OrientIn, params: OrientParams, ctx: StepContext, estimator: Estimator
 ) -> list[Oriented]:
     """Orient each photo separately from its own ties, and test each orientation.
 
     Raises:
         MethodError: there are no photos or no ties, or the ties refer to other photos.
     """
-    require(ties, photos)
+    ties = inputs.ties
+    require(ties, inputs.photos)
 
     def look(tied: TiedPhoto) -> Oriented:
         result = by_itself(tied, ties, params, estimator)
@@ -416,8 +446,9 @@ def each_by_itself(
             return result
         return result.judged(ties, params, result.estimate)
 
-    believed = with_believable_priors(photos.photos, ties, params, ctx)
-    tied = [tied_photo(photo, ties, params, ctx.rng) for photo in believed]
+    believed = with_believable_priors(inputs.photos.photos, ties, params, ctx)
+    scan_errors = scan_errors_of(inputs, ctx)
+    tied = [tied_photo(photo, ties, params, ctx.rng, scan_errors) for photo in believed]
     return looked_at(tied, look, ctx)
 
 

@@ -70,7 +70,7 @@ class OrientPnp(Method):
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
         """Orient each photo separately."""
         estimator = estimate_pose if params.method == "weighted" else estimate_by_opencv
-        found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
+        found = each_by_itself(inputs, params, ctx, estimator)
         return OrientOut(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod

@@ -30,7 +30,7 @@ from orthoflow.geometry.resection import (
     stated,
 )
 from orthoflow.geometry.robust import MEDIAN_LENGTH
-from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
+from orthoflow.products import Cameras, Intrinsics, Photo, Photos, PointCloud, Ties
 from orthoflow.sdk import DiagnosticSpec, MethodParams, MetricSpec, Ports
 
 # Declaration and values of a diagnostic about one photo.
@@ -67,6 +67,12 @@ ORIENTATION_METRICS: Final = (
     MetricSpec("n_control", label="control ties"),
     MetricSpec("n_check", label="withheld ties"),
     MetricSpec("rejected_share", label="share of rejected ties"),
+    MetricSpec(
+        "scan_registration_mm",
+        label="registration error of a scan, per coordinate",
+        better="lower",
+        description="standard deviation, from surfaces that several scans contain",
+    ),
     *_median_and_worst("control_rmse_px", "control ties, RMS residual per axis"),
     *_median_and_worst("check_rmse_px", "withheld ties, RMS residual per axis"),
     *_median_and_worst(
@@ -87,10 +93,14 @@ ORIENTATION_METRICS: Final = (
 
 
 class OrientIn(Ports):
-    """Ties to the walls, and the photos in which they were found."""
+    """Ties to the walls, the photos in which they were found, and the cloud of the walls.
+
+    The cloud shows how well its scans are registered, which is part of the expected errors.
+    """
 
     ties: Ties
     photos: Photos
+    cloud: PointCloud | None = None
 
 
 class OrientOut(Ports):

@@ -108,11 +108,7 @@ def read_e57(path: Path) -> Read:
     }
 
 
-FORMATS = {
-    "laz": (write_laz, read_laz),
-    "ply": (write_ply, read_ply),
-    "e57": (write_e57, read_e57),
-}
+FORMATS = {"laz": (write_laz, read_laz), "ply": (write_ply, read_ply), "e57": (write_e57, read_e57)}
 
 
 @pytest.mark.parametrize("name", FORMATS)

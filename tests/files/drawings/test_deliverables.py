@@ -30,15 +30,7 @@ from orthoflow.files.sidecars import placed_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.records.open import open_run
 from orthoflow.records.walls import delivered_walls, room_results, write_walls_json
-from tests.drawing_runs import (
-    GSD_M,
-    SIZE_M,
-    WALL,
-    box_image,
-    box_planes,
-    export,
-    write_drawing_run,
-)
+from tests.drawing_runs import GSD_M, SIZE_M, WALL, box_image, box_planes, export, write_drawing_run
 from tests.optional import skip
 
 UP = np.array([0.0, 0.0, 1.0])

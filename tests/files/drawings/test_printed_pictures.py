@@ -9,12 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings import printed_pictures
-from orthoflow.files.drawings.printed_pictures import (
-    Stretch,
-    contours,
-    encode_part,
-    stretch_of,
-)
+from orthoflow.files.drawings.printed_pictures import Stretch, contours, encode_part, stretch_of
 from orthoflow.files.drawings.sheet_contents import Part
 from orthoflow.files.geotiff import GridPlace, write_orthoimage, write_raster
 from orthoflow.files.images import decode_image

@@ -175,12 +175,7 @@ def test_a_hatch_too_small_for_a_line_of_its_pattern_is_left_out(tmp_path: Path)
 def test_the_files_of_a_plan_show_the_same_lines_in_scale(tmp_path: Path) -> None:
     section = section_of(plan_cut(box_planes(), 1.2), box_planes(), (), box_cloud())
     drawing = SectionDrawing(
-        kind="plan",
-        section=section,
-        scale=50,
-        origin="a box",
-        has_dimensions=True,
-        language="pl",
+        kind="plan", section=section, scale=50, origin="a box", has_dimensions=True, language="pl"
     )
     write_section(tmp_path, "plan_1", drawing)
     document = ezdxf.readfile(tmp_path / "plan_1.dxf")

@@ -595,8 +595,7 @@ def test_a_wall_that_is_not_recommended_says_so_on_its_sheet(
 
 
 @pytest.mark.parametrize(
-    ("direction_deg", "turned_deg"),
-    [(0, 0), (30, 30), (90, 90), (91, -89), (225, 45), (300, -60)],
+    ("direction_deg", "turned_deg"), [(0, 0), (30, 30), (90, 90), (91, -89), (225, 45), (300, -60)]
 )
 def test_a_number_lies_along_its_line_and_is_never_upside_down(
     direction_deg: float, turned_deg: float

@@ -160,11 +160,7 @@ WRITERS: Mapping[str, tuple[str, Callable[..., Fields], dict[str, Any]]] = {
     "pandas": ("a.csv", by_pandas, {"index": False}),
     "pandas index": ("a.csv", by_pandas, {"index": True}),
     "pandas commas": ("a.csv", by_pandas, {"index": True, "sep": ";", "decimal": ","}),
-    "pandas quotes": (
-        "a.csv",
-        by_pandas,
-        {"index": False, "quoting": 1, "encoding": "utf-8-sig"},
-    ),
+    "pandas quotes": ("a.csv", by_pandas, {"index": False, "quoting": 1, "encoding": "utf-8-sig"}),
 }
 
 

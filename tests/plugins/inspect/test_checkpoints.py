@@ -13,25 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect import checkpoints, point_doubts
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
-from orthoflow_plugins.inspect.findings import (
-    check_findings,
-    outliers_at_once,
-    outliers_iterated,
-)
+from orthoflow_plugins.inspect.findings import check_findings, outliers_at_once, outliers_iterated
 from orthoflow_plugins.inspect.point_doubts import with_reasons
 from orthoflow_plugins.inspect.point_places import ShownPoint
 from orthoflow_plugins.plane.given import GivenPlane
 from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.errors import MethodError
-from orthoflow.products import (
-    CheckPoints,
-    InputFiles,
-    Inspection,
-    Orthoimage,
-    Orthoimages,
-    Walls,
-)
+from orthoflow.products import CheckPoints, InputFiles, Inspection, Orthoimage, Orthoimages, Walls
 from orthoflow.sdk import StepContext
 from tests import inspect_scenes, samples
 from tests.inspect_scenes import BUFFER_M, GSD_M, points_at
@@ -41,10 +30,7 @@ from tests.raster_scenes import context, peak_bytes, rastered
 
 
 def inspect(
-    folder: Path,
-    points: CheckPoints,
-    walls: Walls,
-    image: Orthoimage | None = None,
+    folder: Path, points: CheckPoints, walls: Walls, image: Orthoimage | None = None
 ) -> tuple[dict[str, float], Inspection, StepContext]:
     images = None if image is None else Orthoimages(images=(image,))
     inputs: Any = {"checkpoints": points, "walls": walls, "orthoimages": images}

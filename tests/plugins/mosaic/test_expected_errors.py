@@ -16,15 +16,7 @@ from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow.geometry.bands import in_memory
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.frames import cross_matrix, rotation_from_vector
-from orthoflow.products import (
-    Camera,
-    Cameras,
-    Intrinsics,
-    LayerMask,
-    Layers,
-    Product,
-    TieRole,
-)
+from orthoflow.products import Camera, Cameras, Intrinsics, LayerMask, Layers, Product, TieRole
 from tests import samples
 from tests.method_runs import run
 from tests.raster_scenes import context

@@ -37,10 +37,7 @@ SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
         [(0.0, -0.6, 2.0), (175.0, 0.3, 1.5)],
     ),
     "spire": (curved_scenes.spire(**RING), [(0.0, 3.0, 2.5), (60.0, 3.9, 1.6)]),
-    "dome": (
-        curved_scenes.dome(band_m=(0.5, 0.8), height_m=0.1),
-        [(20.0, 0.3, 0.8)],
-    ),
+    "dome": (curved_scenes.dome(band_m=(0.5, 0.8), height_m=0.1), [(20.0, 0.3, 0.8)]),
     "ball": (
         curved_scenes.dome(is_concave=False, band_m=(0.3, 0.6), height_m=0.1),
         [(20.0, 0.3, 2.0), (100.0, 0.9, 2.0)],

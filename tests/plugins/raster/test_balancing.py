@@ -46,10 +46,7 @@ def cloud(n_scans: int = 3, n_points: int = 40_000) -> tuple[PointCloud, np.ndar
     true = albedo(points)
     seen = true * SCALES[scan] * range_m**RANGE_POWER * cosine**COSINE_POWER
     plain = cloud_of(points, origin=ORIGIN, stations=STATIONS[:n_scans])
-    return (
-        replace(plain, scan=scan.astype(np.uint16), intensity=seen.astype(np.float32)),
-        true,
-    )
+    return (replace(plain, scan=scan.astype(np.uint16), intensity=seen.astype(np.float32)), true)
 
 
 def test_scale_range_and_incidence_are_estimated_from_overlaps(tmp_path: Path) -> None:

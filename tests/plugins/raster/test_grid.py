@@ -313,11 +313,7 @@ def test_a_depth_step_is_not_bridged(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("without", "reach"),
-    [
-        (("row", "column"), {}),
-        ((), {"recover_scan_steps": 0}),
-        ((), {"recover_gap_cells": 0}),
-    ],
+    [(("row", "column"), {}), ((), {"recover_scan_steps": 0}), ((), {"recover_gap_cells": 0})],
 )
 def test_without_grid_or_reach_nothing_is_spanned(
     tmp_path: Path, without: tuple[str, ...], reach: dict[str, object]

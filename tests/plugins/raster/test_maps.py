@@ -108,10 +108,7 @@ def test_a_map_reads_back_to_where_it_lies(tmp_path: Path) -> None:
     assert 'AUTHORITY["EPSG","2100"]' in raster.crs_wkt
     assert raster.place.corner_m == pytest.approx(tuple(frame.origin_world[:2]), abs=1e-9)
     again = frame_of_raster(
-        frame_json(walls.walls[0].frame),
-        raster=raster.place,
-        shape=raster.values.shape,
-        name="map",
+        frame_json(walls.walls[0].frame), raster=raster.place, shape=raster.values.shape, name="map"
     )
     assert again.has_cells_of(frame)
     assert again.map_crs == "EPSG:2100"

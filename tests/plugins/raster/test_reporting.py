@@ -133,10 +133,7 @@ def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(ctx: StepC
 def test_objects_in_front_of_walls_are_errors_and_on_floors_notes(ctx: StepContext) -> None:
     floor = wall([[1, 1]], name="floor 1")
     flat = replace(
-        floor.frame,
-        v_world=np.array([0.0, -1.0, 0.0]),
-        normal_world=UP.copy(),
-        up=(0.0, 0.0, 1.0),
+        floor.frame, v_world=np.array([0.0, -1.0, 0.0]), normal_world=UP.copy(), up=(0.0, 0.0, 1.0)
     )
     walls = [wall([[1, 1]]), replace(floor, frame=flat)]
     reporting.report_empty(ctx, walls, [emptiness(before=0.06), emptiness(before=0.12)])

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster.grid import RasterGrid
-from orthoflow_plugins.raster.selection import (
-    chosen_walls,
-    covered_planes,
-)
+from orthoflow_plugins.raster.selection import chosen_walls, covered_planes
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Planes

@@ -279,8 +279,7 @@ def shadow(*, agree: int, n: int = 6) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize(
-    ("agree", "n", "is_speck"),
-    [(3, 6, False), (2, 6, True), (2, 3, True), (3, 3, False)],
+    ("agree", "n", "is_speck"), [(3, 6, False), (2, 6, True), (2, 3, True), (3, 3, False)]
 )
 def test_in_a_shadow_three_and_half_must_agree(agree: int, n: int, is_speck: bool) -> None:
     assert specks(shadow(agree=agree, n=n))[20, 30] == is_speck

@@ -17,13 +17,7 @@ from PIL import Image
 from rasterio.transform import Affine
 
 from orthoflow.errors import InputError
-from orthoflow.files.images import (
-    decode_levels,
-    encode_jpeg,
-    encode_png,
-    encode_webp,
-    used_pixels,
-)
+from orthoflow.files.images import decode_levels, encode_jpeg, encode_png, encode_webp, used_pixels
 from orthoflow.files.polygons import MOST_BYTES
 from orthoflow.products import InputFiles, Photo
 from tests import photo_files as made
@@ -132,10 +126,7 @@ def test_cameras_calibrate_wide_photos(tmp_path: Path, lens: bytes, faces: tuple
     (path,) = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
     model = made.write(
         tmp_path,
-        {
-            "cameras.txt": b"1 " + lens + b"\n",
-            "images.txt": b"1 1 0 0 0 0 0 0 1 a.jpg\n\n",
-        },
+        {"cameras.txt": b"1 " + lens + b"\n", "images.txt": b"1 1 0 0 0 0 0 0 1 a.jpg\n\n"},
     )
     given = InputFiles(name="cameras", paths=model)
 

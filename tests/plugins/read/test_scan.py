@@ -15,11 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import figures, scales
 from orthoflow_plugins.read.assembly import CloudAssembly, rounding_m
-from orthoflow_plugins.read.figures import (
-    plan_view,
-    polar_view_png,
-    scan_lines_png,
-)
+from orthoflow_plugins.read.figures import plan_view, polar_view_png, scan_lines_png
 from orthoflow_plugins.read.scales import ColourScale, IntensityScale, choose_scales, normalise
 from orthoflow_plugins.read.scan import ReadScan
 
@@ -337,11 +333,7 @@ def block(seed: int, n: int, *, scan: int = 0, **more: object) -> PointBlock:
     return PointBlock(**(plain | more))  # type: ignore[arg-type]
 
 
-def file(
-    name: str,
-    *blocks: PointBlock,
-    fields: Sequence[PointField] = FIELDS,
-) -> ScanFile:
+def file(name: str, *blocks: PointBlock, fields: Sequence[PointField] = FIELDS) -> ScanFile:
     n_scans = max(one.scan for one in blocks) + 1
     return ScanFile(
         name=name,
@@ -485,7 +477,7 @@ def test_each_scan_is_scaled_by_its_own_limits_and_similar_ones_together() -> No
     scales = choose_scales(ranges, stated, None)
     assert scales[2] is None
     assert [(scale.low, scale.high) for scale in scales if scale is not None] == [
-        *((0.0, 1.0), (0.0, 65535.0), (0.0, 255.0), (0.0, 255.0), (-2048.0, 2047.0)),
+        *((0.0, 1.0), (0.0, 65535.0), (0.0, 255.0), (0.0, 255.0), (-2048.0, 2047.0))
     ]
 
 
