@@ -7,18 +7,20 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from markupsafe import Markup
 
 from orthoflow.errors import InputError
-from orthoflow.files.drawing import styled
 from orthoflow.files.images import decode_image, encode_pdf, encode_png, shrunk_webp
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedCell, RecordedFigure
 from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run, figure_files, write_files
-from orthoflow.report.charts import as_image, saved
+from orthoflow.report.charts import as_image
 from orthoflow.report.combinations import baseline_addresses
 from orthoflow.report.pictures import LONGEST_SIDE_PX, Picture, data_uri
 from orthoflow.report.rankings import seconds_in_words
+from orthoflow.report.rendering import environment
 from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
@@ -26,12 +28,14 @@ if TYPE_CHECKING:
 
 _MAX_ABREAST: Final = 5  # boxes in a row
 _MAX_LETTERS: Final = 26
+_SPACING_PT: Final = (132.0, 46.8)  # of the middles of boxes
+_BOX_PT: Final = (102.0, 26.0)
 # The states can be distinguished without colour, by line width and dashes.
-_FRAMES: Final[dict[str, dict[str, Any]]] = {
-    "ok": {"edgecolor": "#5b6570", "facecolor": "#f3f5f7"},
-    "cached": {"edgecolor": "#1c6b35", "facecolor": "#eaf5ec"},
-    "failed": {"edgecolor": "#a11616", "facecolor": "#fbeaea", "linewidth": 2.0},
-    "skipped": {"edgecolor": "#5b6570", "facecolor": "white", "linestyle": "--"},
+_FRAMES: Final = {
+    "ok": Markup('stroke="#5b6570" fill="#f3f5f7"'),
+    "cached": Markup('stroke="#1c6b35" fill="#eaf5ec"'),
+    "failed": Markup('stroke="#a11616" fill="#fbeaea" stroke-width="2"'),
+    "skipped": Markup('stroke="#5b6570" fill="white" stroke-dasharray="4 2"'),
 }
 
 
@@ -69,48 +73,41 @@ def run_graph(run: Run) -> nx.DiGraph[str]:
 
 def graph_file(run: Run) -> bytes:
     """Return the drawing of a run's graph as an SVG file."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - not needed for pages without charts
-
     nodes, edges = (graph := run_graph(run)).nodes, graph.edges
     rows = 1 + max((row for _, row in nodes(data="row")), default=0)
     wide = 0.5 + max((column for _, column in nodes(data="column")), default=0.0)
-    with styled({"font.size": 7.0}):
-        figure = Figure(figsize=(3.0 * wide, 0.65 * rows))
-        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        axes.set_axis_off()
-        axes.set(xlim=(-wide, wide), ylim=(rows - 0.5, -0.5))
-        boxes = {
-            node: axes.text(
-                about["column"],
-                about["row"],
-                "\n".join(_shortened(line) for line in (node, about["about"])),
-                ha="center",
-                va="center",
-                bbox={"boxstyle": "round", **_FRAMES[about["state"]]},
-            ).get_bbox_patch()
-            for node, about in nodes(data=True)
+    middles = {
+        node: ((about["column"] + wide) * _SPACING_PT[0], (about["row"] + 0.5) * _SPACING_PT[1])
+        for node, about in nodes(data=True)
+    }
+    boxes = [
+        {
+            "x": middles[node][0],
+            "y": middles[node][1],
+            "frame": _FRAMES[about["state"]],
+            "lines": [_shortened(line) for line in (node, about["about"])],
         }
-        for before, after in edges:
-            (x0, y0), (x1, y1) = (
-                (nodes[node]["column"], nodes[node]["row"]) for node in (before, after)
-            )
-            # Curve the arrows that cross other rows, so that they do not pass behind boxes.
-            bulge = 0.25 if y1 - y0 > 1 else 0.0
-            axes.annotate(
-                "",
-                (x1, y1),
-                (x0, y0),
-                arrowprops={
-                    "arrowstyle": "-|>",
-                    "color": "#5b6570",
-                    "connectionstyle": f"arc3,rad={bulge}",
-                    "patchA": boxes[before],
-                    "patchB": boxes[after],
-                    "shrinkB": 3.0,
-                    "mutation_scale": 8.0,
-                },
-            )
-        return saved(figure, "svg")
+        for node, about in nodes(data=True)
+    ]
+    drawing = environment().get_template("graph.svg.j2")
+    return drawing.render(
+        width=2.0 * wide * _SPACING_PT[0],
+        height=rows * _SPACING_PT[1],
+        size=_BOX_PT,
+        boxes=boxes,
+        arrows=[_arrow(middles[before], middles[after]) for before, after in edges],
+    ).encode()
+
+
+def _arrow(before: tuple[float, float], after: tuple[float, float]) -> str:
+    """Return the path from the lower edge of a box to the upper edge of one in a later row."""
+    (x0, y0), (x1, y1) = before, after
+    # Curve the arrows that cross other rows, so that they pass between boxes.
+    n_rows = round((y1 - y0) / _SPACING_PT[1])
+    bulge = min(108.0 + 6.0 * n_rows, _SPACING_PT[0]) if n_rows > 1 else 0.0
+    x, y = 0.5 * (x0 + x1) + bulge, 0.5 * (y0 + y1)
+    half = 0.5 * _BOX_PT[1]
+    return f"M{x0:g} {y0 + half:g}Q{x:g} {y:g} {x1:g} {y1 - half:g}"
 
 
 def graph_picture(run: Run) -> Picture:
