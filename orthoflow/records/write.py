@@ -303,15 +303,16 @@ def write_run(
         with kept_from_others(run_folder):
             unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
             with writing_to(run_folder):
+                run = read_run(unfinished)
                 if before_finish is not None:
-                    before_finish(read_run(unfinished))
+                    before_finish(run)
                 # Flush all files to the disk before the record, which references them, gets its
                 # name.
                 sync_tree(run_folder)
                 finished = unfinished.replace(run_folder / RECORD_FILE)
                 (run_folder / OUTLINE_FILE).unlink(missing_ok=True)
                 sync(run_folder)
-            return read_run(finished)
+            return replace(run, path=finished)
     except StoreError as error:
         needed = [name for result in outcome.results.values() for name in result.objects]
         damaged = [name for name in needed if store.damage(name)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections import Counter
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -205,8 +205,10 @@ def read_whole(dataset: h5py.Dataset) -> object:
     return value
 
 
-# Number of handles of each open file whose objects have been checked.
-_CHECKED: Final[Counter[int]] = Counter()
+# Files whose objects this process has checked: device, number, size, times of the last change.
+_CHECKED: Final[set[tuple[int, ...]]] = set()
+# A file that was changed a moment ago may change again without getting another time.
+_RECENT_NS: Final = 2_000_000_000
 
 
 class FileSink:
@@ -328,7 +330,7 @@ def create_group(parent: h5py.Group, name: str) -> h5py.Group:
 def safe_open(path: Path, format_name: str) -> Iterator[h5py.File]:
     """Open a file with a given format for reading, after checking all objects in it.
 
-    A file that is open already is not checked again.
+    A file that this process has checked is not checked again until it changes.
 
     Raises:
         UnknownFormatError: the file is not an HDF5 file, or it has another format or another
@@ -346,17 +348,14 @@ def safe_open(path: Path, format_name: str) -> Iterator[h5py.File]:
         file = h5py.File(path, "r", locking=False)
     try:
         _require_format(file, path.name, format_name)
-        # HDF5 gives this number to a file until all its handles are closed.
-        number = int(h5py.h5o.get_info(file.id).fileno)
-        if number not in _CHECKED:
+        state = os.fstat(file.id.get_vfd_handle())
+        times_ns = state.st_mtime_ns, state.st_ctime_ns
+        identity = (state.st_dev, state.st_ino, state.st_size, *times_ns)
+        if identity not in _CHECKED:
             _Inspection(file, path).run()
-        _CHECKED[number] += 1
-        try:
-            yield file
-        finally:
-            _CHECKED[number] -= 1
-            if _CHECKED[number] <= 0:
-                _CHECKED.pop(number, None)
+            if time.time_ns() - max(times_ns) > _RECENT_NS:
+                _CHECKED.add(identity)
+        yield file
     finally:
         file.close()
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from functools import partial
+from operator import add
 from pathlib import Path
 
 import h5py
@@ -143,20 +146,29 @@ def test_well_packed_data_of_any_size_is_allowed(tmp_path: Path) -> None:
         assert file["a"].shape == (80 << 20,)
 
 
-def test_more_objects_than_any_record_has_are_refused(
+def test_more_objects_than_any_record_has_are_refused_in_all_that_was_not_checked_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
+    with h5py.File(path := tmp_path / "a.h5", "w") as file:
         for index in range(10):
             file.create_group(str(index)).attrs["a"] = index
         set_attributes(file, **NAMED)
-    monkeypatch.setattr("orthoflow_provenance.hdf5.MAX_OBJECTS", 23)
-    with safe_open(tmp_path / "a.h5", RUN_FORMAT):
-        pass
-    monkeypatch.setattr("orthoflow_provenance.hdf5.MAX_OBJECTS", 22)
-    refused = pytest.raises(RecordFormatError, match="the limit of 22 groups, datasets and")
-    with refused, safe_open(tmp_path / "a.h5", RUN_FORMAT):
-        pass
+
+    def check(objects_most: int) -> None:
+        monkeypatch.setattr("orthoflow_provenance.hdf5.MAX_OBJECTS", objects_most)
+        with safe_open(path, RUN_FORMAT):
+            pass
+
+    refused = "the limit of 22 groups, datasets and"
+    check(23)
+    with pytest.raises(RecordFormatError, match=refused):
+        check(22)  # it could have changed within a tick of the clock
+    monkeypatch.setattr("time.time_ns", partial(add, 10**11, time.time_ns()))
+    check(23)
+    check(22)
+    path.touch()
+    with pytest.raises(RecordFormatError, match=refused):
+        check(22)
 
 
 def test_tables_and_texts_that_unpack_to_much_are_not_read(tmp_path: Path) -> None:
