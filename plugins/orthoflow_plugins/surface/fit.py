@@ -376,19 +376,24 @@ def _solution(
     change, used = _solved(tiles, variance, n_own)
     own = _covariance(used, n_own)
     variation, chance = _variation(used, radius_m)
-    sector, _ = _sectors(tiles, _END_RAD)
-    if len(np.unique(sector)) == sector.max() + 1 >= _SECTORS[0] + 2:
-        # The ends of the arc may be on walls that adjoin it without an edge. Then the radius
-        # without them differs significantly (Hausman 1978, doi:10.2307/1913827).
+    # The ends of the arc may be on walls, or on arcs of another radius, that adjoin it without an
+    # edge. Then the radius without them differs significantly (Hausman 1978, doi:10.2307/1913827).
+    # Smaller differences are part of the stated errors.
+    while True:
+        sector, _ = _sectors(tiles, _END_RAD, _SECTORS[0] + 2)
+        if not len(np.unique(sector)) == sector.max() + 1 >= _SECTORS[0] + 2:
+            break
         inner = tiles.take((sector > 0) & (sector < sector.max()))
         again, kept = _solved(inner, variance, n_own)
-        if len(kept) > _LEAST_INNER * len(inner) and _variation(kept, radius_m)[1] > _LEVELS[0]:
-            theirs = _covariance(kept, n_own)
-            largest = theirs[radius, radius] - own[radius, radius]
-            largest = special.chdtri(1.0, _LEVELS[1]) * max(0.0, largest)
-            differs = (again[radius] - change[radius]) ** 2
-            if chance < _LEVELS[1] or differs > largest:
-                tiles, change, used, own, chance = inner, again, kept, theirs, 1.0
+        theirs, differs = _covariance(kept, n_own), again - change
+        largest = theirs[radius, radius] - own[radius, radius]
+        largest = special.chdtri(1.0, _LEVELS[1]) * max(0.0, largest)
+        is_circle = len(kept) > _LEAST_INNER * len(inner)
+        is_circle = is_circle and _variation(kept, radius_m)[1] > _LEVELS[0]
+        if not (is_circle and (chance < _LEVELS[1] or differs[radius] ** 2 > largest)):
+            own += np.outer(differs, differs)
+            break
+        tiles, change, used, own, chance = inner, again, kept, theirs, 1.0
     variation = variation if chance < _LEVELS[1] else 0.0
     # If the radius of curvature varies, the centre does, too; the middle of the arc stays.
     turn = np.zeros(n_own)
@@ -573,12 +578,15 @@ def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
     return np.asarray(inverse @ weighted.T @ best @ weighted @ inverse)
 
 
-def _sectors(tiles: _Means, least_rad: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _sectors(
+    tiles: _Means, least_rad: float, n_least: int = _SECTORS[0]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the sector (m,) of each tile, and its angle (m,) from the middle of the sector.
 
     Args:
         tiles: the tiles.
         least_rad: least angle of a sector.
+        n_least: least number of sectors, if there are enough tiles.
     """
     # Positions around the axis, from the end of the longest gap.
     columns = np.unique(tiles.i)
@@ -587,7 +595,7 @@ def _sectors(tiles: _Means, least_rad: float) -> tuple[NDArray[np.int64], NDArra
     width_rad = 2.0 * math.pi / tiles.n_around
     n_around = int(around.max()) + 1
     count = int(n_around / max(_SECTOR_TILES, least_rad / width_rad))
-    count = max(1, count, min(_SECTORS[0], n_around // _SECTOR_TILES))
+    count = max(1, count, min(n_least, n_around // _SECTOR_TILES))
     count = min(count, _SECTORS[1])
     sector = around * count // n_around
     return sector, (around + 0.5 - (sector + 0.5) * n_around / count) * width_rad
