@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from orthoflow.geometry.bends import NARROWEST
 from orthoflow.geometry.slabs import OffsetPoints, Slab
 
-_CHUNK: Final = 1 << 20
+# So many points fit into the processor's cache.
+_CHUNK: Final = 1 << 14
 # Number of positions along the arc from which the bounding box of a curved slab is computed.
 _PLACES: Final = 65
 

@@ -220,15 +220,16 @@ def _picture(pickled: bytes) -> bytes:
     rays = camera.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
     gsd_m = scene.frame.gsd_m
     start = scene.frame.wall_from_world(camera.centre_world[None])[0] * [gsd_m, gsd_m, 1.0]
-    local = rays @ scene.frame.axes_world.T
-    depth = np.zeros(len(rays))
+    local = scene.frame.axes_world @ rays.T
+    slopes, depth = local[:2] / local[2], np.zeros(len(rays))
     for _ in range(30):
-        across, down = (start[i] + local[:, i] * (depth - start[2]) / local[:, 2] for i in range(2))
+        across, down = start[:2, None] + slopes * (depth - start[2])
         before, depth = depth, scene.depth_m(across, down)
         if np.abs(depth - before).max() < 1e-7:
             break
     inside = (across > 0) & (across < SIZE_M[0]) & (down > 0) & (down < SIZE_M[1])
-    grey = np.rint(255 * np.where(inside, scene.grey(across, down), 0.0))
+    grey = np.zeros(inside.shape)
+    grey[inside] = np.rint(255 * scene.grey(across[inside], down[inside]))
     return encode_png(grey.astype(np.uint8).reshape(camera.height, camera.width))
 
 
