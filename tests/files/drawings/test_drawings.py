@@ -123,7 +123,7 @@ def test_the_step_of_the_wall_is_a_contour(sheet: pdfplumber.page.Page) -> None:
 
 
 def test_a_wall_that_does_not_fit_takes_several_sheets(run: Path, tmp_path: Path) -> None:
-    export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A4", code=0)
+    export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A3", code=0)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == [f"wall_{WALL}_sheet_{number}.pdf" for number in range(1, len(names) + 1)]
     areas = 0.0

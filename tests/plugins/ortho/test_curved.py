@@ -28,7 +28,10 @@ BAND: dict[str, Any] = {"band_m": (0.2, 0.5), "height_m": 0.15}
 RING: dict[str, Any] = {"band_m": (3.4, 3.7), "height_m": 0.15}
 # The drum, and cameras: place along the arc in degrees, along the axis, and distance.
 SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
-    "vault": (curved_scenes.vault(half_deg=50.0, length_m=2.0, **BAND), [(0.0, -0.6, 2.5), (30.0, 0.7, 2.4)]),
+    "vault": (
+        curved_scenes.vault(half_deg=50.0, length_m=2.0, **BAND),
+        [(0.0, -0.6, 2.5), (30.0, 0.7, 2.4)],
+    ),
     "tower": (curved_scenes.tower(**BAND), [(0.0, -0.6, 2.5), (60.0, 0.5, 1.6)]),
     "apse": (curved_scenes.tower(is_concave=True, **BAND), [(100.0, 0.3, 1.5)]),
     # The second camera faces the cut of the closed surface.
