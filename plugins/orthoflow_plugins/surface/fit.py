@@ -49,8 +49,10 @@ _LENGTHS: Final = (1.0, 2.0, 4.0, 8.0)
 _CORRELATED: Final = (0.25, 0.5, 0.75, 0.95)
 # The profile is tested in sectors of at least this angle and this number of tiles, which are
 # divided into pieces of this number of tiles along the axis. There are at least three sectors if
-# there are enough tiles, and at most twelve. The sagitta of a sector is 3.4 % of the radius, i.e.
-# several times the scatter of relief that is accepted. The ends of an arc are narrower sectors.
+# there are enough tiles, and at most twelve. Angles from 25 to 45 degrees give the same results for
+# 70 drawn profiles (circles with and without relief, ellipses, basket vaults, strips of planes);
+# with smaller ones, relief looks like a variation of the profile. To find where the ends of an arc
+# leave its circle, there are at least five sectors, which may be narrower.
 _SECTOR_RAD: Final = math.radians(30.0)
 _END_RAD: Final = math.radians(15.0)
 _SECTOR_TILES: Final = 3
