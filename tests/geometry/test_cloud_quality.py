@@ -80,7 +80,7 @@ def room(turned_deg: float, *, without_level: bool = False) -> NDArray[np.float6
     points = []
     for axis in range(2 if without_level else 3):
         for end in (0.0, sides[axis]):
-            one = rng.uniform(0.0, 1.0, (20_000, 3)) * sides
+            one = rng.uniform(0.0, 1.0, (8_000, 3)) * sides
             one[:, axis] = end + rng.normal(0.0, 0.002, len(one))
             points.append(one)
     turn = np.radians(turned_deg)

@@ -164,7 +164,7 @@ def stretched_photos(
     return AdjustedPoints(
         photo=photo,
         places=np.tile(places, (N_PHOTOS, 1)),
-        residuals=seen - (rows @ cofactors @ rows.T @ seen.ravel()).reshape(-1, 2),
+        residuals=seen - (rows @ (cofactors @ (rows.T @ seen.ravel()))).reshape(-1, 2),
         jacobian=jacobian,
         by_place=by_photo[photo],
         pulls=np.einsum("nip,nid->npd", jacobian, by_photo[photo]),

@@ -147,7 +147,7 @@ def test_the_adjustment_finds_the_least_sum_of_huber_losses() -> None:
     # Every fifteenth observation is off by ten standard deviations.
     block.seen.pixels[::15] += [8.0 * SIGMA_PX, -6.0 * SIGMA_PX]
     # Use few joint points, because SciPy differentiates by each of their coordinates.
-    few = ~block.is_joint[block.seen.point] | (block.seen.point % 6 == 0)
+    few = ~block.is_joint[block.seen.point] | (block.seen.point % 8 == 0)
     block = replace(block, seen=block.seen.take(few))
     solved = adjustment.solve(block, soft_limit=1.5)
     sigmas = np.sqrt(np.diag(adjustment.block_covariance(solved, soft_limit=1.5).matrix)).reshape(

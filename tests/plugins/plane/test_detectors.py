@@ -318,7 +318,7 @@ def room(rng: np.random.Generator, noise_m: float, shared_m: float) -> NDArray[n
     points = []
     for axis in range(3):
         for level in (0.0, SIZE_M[axis]):
-            count = int(500 * np.prod(np.delete(SIZE_M, axis)))
+            count = int(350 * np.prod(np.delete(SIZE_M, axis)))
             side = rng.uniform(0.0, 1.0, (count, 3)) * SIZE_M
             side[:, axis] = level + rng.normal(0.0, noise_m * (1.5 if axis == 0 else 1.0), count)
             side[:, axis] += shared_m * waves(rng, np.delete(side, axis, axis=1))
@@ -375,14 +375,14 @@ def test_walls_of_a_noisy_room_are_found_beside_denser_clutter(
     middle = 0.5 * (walls.min(axis=0) + walls.max(axis=0))
     along, across = np.array([[0.8, 0.6, 0.0], [0.6, -0.8, 0.0]])
     place = middle + np.array([0.4, 0.5, -0.3])
-    u, v = rng.uniform(-1.0, 1.0, (2, 1100, 1))
-    screen = place + u * along + v * (0.0, 0.0, 1.0) + rng.normal(0.0, noise_m, (1100, 1)) * across
-    rays = rng.normal(size=(4000, 3))
+    u, v = rng.uniform(-1.0, 1.0, (2, 770, 1))
+    screen = place + u * along + v * (0.0, 0.0, 1.0) + rng.normal(0.0, noise_m, (770, 1)) * across
+    rays = rng.normal(size=(2800, 3))
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    ball = middle - np.array([1.0, 0.4, 0.9]) + rays * rng.normal(0.4, noise_m, (4000, 1))
-    turn = rng.uniform(0.0, 2.0 * np.pi, 8000)
+    ball = middle - np.array([1.0, 0.4, 0.9]) + rays * rng.normal(0.4, noise_m, (2800, 1))
+    turn = rng.uniform(0.0, 2.0 * np.pi, 5600)
     column = 0.3 * np.column_stack([np.cos(turn), np.sin(turn)]) + middle[:2] + [0.6, -1.0]
-    column = np.column_stack([column, rng.uniform(0.0, SIZE_M[2], 8000)])
+    column = np.column_stack([column, rng.uniform(0.0, SIZE_M[2], 5600)])
     column += rng.normal(0.0, noise_m, column.shape)
     planes = detected(method, np.concatenate([walls, screen, ball, column]), tmp_path)
     assert len(planes) == 7

@@ -23,7 +23,7 @@ from tests.raster_scenes import UP, cell_centres, cloud_of, context
 GSD_M = 0.02
 BAND: dict[str, Any] = {"band_m": (0.2, 0.5), "height_m": 0.1}
 DRUMS = {
-    "vault": curved_scenes.vault(**BAND),
+    "vault": curved_scenes.vault(half_deg=50.0, **BAND),
     "tower": curved_scenes.tower(**BAND),
     "apse": curved_scenes.tower(is_concave=True, **BAND),
     # A whole turn is 188.5 cells wide.
@@ -128,7 +128,7 @@ def test_curved_walls_follow_planes_and_cover_their_facets(tmp_path: Path) -> No
 
 
 def test_crossing_vaults_end_at_their_groins(tmp_path: Path) -> None:
-    params = {"subject": "cross-vault", "scan_step_m": 0.03}
+    params = {"subject": "cross-vault", "scan_step_m": 0.04}
     trial = Trial(method=SimulateCurved, inputs={}, params=params, seed=3)
     room = run_trial(trial, tmp_path / "room").outputs
     surfaces = room["truth"].surfaces

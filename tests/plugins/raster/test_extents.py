@@ -20,7 +20,7 @@ from tests.long_loops import long_only
 
 # The wall is at y = 0, seen along +y, 4 m wide and 3 m high; depth is -y.
 WIDTH_M, HEIGHT_M = 4.0, 3.0
-STEP_M = 0.006
+STEP_M = 0.007
 NOISE_M = 0.001
 GSD_M = 0.01
 # Near a corner, points within three sigmas of the adjoining surface are omitted, then whole cells.

@@ -57,7 +57,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
     """Return six photos of 150 x 112 pixels, each rendered in two parts by several threads."""
-    return simulate(tmp_path_factory.mktemp("small"), photo_gsd_m=0.016)
+    return simulate(tmp_path_factory.mktemp("small"), photo_gsd_m=0.024)
 
 
 def cameras_of(truth: Truth) -> tuple[ViewingCamera, ...]:
@@ -68,7 +68,7 @@ def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> N
     truth = room.truth
     whole = cameras_of(truth)[1]
     # Use a section of the photo that includes the object and its edges.
-    camera = replace(whole, width=160, height=120, cx=whole.cx - 200.0, cy=whole.cy - 20.0)
+    camera = replace(whole, width=100, height=80, cx=whole.cx - 230.0, cy=whole.cy - 40.0)
     views = SceneCameras(truth.scene, cores=2)
     image = views.expose(camera, supersample=8)
     rng = np.random.default_rng(5)
@@ -149,7 +149,7 @@ def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int)
 
 def test_photos_are_the_same_in_any_world(tmp_path: Path, small: SimulateRoom.Out) -> None:
     world = {"shift_world_m": tuple(scenes.SURVEY_SHIFT_M), "up": "-y"}
-    far = simulate(tmp_path, cores=1, photo_gsd_m=0.016, **world)
+    far = simulate(tmp_path, cores=1, photo_gsd_m=0.024, **world)
     assert [photo.encoded for photo in small.photos.photos] == [
         photo.encoded for photo in far.photos.photos
     ]
@@ -160,7 +160,7 @@ def test_photos_are_the_same_in_any_world(tmp_path: Path, small: SimulateRoom.Ou
         # translation is 1e-10 m.
         np.testing.assert_allclose(marks_near, marks_far, atol=1e-5)
 
-    known, unknown = small, simulate(tmp_path / "a", photo_gsd_m=0.016, calibrated=False)
+    known, unknown = small, simulate(tmp_path / "a", photo_gsd_m=0.024, calibrated=False)
     camera = cameras_of(known.truth)[0]
     assert known.calibration.patterns == ("*",)
     assert known.calibration.intrinsics[0].fx == camera.fx
@@ -170,7 +170,7 @@ def test_photos_are_the_same_in_any_world(tmp_path: Path, small: SimulateRoom.Ou
     assert unknown.photos.photos[0].intrinsics is None
     assert unknown.photos.photos[0].exif_focal_px == pytest.approx(camera.fx, rel=0.02)
     assert [p.encoded for p in known.photos.photos] == [p.encoded for p in unknown.photos.photos]
-    other = simulate(tmp_path / "b", seed=2, photo_gsd_m=0.016)
+    other = simulate(tmp_path / "b", seed=2, photo_gsd_m=0.024)
     for first, second in zip(cameras_of(small.truth), cameras_of(other.truth), strict=True):
         assert np.linalg.norm(first.centre_world - second.centre_world) > 0.01
 
