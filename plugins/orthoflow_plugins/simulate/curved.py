@@ -163,7 +163,7 @@ class SimulateCurved(Method):
         shots = _shots(building, params.photo_gsd_m, photo_rng)
         known = (Intrinsics.of(shots[0].camera),) if shots else ()
         photos = take_photos(
-            SceneCameras(building.scene, cores=ctx.cores),
+            SceneCameras(building.scene, cores=ctx.cores) if shots else (),
             shots,
             Film(noise_grey=1.5, vignetting=0.1, supersample=2, exposures=0.0),
             ctx,

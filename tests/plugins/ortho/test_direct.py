@@ -335,7 +335,7 @@ CAST = np.array([1.3, 1.0, 0.7])
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[PointCloud, Walls]:
     """Return a simulated room, scanned in colour from two stations, and its largest wall."""
     ctx = context(tmp_path_factory.mktemp("room"))
-    made = run(SimulateRoom, ctx, {}, scan_step_m=0.018, panorama_step_m=0.012)
+    made = run(SimulateRoom, ctx, {}, scan_step_m=0.018, panorama_step_m=0.012, photo_layout="none")
     params = {"gsd_m": 0.02, "n_walls_max": 1}
     return made.cloud, scenes.rastered(made.cloud, made.truth.planes, ctx.scratch, **params)[0]
 

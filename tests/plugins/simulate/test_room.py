@@ -21,7 +21,7 @@ from tests.method_runs import run
 from tests.plane_scenes import cloud_of
 from tests.scene_rays import cast, colours_at
 
-COARSE = {"scan_step_m": 0.06, "panorama_step_m": 0.18}
+COARSE = {"scan_step_m": 0.06, "photo_layout": "none"}
 CLEAN = {**COARSE, "noise_m": 0.0, "outlier_share": 0.0, "beam_m": 0.0, "colour_noise_grey": 0.0}
 
 
