@@ -30,7 +30,7 @@ _CELL_RAD: Final = 0.05
 _MOST_CELLS: Final = 30_000
 _LEAST_CELLS: Final = 8
 # Number of parts of the sums; it is fixed, so that the sums do not depend on the number of threads.
-_PARTS: Final = 4
+_PARTS: Final = 8
 # Maximum distance, in standard deviations, of the points that are summed.
 _SUM_SIGMAS: Final = 5.0
 _LEAST_SUM_M: Final = 0.012

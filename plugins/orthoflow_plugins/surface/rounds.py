@@ -16,7 +16,7 @@ from orthoflow_plugins.surface.kernels import solve_robustly
 # Tukey's constant, in standard deviations.
 TUKEY: Final = 4.685
 # Maximum number of voxels in a fit.
-_MOST_VOXELS: Final = 3_000
+_MOST_VOXELS: Final = 2_000
 
 
 @dataclass(frozen=True, kw_only=True)
