@@ -5,11 +5,11 @@
 Loading takes most of the time of many a command; with `libraries`, all that the built-in methods
 need is loaded as well. Reads orders from stdin, a JSON object per line:
 `arguments`, `folder`, `environment`, `streams`, two files for what is written to stdout and stderr,
-`forgone`, numbers of rights of root that it gives up, and `draws`; answers each with the exit code.
-A command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
-what the interpreter, and the libraries that steps need if they are loaded, read from the
-environment is as it was when the first command was asked for. The servers that steps are forked
-from serve all commands, unless they gave up rights.
+and `forgone`, numbers of rights of root that it gives up; answers each with the exit code.
+A command has its import path, its surroundings and its end as `python -m orthoflow` has them, but
+draws no charts; only what the interpreter, and the libraries that steps need if they are loaded,
+read from the environment is as it was when the first command was asked for. The server that steps
+are forked from serves all commands, unless they gave up rights.
 """
 
 from __future__ import annotations
@@ -53,11 +53,10 @@ def run_command(
     timeout_s: float = 300,
     *,
     forgone: Sequence[int] = (),
-    draws: bool = True,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder, without some of the rights of root, and wait for its end.
 
-    Where it does not draw, its steps keep a dot in the place of each chart.
+    Its steps keep a dot in the place of each chart.
 
     Raises:
         TimeoutExpired: it has not ended; it is killed with the process that it came from.
@@ -71,7 +70,6 @@ def run_command(
             "environment": dict(environment),
             "streams": [*map(str, streams)],
             "forgone": [*forgone],
-            "draws": draws,
         }
         # Without rights of root, also the libraries are loaded as that user loads them.
         server = _server(_framework_path(environment.get("PYTHONPATH", "")), loads=not forgone)
@@ -143,15 +141,15 @@ def _serve() -> None:
     git_commit()
     for name in environment().list_templates(["j2"]):
         environment().get_template(name)
-    servers: dict[bool, ForkServer] = {}
+    server = None
     for line in sys.stdin:
         order = json.loads(line)
-        if _forks_steps(order) and order["draws"] not in servers:
-            servers[order["draws"]] = _step_server(draws=order["draws"])
+        if _forks_steps(order) and server is None:
+            server = _step_server()
         gc.freeze()
         process = os.fork()
         if process == 0:
-            _become(order, servers)
+            _become(order, server)
             # It ends through the interpreter, as any command does.
             orthoflow.cli.main()
         code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
@@ -167,12 +165,12 @@ def _forks_steps(order: dict[str, Any]) -> bool:
     return words[0] in ("run", "replay") and not is_here
 
 
-def _step_server(*, draws: bool) -> ForkServer:
-    """A server of steps, which keep dots in the place of charts where they do not draw."""
+def _step_server() -> ForkServer:
+    """A server of steps, which keep dots in the place of charts."""
     from orthoflow.engine.local import PRELOADED
 
     server, path = ForkServer(), os.environ["PYTHONPATH"]
-    server.set_forkserver_preload([*PRELOADED, *([] if draws else ["tests.keep_dots"])])
+    server.set_forkserver_preload([*PRELOADED, "tests.keep_dots"])
     os.environ.update(PYTHONSAFEPATH="1", PYTHONPATH=os.pathsep.join((path, _TESTS)))
     server.ensure_running()
     os.environ["PYTHONPATH"] = path
@@ -187,7 +185,7 @@ def _share(server: ForkServer) -> None:
     forkserver.connect_to_new_process = server.connect_to_new_process
 
 
-def _become(order: dict[str, Any], servers: Mapping[bool, ForkServer]) -> None:
+def _become(order: dict[str, Any], server: ForkServer | None) -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     out, err = (os.open(path, os.O_WRONLY | os.O_CREAT) for path in order["streams"])
     for descriptor, replaced in ((nothing, 0), (out, 1), (err, 2)):
@@ -195,11 +193,11 @@ def _become(order: dict[str, Any], servers: Mapping[bool, ForkServer]) -> None:
         os.close(descriptor)
     if order["forgone"]:
         _forgo(order["forgone"])
-    elif order["draws"] in servers:
-        _share(servers[order["draws"]])
-    if not order["draws"]:
-        sys.path[0] = _TESTS
-        import tests.keep_dots  # noqa: F401
+    elif server is not None:
+        _share(server)
+    sys.path[0] = _TESTS
+    import tests.keep_dots  # noqa: F401
+
     framework = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     os.environ.clear()
     os.environ.update(order["environment"])

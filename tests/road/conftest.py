@@ -57,12 +57,10 @@ class Shell:
             words += ["--store", str(self.store)]
         return [sys.executable, "-m", "orthoflow", *words]
 
-    def __call__(
-        self, *arguments: object, code: int | None = 0, timeout_s: float = 300, draws: bool = False
-    ) -> Ended:
+    def __call__(self, *arguments: object, code: int | None = 0, timeout_s: float = 300) -> Ended:
         """Run a command, which must end with an exit code unless None is given."""
         words = self.command(*arguments)[3:]
-        done = run_command(self.folder, words, self.variables(), timeout_s, draws=draws)
+        done = run_command(self.folder, words, self.variables(), timeout_s)
         ended = Ended(done.returncode, done.stdout, done.stderr)
         assert code in (None, ended.code), ended.said
         return ended
