@@ -58,7 +58,7 @@ def test_projection_is_opencvs_half_a_pixel_on(seed: int) -> None:
 @pytest.mark.parametrize("seed", seeds(6))
 def test_the_ray_of_a_points_pixel_leads_back_to_the_point(seed: int) -> None:
     viewer = camera(seed)
-    scene = points(seed)
+    scene = np.repeat(points(seed), 200, axis=0)
     seen = viewer.project(scene)
     rays = viewer.rays_world(seen[:, :2])
     expected = scene - viewer.centre_world

@@ -74,12 +74,13 @@ def test_a_mirrored_photo_and_one_of_another_wall_are_placed_nowhere() -> None:
 
 
 CAMERAS = [
-    ms.camera_before(),
-    ms.camera_before(centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
-    ms.camera_before(centre=(1.5, -2.4, 0.9), towards=(1.4, 0.0, 1.1)),
+    replace(each, width=600, height=420, fx=560.0, fy=562.0, cx=303.0, cy=208.0)
+    for each in (
+        ms.camera_before(),
+        ms.camera_before(centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
+        ms.camera_before(centre=(1.5, -2.4, 0.9), towards=(1.4, 0.0, 1.1)),
+    )
 ]
-
-
 NEAR = pytest.approx(0.0, abs=1e-9)
 
 
