@@ -57,7 +57,8 @@ def errors(found: Surface, true: Surface) -> tuple[float, float, float]:
         off = float(np.linalg.norm(found.middle_world - true.middle_world))
         return 0.0, 1000.0 * (found.radius_m - true.radius_m), 1000.0 * off
     axis = true.shape.axis_world
-    turn = math.degrees(math.asin(float(np.linalg.norm(np.cross(found.shape.axis_world, axis)))))
+    sine = float(np.linalg.norm(np.cross(found.shape.axis_world, axis)))
+    turn = math.degrees(math.asin(min(1.0, sine)))
     apart = found.shape.point_world - true.shape.point_world
     apart = apart - float(apart @ axis) * axis
     return turn, 1000.0 * (found.radius_m - true.radius_m), 1000.0 * float(np.linalg.norm(apart))
