@@ -18,8 +18,8 @@ _ROUGH: Final = (0.15, 0.5, 1.5)
 _SMOOTH: Final = (0.1, 0.25, 0.63, 1.8)
 # Shares of the variance of a common error that all photos have in common; the rest differs between
 # photos. Simulated clouds have only errors of positions (1). Of entry-p10 and fountain-p11, a tenth
-# differs: true errors are 0.56 to 1.47 times the stated ones, 0.39 to 1.24 times without this kind,
-# and 0.45 to 1.62 times with shares of 0.8 to 0.95.
+# differs: when this was compared, true errors were 0.56 to 1.47 times the stated ones, 0.39 to 1.24
+# times without this kind, and 0.45 to 1.62 times with shares of 0.8 to 0.95 (now 0.42 to 1.75).
 _OF_ALL_PHOTOS: Final = (1.0, 0.9, 0.0)
 # Ratios of the standard deviation of the common error to that of the independent error. Their prior
 # is uniform on a logarithmic scale and decays exponentially above a ratio of about 10, since the
