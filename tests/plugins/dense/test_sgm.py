@@ -25,7 +25,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
         scan_step_m=0.05,
         panorama_step_m=0.2,
         photo_layout="variant2",
-        photo_gsd_m=0.012,
+        photo_gsd_m=0.008,
         photo_obliquity_deg=3.0,
     )
     ctx = scenes.context(tmp_path_factory.mktemp("room"))
@@ -71,10 +71,10 @@ def test_points_lie_on_the_surface(
         rays = points[(stations == station).all(axis=1)] - station
         off.append(np.abs(views.cast(station, rays).t - 1.0) * np.linalg.norm(rays, axis=1))
     off_m = np.concatenate(off)
-    # With 12 mm pixels and a base of a third of the distance, 0.3 px of disparity are 12 mm.
-    assert np.median(off_m) < 0.012
+    # With 8 mm pixels and a base of a third of the distance, 0.3 px of disparity are 8 mm.
+    assert np.median(off_m) < 0.008
     # The other points are at edges, where one photo shows areas that the other does not show.
-    assert np.mean(off_m < 0.045) > 0.85
+    assert np.mean(off_m < 0.03) > 0.85
 
 
 def test_of_points_in_one_cube_one_is_kept(

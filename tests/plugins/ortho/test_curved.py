@@ -23,15 +23,12 @@ from tests.long_loops import long_only
 from tests.method_runs import run
 from tests.raster_scenes import cell_centres, context, numbers
 
-GSD_M = 0.0125
+GSD_M = 0.01
 BAND: dict[str, Any] = {"band_m": (0.2, 0.5), "height_m": 0.15}
 RING: dict[str, Any] = {"band_m": (3.4, 3.7), "height_m": 0.15}
 # The drum, and cameras: place along the arc in degrees, along the axis, and distance.
 SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
-    "vault": (
-        curved_scenes.vault(half_deg=50.0, length_m=2.0, **BAND),
-        [(0.0, -0.6, 2.5), (30.0, 0.7, 2.4)],
-    ),
+    "vault": (curved_scenes.vault(length_m=2.0, **BAND), [(0.0, -0.6, 2.5), (30.0, 0.7, 2.4)]),
     "tower": (curved_scenes.tower(**BAND), [(0.0, -0.6, 2.5), (60.0, 0.5, 1.6)]),
     "apse": (curved_scenes.tower(is_concave=True, **BAND), [(100.0, 0.3, 1.5)]),
     # The second camera faces the cut of the closed surface.
@@ -40,7 +37,10 @@ SCENES: dict[str, tuple[Drum, list[tuple[float, float, float]]]] = {
         [(0.0, -0.6, 2.0), (175.0, 0.3, 1.5)],
     ),
     "spire": (curved_scenes.spire(**RING), [(0.0, 3.0, 2.5), (60.0, 3.9, 1.6)]),
-    "dome": (curved_scenes.dome(band_m=(0.5, 0.8), height_m=0.1), [(20.0, 0.3, 0.8)]),
+    "dome": (
+        curved_scenes.dome(band_m=(0.5, 0.8), height_m=0.1),
+        [(20.0, 0.3, 0.8)],
+    ),
     "ball": (
         curved_scenes.dome(is_concave=False, band_m=(0.3, 0.6), height_m=0.1),
         [(20.0, 0.3, 2.0), (100.0, 0.9, 2.0)],
@@ -60,7 +60,7 @@ def projected(
     cloud = drum.cloud(0.6 * GSD_M)
     found = {"cloud": cloud, "planes": curved_scenes.NO_PLANES, "surfaces": drum.surfaces()}
     walls = run(RasterGrid, context(folder), found, gsd_m=GSD_M).walls
-    cameras = [curved_scenes.camera(drum, *pose, width=400) for pose in poses]
+    cameras = [curved_scenes.camera(drum, *pose, width=500) for pose in poses]
     inputs = {"walls": walls, "cloud": cloud}
     if method is not PointcloudDirect:
         inputs["photos"] = ortho_scenes.photos(*map(drum.rendered, cameras))
@@ -90,8 +90,7 @@ def test_photos_colour_what_they_see_of_a_curved_surface(name: str, tmp_path: Pa
         cosines = -np.einsum("ij,ij->i", rays, frame.axes_at(cells)[:, 2]) / lengths_m
         mask = layer.mask.ravel()
         is_painted = mask == LayerMask.PAINTED
-        # Such cells are along edges.
-        assert (is_painted & ~is_seen).mean() < 0.05 * GSD_M
+        assert (is_painted & ~is_seen).mean() < 5e-4
         # Cells beside hidden ones are left out.
         assert (is_seen & (cosines > 0.3) & ~is_painted).mean() < 0.035
         assert (is_painted & is_seen).mean() > 0.9 * (is_seen & (cosines > 0.3)).mean() > 0.05
@@ -150,7 +149,7 @@ def test_points_get_the_colours_of_photos(name: str, tmp_path: Path) -> None:
     drum, poses = SCENES[name]
     # The cloud has no points on the sides of the band, through which the back would be seen.
     drum = replace(drum, height_m=0.0)
-    cameras = [curved_scenes.camera(drum, *pose, width=400) for pose in poses]
+    cameras = [curved_scenes.camera(drum, *pose, width=500) for pose in poses]
     inputs = {
         "cloud": drum.cloud(GSD_M),
         "photos": ortho_scenes.photos(*map(drum.rendered, cameras)),
