@@ -1,4 +1,4 @@
-"""Selection of items or raster rows from dataclasses of arrays."""
+"""Selection of items or raster rows from dataclasses of arrays, and sums over groups of rows."""
 
 from __future__ import annotations
 
@@ -30,6 +30,18 @@ class Rows:
         """Concatenate items; fields that are not arrays are copied from the first object."""
         columns = {name: [getattr(part, name) for part in parts] for name in _arrays(parts[0])}
         return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
+
+
+def group_sums(
+    values: NDArray[np.float64], group: NDArray[np.integer], n_groups: int = 0
+) -> NDArray[np.float64]:
+    """Sum the rows of values (n, k) by their group (n,).
+
+    Returns:
+        (g, k) sums, where g is `n_groups`, or more if there are groups with larger numbers.
+    """
+    columns = [np.bincount(group, column, minlength=n_groups) for column in values.T]
+    return np.stack(columns, axis=1)
 
 
 def spread_index(n_items: int, count: int) -> NDArray[np.int64]:

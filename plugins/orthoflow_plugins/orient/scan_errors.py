@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.rows import spread_index
+from orthoflow.geometry.rows import group_sums, spread_index
 
 _MAX_POINTS: Final = 500_000
 # Side of the cubes into which the cloud is divided. It is doubled until most points are in cubes
@@ -118,7 +118,7 @@ def measured_scan_errors(
         if np.median(counts[cube_of]) >= _POINTS_PER_CUBE or len(cubes) == 1:
             break
         side_m *= 2.0
-    means = _sums(cube_of, points) / counts[:, None]
+    means = group_sums(points, cube_of) / counts[:, None]
     cells, cell_of, counts = np.unique(
         cube_of * n_scans + of_point, return_inverse=True, return_counts=True
     )
@@ -143,10 +143,6 @@ def measured_scan_errors(
 def _numbered(points: NDArray[np.float64], side_m: float) -> NDArray[np.int64]:
     cubes = np.floor((points - points.min(axis=0)) / side_m).astype(np.int64)
     return np.asarray(np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1)))
-
-
-def _sums(groups: NDArray[np.intp], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.column_stack([np.bincount(groups, column) for column in values.T])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,16 +185,16 @@ class _Pieces:
         """
         cell_of, cube, scan, counts = cells
         first, second = np.triu_indices(3)
-        means = _sums(cell_of, local) / counts[:, None]
+        means = group_sums(local, cell_of) / counts[:, None]
         squares = np.zeros((len(cube), 3, 3))
-        squares[:, first, second] = _sums(cell_of, local[:, first] * local[:, second])
+        squares[:, first, second] = group_sums(local[:, first] * local[:, second], cell_of)
         squares[:, second, first] = squares[:, first, second]
         squares -= counts[:, None, None] * means[:, :, None] * means[:, None]
         kept = counts >= _LEAST
         n_scans, n_points = np.bincount(cube, kept), np.bincount(cube, kept * (counts - 1.0))
         # A displacement of the scans does not change the scatter within each of them.
-        within = _sums(cube[kept], squares[kept].reshape(-1, 9)).reshape(-1, 3, 3)
-        within = np.pad(within, [(0, len(centres) - len(within)), (0, 0), (0, 0)])
+        within = group_sums(squares[kept].reshape(-1, 9), cube[kept], len(centres))
+        within = within.reshape(-1, 3, 3)
         values, axes = np.linalg.eigh(within / np.maximum(n_points, 1.0)[:, None, None])
         is_surface = (n_scans > 1) & (
             np.sqrt(np.maximum(values[:, 1], 0.0)) > _COVER_SIDES * side_m

@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, basis_from_up
+from orthoflow.geometry.rows import group_sums
 from orthoflow_plugins.plane.kernels import (
     FREE,
     LEVEL,
@@ -469,7 +470,7 @@ def jackknife_covariance(
     """Return the jackknife covariance, leaving out one tile at a time."""
     held = np.bincount(tile) > 0
     n_tiles, size = int(np.count_nonzero(held)), scores.shape[1]
-    sums = np.column_stack([np.bincount(tile, column)[held] for column in scores.T])
+    sums = group_sums(scores, tile)[held]
     parts = np.empty((n_tiles, size, size))
     for i in range(size):
         for j in range(i, size):

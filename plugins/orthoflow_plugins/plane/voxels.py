@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.rows import group_sums
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
@@ -214,7 +215,7 @@ class VoxelTable:
         # In the larger voxel, half steps are twice as long and are counted from its centre.
         moved = _moved(self.sums[member], (2 * odd - 1) * HALF_STEPS)
         moved *= 0.5 ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
-        sums = np.rint(_totals(moved, of_member, len(keys))).astype(np.int64)
+        sums = np.rint(group_sums(moved, of_member, len(keys))).astype(np.int64)
         wider = replace(
             self,
             voxel_m=2.0 * self.voxel_m,
@@ -231,7 +232,7 @@ class VoxelTable:
         unit = 1.0 / (2 * HALF_STEPS)
         moved = _moved(self.sums[held], (2 * self.places[held] + 1) * HALF_STEPS)
         moved *= unit ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
-        return _totals(moved, regions[held], n_regions)
+        return group_sums(moved, regions[held], n_regions)
 
     def centroids(self) -> NDArray[np.float64]:
         """Return centroids (m, 3) of voxels along e1, e2 and up, metres from the origin."""
@@ -267,13 +268,6 @@ def _moved(sums: NDArray[np.int64], shift: NDArray[np.integer[Any]]) -> NDArray[
     for k, (i, j) in enumerate(_PAIRS):
         mixed = away[:, i] * linear[:, j] + away[:, j] * linear[:, i]
         columns.append(sums[:, 4 + k] + mixed + number * away[:, i] * away[:, j])
-    return np.stack(columns, axis=1)
-
-
-def _totals(
-    values: NDArray[np.float64], owner: NDArray[np.int64] | NDArray[np.int32], count: int
-) -> NDArray[np.float64]:
-    columns = [np.bincount(owner, column, minlength=count) for column in values.T]
     return np.stack(columns, axis=1)
 
 

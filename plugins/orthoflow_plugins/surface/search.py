@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from orthoflow.geometry.rows import group_sums
 from orthoflow.geometry.surfaces import zero_direction
 from orthoflow_plugins.surface.kernels import count_votes, near_voxels
 from orthoflow_plugins.surface.rounds import Round, cross, fitted
@@ -545,7 +546,7 @@ def _turning_of_sphere(
     sector = np.unique(columns, axis=0, return_inverse=True)[1].ravel()
     counts = np.bincount(sector)
     x, y = (
-        values - np.column_stack([np.bincount(sector, one) / counts for one in values.T])[sector]
+        values - (group_sums(values, sector) / counts[:, None])[sector]
         for values in (outwards, normals)
     )
     products = np.bincount(sector, (x * y).sum(axis=1))
