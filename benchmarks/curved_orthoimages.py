@@ -6,8 +6,7 @@
 
 For each subject, `simulate.curved` makes a scan (E57, with rows and columns) and photos of which
 only those nearest to the middle of the curved surface are kept. The recipe reads these files, finds
-the surfaces (with `surface.sphere` for `dome`), orients the photos and makes the orthoimages, which
-are compared with the scene. `u`
+the surfaces, orients the photos and makes the orthoimages, which are compared with the scene. `u`
 and `v` are RMS errors on the wall, and `limit` is 0.35 mm plus a tenth of a cell. With
 `--only-curved`, only the curved wall is rasterised; with `--exif`, the calibration is withheld.
 """
@@ -83,11 +82,8 @@ def made(folder: Path, subject: str, options: argparse.Namespace) -> None:
     given = [f"scan={folder / 'scan.e57'}", f"photos={folder / 'photos'}"]
     if not options.exif:
         given.append(f"calibration={folder / 'calibration.yaml'}")
-    recipe = (Path(__file__).parents[1] / "workflows" / RECIPE).read_text(encoding="utf-8")
-    if subject == "dome":
-        recipe = recipe.replace("use: surface.cylinder", "use: surface.sphere")
-    (folder / RECIPE).write_text(recipe, encoding="utf-8")
-    command = [sys.executable, "-m", "orthoflow", "run", str(folder / RECIPE)]
+    recipe = Path(__file__).parents[1] / "workflows" / RECIPE
+    command = [sys.executable, "-m", "orthoflow", "run", str(recipe)]
     command += [word for each in given for word in ("--input", each)]
     command += ["--set", f"wall.gsd_m={options.gsd_m}"]
     if options.only_curved:

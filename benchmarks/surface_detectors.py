@@ -47,8 +47,8 @@ def detected(
     cloud: PointCloud, seed: int = 0, *, form: Form = "cylinder", **params: object
 ) -> Detection:
     known = SurfaceCylinder.Params.model_validate(params)
-    rng = np.random.default_rng(seed)
-    return detect(cloud, None, known, rng, lambda *_: None, form=form, cores=2)
+    ctx = StepContext(rng=np.random.default_rng(seed), cores=2, scratch=Path())
+    return detect(cloud, None, None, known, ctx, form=form)
 
 
 def errors(found: Surface, true: Surface) -> tuple[float, float, float]:

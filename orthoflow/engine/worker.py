@@ -481,7 +481,7 @@ class _Call:
         for port, product in products.items():
             others = {name: other for name, other in products.items() if name != port}
             try:
-                product.check_against(others | given)
+                product.check_against(given | others)
             except ProductError as error:
                 raise MethodError(f"{self.task.who} returns an invalid {port}: {error}") from error
         return products

@@ -99,35 +99,45 @@ def publish_cloud(product: PointCloud, folder: Path, digest: str) -> None:
 
 def publish_planes(product: Planes, folder: Path, digest: str) -> None:
     """Write `planes.json`: the planes in descending order of their numbers of points."""
-    planes: list[JsonValue] = []
-    for index in range(len(product)):
-        omega, phi = omega_phi_deg(product.normal[index], product.up)
-        entry: dict[str, JsonValue] = {
-            "normal": numbers(product.normal[index]),
-            "offset_m": float(product.offset[index]),
-            "corners_world": numbers(product.corners[index]),
-            "n_points": int(product.n_points[index]),
-            "rms_mm": number(1000.0 * float(product.rms_m[index])),
-            "sigma_angle_deg": product.sigma_angle_deg(index),
-            "sigma_offset_mm": 1000.0 * product.sigma_offset_m(index),
-            "label": product.names[index],
-            "omega_deg": omega,
-            "phi_deg": phi,
-            "viewpoint": product.viewpoint,
-            "side_from": product.side_source(index),
-        }
-        if product.part_corners is not None and product.part_plane is not None:
-            entry["part_corners_world"] = numbers(product.part_corners[product.part_plane == index])
-        planes.append(entry)
     write_json(
         folder / "planes.json",
-        {"planes": planes, "up": numbers(product.up), "product_digest": digest},
+        {
+            "planes": [_plane_json(product, index) for index in range(len(product))],
+            "up": numbers(product.up),
+            "product_digest": digest,
+        },
     )
 
 
+def _plane_json(product: Planes, index: int) -> dict[str, JsonValue]:
+    omega, phi = omega_phi_deg(product.normal[index], product.up)
+    entry: dict[str, JsonValue] = {
+        "normal": numbers(product.normal[index]),
+        "offset_m": float(product.offset[index]),
+        "corners_world": numbers(product.corners[index]),
+        "n_points": int(product.n_points[index]),
+        "rms_mm": number(1000.0 * float(product.rms_m[index])),
+        "sigma_angle_deg": product.sigma_angle_deg(index),
+        "sigma_offset_mm": 1000.0 * product.sigma_offset_m(index),
+        "label": product.names[index],
+        "omega_deg": omega,
+        "phi_deg": phi,
+        "viewpoint": product.viewpoint,
+        "side_from": product.side_source(index),
+    }
+    if product.part_corners is not None and product.part_plane is not None:
+        entry["part_corners_world"] = numbers(product.part_corners[product.part_plane == index])
+    return entry
+
+
 def publish_surfaces(product: Surfaces, folder: Path, digest: str) -> None:
-    """Write `surfaces.json`: curved surfaces in descending order of their numbers of points."""
+    """Write `surfaces.json`: the planes, if included, and the curved surfaces."""
     surfaces: list[JsonValue] = []
+    if product.planes is not None:
+        surfaces += [
+            {"chart": "plane", **_plane_json(product.planes, index)}
+            for index in range(product.n_planes)
+        ]
     for surface in product.surfaces:
         shape = surface.shape
         entry: dict[str, JsonValue] = {

@@ -19,7 +19,6 @@ from orthoflow.products.photographs import (
 )
 from orthoflow.products.planes import (
     Planes,
-    PointLabels,
     ScanRow,
     SideSource,
     Spread,
@@ -27,7 +26,7 @@ from orthoflow.products.planes import (
     plane_name,
 )
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
-from orthoflow.products.surfaces import Surface, SurfaceKind, Surfaces, surface_kind
+from orthoflow.products.surfaces import PointLabels, Surface, SurfaceKind, Surfaces, surface_kind
 from orthoflow.products.walls import (
     PAINTED_STATES,
     SHOWN_STATES,

@@ -1,4 +1,4 @@
-"""Planes found in a cloud, and the plane of each point."""
+"""Planes found in a cloud."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
-from orthoflow.products.surfaces import Surfaces
 
 SideSource = Literal["stations", "photos", "guess", "given"]
 # Kind of a plane, which is the first part of its name. Planes of the kinds `level` and `slope` are
@@ -263,46 +262,3 @@ class Planes(Product):
         """
         at_middle = np.append(self.corners[index].mean(axis=0), -1.0)
         return math.sqrt(max(0.0, float(at_middle @ self.covariance[index] @ at_middle)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PointLabels(Product):
-    """The plane or curved surface of each point of a cloud.
-
-    Attributes:
-        plane_index: (n,) int16 index in the `Planes` or the `Surfaces` of the same step; -1 if the
-            point is on none of them.
-    """
-
-    type_name: ClassVar[str] = "labels"
-    mapped: ClassVar[bool] = True
-    embedded: ClassVar[bool] = False
-
-    plane_index: NDArray[np.int16]
-
-    def __post_init__(self) -> None:
-        if self.plane_index.ndim != 1 or self.plane_index.dtype != np.int16:
-            raise ProductError(
-                "labels.plane_index must be a one-dimensional int16 array, got "
-                f"{self.plane_index.dtype} of shape {self.plane_index.shape}"
-            )
-
-    def check_against(self, others: Mapping[str, Product]) -> None:
-        """See `Product.check_against`.
-
-        Raises:
-            ProductError: the labels do not match the points or the planes.
-        """
-        for product in others.values():
-            if isinstance(product, PointCloud) and len(product) != len(self.plane_index):
-                raise ProductError(
-                    f"labels.plane_index must have one label for each of {len(product)} points, "
-                    f"got {len(self.plane_index)}"
-                )
-            if isinstance(product, Planes | Surfaces) and self.plane_index.size:
-                low, high = int(self.plane_index.min()), int(self.plane_index.max())
-                if low < -1 or high >= len(product):
-                    raise ProductError(
-                        f"labels.plane_index must be -1 or the index of one of {len(product)} "
-                        f"{product.type_name} (from 0), got {low if low < -1 else high}"
-                    )

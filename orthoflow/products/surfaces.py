@@ -1,4 +1,4 @@
-"""Curved surfaces found in a cloud."""
+"""Surfaces found in a cloud, and the surface of each point."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import ProductError
 from orthoflow.geometry.surfaces import Cone, CurvedShape, Cylinder, Sphere
 from orthoflow.products.cloud import PointCloud
+from orthoflow.products.planes import Planes
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
 # Kind of a surface, which is the first part of its name.
@@ -124,39 +125,42 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Surfaces(Product):
-    """Curved surfaces of a scene, in descending order of their numbers of points.
+    """Surfaces of a scene: planes, if included, and curved surfaces.
+
+    The index of a curved surface is its place in `surfaces` plus the number of planes.
 
     Attributes:
-        surfaces: the surfaces.
+        surfaces: the curved surfaces, those of the first detector first. Those of one detector are
+            in descending order of their numbers of points.
         up: (3,) float64 unit vector of the cloud.
+        planes: the planes, or None if they are not included.
         details: further results as JSON, intended only for users.
     """
 
     type_name: ClassVar[str] = "surfaces"
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        **Planes.tolerances,
         "point_world": Tolerance(limit=1e-4, unit="m"),
         "apex_world": Tolerance(limit=1e-3, unit="m"),
         "centre_world": Tolerance(limit=1e-4, unit="m"),
         "axis_world": Tolerance(limit=1e-6, unit="1"),
         "zero_world": Tolerance(limit=1e-6, unit="1"),
-        "covariance": Tolerance(limit=1e-6, unit="1"),
         "radius_m": Tolerance(limit=1e-5, unit="m"),
         "half_angle_rad": Tolerance(limit=1e-6, unit="1"),
         "along_m": Tolerance(limit=1e-3, unit="m"),
         "arc_rad": Tolerance(limit=1e-3, unit="1"),
-        "rms_m": Tolerance(limit=1e-5, unit="m"),
-        "n_points": Tolerance(limit=10, unit="1"),
     }
 
     surfaces: tuple[Surface, ...]
     up: NDArray[np.float64]
+    planes: Planes | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.up.shape != (3,) or not np.isfinite(self.up).all():
             raise ProductError(f"surfaces.up must be finite and of shape (3,), got {self.up!r}")
         for index, surface in enumerate(self.surfaces):
-            if not surface.name.endswith(f" {index}"):
+            if not surface.name.endswith(f" {self.n_planes + index}"):
                 raise ProductError(
                     f"surfaces[{index}].name must end in its index, got {surface.name!r}"
                 )
@@ -166,8 +170,13 @@ class Surfaces(Product):
                     f"{surface.covariance.shape} and {surface.zero_world.shape}"
                 )
 
+    @property
+    def n_planes(self) -> int:
+        """Number of included planes."""
+        return 0 if self.planes is None else len(self.planes)
+
     def __len__(self) -> int:
-        return len(self.surfaces)
+        return self.n_planes + len(self.surfaces)
 
     def check_against(self, others: Mapping[str, Product]) -> None:
         """See `Product.check_against`.
@@ -176,6 +185,8 @@ class Surfaces(Product):
             ProductError: a covariance, direction, range, number of points or RMS distance is
                 invalid.
         """
+        if self.planes is not None:
+            self.planes.check_against(others)
         n_all = [len(other) for other in others.values() if isinstance(other, PointCloud)]
         for index, surface in enumerate(self.surfaces):
             start, end = surface.arc_rad
@@ -205,3 +216,46 @@ class Surfaces(Product):
             for rule, is_kept in rules.items():
                 if not is_kept:
                     raise ProductError(f"surfaces[{index}].{rule}, got {surface!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointLabels(Product):
+    """The plane or curved surface of each point of a cloud.
+
+    Attributes:
+        plane_index: (n,) int16 index in the `Planes` or the `Surfaces` of the same step; -1 if the
+            point is on none of them. In `Surfaces`, planes come first.
+    """
+
+    type_name: ClassVar[str] = "labels"
+    mapped: ClassVar[bool] = True
+    embedded: ClassVar[bool] = False
+
+    plane_index: NDArray[np.int16]
+
+    def __post_init__(self) -> None:
+        if self.plane_index.ndim != 1 or self.plane_index.dtype != np.int16:
+            raise ProductError(
+                "labels.plane_index must be a one-dimensional int16 array, got "
+                f"{self.plane_index.dtype} of shape {self.plane_index.shape}"
+            )
+
+    def check_against(self, others: Mapping[str, Product]) -> None:
+        """See `Product.check_against`.
+
+        Raises:
+            ProductError: the labels do not match the points or the planes.
+        """
+        for product in others.values():
+            if isinstance(product, PointCloud) and len(product) != len(self.plane_index):
+                raise ProductError(
+                    f"labels.plane_index must have one label for each of {len(product)} points, "
+                    f"got {len(self.plane_index)}"
+                )
+            if isinstance(product, Planes | Surfaces) and self.plane_index.size:
+                low, high = int(self.plane_index.min()), int(self.plane_index.max())
+                if low < -1 or high >= len(product):
+                    raise ProductError(
+                        f"labels.plane_index must be -1 or the index of one of {len(product)} "
+                        f"{product.type_name} (from 0), got {low if low < -1 else high}"
+                    )

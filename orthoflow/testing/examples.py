@@ -31,8 +31,9 @@ def example_inputs(
 ) -> dict[str, Product | InputFiles]:
     """Return the required inputs of a method, all from one scene: a photographed wall or a room.
 
-    The ground truth of the room is included if the method has a port for it. Products of types that
-    neither scene contains are created by an installed method that outputs them.
+    The ground truth and the planes of the room are included if the method has ports for them.
+    Products of types that neither scene contains are created by an installed method that outputs
+    them.
 
     Args:
         method: class of the method.
@@ -48,7 +49,7 @@ def example_inputs(
     scene = PHOTOGRAPHED if is_photographed else SURVEYED
     found: dict[str, Product | InputFiles] = {}
     for name, port in ports.items():
-        is_known = port.type_name == "truth" and not is_photographed
+        is_known = port.type_name in {"truth", "planes"} and not is_photographed
         if name not in besides and (port.required or is_known):
             make = scene.get(port.type_name)
             found[name] = make() if make else example(port.type_name, within=within)

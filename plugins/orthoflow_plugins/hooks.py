@@ -19,8 +19,8 @@ _METHODS: Final = {
     "their wall",
     "simulate.room:SimulateRoom": "a simulated room, scanned and photographed, with its true "
     "geometry",
-    "simulate.curved:SimulateCurved": "a simulated vault, apse, tower, column or spire, scanned "
-    "and photographed, with its true geometry",
+    "simulate.curved:SimulateCurved": "a simulated vault, apse, tower, column, spire, dome or "
+    "baptistery, scanned and photographed, with its true geometry",
     "register.similarity:RegisterSimilarity": "translation, rotation and scale from pairs of "
     "points, with sigma0 and residuals",
     "plane.hough2d:Hough2d": "Hough transform of the plan, with cells weighted by number of points",
@@ -34,6 +34,7 @@ _METHODS: Final = {
     "comparison",
     "plane.comparators:Open3dPatches": "open3d's detect_planar_patches, for comparison",
     "plane.given:GivenPlane": "a reference plane given by the user",
+    "surface.planes:SurfacePlanes": "planes as the first surfaces, to which curved ones are added",
     "surface.cylinder:SurfaceCylinder": "vaults, apses, towers and columns, from pairs of normals",
     "surface.cone:SurfaceCone": "spires and tapering towers, by the same search",
     "surface.sphere:SurfaceSphere": "domes and semi-domes, by the same search",
@@ -99,8 +100,8 @@ def orthoflow_kinds() -> list[KindSpec]:
         ),
         KindSpec(
             name="surface",
-            summary="find curved walls: vaults, apses, towers, columns",
-            inputs=_ports("cloud labels"),
+            summary="find curved walls: vaults, apses, towers, columns, domes, spires",
+            inputs=_ports("cloud planes labels surfaces"),
             outputs=_ports("surfaces labels"),
         ),
         KindSpec(
@@ -192,11 +193,11 @@ def orthoflow_products() -> list[ProductSpec]:
             "planes with rectangles and covariances",
             publisher="publishing",
         ),
-        _product("labels", "planes:PointLabels", "the plane of each point"),
+        _product("labels", "surfaces:PointLabels", "the plane or surface of each point"),
         _product(
             "surfaces",
             "surfaces:Surfaces",
-            "cylinders and cones with their extents and covariances",
+            "planes, cylinders, cones and spheres with their extents and covariances",
             publisher="publishing",
         ),
         _product(

@@ -26,6 +26,7 @@ from orthoflow.products import (
     Layers,
     Orthoimages,
     Planes,
+    Surfaces,
     TieRole,
     Ties,
 )
@@ -185,6 +186,11 @@ def test_planes_are_told_completely(tmp_path: Path, snapshot: SnapshotAssertion)
     assert first.pop("sigma_offset_mm") == pytest.approx(np.sqrt(26.0), rel=1e-12)
     assert first.pop("sigma_angle_deg") == pytest.approx(np.degrees(2e-3), rel=1e-12)
     assert document == snapshot
+    with_planes = Surfaces(surfaces=(), up=UP, planes=product)
+    publishing.publish_surfaces(with_planes, tmp_path, DIGEST)
+    planes = json_of(tmp_path / "planes.json")["planes"]
+    listed = json_of(tmp_path / "surfaces.json")["surfaces"]
+    assert listed == [{"chart": "plane", **plane} for plane in planes]
     without = replace(product, part_corners=None, part_plane=None)
     publishing.publish_planes(without, tmp_path, DIGEST)
     assert "part_corners_world" not in (tmp_path / "planes.json").read_text()

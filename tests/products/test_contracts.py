@@ -121,6 +121,8 @@ def test_impossible_surfaces_are_refused(rule: str, changed: dict[str, Any]) -> 
     labels(-1, 0, 1, -1).check_against({"surfaces": surfaces})
     with pytest.raises(ProductError, match=r"labels\.plane_index.*2 surfaces.*got 2"):
         labels(-1, 0, 2, -1).check_against({"surfaces": surfaces})
+    with pytest.raises(ProductError, match=r"surfaces\[0\]\.name must end in its index"):
+        replace(surfaces, planes=PLANES)
     wrong = replace(surfaces.surfaces[0], **changed)
     with pytest.raises(ProductError, match=rf"surfaces\[0\]\.{rule}"):
         replace(surfaces, surfaces=(wrong, *surfaces.surfaces[1:])).check_against(OTHERS)

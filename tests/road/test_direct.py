@@ -57,7 +57,7 @@ def test_layers_are_written_when_asked_for(road: Shell) -> None:
 def test_the_record_verifies_and_a_second_run_comes_from_the_cache(road: Shell) -> None:
     road("verify", "run")
     again = road("run", "direct.yaml", *SMALL_WALL, "-o", "again")
-    assert "7 of 7 steps cached" in again.out
+    assert "10 of 10 steps cached" in again.out
     run = orthoflow.open_run(road.folder / "run")
     cells = {"cloud", "room", "survey", "plane", "curved", "wall", "ortho", "mosaic", "points"}
     assert set(run.cells) == {*cells, "check"}

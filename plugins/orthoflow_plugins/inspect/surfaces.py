@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from orthoflow.geometry import Sphere, angle_between_deg
+from orthoflow.geometry import Cone, Sphere, angle_between_deg
 from orthoflow.geometry.surfaces import along_and_across
 from orthoflow.products import Finding, Inspection, Surface, Surfaces, Truth
 from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
@@ -119,10 +119,15 @@ def _errors(found: Surface, true: Surface) -> tuple[float, float, float]:
     if isinstance(true.shape, Sphere):
         # The axis of a sphere only states which part of it was found.
         angle_deg, across = 0.0, middle - true.middle_world
+    radius_m = true.radius_m
+    if isinstance(true.shape, Cone):
+        # The extents may differ, so the radii are compared at the same place.
+        along_m = float((middle - true.shape.apex_world) @ axis)
+        radius_m = along_m * math.tan(true.shape.half_angle_rad)
     return (
         min(angle_deg, 180.0 - angle_deg),
         1000.0 * float(np.linalg.norm(across)),
-        1000.0 * abs(found.radius_m - true.radius_m),
+        1000.0 * abs(found.radius_m - radius_m),
     )
 
 

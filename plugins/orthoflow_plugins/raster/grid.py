@@ -127,10 +127,10 @@ class RasterGrid(Method):
     Params = RasterParams
 
     class In(Ports):
-        """The cloud, its planes, and its curved surfaces."""
+        """The cloud, and its planes, which may be included in its surfaces."""
 
         cloud: PointCloud
-        planes: Planes
+        planes: Planes | None = None
         surfaces: Surfaces | None = None
 
     class Out(Ports):
@@ -142,7 +142,7 @@ class RasterGrid(Method):
         """Rasterise the selected planes."""
         from orthoflow.geometry.cloud_quality import scan_step_m
 
-        cloud, planes = inputs.cloud, inputs.planes
+        cloud, planes = inputs.cloud, _planes_of(inputs)
         cloud.require_points(3)
         points = sampled(cloud)
         curved = CurvedWalls(inputs.surfaces, planes, params)
@@ -215,6 +215,26 @@ class RasterGrid(Method):
                 details={"surface": params.surface or "median", "scan_step_m": [*steps_m]},
             )
         )
+
+
+def _planes_of(inputs: RasterGrid.In) -> Planes:
+    """Return the planes, given either separately or with the surfaces.
+
+    Raises:
+        MethodError: there are none, or they are given twice.
+    """
+    included = None if inputs.surfaces is None else inputs.surfaces.planes
+    if inputs.planes is not None and included is not None:
+        raise MethodError(
+            "the planes are given twice, in planes and in surfaces: remove planes from the inputs"
+        )
+    planes = included if inputs.planes is None else inputs.planes
+    if planes is None:
+        raise MethodError(
+            "planes are needed: connect planes to the output of a plane.* step, or surfaces to a "
+            "chain of steps that begins with surface.planes"
+        )
+    return planes
 
 
 def _extents(

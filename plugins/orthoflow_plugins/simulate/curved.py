@@ -51,9 +51,9 @@ class SimulateCurved(Method):
     """Scan and photograph a building with curved walls and random dimensions.
 
     The building is a barrel vault, a cross vault, an apse, a round tower seen from outside, a
-    column of which half is hidden, a conical spire, or a dome over an octagon. It has furniture,
-    mouldings and painted textures. Errors of the scanner and the photos are those of
-    `simulate.room`.
+    column of which half is hidden, a conical spire, a dome over an octagon, or a baptistery: a dome
+    over columns and a font with a conical cover. It has furniture, mouldings and painted textures.
+    Errors of the scanner and the photos are those of `simulate.room`.
     """
 
     id: ClassVar[str] = "simulate.curved"

@@ -1,4 +1,4 @@
-"""Simulated buildings with curved walls: vaults, apse, tower, column, spire and dome.
+"""Simulated buildings with curved walls: vaults, apse, tower, column, spire, dome, baptistery.
 
 All dimensions are random. Coordinates in the frame of a building are in metres, with z upwards and
 the origin at eye level.
@@ -31,7 +31,9 @@ from orthoflow_plugins.simulate.building import (
     wall_side,
 )
 
-Subject = Literal["barrel-vault", "cross-vault", "apse", "tower", "column", "spire", "dome"]
+Subject = Literal[
+    "barrel-vault", "cross-vault", "apse", "tower", "column", "spire", "dome", "baptistery"
+]
 
 FLOOR_M: Final = -1.6
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -617,10 +619,13 @@ def _spire(
 
 
 def _dome(
-    draft: SceneDraft, rng: np.random.Generator, relief: float
+    draft: SceneDraft,
+    rng: np.random.Generator,
+    relief: float,
+    radii_m: tuple[float, float] = (2.0, 3.0),
 ) -> tuple[list[_Bend], NDArray[np.float64]]:
     """Build a hemisphere over eight walls, whose edges meet its rim."""
-    radius_m, spring_m = rng.uniform(2.0, 3.0), rng.uniform(0.4, 1.0)
+    radius_m, spring_m = rng.uniform(*radii_m), rng.uniform(0.4, 1.0)
     shape = Sphere(centre_world=spring_m * _UP, radius_m=radius_m, is_concave=True)
     dome, turn_m = _Dome(draft=draft, shape=shape, zero=_UP), math.pi * radius_m
     dome.place((-turn_m, turn_m, 0.0, 0.51 * turn_m), 0.0, _FRESCO, SurfaceRole.WALL)
@@ -640,6 +645,35 @@ def _dome(
     return [dome], rng.uniform(-0.2, 0.2, (2, 3)) + np.array([[-0.6, 0.4, 0.0], [0.6, 0.2, 0.0]])
 
 
+def _baptistery(
+    draft: SceneDraft, rng: np.random.Generator, relief: float
+) -> tuple[list[_Bend], NDArray[np.float64]]:
+    """Build a dome, two columns and a font with a conical cover below it."""
+    bends, _ = _dome(draft, rng, relief, (5.0, 6.0))
+    zero = np.array([1.0, 0.0, 0.0])
+    for x, y in rng.uniform(-0.1, 0.1, (2, 2)) + np.array([[-1.1, -0.7], [1.1, -0.7]]):
+        shape = Cylinder(
+            point_world=np.array([x, y, 0.0]),
+            axis_world=_UP,
+            radius_m=rng.uniform(0.2, 0.3),
+            is_concave=False,
+        )
+        column, turn_m = _Bend(draft=draft, shape=shape, zero=zero), math.pi * shape.radius_m
+        column.place((-turn_m, turn_m, FLOOR_M, 0.9), 0.0, _FRESCO, SurfaceRole.WALL)
+        bends.append(column)
+    base = np.array([*rng.uniform((-0.1, 0.9), (0.1, 1.1)), FLOOR_M])
+    add_block(draft, base=base, yaw_deg=20.0, size_m=(1.4, 1.4, 0.9), paint=_STONE)
+    half_rad, base_m = math.radians(rng.uniform(18.0, 25.0)), rng.uniform(0.5, 0.65)
+    slant_m = base_m / math.sin(half_rad)
+    apex = base + (0.9 + slant_m * math.cos(half_rad)) * _UP
+    cone = Cone(apex_world=apex, axis_world=-_UP, half_angle_rad=half_rad, is_concave=False)
+    cover = _Bend(draft=draft, shape=cone, zero=zero, slant_m=0.55 * slant_m)
+    turn_m, reach_m = math.pi * cover.radius_m, 0.45 * slant_m
+    cover.place((-turn_m, turn_m, -reach_m, reach_m), 0.0, _FRESCO, SurfaceRole.WALL)
+    around = np.array([[-2.2, 0.4, 0.0], [2.2, 0.2, 0.0], [0.3, 3.2, 0.0]])
+    return [*bends, cover], rng.uniform(-0.2, 0.2, (3, 3)) + around
+
+
 _BUILDERS: Final = {
     "barrel-vault": _barrel_vault,
     "cross-vault": _cross_vault,
@@ -648,4 +682,5 @@ _BUILDERS: Final = {
     "column": _column,
     "spire": _spire,
     "dome": _dome,
+    "baptistery": _baptistery,
 }

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Cone, Cylinder
-from orthoflow.products import PointCloud, Surface, surface_kind
+from orthoflow.errors import MethodError
+from orthoflow.geometry import Cone, Cylinder, Sphere
+from orthoflow.geometry.surfaces import zero_direction
+from orthoflow.products import PointCloud, Surface, Surfaces, surface_kind
+from orthoflow.sdk import StepContext
 from orthoflow_plugins.surface.fit import CYLINDER_SLOPE, fit_all
 from orthoflow_plugins.surface.parameters import DetectorParams
+from orthoflow_plugins.surface.rounds import Round
 from orthoflow_plugins.surface.search import (
     MOST_RADIUS,
     Form,
@@ -44,6 +47,8 @@ _LARGEST_SHIFT: Final = 1.0
 # deviations of the curvature along the arc (97.5 %, one-sided).
 _CURVED_SIGMAS: Final = 1.96
 _OUTSIDE_RAD: Final = math.radians(200.0)
+# Number of parts into which the circle around an earlier surface is divided.
+_OPEN_CELLS: Final = 360
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +56,11 @@ class Detection:
     """The result of a detection.
 
     Attributes:
-        surfaces: the surfaces, in descending order of their numbers of points.
+        surfaces: the new surfaces, in descending order of their numbers of points.
         accepted: the surfaces as found among voxels, in the same order, with the values of
             all tests.
-        labels: (n,) int16 index of the surface of each point; -1 for none.
+        labels: (n,) int16 index of the surface of each point, counted from the first of the earlier
+            ones; -1 for none.
         plane_tests: tests of the given planes.
         rejected: hypotheses that failed the tests.
         noise_m: standard deviation of the points, normal to the surfaces.
@@ -73,30 +79,36 @@ class Detection:
 def detect(
     cloud: PointCloud,
     plane_index: NDArray[np.int16] | None,
+    earlier: Surfaces | None,
     params: DetectorParams,
-    rng: np.random.Generator,
-    progress: Callable[[float, str], None],
+    ctx: StepContext,
     *,
     form: Form,
-    cores: int,
 ) -> Detection:
     """Detect the curved surfaces of a cloud.
 
     Args:
         cloud: the cloud.
-        plane_index: (n,) index of the plane of each point, -1 for none; or None without planes.
+        plane_index: (n,) index of the plane or earlier surface of each point, -1 for none; or None
+            if unknown.
+        earlier: surfaces that were found before; None if `plane_index` counts planes only.
         params: parameters of the search.
-        rng: random generator for pairs of voxels.
-        progress: receives the completed share of the work, and a text.
+        ctx: context of the step.
         form: the form of the surfaces.
-        cores: number of threads.
+
+    Raises:
+        MethodError: `plane_index` contains the index of a surface that is not in `earlier`.
     """
-    progress(0.0, "sample")
-    sample = draw_sample(cloud, plane_index, cores=cores)
+    ctx.progress(0.0, "sample")
+    is_oriented = cloud.stations is not None and len(cloud.stations) > 0
+    known = _known(earlier, plane_index, cloud, is_oriented=is_oriented)
+    sample = draw_sample(cloud, plane_index, cores=ctx.cores)
     tests = [] if plane_index is None else tested_planes(sample)
+    if earlier is not None:
+        tests = [test for test in tests if test.index < earlier.n_planes]
     flat = [test.index for test in tests if not test.is_strip]
     searched = sample.take(~np.isin(sample.label, flat)) if flat else sample
-    levels, noise_m = _levels(searched, cloud, params, cores=cores)
+    levels, noise_m = _levels(searched, cloud, params, cores=ctx.cores)
     limits = Limits(
         tolerance_m=max(params.tolerance_m, 3.0 * noise_m),
         noise_m=noise_m,
@@ -106,24 +118,19 @@ def detect(
         form=form,
     )
     is_cone = form == "cone"
-    is_oriented = cloud.stations is not None and len(cloud.stations) > 0
-    found, rejected = search(levels, limits, cloud.up, rng, progress, is_oriented=is_oriented)
+    found, rejected = search(
+        levels, limits, cloud.up, ctx.rng, ctx.progress, is_oriented=is_oriented, earlier=known
+    )
     found = [with_bridged_gaps(item, _BRIDGED_RAD) for item in found[: params.max_surfaces]]
-    progress(0.8, "fitting surfaces")
-    planes = None
-    if plane_index is not None and tests:
-        planes = np.full((int(plane_index.max(initial=-1)) + 1, 4), np.nan)
-        for test in tests:
-            if not test.is_strip:
-                planes[test.index] = np.append(test.normal, test.offset_m)
+    ctx.progress(0.8, "fitting surfaces")
     fitted, labels = fit_all(
-        found,
+        [*found, *known],
         cloud,
-        None if plane_index is None or planes is None else (plane_index, planes),
-        [limits.tolerance_at(item.round.radius_m) for item in found],
+        None if plane_index is None else (plane_index, _rows_of(tests, plane_index)),
+        [limits.tolerance_at(item.round.radius_m) for item in (*found, *known)],
         noise_m,
         is_cone=is_cone,
-        cores=cores,
+        cores=ctx.cores,
     )
     counts = np.array([item.surface.n_points for item in fitted], dtype=np.int64)
     kept: dict[int, Found] = {}
@@ -151,19 +158,85 @@ def detect(
             rejected.append(Rejected(reason="rough", evidence=evidence))
         else:
             kept[index] = replace(found[index], evidence=evidence)
-    rank = np.full(len(found) + 1, -1, dtype=np.int16)
-    rank[list(kept)] = np.arange(len(kept))
+    n_before = 0 if earlier is None else len(earlier)
+    rank = np.full(len(found) + len(known) + 1, -1, dtype=np.int16)
+    rank[list(kept)] = n_before + np.arange(len(kept))
+    rank[len(found) : -1] = n_before + np.arange(-len(known), 0)
+    labels = rank[labels]
+    if earlier is not None and plane_index is not None:
+        labels = np.where(labels < 0, plane_index, labels)
     return Detection(
         surfaces=tuple(
-            _named(fitted[index].surface, place, cloud.up, is_oriented=is_oriented)
+            _named(fitted[index].surface, n_before + place, cloud.up, is_oriented=is_oriented)
             for place, index in enumerate(kept)
         ),
         accepted=tuple(kept.values()),
-        labels=rank[labels] if len(kept) < len(found) or list(kept) != sorted(kept) else labels,
+        labels=labels,
         plane_tests=tests,
         rejected=rejected,
         noise_m=noise_m,
         voxel_m=levels[-1].size_m if levels else 0.0,
+    )
+
+
+def _rows_of(tests: list[PlaneTest], plane_index: NDArray[np.int16]) -> NDArray[np.float64]:
+    """Return normal and offset (k, 4) of each plane; NaN for strips and earlier surfaces."""
+    rows = np.full((int(plane_index.max(initial=-1)) + 1, 4), np.nan)
+    for test in tests:
+        if not test.is_strip:
+            rows[test.index] = np.append(test.normal, test.offset_m)
+    return rows
+
+
+def _known(
+    earlier: Surfaces | None,
+    plane_index: NDArray[np.int16] | None,
+    cloud: PointCloud,
+    *,
+    is_oriented: bool,
+) -> list[Found]:
+    if earlier is None:
+        return []
+    last = -1 if plane_index is None else int(plane_index.max(initial=-1))
+    if last >= len(earlier):
+        raise MethodError(
+            f"the labels contain surface {last}, but there are only {len(earlier)} surfaces: "
+            "connect labels and surfaces to the same step, which for planes is surface.planes"
+        )
+    return [_as_found(item, cloud, is_oriented=is_oriented) for item in earlier.surfaces]
+
+
+def _as_found(surface: Surface, cloud: PointCloud, *, is_oriented: bool) -> Found:
+    """Return an earlier surface as if it had been found among voxels now."""
+    shape, zero = surface.shape, surface.zero_world
+    low_m, high_m = surface.along_m
+    slope = middle_m = 0.0
+    if isinstance(shape, Cone):
+        slope, middle_m = math.tan(shape.half_angle_rad), 0.5 * (low_m + high_m)
+        low_m, high_m = low_m - middle_m, high_m - middle_m
+    is_sphere = isinstance(shape, Sphere)
+    if is_sphere:
+        zero = zero_direction(surface.axis_world, cloud.up)
+        low_m, high_m = (
+            surface.radius_m * math.cos(it / surface.radius_m) for it in (high_m, low_m)
+        )
+    start = shape.point_world if isinstance(shape, Cylinder) else surface.middle_world
+    angles = (np.arange(_OPEN_CELLS) + 0.5) * math.tau / _OPEN_CELLS - math.pi
+    turned = (angles - surface.arc_rad[0]) % math.tau
+    return Found(
+        round=Round(
+            point=start - cloud.origin,
+            axis=surface.axis_world,
+            radius_m=surface.radius_m,
+            slope=slope,
+            is_sphere=is_sphere,
+        ),
+        zero=zero,
+        side=(1.0 if shape.is_concave else -1.0) * is_oriented,
+        is_open=is_sphere | (turned < surface.arc_rad[1] - surface.arc_rad[0]),
+        along_m=(low_m, high_m),
+        evidence={"scatter_mm": 1000.0 * surface.rms_m},
+        is_earlier=True,
     )
 
 

@@ -6,8 +6,6 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, ClassVar, Final
 
-import numpy as np
-
 from orthoflow.products import PointCloud, PointLabels, Surfaces
 from orthoflow.sdk import (
     Determinism,
@@ -56,14 +54,18 @@ SIDE_GUESSED: Final = DiagnosticSpec(
 
 
 class DetectorIn(Ports):
-    """The cloud and, if known, the planes of its points."""
+    """The cloud, the labels of its points, and the earlier surfaces, to which others are added.
+
+    Without earlier surfaces, labels are those of planes.
+    """
 
     cloud: PointCloud
     labels: PointLabels | None = None
+    surfaces: Surfaces | None = None
 
 
 class DetectorOut(Ports):
-    """The surfaces, and the surface of each point."""
+    """All surfaces, and the surface of each point."""
 
     surfaces: Surfaces
     labels: PointLabels
@@ -72,7 +74,7 @@ class DetectorOut(Ports):
 class Detector(Method):
     """Base class of the detectors of curved surfaces."""
 
-    result_version = 6
+    result_version = 7
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = (
         MetricSpec("n_surfaces", label="curved surfaces found"),
@@ -108,22 +110,22 @@ class Detector(Method):
         cloud = inputs.cloud
         cloud.require_points(3)
         start_s, start_cpu_s = ctx.clock_s(), ctx.processor_s()
-        plane_index = None if inputs.labels is None else inputs.labels.plane_index
         found = detect(
             cloud,
-            plane_index,
+            None if inputs.labels is None else inputs.labels.plane_index,
+            inputs.surfaces,
             params,
-            ctx.rng,
-            ctx.progress,
+            ctx,
             form=self.form,
-            cores=ctx.cores,
         )
         ctx.metric("detection_s", ctx.clock_s() - start_s, "s")
         ctx.metric("detection_cpu_s", ctx.processor_s() - start_cpu_s, "s")
         self._report(found, cloud, ctx)
+        earlier = inputs.surfaces
         surfaces = Surfaces(
-            surfaces=found.surfaces,
+            surfaces=(*(() if earlier is None else earlier.surfaces), *found.surfaces),
             up=cloud.up,
+            planes=None if earlier is None else earlier.planes,
             details={
                 "planes": [
                     asdict(test) | {"normal": test.normal.tolist()} for test in found.plane_tests
@@ -136,7 +138,7 @@ class Detector(Method):
 
     def _report(self, found: Detection, cloud: PointCloud, ctx: StepContext) -> None:
         ctx.metric("n_surfaces", len(found.surfaces), "1")
-        labelled = int(np.count_nonzero(found.labels >= 0))
+        labelled = sum(surface.n_points for surface in found.surfaces)
         ctx.metric("labelled_share", labelled / max(1, len(cloud)), "1")
         ctx.metric("noise_mm", 1000.0 * found.noise_m, "mm")
         ctx.metric("voxel_mm", 1000.0 * found.voxel_m, "mm")

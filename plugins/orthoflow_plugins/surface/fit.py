@@ -166,7 +166,7 @@ def fit_all(
     """Fit surfaces to all points near them, and label the points.
 
     Args:
-        found: the surfaces.
+        found: the surfaces; earlier ones, which are last, only keep the points near them.
         cloud: the cloud.
         plane_labels: planes of the points (n,), and normal and offset (k, 4) of each plane whose
             points are only used where they are nearer to the surface; NaN for other planes.
@@ -178,7 +178,8 @@ def fit_all(
     Returns:
         The fitted surfaces, and the index of the surface of each point, -1 for none.
     """
-    if not found:
+    new = [item for item in found if not item.is_earlier]
+    if not new:
         return [], np.full(len(cloud), -1, dtype=np.int16)
     labels = np.empty(len(cloud), dtype=np.int16)
     cells = _cells_of(found, tolerances_m, noise_m)
@@ -209,7 +210,7 @@ def fit_all(
 
     # Threads of the linear algebra library would cost more than they save for such small systems.
     with threadpoolctl.threadpool_limits(1):
-        fitted = list(in_order(fit, range(len(found)), threads=cores))
+        fitted = list(in_order(fit, range(len(new)), threads=cores))
     return fitted, labels
 
 

@@ -114,6 +114,7 @@ class Found:
         is_open: (a,) bool, parts of the circle from angle -pi that have voxels.
         along_m: range along the axis, with a margin of one cell.
         evidence: values determined by the tests.
+        is_earlier: whether the surface was found before, so that its ends are known.
     """
 
     round: Round
@@ -122,6 +123,7 @@ class Found:
     is_open: NDArray[np.bool_]
     along_m: tuple[float, float]
     evidence: dict[str, float]
+    is_earlier: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,6 +142,7 @@ def search(
     progress: Callable[[float, str], None],
     *,
     is_oriented: bool,
+    earlier: list[Found],
 ) -> tuple[list[Found], list[Rejected]]:
     """Find surfaces in voxels of several sizes.
 
@@ -150,8 +153,9 @@ def search(
         rng: random generator for the pairs.
         progress: receives the completed share of the work (0.2 to 0.8), and a text.
         is_oriented: whether the normals point to the viewer.
+        earlier: surfaces that were found before.
     """
-    found: list[Found] = []
+    found = [*earlier]
     rejected: list[Rejected] = []
     for number, voxels in enumerate(levels):
         voxel_m = voxels.size_m
@@ -200,7 +204,7 @@ def search(
             found.append(result)
             is_free &= ~claimed(result, voxels, limits)
             is_live &= is_free[ends].all(axis=1)
-    return found, rejected
+    return found[len(earlier) :], rejected
 
 
 def _suited(levels: list[Voxels], radius_m: float) -> Voxels:
@@ -209,8 +213,10 @@ def _suited(levels: list[Voxels], radius_m: float) -> Voxels:
 
 
 def _is_fringe(new: Found, old: Found) -> bool:
-    """Return whether a surface consists of noise or relief near another surface."""
+    """Return whether a surface consists of noise or relief near another one of the same form."""
     is_sphere = new.round.is_sphere
+    if (is_sphere, new.round.slope != 0.0) != (old.round.is_sphere, old.round.slope != 0.0):
+        return False
     row = [np.append(item.round.point, item.round.axis * (not is_sphere)) for item in (new, old)]
     ends = [np.append(item.round.radius_m, item.side) for item in (new, old)]
     one, other = (np.concatenate(pair) for pair in zip(row, ends, strict=True))
@@ -231,7 +237,7 @@ def claimed(found: Found, voxels: Voxels, limits: Limits) -> NDArray[np.bool_]:
     n_around = len(found.is_open)
     column = np.minimum(((angles / (2.0 * math.pi) + 0.5) * n_around).astype(int), n_around - 1)
     low, high = found.along_m
-    margin = 0.1 * (high - low)
+    margin = 0.0 if found.is_earlier else 0.1 * (high - low)
     is_on = np.zeros(len(voxels), dtype=np.bool_)
     is_on[near] = found.is_open[column] & (along > low - margin) & (along < high + margin)
     return is_on
@@ -488,7 +494,10 @@ def _judged(
         "curvature_ratio": abs(2.0 * bend * found.radius_m),
     }
     rough_mm = 1000.0 * (_ROUGHEST_SHARE * found.radius_m + limits.noise_m)
-    is_long = evidence["length_m"] > 0.5 * found.radius_m
+    # A strip of a large dome is narrow, but as long as the tolerance on both sides permits.
+    is_long = evidence["length_m"] > min(
+        0.5 * found.radius_m, math.sqrt(8.0 * found.radius_m * limits.tolerance_at(found.radius_m))
+    )
     reasons = {
         "short arc": arc_rad < limits.min_arc_rad,
         "small": evidence["area_m2"] < limits.min_area_m2,

@@ -10,7 +10,8 @@ from orthoflow.products.cloud import PointCloud
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.inspections import Inspection, Truth
 from orthoflow.products.photographs import Cameras, Photos, Ties
-from orthoflow.products.planes import Planes, PointLabels
+from orthoflow.products.planes import Planes
+from orthoflow.products.surfaces import PointLabels
 from orthoflow.products.walls import Layers, Orthoimages, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from orthoflow_plugins.simulate.curved import SimulateCurved
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.surfaces import angles_around
-from orthoflow.products import LayerMask, SurfaceMask, Wall
+from orthoflow.products import LayerMask, SurfaceMask, Surfaces, Wall
 from orthoflow.testing import Trial, run_trial
 from tests import curved_scenes, samples
 from tests.curved_scenes import Drum
@@ -119,12 +120,21 @@ def test_curved_walls_follow_planes_and_cover_their_facets(tmp_path: Path) -> No
         return [wall.name for wall in walls.walls], [wall.plane_index for wall in walls.walls]
 
     assert names() == (["floor 1", "vault 2"], [1, 2])
+    del inputs["planes"]
+    with pytest.raises(MethodError, match="planes are needed"):
+        names()
+    (vault,) = drum.surfaces().surfaces
+    inputs["surfaces"] = Surfaces(surfaces=(replace(vault, name="vault 2"),), up=UP, planes=planes)
+    assert names() == (["floor 1", "vault 2"], [1, 2])
     springing = tuple(drum.points(np.array([3.5]), np.zeros(1))[0].tolist())
     assert names(near=[springing]) == (["vault 2"], [2])
     assert names(ranks=(2, 1)) == (["floor 1", "vault 2"], [1, 2])
     assert names(constraint="horizontal") == (["ceiling 0", "floor 1"], [0, 1])
     with pytest.raises(MethodError, match="ranks contains 3"):
         names(ranks=(3,))
+    inputs["planes"] = planes
+    with pytest.raises(MethodError, match="given twice"):
+        names()
 
 
 def test_crossing_vaults_end_at_their_groins(tmp_path: Path) -> None:
