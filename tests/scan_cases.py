@@ -65,9 +65,12 @@ class Case:
         has_linear: (n,) of which of them it is a function of reflectance; None for all.
         rgb: the colours must be the scene's; False: the cloud must have none.
         has_rgb: (n,) which points have a colour; None for all.
+        has_grid: whether the cloud must have rows and columns; None if it does not matter.
+        not_used: fields that must be named as not used.
         left_out: points that are left out, by cause.
-        unit: what `scans.json` must say.
+        unit: what `scans.json` must say of all scans, in words.
         warnings: parts of what must be reported.
+        not_reported: parts of what must not be reported.
         refusal: parts of the sentence with which the file is refused instead.
     """
 
@@ -81,24 +84,36 @@ class Case:
     has_linear: NDArray[np.bool_] | None = None
     rgb: bool = False
     has_rgb: NDArray[np.bool_] | None = None
+    has_grid: bool | None = None
+    not_used: tuple[str, ...] = ()
     left_out: dict[str, int] = field(default_factory=dict)
     unit: str = "m"
     warnings: tuple[str, ...] = ()
+    not_reported: tuple[str, ...] = ()
     refusal: tuple[str, ...] = ()
 
 
 class Draw:
-    """Choices of a case by seed; of seed 0 the first of everything."""
+    """Choices of a case by seed: the first of everything, each of up to three in turn, or drawn.
+
+    Seeds 1 to 3 make each choice among up to three, and each but the first among four.
+    """
 
     def __init__(self, seed: int, folder: Path, n_points: int | None = None) -> None:
         self.folder = folder
         self.rng = np.random.default_rng(seed)
+        self.seed, self.n_choices = seed, 0
         self.is_first = seed == 0
         drawn = 900 if self.is_first else int(self.rng.integers(500, 1500))
         self.scene = paint(self.rng, n_points or drawn)
 
     def one_of(self, *choices: T) -> T:
-        return choices[0] if self.is_first else choices[int(self.rng.integers(len(choices)))]
+        self.n_choices += 1
+        turns = np.random.default_rng(self.n_choices).permutation(len(choices))
+        if len(choices) > 3:
+            turns = np.append(0, turns[turns > 0])
+        drawn = turns[self.seed % len(turns)] if self.seed < 4 else self.rng.choice(turns)
+        return choices[0] if self.is_first else choices[drawn]
 
     def path(self, *suffixes: str) -> Path:
         return self.folder / f"a.{self.one_of(*suffixes)}"
@@ -258,6 +273,7 @@ def text_header_unknown(draw: Draw) -> Case:
     words = header.replace('"', "").split(separator)
     table = {str(k): draw.rng.uniform(0.0, 9.0, 60) for k in range(len(words))}
     path = _write_table(draw.path("txt", "csv"), table, separator=separator, header=header)
+    words += ["if these are degrees"] * ("lat" in header.lower())
     return Case(draw.scene, [path], refusal=("cloud.columns", *words))
 
 
@@ -273,7 +289,8 @@ def text_names_twice(draw: Draw) -> Case:
         columns["Intensity"] = scene.reflectance
     columns = {name: columns[name] for name in draw.order(list(columns))}
     path = _write_table(draw.path("csv"), columns, separator=draw.one_of(",", " ", ";"))
-    return Case(scene, [path], intensity="linear" if has_intensity else "none")
+    intensity: Any = "linear" if has_intensity else "none"
+    return Case(scene, [path], intensity=intensity, not_used=names)
 
 
 def text_index_first(draw: Draw) -> Case:
@@ -290,14 +307,16 @@ def text_index_first(draw: Draw) -> Case:
 
 
 def text_not_a_number(draw: Draw) -> Case:
-    """NaN and infinity in every spelling."""
+    """NaN and infinity in every spelling, of coordinates and colours."""
     scene = draw.scene
     lost = draw.chosen(draw.one_of(0.02, 0.3, 0.0))
     spellings = ["-nan(ind)", "nan", "NaN", "-nan", "1.#QNAN", "-1.#IND00", "1.#INF", "inf"]
     spellings += ["-Infinity", "nan(snan)", "NAN", "#NUM!", "#N/A", "n/a", "NA", "null"]
     spelling = draw.one_of(*spellings)
     columns: dict[str, Any] = _fields(scene, rgb=scene.rgb)
-    for name in draw.one_of("xyz", "z", "xy"):
+    names = draw.one_of("xyz", "z", ("red",))
+    is_point = "z" in names
+    for name in names:
         columns[name] = [
             spelling if is_lost else f"{value:.4f}"
             for value, is_lost in zip(columns[name], lost, strict=True)
@@ -307,10 +326,11 @@ def text_not_a_number(draw: Draw) -> Case:
     _write_table(path, columns, separator=separator, header=draw.one_of(None, ""))
     n_lost = int(lost.sum())
     return Case(
-        scene.part(~lost),
+        scene.part(~lost) if is_point else scene,
         [path],
         rgb=True,
-        left_out={"not_finite": n_lost},
+        has_rgb=None if is_point else ~lost,
+        left_out={"not_finite": n_lost} if is_point else {},
         warnings=(f"{n_lost} points",),
     )
 
@@ -318,16 +338,21 @@ def text_not_a_number(draw: Draw) -> Case:
 def text_normals(draw: Draw) -> Case:
     """Normals without a header are no colours."""
     scene = draw.scene
-    normals = draw.rng.normal(size=(len(scene), 3)) * 0.05 + [0.0, -1.0, 0.0]
+    header, facing = draw.one_of(
+        (None, [0.0, -1.0, 0.0]),
+        ("", [0.0, -1.0, 0.0]),
+        (None, [0.6, 0.64, 0.48]),
+        ("//X Y Z Nx Ny Nz", [0.0, -1.0, 0.0]),
+    )
+    normals = draw.rng.normal(size=(len(scene), 3)) * 0.05 + facing
     normals = np.round(normals / np.linalg.norm(normals, axis=1)[:, None], 3)
     parts = [_named("nx ny nz", normals)]
-    has_rgb = draw.one_of(False, True)
+    has_rgb = draw.one_of(False, True) and not header
     if has_rgb:
         parts.append(_named("r g b", scene.rgb))
     columns = _fields(scene)
     for part in draw.order(parts):
         columns |= part
-    header = draw.one_of(None, "", "//X Y Z Nx Ny Nz" if not has_rgb else None)
     path = draw.path("xyz")
     _write_table(path, columns, separator=draw.one_of(" ", ",", "\t"), header=header)
     return Case(scene, [path], rgb=has_rgb)
@@ -426,52 +451,52 @@ def e57_colour_limit_wrong(draw: Draw) -> Case:
     return Case(scene, [path], rgb=True, intensity="linear", warnings=warnings)
 
 
-def e57_scan_without(draw: Draw) -> Case:
-    """One of several scans has no colour, or no intensity."""
+def one_scan_without(draw: Draw) -> Case:
+    """One of the scans of a file, or one of several files, has no colour or no intensity."""
     scenes = list(draw.scene.halves())[:: draw.one_of(1, -1)]
-    lacks = draw.one_of("colour", "intensity")
-    place = draw.one_of(1, 0)
-    scans = [{"fields": _whole(scene), **_LIMITS} for scene in scenes]
-    kept = {"colour": {"grey": scenes[place].reflectance}, "intensity": {"rgb": scenes[place].rgb}}
-    scans[place]["fields"] = _e57_fields(scenes[place], **kept[lacks])
+    lacks, place = draw.one_of("rgb", "grey"), draw.one_of(1, 0)
+    values = [{"grey": scene.reflectance, "rgb": scene.rgb} for scene in scenes]
+    values[place].pop(lacks)
+    is_one = draw.one_of(True, False)
+    if is_one:
+        pairs = zip(scenes, values, strict=True)
+        scans = [{"fields": _e57_fields(scene, **some), **_LIMITS} for scene, some in pairs]
+        paths = [scan_files.write_e57(draw.path("e57"), scans)]
+    else:
+        paths = [draw.folder / "0.ply", draw.folder / "1.ply"]
+        for path, scene, some, unit in zip(paths, scenes, values, ("m", "mm"), strict=True):
+            write_scene(path, in_unit(scene, unit), **some)
+            path.write_bytes(path.read_bytes().replace(b"made by hand", f"unit: {unit}".encode()))
     has = np.concatenate([np.full(len(scene), k != place) for k, scene in enumerate(scenes)])
     return Case(
         joined(scenes),
-        [scan_files.write_e57(draw.path("e57"), scans)],
+        paths,
         rgb=True,
-        has_rgb=has if lacks == "colour" else None,
-        intensity="equal",
-        has_intensity=has if lacks == "intensity" else None,
-        warnings=(f"scan {place}", f"no {lacks}", str(len(scenes[place]))),
+        has_rgb=has if lacks == "rgb" else None,
+        intensity="equal" if is_one else "linear",
+        has_intensity=has if lacks == "grey" else None,
+        unit="m" if is_one else "m mm",
+        warnings=(f"no {'colour' if lacks == 'rgb' else 'intensity'}", str(len(scenes[place]))),
+        not_reported=("is zero",),
     )
 
 
-def e57_two_depths(draw: Draw) -> Case:
-    """Scans of one file with colours of different depth."""
-    scenes = draw.scene.halves()
-    scans = []
-    for scene, (limit, scale) in zip(
-        scenes, draw.order([(255, 1), (65535, draw.one_of(257, 256))]), strict=True
+def e57_two_scales(draw: Draw) -> Case:
+    """Scans of one file with limits of intensity and depths of colour of their own."""
+    scenes, scans = draw.scene.halves(), []
+    limits = [(0.0, 1.0), (0.0, 65535.0), (-2048.0, 2047.0), (0.0, 255.0), (0.0, 100.0)]
+    depths = draw.order([(255, 1), (65535, draw.one_of(257, 256))])
+    for scene, (low, high), (most, scale) in zip(
+        scenes, draw.order(limits)[:2], depths, strict=True
     ):
         rgb = scene.rgb.astype(np.float64) * scale
-        scans.append({"fields": _e57_fields(scene, grey=scene.reflectance, rgb=rgb)})
-        if draw.one_of(True, False):
-            scans[-1]["rgb_limit"] = limit
-    path = scan_files.write_e57(draw.path("e57"), scans)
-    return Case(joined(scenes), [path], rgb=True, intensity="linear")
-
-
-def e57_two_intensity_limits(draw: Draw) -> Case:
-    """Scans of one file with intensity limits of their own."""
-    scenes = draw.scene.halves()
-    limits = [(0.0, 1.0), (0.0, 65535.0), (-2048.0, 2047.0), (0.0, 255.0), (0.0, 100.0)]
-    scans = []
-    for scene, (low, high) in zip(scenes, draw.order(limits)[:2], strict=True):
-        grey = low + scene.reflectance * (high - low)
-        fields = _e57_fields(scene, grey=grey, rgb=scene.rgb)
+        fields = _e57_fields(scene, grey=low + scene.reflectance * (high - low), rgb=rgb)
         scans.append({"fields": fields, "intensity_limits": (low, high)})
+        if draw.one_of(True, False):
+            scans[-1]["rgb_limit"] = most
     path = scan_files.write_e57(draw.path("e57"), scans)
-    return Case(joined(scenes), [path], rgb=True, intensity="equal")
+    wrong = ("declares colours",)
+    return Case(joined(scenes), [path], rgb=True, intensity="equal", not_reported=wrong)
 
 
 def e57_not_finite(draw: Draw) -> Case:
@@ -481,12 +506,14 @@ def e57_not_finite(draw: Draw) -> Case:
     fields = _whole(replace(scene, points=scene.points - STATION))
     for name in draw.one_of(("cartesianY",), ("cartesianX", "cartesianY", "cartesianZ")):
         fields[name] = np.where(lost, draw.one_of(np.nan, np.inf, -np.inf), fields[name])
+    fields["timeStamp"] = np.zeros(len(scene))
     scan = {"fields": fields, "rotation": (1.0, 0.0, 0.0, 0.0), "translation": STATION} | _LIMITS
     return Case(
         scene.part(~lost),
         [scan_files.write_e57(draw.path("e57"), [scan])],
         rgb=True,
         intensity="equal",
+        not_used=("timeStamp",),
         left_out={"not_finite": int(lost.sum())},
         warnings=("not finite",),
     )
@@ -551,27 +578,20 @@ def _las(path: Path, scene: Scene, **options: Any) -> Path:
     return write_scene(path, scene, **(given | {"offset": np.zeros(3)} | options))
 
 
-def las_bounds_stale(draw: Draw) -> Case:
-    """Bounds of another place."""
+def las_header_stale(draw: Draw) -> Case:
+    """Bounds of another place, and of a LAS file the number before points were appended."""
     scene, shift = draw.scene, draw.shift()
     moved = replace(scene, points=scene.points + shift)
     path = _las(draw.path("las", "laz"), moved, offset=np.floor(shift), version="1.2")
     content = bytearray(path.read_bytes())
     bounds = np.array(struct.unpack_from("<6d", content, 179)) + draw.one_of(-1000.0, 250.0, 1e5)
     struct.pack_into("<6d", content, 179, *bounds)
+    warnings = ["outside the bounding box"]
+    if path.suffix == ".las":
+        struct.pack_into("<I", content, 107, draw.one_of(len(scene) // 2, 1, len(scene) - 1))
+        warnings.append(f"contains {len(scene)}")
     path.write_bytes(bytes(content))
-    warnings = ("outside the bounding box",)
-    return Case(scene, [path], shift=shift, rgb=True, intensity="linear", warnings=warnings)
-
-
-def las_count_stale(draw: Draw) -> Case:
-    """Points were appended, and the header still states the number before."""
-    scene = draw.scene
-    path = _las(draw.path("las"), scene, version="1.2")
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<I", content, 107, draw.one_of(len(scene) // 2, 1, len(scene) - 1))
-    path.write_bytes(bytes(content))
-    return Case(scene, [path], rgb=True, intensity="linear", warnings=(str(len(scene)),))
+    return Case(scene, [path], shift=shift, rgb=True, intensity="linear", warnings=(*warnings,))
 
 
 def colours_of_few_bits(draw: Draw) -> Case:
@@ -584,49 +604,46 @@ def colours_of_few_bits(draw: Draw) -> Case:
     return Case(scene, [path], rgb=True, warnings=(f"colours reach {most} and",))
 
 
+# Codes of systems with coordinates and with heights in a unit, and of the unit.
+_CODES: Final = {"m": (32618, 5703, 9001), "ft": (2222, 8228, 9002), "us-ft": (2260, 6360, 9003)}
+
+
 def las_feet(draw: Draw) -> Case:
-    """Feet by GeoTIFF keys or WKT, also with heights in another unit."""
-    level, height, epsg = draw.one_of(
-        ("us-ft", "us-ft", 2260),
-        ("ft", "ft", 2222),
-        ("us-ft", "us-ft", 2229),
-        ("us-ft", "m", 2260),
-        ("m", "us-ft", 32618),
-    )
-    how = draw.one_of("keys", "wkt", "wkt behind the points", "citation")
-    has_height = height != level or draw.one_of(False, True)
-    if how == "citation" and level == height:
-        foot = {"us-ft": "US survey foot", "ft": "foot", "m": "metre"}[level]
+    """Feet by WKT or a citation, also with heights in another unit."""
+    how = draw.one_of("wkt", "wkt behind the points", "citation")
+    units = (("us-ft", "us-ft"), ("us-ft", "m"), ("ft", "ft"), ("m", "us-ft"))
+    level, height = draw.one_of(*units)
+    if how == "citation":
+        height, foot = level, {"us-ft": "US survey foot", "ft": "foot", "m": "metre"}[level]
         number, data = 34737, f"PCS Name = site|Linear unit = {foot}|\0".encode()
-    elif how.startswith("wkt"):
-        vertical = {"us-ft": 6360, "m": 5703, "ft": 8228}[height]
-        data = _wkt(f"EPSG:{epsg}+{vertical}" if has_height else f"EPSG:{epsg}", draw)
-        number = 2112
     else:
-        codes = {"m": 9001, "ft": 9002, "us-ft": 9003}
-        keys = {1024: 1, 3072: epsg, 3076: codes[level]}
-        keys |= {4099: codes[height]} if has_height else {}
-        words = [
-            1,
-            1,
-            0,
-            len(keys),
-            *(w for key, value in keys.items() for w in (key, 0, 1, value)),
-        ]
-        number, data = 34735, struct.pack(f"<{len(words)}H", *words)
+        has_height = height != level or draw.one_of(False, True)
+        vertical = f"+{_CODES[height][1]}" if has_height else ""
+        number, data = 2112, _wkt(f"EPSG:{_CODES[level][0]}{vertical}", draw)
+    return _of_unit(draw, (level, height), number, data, is_behind=how == "wkt behind the points")
+
+
+def las_feet_by_keys(draw: Draw) -> Case:
+    """Feet by GeoTIFF keys: those of coded systems, or stated ones, which win over them."""
+    level, height = draw.one_of(("us-ft", "us-ft"), ("ft", "m"), ("m", "us-ft"))
+    keys = {1024: 1, 3072: _CODES[level][0], 4096: _CODES[height][1]}
+    if draw.one_of(True, False):
+        other = _CODES["ft" if level == "m" else "m"]
+        keys |= {3072: other[0], 4096: other[1], 3076: _CODES[level][2], 4099: _CODES[height][2]}
+    words = [1, 1, 0, len(keys), *(w for key, value in keys.items() for w in (key, 0, 1, value))]
+    return _of_unit(draw, (level, height), 34735, struct.pack(f"<{len(words)}H", *words))
+
+
+def _of_unit(
+    draw: Draw, units: tuple[str, str], number: int, data: bytes, *, is_behind: bool = False
+) -> Case:
+    """A LAS file with a record that states the units of coordinates and heights."""
+    level, height = units
     scene = draw.scene
     metres = np.array([UNITS_M[level], UNITS_M[level], UNITS_M[height]])
     in_feet = replace(scene, points=scene.points / metres)
-    is_behind = how == "wkt behind the points"
-    vlrs = [] if is_behind else [("LASF_Projection", number, data)]
-    path = _las(draw.path("las", "laz"), in_feet, vlrs=vlrs)
-    if is_behind:
-        # A record behind the points, which LAS 1.4 allows.
-        content = bytearray(path.read_bytes())
-        struct.pack_into("<QI", content, 235, len(content), 1)
-        struct.pack_into("<H", content, 6, 0x11)
-        head = struct.pack("<H16sHQ32s", 0, b"LASF_Projection", number, len(data), b"")
-        path.write_bytes(bytes(content) + head + data)
+    record = {"evlrs" if is_behind else "vlrs": [("LASF_Projection", number, data)]}
+    path = _las(draw.path("las", "laz"), in_feet, **record)
     unit = level if level == height else f"{level}/{height}"
     if draw.one_of(False, True):
         # What the user says wins over what the file states.
@@ -646,13 +663,17 @@ def las_degrees(draw: Draw) -> Case:
     """Geographic coordinates are refused, with the way out."""
     data = _wkt(f"EPSG:{draw.one_of(4326, 4979, 4258)}", draw)
     path = _las(draw.path("las"), draw.scene, vlrs=[("LASF_Projection", 2112, data)])
+    if draw.one_of(False, True):
+        return Case(draw.scene, [path], rgb=True, intensity="linear", params={"unit": "m"})
     return Case(draw.scene, [path], refusal=("degrees", "cloud.unit"))
 
 
 def las_extra_intensity(draw: Draw) -> Case:
     """Intensity 0, and fields of the scanner's maker that hold it."""
     scene = draw.scene
-    names = draw.one_of(("Reflectance", "Amplitude"), ("reflectance", "Deviation"), ("Amplitude",))
+    names = draw.one_of(
+        ("Reflectance", "Amplitude"), ("reflectance", "Deviation"), ("Echo",), ("Amplitude",)
+    )
     # Reflectance of this maker is in decibels.
     extra = {names[0]: (scene.reflectance * 20.0 - 15.0).astype(np.float32)}
     extra |= {name: draw.rng.uniform(0.0, 9.0, len(scene)).astype(np.float32) for name in names[1:]}
@@ -666,7 +687,16 @@ def las_extra_intensity(draw: Draw) -> Case:
         **({} if has_rgb else {"rgb": None}),
     )
     params = {"intensity_field": draw.one_of(names[0], names[0].upper())} if wants else {}
-    return Case(scene, [path], rgb=has_rgb, intensity="linear", params=params)
+    is_taken = wants or names != ("Echo",)
+    return Case(
+        scene,
+        [path],
+        rgb=has_rgb,
+        intensity="linear" if is_taken else "none",
+        params=params,
+        not_used=tuple(names[is_taken:]),
+        warnings=() if is_taken else ("fields not used: Echo",),
+    )
 
 
 def one_reflector(draw: Draw) -> Case:
@@ -676,11 +706,13 @@ def one_reflector(draw: Draw) -> Case:
     grey = np.rint(low + scene.reflectance * (high - low)).astype(np.float32)
     places = draw.rng.choice(len(scene), draw.one_of(5, 1, 3), replace=False)
     grey[places] = 65535
-    path = draw.path("las", "ply", "pcd", "xyz", "e57")
-    options = {"intensity_limits": (0.0, 65535.0)} if path.suffix == ".e57" else {}
+    path = draw.path("las", "ply", "xyz", "e57")
+    is_e57 = path.suffix == ".e57"
+    options = {"intensity_limits": (0.0, 65535.0)} if is_e57 else {}
     write_scene(path, scene, grey=grey, **options)
     is_usual = ~np.isin(np.arange(len(scene)), places)
-    return Case(scene, [path], intensity="linear", has_linear=is_usual)
+    warnings = ("declares intensities from 0 to 65535",) if is_e57 else ()
+    return Case(scene, [path], intensity="linear", has_linear=is_usual, warnings=warnings)
 
 
 # PLY and PCD
@@ -751,7 +783,7 @@ def pcd_names(draw: Draw) -> Case:
         fields |= _named(colours, scene.rgb.astype(draw.one_of(np.uint8, np.uint16)))
     has_intensity = draw.one_of(True, False) or not colours
     if has_intensity:
-        name = draw.one_of("intensity", "Intensity", "INTENSITY", "i", "Reflectance")
+        name = draw.one_of("scalar_Intensity", "Intensity", "INTENSITY", "i", "Reflectance")
         fields[name] = (scene.reflectance * draw.one_of(1.0, 255.0)).astype(np.float32)
     data = draw.one_of("binary", "ascii", "binary_compressed")
     if data == "ascii" and colours == "packed":
@@ -805,6 +837,7 @@ def ptx_scans(draw: Draw) -> Case:
         rgb=True,
         has_rgb=np.concatenate(has_rgb),
         intensity="equal",
+        has_grid=lacks != "lines",
         warnings={"lines": ("lines of points",), "colour": ("no colour",)}.get(lacks, ()),
     )
 
@@ -812,5 +845,5 @@ def ptx_scans(draw: Draw) -> Case:
 CASES: Final[Mapping[str, Callable[[Draw], Case]]] = {
     name: function
     for name, function in list(globals().items())
-    if getattr(function, "__annotations__", {}).get("return") == "Case"
+    if name[0] != "_" and getattr(function, "__annotations__", {}).get("return") == "Case"
 }

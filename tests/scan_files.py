@@ -35,10 +35,14 @@ def write_las(
     offset: NDArray[np.float64] | None = None,
     version: str = "1.4",
     vlrs: Sequence[tuple[str, int, bytes]] = (),
+    evlrs: Sequence[tuple[str, int, bytes]] = (),
     extra: Mapping[str, NDArray[Any]] | None = None,
     **fields: Any,
 ) -> Path:
-    """Write points with fields of the format, extra ones, and records (user, number, content)."""
+    """Write points with fields of the format, extra ones, and records (user, number, content).
+
+    The records `evlrs` come after the points, which only version 1.4 allows.
+    """
     import laspy
 
     point_format = (7 if rgb is not None else 6) if version == "1.4" else 2
@@ -55,6 +59,8 @@ def write_las(
     for name, values in {**fields, **(extra or {})}.items():
         if values is not None:
             las[name] = np.rint(values).astype(np.uint16) if name == "intensity" else values
+    if evlrs:
+        las.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR(u, n, "", c) for u, n, c in evlrs])
     las.write(path)
     return path
 

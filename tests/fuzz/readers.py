@@ -146,7 +146,7 @@ def _cases(*names: str, more: Callable[[Path], None] | None = None) -> Callable[
 
 
 E57 = Target(
-    seeds=_cases("e57_colour_invalid", "e57_scan_without", more=_spherical_files),
+    seeds=_cases("e57_colour_invalid", "e57_two_scales", more=_spherical_files),
     read=_read_scan,
     mutate=mutate_e57,
 )

@@ -89,12 +89,8 @@ def by_pye57(path: Path, fields: Fields, *, is_posed: bool, has_grid: bool) -> F
         for half in halves:
             file.write_scan_raw({name: values[half] for name, values in raw.items()}, **pose)
     with pye57.E57(str(path)) as file:
-        scans = [
-            file.read_scan(
-                k, intensity=True, colors=True, row_column=has_grid, ignore_missing_fields=True
-            )
-            for k in range(2)
-        ]
+        wanted = {"intensity": True, "colors": True, "ignore_missing_fields": True}
+        scans = [file.read_scan(k, row_column=has_grid, **wanted) for k in range(2)]
     whole = {name: np.concatenate([scan[name] for scan in scans]) for name in scans[0]}
     names = dict(zip([*axes, *colours], [*XYZ, *RGB], strict=True))
     names |= {"intensity": "intensity", "rowIndex": "row", "columnIndex": "column"}
@@ -230,12 +226,10 @@ def test_a_file_that_is_cut_off_is_refused_or_read_as_far_as_it_goes(
         return
     # Only text can end anywhere.
     assert path.suffix in (".xyz", ".txt", ".csv")
-    whole = points[:-1]
-    n_points = len(whole)
+    n_points = len(points) - 1
     assert n_points < len(right["x"])
-    np.testing.assert_allclose(
-        whole, np.column_stack([right[a] for a in XYZ])[:n_points], atol=6e-5
-    )
+    expected = np.column_stack([right[a] for a in XYZ])[:n_points]
+    np.testing.assert_allclose(points[:-1], expected, atol=6e-5)
 
 
 def test_scans_of_a_ptx_file_are_placed_by_their_poses(tmp_path: Path) -> None:
@@ -252,8 +246,5 @@ def test_scans_of_a_ptx_file_are_placed_by_their_poses(tmp_path: Path) -> None:
     index = np.arange(400)
     np.testing.assert_array_equal(found["row"], np.concatenate([index % 20, index % 50]))
     np.testing.assert_array_equal(found["column"], np.concatenate([index // 20, index // 50]))
-    file = open_scan(path)
-    assert [scan.station.tolist() for scan in file.scans if scan.station is not None] == [
-        [0.0, 0.0, 0.0],
-        pose[:3, 3].tolist(),
-    ]
+    stations = [scan.station for scan in open_scan(path).scans]
+    np.testing.assert_array_equal(stations, [np.zeros(3), pose[:3, 3]])

@@ -17,24 +17,23 @@ from tests.scan_files import read_all
 POINTS = np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (40, 3)), 4)
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(("suffix", "flag"), [(".las", "withheld"), (".laz", "synthetic")])
 def test_only_the_classes_asked_for_are_given_and_the_rest_is_counted(
-    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    suffix: str, flag: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(1)
-    points, withheld = rng.uniform(0, 5, (60_000, 3)), np.arange(60_000) % 7 == 0
+    points, is_flagged = rng.uniform(0, 5, (60_000, 3)), np.arange(60_000) % 7 == 0
     classes = rng.choice([2, 6, 40], 60_000)
-    path = scan_files.write_las(
-        tmp_path / f"a{suffix}", points, withheld=withheld, classification=classes.astype(np.uint8)
-    )
+    fields = {flag: is_flagged, "classification": classes.astype(np.uint8)}
+    path = scan_files.write_las(tmp_path / f"a{suffix}", points, **fields)
     monkeypatch.setattr(las, "BLOCK_POINTS", 50_000)
     blocks = list(open_scan(path, classes=(6, 40)).read())
     wanted = np.isin(classes, [6, 40])
     found = np.concatenate([block.points for block in blocks])
-    np.testing.assert_allclose(found, points[wanted & ~withheld], atol=6e-5)
+    np.testing.assert_allclose(found, points[wanted & ~is_flagged], atol=6e-5)
     assert sum(block.n_read for block in blocks) == 60_000
-    assert sum(block.left_out["withheld"] for block in blocks) == withheld.sum()
-    assert sum(block.left_out["other_class"] for block in blocks) == (~wanted & ~withheld).sum()
+    assert sum(block.left_out[flag] for block in blocks) == is_flagged.sum()
+    assert sum(block.left_out["other_class"] for block in blocks) == (~wanted & ~is_flagged).sum()
 
 
 def test_points_outside_the_stated_bounds_are_a_note_and_far_ones_of_laz_damage(
@@ -50,12 +49,11 @@ def test_points_outside_the_stated_bounds_are_a_note_and_far_ones_of_laz_damage(
     # Without compression there is nothing that a changed byte could spoil but itself.
     change(tmp_path / "a.las", 179, np.float64(POINTS[:, 0].max() - 0.5).tobytes())
     n_outside = np.count_nonzero(stray[:, 0] > POINTS[:, 0].max() - 0.5)
-    # Of one block, and of many that are counted together.
-    for block_points in (las.BLOCK_POINTS, 7):
-        monkeypatch.setattr(las, "BLOCK_POINTS", block_points)
-        scan = open_scan(tmp_path / "a.las")
-        assert sum(len(block.points) for block in scan.read()) == len(stray)
-        assert f": {n_outside} points are outside the bounding box in its header" in scan.notes[0]
+    # Blocks are counted together.
+    monkeypatch.setattr(las, "BLOCK_POINTS", 7)
+    scan = open_scan(tmp_path / "a.las")
+    assert sum(len(block.points) for block in scan.read()) == len(stray)
+    assert f": {n_outside} points are outside the bounding box in its header" in scan.notes[0]
 
 
 def change(path: Path, position: int, content: bytes) -> Path:

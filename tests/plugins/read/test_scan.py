@@ -214,6 +214,8 @@ def test_the_user_can_set_full_intensity(tmp_path: Path, read: ScanReader) -> No
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=200.0)
     np.testing.assert_allclose(cloud.intensity, np.minimum(np.arange(400) / 200, 1), atol=1e-6)
     assert "199 intensities are outside 0 to 200 (intensity_max) and were clipped" in read.warnings
+    with pytest.raises(InputError, match=r"intensity_field=Echo: no file has such a field; they"):
+        read(tmp_path / "a.xyz", intensity_field="Echo")
 
 
 def test_zero_intensity_and_colours_are_missing(tmp_path: Path, read: ScanReader) -> None:
@@ -473,11 +475,13 @@ def test_a_scan_has_the_users_scale_the_one_it_states_or_that_of_its_data(
 
 def test_each_scan_is_scaled_by_its_own_limits_and_similar_ones_together() -> None:
     ranges = [(0.1, 0.9), (7000.0, 60000.0), None, (0.0, 255.0), (5.0, 200.0), (-2048.0, 2047.0)]
-    stated = [(0.0, 1.0), (0.0, 65535.0), (0.0, 1.0), None, None, None]
+    ranges += [(0.0, 90000.0)]  # beyond its limits
+    stated = [(0.0, 1.0), (0.0, 65535.0), (0.0, 1.0), None, None, None, (0.0, 65535.0)]
     scales = choose_scales(ranges, stated, None)
     assert scales[2] is None
     assert [(scale.low, scale.high) for scale in scales if scale is not None] == [
-        *((0.0, 1.0), (0.0, 65535.0), (0.0, 255.0), (0.0, 255.0), (-2048.0, 2047.0))
+        *((0.0, 1.0), (0.0, 65535.0), (0.0, 255.0), (0.0, 255.0), (-2048.0, 2047.0)),
+        (0.0, 90000.0),
     ]
 
 
@@ -530,6 +534,12 @@ def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
     assert stored(byte, word) == ([[0, 0, 1], [0, 128, 255]], "16 bit")
     assert stored(word, byte) == ([[0, 128, 255], [0, 0, 0]], "16 bit")
     assert stored(byte, unit) == ([[0, 128, 255], [0, 0, 1]], "8 bit")
+    # A stated limit also holds for dark colours.
+    assert stored(np.array([[0.0, 360.0, 900.0]]), limit=65535.0) == ([[0, 1, 3]], "16 bit")
+    # A few values beyond a scale do not change it.
+    stray = np.repeat(byte, 2000, axis=0)
+    stray[7, 0] = 300.0
+    assert stored(stray)[1] == "8 bit"
 
 
 @pytest.mark.parametrize(
