@@ -33,12 +33,22 @@ _PARALLAX_NOISE_CELLS: Final = 0.065
 _LEAST_OVERLAPS: Final = 10
 # Tangent of the maximum viewing angle, 84 degrees.
 _MOST_TANGENT: Final = 10.0
-# The errors of interpolated depths are larger than those of measured depths by this factor
-# (`docs/accuracy.md`).
-_RECOVERED_TIMES: Final = 2.0
-# The standard deviation of a few points is uncertain, so it is used only if it exceeds that of the
-# whole raster by this factor, which is typical of edges.
-_SPREAD_TIMES: Final = 2.0
+# A cell with a larger spread, in standard deviations of a point, contains points of several
+# surfaces. In simulated rooms, apses and columns, cells with a spread of 2 to 3 are as accurate as
+# those with less, and the errors of cells with a larger spread are about as large as the spread.
+_SPREAD_TIMES: Final = 3.0
+# Variance of a linear interpolation in a triangle, relative to that of its corners: the mean of the
+# squared weights. 0.2 to 0.4 was measured, because triangles overlap.
+_BETWEEN_SHARE: Final = 0.5
+# If neighbouring cells differ by less than this share of what the spread of their points predicts,
+# the depths have been smoothed. It is 0.01 to 0.04 for the surface `denoised`, about 1 otherwise.
+_SMOOTHED_SHARE: Final = 0.5
+# Distance beyond which errors of smoothed depths are independent; correlation 0.08 for the surface
+# `denoised`.
+_SMOOTHED_CELLS: Final = 9
+# Cells from which the noise is estimated, in bands of rows.
+_NOISE_CELLS: Final = 1 << 23
+_NOISE_ROWS: Final = 256
 # Depth errors of clouds from photos are correlated over this distance.
 _PATCH_M: Final = 0.05
 # Depth errors count as correlated if depth differences over this distance exceed those between
@@ -108,7 +118,7 @@ def expected_errors_m(
             np.minimum(nodes[..., 0].astype(np.intp), frame.width - 1),
         ].astype(np.float64)
     )
-    noise_m, patchy_m = _depth_noises_m(wall)
+    *noises_m, patchy_m, point_m = _depth_noises_m(wall)
     excess = _excess_of_overlaps(wall, cameras, overlaps)
     position_m, depth_m = (0.0, None) if excess is None else excess
     if depth_m is not None:
@@ -130,7 +140,8 @@ def expected_errors_m(
                 continue
             down = down + rows.start
             variances = _between(of_pose, down, across, step)
-            variances += _depth_variances(wall, down, across, centre_world, (noise_m, patchy_m))
+            known_m = (*noises_m, patchy_m, point_m)
+            variances += _depth_variances(wall, down, across, centre_world, known_m)
             errors_m[down, across] = np.sqrt(variances + position_m**2)
     return errors_m
 
@@ -198,14 +209,35 @@ def _between(
     return np.asarray(upper * (1.0 - down) + lower * down, dtype=np.float64)
 
 
-def _depth_noises_m(wall: Wall) -> tuple[float, float]:
-    """Return the noise of single depths, and the error that neighbours share (0 if none)."""
-    noise_m = depth_noise_m(wall.depth_m)
+def _depth_noises_m(wall: Wall) -> tuple[float, float, float, float]:
+    """Return four standard deviations in metres, estimated from measured cells.
+
+    The first two are the noise of single measured and interpolated depths, and the third is the
+    error that neighbours share (0 if none). The last is the spread of the points in a cell on a
+    single surface (0 if unknown). Interpolated cells are not used: their neighbours are
+    interpolated between the same points.
+    """
+    every = max(1, -(-wall.depth_m.size // _NOISE_CELLS))
+    rows = np.flatnonzero(np.arange(wall.frame.height) // _NOISE_ROWS % every == 0)
+    is_measured = wall.mask[rows] == SurfaceMask.MEASURED
+    depth_m = np.where(is_measured, wall.depth_m[rows], np.float32(np.nan))
+    several = is_measured & (wall.count[rows] > 1) & np.isfinite(wall.sigma_m[rows])
+    n_points = wall.count[rows][several].astype(np.float64)
+    point_m = mean_m = 0.0
+    if len(n_points):
+        # The median of chi-square with n degrees of freedom is n (1 - 2 / (9 n))^3 (Wilson and
+        # Hilferty 1931).
+        spreads_m = wall.sigma_m[rows][several] / (1.0 - 2.0 / (9.0 * (n_points - 1.0))) ** 1.5
+        point_m, mean_m = np.median([spreads_m, spreads_m / np.sqrt(n_points)], axis=1).tolist()
+    noise_m = depth_noise_m(depth_m)
+    between_m = float(np.sqrt(_BETWEEN_SHARE)) * noise_m
+    if noise_m <= _SMOOTHED_SHARE * mean_m:
+        noise_m = between_m = depth_noise_m(depth_m[::_SMOOTHED_CELLS, ::_SMOOTHED_CELLS])
     step = max(1, round(_PATCH_M / wall.frame.gsd_m))
-    apart_m = depth_noise_m(wall.depth_m[::step, ::step])
-    if apart_m <= _PATCHY_TIMES * noise_m:
-        return noise_m, 0.0
-    return noise_m, float(np.sqrt(apart_m**2 - noise_m**2))
+    apart_m = depth_noise_m(depth_m[::step, ::step])
+    is_patchy = apart_m > _PATCHY_TIMES * noise_m
+    patchy_m = float(np.sqrt(apart_m**2 - noise_m**2)) if is_patchy else 0.0
+    return noise_m, between_m, patchy_m, point_m
 
 
 def _depth_variances(
@@ -213,22 +245,20 @@ def _depth_variances(
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
     centre_world: NDArray[np.float64],
-    noises_m: tuple[float, float],
+    noises_m: tuple[float, ...],
 ) -> NDArray[np.float64]:
     """Return variances (n,), in m², of a wall coordinate due to depth errors.
 
-    The viewer is at `centre_world` (3,). The first noise is that of single cells;
-    the second is shared by neighbouring cells.
+    The viewer is at `centre_world` (3,); `noises_m` is the result of `_depth_noises_m`.
     """
-    noise_m, patchy_m = noises_m
+    noise_m, between_m, patchy_m, point_m = noises_m
     depths_m = np.nan_to_num(wall.depth_m[rows, columns].astype(np.float64))
     places = np.column_stack([columns, rows]).astype(np.float64) + 0.5
     beside_m, before_m = _seen_from(centre_world, wall.frame, places, depths_m)
     squares = np.minimum((beside_m**2).sum(axis=1) / before_m**2, _MOST_TANGENT**2)
-    n_points = np.maximum(1.0, wall.count[rows, columns].astype(np.float64))
-    spread = np.nan_to_num(wall.sigma_m[rows, columns].astype(np.float64)) / np.sqrt(n_points)
-    sigma_m = np.where(spread > _SPREAD_TIMES * noise_m, spread, noise_m)
-    sigma_m[wall.mask[rows, columns] == SurfaceMask.RECOVERED] *= _RECOVERED_TIMES
+    spread_m = np.nan_to_num(wall.sigma_m[rows, columns].astype(np.float64))
+    sigma_m = np.where(spread_m > _SPREAD_TIMES * point_m, spread_m, noise_m)
+    sigma_m[wall.mask[rows, columns] == SurfaceMask.RECOVERED] = between_m
     return np.asarray(0.5 * squares * (sigma_m**2 + patchy_m**2), dtype=np.float64)
 
 

@@ -134,6 +134,7 @@ class MosaicSeams(Method):
     id: ClassVar[str] = "mosaic.seams"
     repeatable: ClassVar[tuple[str, ...]] = ("seams",)
     determinism: ClassVar[Determinism] = "exact"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_orthoimages", label="orthoimages"),
         MetricSpec("n_sources", label="photos used"),

@@ -94,7 +94,7 @@ class RasterGrid(Method):
 
     id: ClassVar[str] = "raster.grid"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
         MetricSpec("omega_deg", label="direction of the first wall's normal (omega)"),

@@ -235,8 +235,6 @@ def _surface_of_all(
             _sort_depths(depths_m, ends, depth_m[cells], layer_m, threads=threads)
         raster_m = depth_m.reshape(slab.frame.shape)
         raster_m = without_specks(raster_m, gsd_m=gsd_m, layer_m=layer_m, threads=threads)
-        if params.surface == "denoised":
-            raster_m = denoised(raster_m)
         depth_m = raster_m.ravel()
     few = kernels.FewPoints(
         n_inside=count,
@@ -429,21 +427,20 @@ def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return is_known & (known < _SPARSE_SHARE * np.asarray(around))
 
 
-def denoised(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+def denoised(depth_m: NDArray[np.float32], noise_m: float) -> NDArray[np.float32]:
     """Average depths of neighbouring cells on the same surface (bilateral filter, Tomasi 1998).
 
-    The maximum difference in depth depends on the noise of the raster. Steps of more than about six
-    standard deviations are preserved.
+    Steps of more than about six standard deviations are preserved.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
+        noise_m: standard deviation of measured depths.
 
     Returns:
         (rows, cols) metres, NaN for void cells.
     """
     import cv2
 
-    noise_m = depth_noise_m(depth_m)
     is_known = np.isfinite(depth_m)
     if noise_m < _NOISE_LEAST_M or not is_known.any():
         return depth_m

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final, cast
 
 import numpy as np
@@ -13,6 +14,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
 from orthoflow.geometry.levels import REC_601
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.parameters import RasterParams
@@ -114,11 +116,21 @@ def _rastered(
     threads: int,
 ) -> dict[str, NDArray[np.generic]]:
     """Return the arrays of a `Wall` for a slab; their first axis is the cell, in row order."""
-    from orthoflow_plugins.raster.surfaces import carried_to_centres, close_gaps, surface_of
+    from orthoflow_plugins.raster.surfaces import (
+        carried_to_centres,
+        close_gaps,
+        denoised,
+        surface_of,
+    )
 
     surface = surface_of(cloud, slab, params, threads=threads)
+    # Interpolated depths have less noise than the points, which the filter is meant for.
+    noise_m = depth_noise_m(surface.depth_m.reshape(slab.frame.shape))
     mask = close_gaps(cloud, slab, surface, params, threads=threads)
     surface = carried_to_centres(surface, slab, params, threads=threads)
+    if params.surface == "denoised":
+        depth_m = denoised(surface.depth_m.reshape(slab.frame.shape), noise_m)
+        surface = replace(surface, depth_m=depth_m.ravel())
     intensity, rgb, rgb_mask = surface.intensity, surface.rgb, None
     if rgb is not None:
         rgb_mask = (mask != SurfaceMask.VOID).astype(np.uint8)

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from orthoflow_plugins.mosaic.agreement import Overlaps
 from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 from orthoflow_plugins.mosaic.seams import MosaicSeams
+from orthoflow_plugins.raster.surfaces import denoised
 
 from orthoflow.geometry.bands import in_memory
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.frames import cross_matrix, rotation_from_vector
-from orthoflow.products import Camera, Cameras, Intrinsics, LayerMask, Layers, Product, TieRole
+from orthoflow.products import Camera, Cameras, Intrinsics, LayerMask, Layers, SurfaceMask, TieRole
 from tests import samples
 from tests.method_runs import run
 from tests.raster_scenes import context
@@ -31,16 +32,11 @@ def stated_m(
     *cameras: Camera,
     source: NDArray[np.int16] | None = None,
     overlaps: Overlaps | None = None,
-    spread_m: float = 0.0,
+    wall: Any = None,
 ) -> NDArray[np.float32]:
     """Return the errors of an orthoimage whose cells are all from the first photo by default."""
-    wall = samples.wall(
-        FRAME,
-        sigma_m=np.full(FRAME.shape, spread_m, np.float32),
-        count=np.full(FRAME.shape, 4, np.uint32),
-    )
     return expected_errors_m(
-        wall,
+        samples.wall(FRAME) if wall is None else wall,
         np.zeros(FRAME.shape, np.int16) if source is None else source,
         tuple(each.photo for each in cameras),
         {each.photo: each for each in cameras},
@@ -73,7 +69,7 @@ def camera(viewing: ViewingCamera, **known: Any) -> Camera:
 
 
 def shown_m(
-    viewing: ViewingCamera, moved: ViewingCamera, places: NDArray[np.float64], depth_m: float
+    viewing: ViewingCamera, moved: ViewingCamera, places: NDArray[np.float64], depth_m: ArrayLike
 ) -> NDArray[np.float64]:
     """Return the distance between a cell and the point that another camera shows there."""
     near, other = viewing.shifted(SURVEY), moved.shifted(SURVEY)
@@ -87,12 +83,27 @@ def shown_m(
     return np.asarray((points - met) @ np.array([FRAME.u_world, FRAME.v_world]).T)
 
 
-@pytest.mark.parametrize("spread_m", [0.0, 0.004])
-def test_errors_of_poses_and_depths_are_propagated_to_the_wall(spread_m: float) -> None:
+@pytest.mark.parametrize(("noise_m", "is_denoised", "rtol"), [
+    (0.0, False, 0.002),
+    (0.01, False, 0.04),
+    (0.02, True, 0.1),
+])  # fmt: skip
+def test_errors_of_poses_and_depths_are_propagated_to_the_wall(
+    noise_m: float, is_denoised: bool, rtol: float
+) -> None:
+    points = np.random.default_rng(5).normal(0.0, 2.0 * noise_m, (4, *FRAME.shape))
+    sigma_m, depth_m = points.std(axis=0, ddof=1), points.mean(axis=0).astype(np.float32)
+    if is_denoised:
+        depth_m = denoised(depth_m, noise_m)
+    count, mask = np.full(FRAME.shape, 4, np.uint32), np.full(FRAME.shape, 1, np.uint8)
+    # The second place is interpolated between three others, and the third contains an edge.
+    sigma_m[80, 130], mask[50, 75] = 8.0 * noise_m, SurfaceMask.RECOVERED
+    wall = samples.wall(FRAME, depth_m=depth_m, sigma_m=sigma_m, mask=mask, count=count)
+    between = 1.0 if is_denoised else np.sqrt(0.5)
+    off_m = np.array([depth_m.std(), between * depth_m.std(), sigma_m[80, 130]])
     viewing = oblique()
     places = np.array([[20.5, 20.5], [75.5, 50.5], [130.5, 80.5]])
-    # The error of a median of four points is half of their spread.
-    errors_m = [shown_m(viewing, viewing, places, 0.5 * spread_m)]
+    errors_m = [shown_m(viewing, viewing, places, off_m)]
     for axis in np.eye(3):
         turn = rotation_from_vector(TURN_RAD * axis)
         rotation, translation = turn @ viewing.rotation, turn @ viewing.translation
@@ -101,8 +112,8 @@ def test_errors_of_poses_and_depths_are_propagated_to_the_wall(spread_m: float) 
         errors_m += [shown_m(viewing, moved, places, 0.0) for moved in (turned, shifted)]
     expected = np.sqrt(np.square(errors_m).sum(axis=0).mean(axis=1))
     columns, rows = places.T.astype(int)
-    stated = stated_m(camera(viewing), spread_m=spread_m)
-    np.testing.assert_allclose(stated[rows, columns], expected, rtol=0.002)
+    stated = stated_m(camera(viewing), wall=wall)
+    np.testing.assert_allclose(stated[rows, columns], expected, rtol=rtol)
 
 
 def test_a_lens_that_was_estimated_adds_what_its_photo_states() -> None:
@@ -169,7 +180,7 @@ def test_only_a_wall_with_ties_states_errors(tmp_path: Path, number: int) -> Non
         np.full(FRAME.shape, LayerMask.PAINTED, np.uint8), frame=FRAME, source="a.jpg"
     )
     ctx = context(tmp_path)
-    inputs: dict[str, Product] = {
+    inputs: dict[str, Any] = {
         "layers": Layers(layers=(layer,)),
         "walls": samples.walls(samples.wall(FRAME)),
         "cameras": Cameras(cameras=(camera(oblique()),), ties=ties),

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster import surfaces
 from orthoflow_plugins.raster.nets import interpolate_net
 from orthoflow_plugins.raster.surfaces import denoised, without_specks
 from scipy.interpolate import LinearNDInterpolator
@@ -18,6 +17,7 @@ from scipy.spatial import cKDTree
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.rastering import NO_POINT
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, SurfaceMask, Wall, Walls
 from tests import raster_scenes as scenes
@@ -87,14 +87,15 @@ def test_nearest_takes_the_nearest_point_wherever_it_lies(tmp_path: Path) -> Non
     assert wall.count.sum() == len(places)
 
 
-def test_denoising_filters_the_median(tmp_path: Path) -> None:
+def test_denoising_filters_the_median_after_gaps_are_closed(tmp_path: Path) -> None:
     known = scenes.leaning_wall(shape=(60, 80))
-    cloud, _, _ = scattered(known, per_cell=2.25, noise_m=NOISE_M)
-    median, filtered = (
-        rastered(cloud, known, tmp_path, surface=surface, recover_gap_cells=0).walls[0]
-        for surface in ("median", "denoised")
+    cloud, _, _ = scattered(known, per_cell=1.0, noise_m=NOISE_M)
+    measured, median, filtered = (
+        rastered(cloud, known, tmp_path, surface=surface, recover_gap_cells=gap_cells).walls[0]
+        for surface, gap_cells in (("median", 0), ("median", 2), ("denoised", 2))
     )
-    np.testing.assert_allclose(filtered.depth_m, denoised(median.depth_m), atol=1e-6)
+    noise_m = depth_noise_m(measured.depth_m)
+    np.testing.assert_allclose(filtered.depth_m, denoised(median.depth_m, noise_m), atol=1e-6)
     assert 5e-4 < np.nanstd(filtered.depth_m - median.depth_m) < 2e-3
 
 
@@ -310,12 +311,11 @@ def weighed(depth_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]
     return total / weights
 
 
-def test_noise_is_removed_by_two_bilateral_filters(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surfaces, "depth_noise_m", lambda _depth_m: 0.01)
+def test_noise_is_removed_by_two_bilateral_filters() -> None:
     depth_m = flat(30, 30, noise_m=0.012)
     depth_m[:, 15:] += 0.05
     expected = weighed(weighed(depth_m.astype(np.float64), 0.03), 0.015)
-    np.testing.assert_allclose(denoised(depth_m), expected, atol=2e-5)
+    np.testing.assert_allclose(denoised(depth_m, 0.01), expected, atol=2e-5)
 
 
 TURNED = (34, 43)
