@@ -2,13 +2,16 @@
 
     python benchmarks/curved_orthoimages.py FOLDER --subjects barrel-vault apse
         [--seed 7] [--photos 9] [--stations 1] [--scan-step-m 0.005] [--gsd-m 0.004]
-        [--only-curved] [--exif]
+        [--only-curved] [--exif] [--known-poses]
 
 For each subject, `simulate.curved` makes a scan (E57, with rows and columns) and photos of which
 only those nearest to the middle of the curved surface are kept. The recipe reads these files, finds
 the surfaces, orients the photos and makes the orthoimages, which are compared with the scene. `u`
 and `v` are RMS errors on the wall, and `limit` is 0.35 mm plus a tenth of a cell. With
-`--only-curved`, only the curved wall is rasterised; with `--exif`, the calibration is withheld.
+`--only-curved`, only the curved wall is rasterised; with `--exif`, the calibration is withheld;
+with `--known-poses`, the photos have their true poses. `within_1_sigma_share` and
+`within_2_sigma_share` are the shares of errors below one and two expected standard deviations (0.68
+and 0.95 for a normal distribution).
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from orthoflow_plugins.simulate.curved import SimulateCurved
 from scan_formats import write_e57
 
 from orthoflow.files.calibration import write_calibration
+from orthoflow.files.publishing import publish_cameras
 from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import Surface, Truth
 from orthoflow.records.open import open_run
@@ -36,6 +40,7 @@ RECIPE = "photos-on-scan.yaml"
 SHOWN = (
     *("rmse_u_mm", "rmse_v_mm", "nmad_u_mm", "nmad_v_mm"),
     *("patch_rmse_u_mm", "patch_rmse_v_mm", "completeness"),
+    *("within_1_sigma_share", "within_2_sigma_share"),
 )
 
 
@@ -52,6 +57,7 @@ def main() -> None:
     parser.add_argument("--gsd-m", type=float, default=0.004)
     parser.add_argument("--only-curved", action="store_true")
     parser.add_argument("--exif", action="store_true")
+    parser.add_argument("--known-poses", action="store_true")
     options = parser.parse_args()
     for subject in options.subjects:
         folder = options.folder.resolve() / f"{subject}-{options.seed}"
@@ -82,6 +88,9 @@ def made(folder: Path, subject: str, options: argparse.Namespace) -> None:
     given = [f"scan={folder / 'scan.e57'}", f"photos={folder / 'photos'}"]
     if not options.exif:
         given.append(f"calibration={folder / 'calibration.yaml'}")
+    if options.known_poses:
+        publish_cameras(room.cameras, folder, "")
+        given.append(f"cameras={folder / 'cameras.json'}")
     recipe = Path(__file__).parents[1] / "workflows" / RECIPE
     command = [sys.executable, "-m", "orthoflow", "run", str(recipe)]
     command += [word for each in given for word in ("--input", each)]
@@ -115,7 +124,7 @@ def judged(run_folder: Path, subject: str, truth: Truth, options: argparse.Names
         print(f"{subject}: no orthoimage; failed: {', '.join(failed) or 'none'}", flush=True)
         return
     walls, orthoimages = run.product("wall", "walls"), run.product("mosaic", "orthoimages")
-    cameras = run.product("orient", "cameras")
+    cameras = run.product("placed" if options.known_poses else "orient", "cameras")
     oriented = [one.photo for one in cameras.cameras if one.status == "ok"]
     print(f"{subject}: {len(oriented)} of {len(cameras.cameras)} photos oriented")
     for error in pose_errors(cameras, walls, truth, SceneCameras(truth.scene, cores=2)):
