@@ -22,7 +22,7 @@ from orthoflow.geometry.interpolation import Surroundings, cell_values, interpol
 from orthoflow.geometry.key_points import in_turns
 from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.products import SurfaceMask, Wall
-from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
+from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread
 
 # As in rasters, gaps between merged cells are filled if they are too narrow for a disc of this
 # radius.
@@ -299,7 +299,8 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
 
 def least_step_m(wall: Wall) -> float:
     """Return the minimum depth difference of a relief step."""
-    return max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
+    spread = usual_spread(wall)
+    return max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * spread.share * spread.usual_m)
 
 
 def grain_of(wall: Wall) -> NDArray[np.float32]:

@@ -67,7 +67,7 @@ class MatchGuided(Method):
 
     id: ClassVar[str] = "match.guided"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_ties", label="ties"),
         MetricSpec("rejected_share", label="share of rejected ties"),

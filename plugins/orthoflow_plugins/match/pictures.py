@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photos, Wall, Walls
 
@@ -25,6 +27,10 @@ _MAX_SPREADS: Final = 100_000
 _MIN_SPREADS: Final = 100
 # Standard deviation of depths, in cells, if it cannot be estimated.
 _UNKNOWN_SIGMA_CELLS: Final = 0.5
+# Smoothed depths of cells at this distance are nearly independent.
+_APART_CELLS: Final = 10
+# Smaller depth differences are due to rounding.
+_LEAST_NOISE_M: Final = 1e-5
 
 
 def require_photos(photos: Photos) -> None:
@@ -113,7 +119,7 @@ def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
 
 
 def points_on_wall(
-    wall: Wall, pixels_wall: NDArray[np.float64], *, usual_m: float | None = None
+    wall: Wall, pixels_wall: NDArray[np.float64], *, spread: Spread | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Return the surface points at positions (n, 2) = (column, row) in the raster of a wall.
 
@@ -123,7 +129,7 @@ def points_on_wall(
     Args:
         wall: the wall.
         pixels_wall: the positions.
-        usual_m: result of `usual_spread_m` for the wall; computed if None.
+        spread: result of `usual_spread` for the wall; computed if None.
 
     Returns:
         World points (n, 3) in metres, NaN where the depth is unknown; the standard deviations (n,)
@@ -134,24 +140,37 @@ def points_on_wall(
     centre_column = np.clip(np.rint(columns).astype(np.intp), 0, width - 1)
     centre_row = np.clip(np.rint(rows).astype(np.intp), 0, height - 1)
     nearest = wall.depth_m[centre_row, centre_column].astype(np.float64)
-    spread = _spread_about(wall, centre_row, centre_column)
-    smooth = spread < _SMOOTH_CELLS * wall.frame.gsd_m
+    range_m = _spread_about(wall, centre_row, centre_column)
+    smooth = range_m < _SMOOTH_CELLS * wall.frame.gsd_m
     depth = np.where(smooth, _bilinear(wall.depth_m, columns, rows), nearest)
     depth = np.where(np.isfinite(depth), depth, nearest)
     gsd_m, cell = wall.frame.gsd_m, (centre_row, centre_column)
-    usual = usual_spread_m(wall) if usual_m is None else usual_m
+    usual, share = usual_spread(wall) if spread is None else spread
     count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
     own = wall.sigma_m[cell].astype(np.float64)
     own = np.where(np.isfinite(own) & (count > 1.0), own, usual)
     # The depth of a cell is a mean or median of points at arbitrary positions in the cell.
-    noise = np.maximum(own / np.sqrt(count), 0.3 * usual)
-    step = np.where(smooth, 0.0, spread)
+    noise = share * np.maximum(own / np.sqrt(count), 0.3 * usual)
+    step = np.where(smooth, 0.0, range_m)
     sigma = np.sqrt(noise**2 + (0.5 * _CELL_SIGMA * gsd_m) ** 2 + (step * _CELL_SIGMA) ** 2)
     return wall.frame.world_from_wall(pixels_wall, depth), sigma, np.isfinite(nearest)
 
 
-def usual_spread_m(wall: Wall) -> float:
-    """Return the median, over cells on smooth surfaces, of the depth spread of points in a cell.
+class Spread(NamedTuple):
+    """Scatter of points on smooth surfaces of a wall.
+
+    Attributes:
+        usual_m: median of the standard deviations of the depths in a cell.
+        share: ratio of the depth errors of cells to those of means of their points; less than 1 if
+            the raster was smoothed.
+    """
+
+    usual_m: float
+    share: float
+
+
+def usual_spread(wall: Wall) -> Spread:
+    """Return the usual scatter of the points in a cell on smooth surfaces.
 
     Cells at relief steps are excluded. If the point spacing exceeds the cell size, most cells with
     several points are at such steps, and the spread would be the height of the step.
@@ -162,8 +181,14 @@ def usual_spread_m(wall: Wall) -> float:
     rows, columns = rows[::every], columns[::every]
     is_even = _spread_about(wall, rows, columns) < _SMOOTH_CELLS * gsd_m
     if is_even.sum() < _MIN_SPREADS:
-        return _UNKNOWN_SIGMA_CELLS * gsd_m
-    return float(np.median(wall.sigma_m[rows[is_even], columns[is_even]]))
+        return Spread(_UNKNOWN_SIGMA_CELLS * gsd_m, 1.0)
+    usual_m = float(np.median(wall.sigma_m[rows[is_even], columns[is_even]]))
+    noise_m = depth_noise_m(wall.depth_m[::_APART_CELLS, ::_APART_CELLS])
+    counts = wall.count[:: max(1, wall.count.size // _MAX_SPREADS)]
+    mean_m = usual_m / math.sqrt(float(np.median(counts[counts > 0])))
+    # Without noise, the depths are synthetic, or no cells are known at this distance.
+    is_known = min(noise_m, mean_m) > _LEAST_NOISE_M
+    return Spread(usual_m, min(1.0, noise_m / mean_m) if is_known else 1.0)
 
 
 def _spread_about(

@@ -218,7 +218,7 @@ def _camera_at(
         translation=-rotation @ (middle + lens.fx / px_per_m * normal),
     )
     cells = place.parts_m / frame.gsd_m
-    lifted, _, known = points_on_wall(wall, cells, usual_m=structure.usual_spread_m)
+    lifted, _, known = points_on_wall(wall, cells, spread=structure.spread)
     # Use the plane of the wall where its surface is unknown.
     points = np.where(known[:, None], lifted, frame.world_from_wall(cells))
     seen = SeenPoints(
@@ -269,7 +269,7 @@ def _tied(
             projection.pixels_at(moved.places + moved.shift_cells),
             moved.places + projection.corner + np.float64(0.5),
             np.full(len(moved), _SIGMA_CELLS * projection.pixels_per_cell),
-            usual_m=structure.usual_spread_m,
+            spread=structure.spread,
         )
         if len(piece) < _MIN_FIT:
             return None

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.robust import NMAD_FACTOR
 from orthoflow.products import Wall
 from orthoflow_plugins.match.channels import Channels
-from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
+from orthoflow_plugins.match.pictures import Spread, filled_smoothly, usual_spread
 
 # Number of cells along the shorter side of a wall, unless its raster is coarser.
 _CELLS: Final = 200.0
@@ -65,13 +65,13 @@ class WallStructure:
         wall: the wall with coarse cells.
         channels: structure of the wall.
         levels: spectra of the structure at one, two and four times the cell size.
-        usual_spread_m: result of the function `usual_spread_m` for the wall.
+        spread: result of `usual_spread` for the wall.
     """
 
     wall: Wall
     channels: Channels
     levels: Sequence[Spectra]
-    usual_spread_m: float
+    spread: Spread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +137,7 @@ def wall_structure(wall: Wall) -> WallStructure | None:
         wall=coarse,
         channels=channels,
         levels=[_spectra(*level) for level in levels],
-        usual_spread_m=usual_spread_m(coarse),
+        spread=usual_spread(coarse),
     )
 
 

@@ -22,7 +22,12 @@ from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.match.key_points import wall_features
-from orthoflow_plugins.match.pictures import one_by_one, points_on_wall, require_intensity
+from orthoflow_plugins.match.pictures import (
+    Spread,
+    one_by_one,
+    points_on_wall,
+    require_intensity,
+)
 from orthoflow_plugins.match.warping import Projection, project_walls
 
 if TYPE_CHECKING:
@@ -79,7 +84,7 @@ def piece_on_wall(
     cells: NDArray[np.float64],
     sigma_px: NDArray[np.float64],
     *,
-    usual_m: float | None = None,
+    spread: Spread | None = None,
     role: TieRole = TieRole.CONTROL,
 ) -> TiePiece:
     """Return the ties of one photo with one wall, except those without a finite pixel or depth.
@@ -91,10 +96,10 @@ def piece_on_wall(
         cells: (n, 2) (column, row) in the raster of the wall, with the first cell centre at (0.5,
             0.5).
         sigma_px: (n,) standard deviation of a pixel coordinate.
-        usual_m: as in `points_on_wall`.
+        spread: as in `points_on_wall`.
         role: role of the ties.
     """
-    points_world, sigma_m, known = points_on_wall(wall, cells, usual_m=usual_m)
+    points_world, sigma_m, known = points_on_wall(wall, cells, spread=spread)
     piece = TiePiece(
         photo=at[0],
         wall=at[1],

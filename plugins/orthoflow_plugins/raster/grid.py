@@ -35,6 +35,7 @@ from orthoflow_plugins.raster.frames import (
 )
 from orthoflow_plugins.raster.parameters import RasterParams
 from orthoflow_plugins.raster.reporting import (
+    is_noisy,
     report,
     report_empty,
     report_tones,
@@ -94,7 +95,7 @@ class RasterGrid(Method):
 
     id: ClassVar[str] = "raster.grid"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
         MetricSpec("omega_deg", label="direction of the first wall's normal (omega)"),
@@ -168,15 +169,18 @@ class RasterGrid(Method):
         for k, (index, slab) in enumerate(slabs.items()):
             name, is_curved = slab.frame.name, slab.frame.bend is not None
             ctx.progress(k / len(slabs), name)
-            rule = params.surface or ("denoised" if is_curved else "median")
-            wall = rastered_wall(
+            make = partial(
+                rastered_wall,
                 *flattened(cloud, slab),
-                params.model_copy(update={"surface": rule}),
                 index=index,
                 name=name,
                 allocate=partial(_allocated, ctx, k),
                 threads=ctx.cores,
             )
+            rule = params.surface or ("denoised" if is_curved else "median")
+            wall = make(params.model_copy(update={"surface": rule}))
+            if params.surface is None and not is_curved and is_noisy(ctx, wall):
+                wall = make(params.model_copy(update={"surface": "denoised"}))
             wall = replace(wall, frame=slab.frame)
             if is_curved:
                 blank_beside(wall)

@@ -51,11 +51,12 @@ class RasterParams(MethodParams):
         default=None,
         description="Depth of a cell. median (default on planes): median of the layer with the "
         "most points (layers are more than 2 cm apart), without outliers; denoised (default on "
-        "curved surfaces, parts of which every photo sees obliquely): the same after "
-        "edge-preserving smoothing; nearest: depth of the point nearest to the centre, also from "
-        "neighbouring cells (markiewicz2015); centre: the same, but only from points of the cell; "
-        "topmost: depth of the point nearest to the viewer (skarlatos2012); mean: mean of all "
-        "points; tin: a triangulation, which closes windows (for comparison).",
+        "curved surfaces, parts of which every photo sees obliquely, and on planes whose depth "
+        "noise exceeds gsd_m): the same after edge-preserving smoothing; nearest: depth of the "
+        "point nearest to the centre, also from neighbouring cells (markiewicz2015); centre: the "
+        "same, but only from points of the cell; topmost: depth of the point nearest to the viewer "
+        "(skarlatos2012); mean: mean of all points; tin: a triangulation, which closes windows "
+        "(for comparison).",
     )
     percentiles: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(
         default=(),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import SphereBend, omega_phi_deg
 from orthoflow.geometry.bands import count_cells
+from orthoflow.geometry.cloud_quality import scan_step_m
 from orthoflow.geometry.levels import plain_tone
 from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import PointCloud, SurfaceMask, Wall
@@ -27,6 +28,8 @@ _SHARE_WORTH_WORDS: Final = 0.1
 _CAUSE_WORTH_WORDS: Final = 0.01
 # Minimum share of cells for a warning about omitted objects in front of a wall.
 _LEFT_OUT_WORTH_WORDS: Final = 0.05
+# Smoothing preserves depth steps of at least about this many standard deviations.
+_STEP_SIGMAS: Final = 6.0
 # Smallest share that is not printed as 0.0 %.
 _SHARE_LEAST: Final = 0.0005
 
@@ -124,6 +127,15 @@ CLOSE_CELLS: Final = DiagnosticSpec(
     remedy="{remedy}",
     rank_by="interpolated",
 )
+NOISY: Final = DiagnosticSpec(
+    code="depths-smoothed",
+    severity="warning",
+    text="{subject}: the depth noise of {noise_m:.2g} m exceeds the cell size of {gsd_m:g} m, so "
+    "depths are smoothed over neighbouring cells, and relief of less than about {relief_m:.2g} m "
+    "may be lost",
+    remedy="set {step}.gsd_m={least_m:g} or larger, with which noise is averaged in the cells",
+    rank_by="noise_m",
+)
 CAUSES: Final[dict[Cause, DiagnosticSpec]] = {
     "behind": BEHIND_BUFFER,
     "before": FRONT_LEFT_OUT,
@@ -160,7 +172,8 @@ def warn(
         if is_close or filled >= _SHARE_WORTH_WORDS:
             measured = np.count_nonzero(wall.count) / wall.count.size
             larger = (
-                f"set {{step}}.gsd_m={_least_gsd_m(step_m):g} or larger to interpolate fewer cells"
+                f"set {{step}}.gsd_m={_least_gsd_m(step_m / _STEP_MOST_CELLS):g} or larger to "
+                "interpolate fewer cells"
             )
             ctx.report(
                 CLOSE_CELLS,
@@ -173,9 +186,30 @@ def warn(
             )
 
 
-def _least_gsd_m(step_m: float) -> float:
-    """Return the smallest cell size, with two significant digits, that suits a point spacing."""
-    least_m = step_m / _STEP_MOST_CELLS
+def is_noisy(ctx: StepContext, wall: Wall) -> bool:
+    """Return whether the depths of a wall have more noise than its cells are wide, and report it.
+
+    At 45 degrees, such noise displaces the pixels of a photo by more than a cell, and noise is
+    mistaken for relief, whose steps are measured in cells.
+    """
+    noise_m, gsd_m = depth_noise_m(wall.depth_m), wall.frame.gsd_m
+    if noise_m <= gsd_m:
+        return False
+    # The noise of a mean is inversely proportional to the cell size, if cells contain points.
+    apart_m = max(gsd_m, scan_step_m(wall.count, gsd_m=gsd_m))
+    ctx.report(
+        NOISY,
+        subject=wall.name,
+        noise_m=noise_m,
+        gsd_m=gsd_m,
+        relief_m=_STEP_SIGMAS * noise_m,
+        least_m=_least_gsd_m(math.sqrt(noise_m * apart_m)),
+    )
+    return True
+
+
+def _least_gsd_m(least_m: float) -> float:
+    """Return the next larger number with two significant digits."""
     digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
     # Round up, because the nearest number with two significant digits may be too fine.
     return float(f"{math.ceil(least_m / digit_m - 1e-6) * digit_m:.2g}")

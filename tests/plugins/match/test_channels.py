@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import channels, pictures
 from orthoflow_plugins.match.channels import in_cells_of_points
+from orthoflow_plugins.raster.surfaces import denoised
 from scipy.ndimage import gaussian_filter
 
 from orthoflow.errors import MethodError
@@ -227,10 +228,21 @@ def test_the_accuracy_of_a_point_is_that_of_its_cell_and_its_place_in_it() -> No
     for usual_m, told_m in ((0.002, None), (0.002, 0.002), (0.005, 0.005)):
         noises_m = (0.008 / 4.0, usual_m, usual_m / 2.0, 0.3 * usual_m)
         np.testing.assert_allclose(
-            pictures.points_on_wall(of, places, usual_m=told_m)[1],
+            pictures.points_on_wall(of, places, spread=told_m and pictures.Spread(told_m, 1.0))[1],
             [math.hypot(noise_m, in_cell_m) for noise_m in noises_m],
             rtol=1e-6,
         )
+
+
+def test_smoothing_reduces_the_error_of_a_point() -> None:
+    noise_m = 0.02
+    depth_m = np.random.default_rng(5).normal(0.0, noise_m, (300, 400)).astype(np.float32)
+    spread_m = np.full(depth_m.shape, noise_m, dtype=np.float32)
+    noisy = wall(depth_m, sigma_m=spread_m, count=np.ones(depth_m.shape, np.uint32))
+    places = 10.0 + 10.0 * np.argwhere(np.ones((38, 28)))
+    for of in (noisy, replace(noisy, depth_m=denoised(depth_m, noise_m))):
+        points, sigmas_m, _ = pictures.points_on_wall(of, places + 0.5)
+        assert np.median(sigmas_m) == pytest.approx(np.std(points[:, 1]), rel=0.3)
 
 
 @pytest.mark.parametrize(("step_m", "is_edge"), [(0.0095, False), (0.0105, True)])

@@ -87,16 +87,29 @@ def test_nearest_takes_the_nearest_point_wherever_it_lies(tmp_path: Path) -> Non
     assert wall.count.sum() == len(places)
 
 
-def test_denoising_filters_the_median_after_gaps_are_closed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("noise_m", [NOISE_M, 0.03])
+def test_the_median_is_denoised_after_gaps_are_closed_by_default_if_noise_exceeds_the_cells(
+    tmp_path: Path, noise_m: float
+) -> None:
     known = scenes.leaning_wall(shape=(60, 80))
-    cloud, _, _ = scattered(known, per_cell=1.0, noise_m=NOISE_M)
-    measured, median, filtered = (
-        rastered(cloud, known, tmp_path, surface=surface, recover_gap_cells=gap_cells).walls[0]
-        for surface, gap_cells in (("median", 0), ("median", 2), ("denoised", 2))
+    cloud, _, _ = scattered(known, per_cell=1.0, noise_m=noise_m)
+    variants: tuple[dict[str, object], ...] = (
+        {"surface": "median", "recover_gap_cells": 0},
+        {"surface": "median"},
+        {"surface": "denoised"},
+        {},
     )
-    noise_m = depth_noise_m(measured.depth_m)
-    np.testing.assert_allclose(filtered.depth_m, denoised(median.depth_m, noise_m), atol=1e-6)
-    assert 5e-4 < np.nanstd(filtered.depth_m - median.depth_m) < 2e-3
+    found = [
+        scenes.rastered(cloud, known.planes(), tmp_path, gsd_m=known.gsd_m, **params)
+        for params in variants
+    ]
+    measured_m, median_m, filtered_m, default_m = (walls.walls[0].depth_m for walls, _ in found)
+    expected_m = denoised(median_m, depth_noise_m(measured_m))
+    np.testing.assert_allclose(filtered_m, expected_m, atol=1e-6)
+    assert 0.25 * noise_m < np.nanstd(filtered_m - median_m) < noise_m
+    is_noisy, ctx = noise_m > known.gsd_m, found[3][1]
+    np.testing.assert_array_equal(default_m, filtered_m if is_noisy else median_m)
+    assert ("depths-smoothed" in {one.code for one in ctx.diagnostics}) == is_noisy
 
 
 def test_percentiles_are_numpys_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
