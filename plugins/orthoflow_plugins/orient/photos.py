@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import POSE_PARAMETERS, ViewingCamera, opencv_matrix, to_opencv
 from orthoflow.geometry.resection import Resection, SeenPoints, adjust, misfit, stated
-from orthoflow.products import Camera, Photo, Photos, TieRole, Ties
+from orthoflow.products import Camera, Photo, Photos, PointCloud, TieRole, Ties
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.orient.gates import (
     GATES_BEFORE_BLOCK,
@@ -43,7 +43,7 @@ from orthoflow_plugins.orient.pose import (
     undistorted_pixels,
 )
 from orthoflow_plugins.orient.report import Oriented, numbers_json
-from orthoflow_plugins.orient.scan_errors import measured_scan_errors
+from orthoflow_plugins.orient.scan_errors import MAX_SCANS, measured_scan_errors
 
 MIN_TIES: Final = 6
 _MAX_WRONG: Final = 2
@@ -242,6 +242,15 @@ _TESTED_PER_LENS: Final = 5
 # _SAME_FOCAL, they take precedence over a contradicting EXIF value of another photo.
 _MIN_OTHERS: Final = 2
 _SAME_FOCAL: Final = 1.05
+REGISTRATION_UNKNOWN: Final = DiagnosticSpec(
+    code="registration-unknown",
+    severity="warning",
+    text="the cloud does not show how well its scans are registered, since {reason}: expected "
+    "errors include errors of registration only as far as residuals show them, and may be half "
+    "the true errors",
+    remedy="read the scans with their scanner positions (E57, or one file per scan), with "
+    "overlaps, or measure check points",
+)
 EXIF_CONTRADICTED: Final = DiagnosticSpec(
     code="exif-focal-contradicted",
     severity="warning",
@@ -321,14 +330,25 @@ def scan_errors_of(inputs: OrientIn, ctx: StepContext) -> NDArray[np.float64] | 
             (cloud.x, cloud.y, cloud.z), cloud.scan, cloud.origin, stations
         )
     if found is None:
-        ctx.log(
-            "the cloud does not show how well scans are registered, since it has one scan, no "
-            "numbers of scans, no surface in several of them, or more than 100 scans: expected "
-            "errors include errors of registration only as far as residuals show them"
-        )
+        if reason := _unmeasured(cloud):
+            ctx.report(REGISTRATION_UNKNOWN, reason=reason)
         return None
     ctx.metric("scan_registration_mm", 1e3 * float(found.sigma_m[0]), "mm")
     return found.at(inputs.ties.points_world)
+
+
+def _unmeasured(cloud: PointCloud) -> str:
+    """Return why a cloud does not show the registration of its scans; empty for a single scan."""
+    if cloud.scan is None:
+        return "its points have no scan numbers"
+    n_scans = np.count_nonzero(np.bincount(cloud.scan))
+    if n_scans > MAX_SCANS:
+        return f"it has {n_scans} scans, more than {MAX_SCANS}"
+    if n_scans > 1:
+        return f"no surface is in several of its {n_scans} scans"
+    if cloud.stations_source == "file":
+        return ""
+    return "it is one scan without a scanner position, which may combine several"
 
 
 def tied_photo(

@@ -32,8 +32,8 @@ _CONVERGED: Final = 0.01
 # Patterns of uncertain motions are omitted if their variance is below this share of that of an
 # unknown motion.
 _KEPT_VARIANCE: Final = 1e-3
-# The motions of more scans would take minutes.
-_MAX_SCANS: Final = 100
+MAX_SCANS: Final = 100
+"""The motions of more scans would take minutes."""
 # Translation and rotation of a scan.
 _MOTION: Final = 6
 
@@ -106,7 +106,7 @@ def measured_scan_errors(
         own = np.unique(stations, axis=0, return_inverse=True)[1].ravel()[own]
     numbers, of_point = np.unique(own, return_inverse=True)
     n_scans = len(numbers)
-    if not 2 <= n_scans <= _MAX_SCANS:
+    if not 2 <= n_scans <= MAX_SCANS:
         return None
     middle = points.mean(axis=0)
     points -= middle

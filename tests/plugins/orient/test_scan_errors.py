@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.orient.photos import scan_errors_of
+from orthoflow_plugins.orient.pose import OrientIn
 from orthoflow_plugins.orient.scan_errors import ScanErrors, measured_scan_errors
+
+from orthoflow.products import Photos
+from tests import samples
+from tests.raster_scenes import cloud_of, context
 
 ORIGIN = np.array([4e5, 5e6, 100.0])
 SIDES_M = np.array([6.0, 5.0, 3.0])
@@ -61,3 +70,31 @@ def test_what_one_wall_does_not_show_is_as_uncertain_as_what_it_shows_is_large()
 
 def test_scans_without_a_common_surface_show_no_motions() -> None:
     assert scanned(np.zeros((2, 2, 3)), (1, 2), gap_m=1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("n_scans", "source", "reason"),
+    [
+        (0, None, "no scan numbers"),
+        (1, "file", None),
+        (1, None, "one scan"),
+        (2, "file", "no surface"),
+        (101, "file", "101 scans"),
+    ],
+)
+def test_clouds_that_do_not_show_their_registration_are_reported_with_the_reason(
+    tmp_path: Path, n_scans: int, source: str | None, reason: str | None
+) -> None:
+    # The scans are metres apart.
+    scan = np.repeat(np.arange(n_scans, dtype=np.uint16), 20) if n_scans else None
+    points = np.random.default_rng(1).uniform(size=(20 * max(n_scans, 1), 3))
+    points[:, 0] += 0.0 if scan is None else 3.0 * scan
+    stations = None if source is None else np.arange(3.0 * n_scans).reshape(-1, 3)
+    cloud = replace(cloud_of(points), scan=scan, stations=stations, stations_source=source)
+    ones = {"points_world": np.ones((1, 3)), "sigma_px": np.ones(1), "sigma_m": np.ones(1)}
+    ties = samples.ties(np.ones((1, 2)), **ones)
+    inputs = OrientIn(ties=ties, photos=Photos(photos=()), cloud=cloud)
+    ctx = context(tmp_path)
+    assert scan_errors_of(inputs, ctx) is None
+    assert [one.code for one in ctx.diagnostics] == ["registration-unknown"] * (reason is not None)
+    assert all(str(reason) in one.text for one in ctx.diagnostics)
