@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.levels import Colours
+from orthoflow.geometry.slabs import read_only_view
 from orthoflow.geometry.threads import in_parts
 
 # Cells are used if they are at most this many cells farther away than the nearest one.
@@ -114,6 +115,7 @@ def interpolate(
         offsets=_offsets_within(max(math.sqrt(_NEIGHBOURS_SQUARE), reach_cells + _BEYOND_CELLS)),
         is_found=np.zeros(len(cells), dtype=np.bool_),
     )
+    values = values._replace(depth_m=read_only_view(values.depth_m))
     task = partial(interpolate_cells, wanted, around, values, into)
     in_parts(task, len(cells), threads=threads)
     return wanted.is_found

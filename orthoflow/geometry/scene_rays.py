@@ -568,8 +568,8 @@ class SceneRays:
         rectangle = np.empty(n_rays, dtype=np.int32)
         cast_rays(
             self._table,
-            np.ascontiguousarray(starts, dtype=np.float64),
-            np.ascontiguousarray(ways, dtype=np.float64),
+            np.require(starts, np.float64, ["C", "W"]),
+            np.require(ways, np.float64, ["C", "W"]),
             t,
             rectangle,
         )

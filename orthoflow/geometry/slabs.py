@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.threads import in_parts
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class Offsets(NamedTuple):
@@ -22,10 +24,14 @@ class Offsets(NamedTuple):
 
 def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> Offsets:
     """Return read-only offsets, as kernels expect them; the arrays may be memory-mapped."""
-    views = [np.asarray(values).view(np.ndarray) for values in (x, y, z)]
-    for view in views:
-        view.flags.writeable = False
-    return Offsets(*views)
+    return Offsets(*map(read_only_view, (x, y, z)))
+
+
+def read_only_view(values: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """Return a read-only view: kernels would be compiled once more for writeable arrays."""
+    view = np.asarray(values).view(np.ndarray)
+    view.flags.writeable = False
+    return view
 
 
 # Two threads use the entire bandwidth of the memory or the disk.

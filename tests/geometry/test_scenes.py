@@ -315,7 +315,7 @@ def colour_at(kind: int, params: NDArray[np.float64], a: float, b: float) -> tup
 def test_colours_stay_within_what_a_photo_and_a_laser_tell(kind: TextureKind) -> None:
     params = np.array([250.0, 5.0, 120.0, 0.9, 1.0, 0.2, 3.0, 0.5])
     places = np.random.default_rng(SEED).uniform(0.0, 2.0, (400, 2))
-    shades = np.array([colour_at(int(kind), params, a, b) for a, b in places])
+    shades = np.array([colour_at(np.int32(kind), params, a, b) for a, b in places])
     assert (shades[:, :3] >= 0.0).all()
     assert (shades[:, :3] <= 255.0).all()
     assert shades[:, 0].max() == 255.0
@@ -323,7 +323,7 @@ def test_colours_stay_within_what_a_photo_and_a_laser_tell(kind: TextureKind) ->
     assert (shades[:, 3] <= 1.0).all()
     # Without contrast nothing but the ground is left.
     plain = params * [1, 1, 1, 1, 0, 1, 1, 1]
-    ground = np.array([colour_at(int(kind), plain, a, b) for a, b in places])
+    ground = np.array([colour_at(np.int32(kind), plain, a, b) for a, b in places])
     np.testing.assert_allclose(ground, np.tile([250.0, 5.0, 120.0, 0.9], (400, 1)))
 
 

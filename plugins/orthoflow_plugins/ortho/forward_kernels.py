@@ -57,7 +57,7 @@ def throw_pixels(
     rows, columns = relief.depth.shape
     width, height = int(view.camera[21]), int(view.camera[22])
     per_step, per_pixel = 1.0 / RAY_STEP_PX, 1.0 / buffer.reduction
-    lowest = float(np.min(relief.bottoms))
+    lowest = np.float64(np.min(relief.bottoms))
     free_m, gsd_m = view.height_m - view.front_m, view.gsd_m
     n_met = 0
     for j in range(height):

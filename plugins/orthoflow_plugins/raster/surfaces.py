@@ -26,7 +26,7 @@ from orthoflow.geometry.rastering import (
     wall_from_offset,
 )
 from orthoflow.geometry.robust import depth_noise_m
-from orthoflow.geometry.slabs import Slab, read_only
+from orthoflow.geometry.slabs import Slab, read_only, read_only_view
 from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.raster import kernels
@@ -354,12 +354,12 @@ def _averaged_values(
     channels: list[tuple[NDArray[np.generic], NDArray[np.bool_], NDArray[np.generic]]] = []
     if cloud.intensity is not None:
         of_intensity = np.zeros((slab.n_cells, 2))
-        channels.append((np.asarray(cloud.intensity)[:, np.newaxis], of_all, of_intensity))
+        channels.append((read_only_view(cloud.intensity)[:, np.newaxis], of_all, of_intensity))
     if cloud.rgb is not None:
         # Integer sums need half the memory and are exact.
         of_colour = np.zeros((slab.n_cells, 4), dtype=np.uint32)
         has_rgb = of_all if cloud.has_rgb is None else np.asarray(cloud.has_rgb)
-        channels.append((np.asarray(cloud.rgb), has_rgb, of_colour))
+        channels.append((read_only_view(cloud.rgb), has_rgb, of_colour))
     offsets = read_only(cloud.x, cloud.y, cloud.z)
     matrix = wall_from_offset(slab.frame, cloud.origin)
     for entries in entries_inside(cloud, slab, threads=threads):

@@ -221,7 +221,7 @@ def robust_solution(
         The solution (k,), the weights (n,), and the standard deviation of the additional scatter.
     """
     solution, weights = np.zeros(matrix.shape[1]), np.empty(len(matrix))
-    matrix = np.ascontiguousarray(matrix)
+    matrix, distances = np.ascontiguousarray(matrix), np.ascontiguousarray(distances)
     extra = solve_robustly(matrix, distances, variances, TUKEY, solution, weights)
     return solution, weights, extra
 

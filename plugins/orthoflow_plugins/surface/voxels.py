@@ -157,7 +157,7 @@ class VoxelGrid:
 
 def in_voxels(sample: Sample, voxel_m: float) -> VoxelGrid:
     """Sort a sample into voxels of a size."""
-    points = sample.offsets_m
+    points = np.ascontiguousarray(sample.offsets_m)
     # Points that are very far away are errors; voxel numbers have 20 bits.
     low = np.array([column.min() for column in points.T])
     high = np.array([column.max() for column in points.T])
