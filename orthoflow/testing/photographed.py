@@ -14,7 +14,6 @@ from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry import WallFrame, up_vector
@@ -76,6 +75,8 @@ class TexturedWall:
 
     def grey(self, across_m: _Array, down_m: _Array) -> _Array:
         """Return the grey value, 0 to 1, at positions in metres from the top-left corner."""
+        from scipy.ndimage import map_coordinates  # noqa: PLC0415 - loads slowly, and here alone
+
         total = np.zeros(np.broadcast(across_m, down_m).shape)
         for step, noise in zip(_OCTAVES_M, self.noises, strict=True):
             at = [down_m / step + 8.0, across_m / step + 8.0]

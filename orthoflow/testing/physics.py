@@ -18,7 +18,6 @@ from orthoflow.products import (
     Planes,
     is_painted,
 )
-from orthoflow.testing.examples import example_room
 from orthoflow.testing.photographed import (
     PHOTOGRAPHING,
     TexturedWall,
@@ -35,14 +34,12 @@ from orthoflow.testing.subjects import Subject, output_of, require
 # With errors of 0.3 px and 1 mm at 2.5 m, a single tie is off by 1.3 mm on the wall, and the mean
 # of a hundred ties by a tenth of that. The half-pixel error of a wrong pixel convention is 1.5 mm.
 _POSE_LIMIT_M: Final = 0.0008
-# The smallest surface of the room has 2,300 points, which determine its direction to 0.003 deg.
-_ROOM_POINTS: Final = 20_000
 _CELL_SIZES_M: Final = (0.006, 0.01)
 _SHIFT_LIMIT_CELLS: Final = 0.2
 _PAINTED_SHARE: Final = 0.3
 # Layers together show all cells of the example.
 _JOINED_SHARE: Final = 0.97
-# Seeds of the rooms or sets of ties whose errors are compared with the predicted ones.
+# Seeds of the sets of ties whose errors are compared with the predicted ones.
 _DRAWS: Final = (2, 3, 4)
 # A plane farther than this from all true planes is not part of the room.
 _SAME_PLANE_M: Final = 0.02
@@ -60,11 +57,8 @@ def planes_follow_a_rigid_motion(subject: Subject) -> None:
     Tolerances are 0.02 deg and 1 mm, far above the noise of the fit (2 mm / sqrt(n)) and far below
     the errors of a method that depends on the direction of the axes or loses precision.
     """
-    shift = np.array([634512.347, 486215.781, 112.193])
-    for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
-        cloud, truth = example_room(n_points=_ROOM_POINTS, turned_deg=turned_deg, shift_m=moved_by)
-        run = subject.run_on(cloud=cloud)
-        planes = output_of(run, "planes", Planes)
+    shift_m = np.array([634512.347, 486215.781, 112.193])
+    for planes, truth in (*subject.turned_rooms, subject.planes_in_room(1, 191.7, shift_m)):
         require(len(planes) > 0, "no plane was found")
         match_planes(planes, truth)
 
@@ -87,9 +81,7 @@ def match_planes(found: Planes, truth: Planes) -> None:
 def stated_errors_of_planes_hold(subject: Subject) -> None:
     """In random rooms, errors of planes are 0.1 to 2 times those predicted by the covariances."""
     ratios: list[float] = []
-    for seed in _DRAWS:
-        cloud, truth = example_room(seed=seed, n_points=_ROOM_POINTS)
-        found = output_of(subject.run_on(cloud=cloud), "planes", Planes)
+    for found, truth in subject.turned_rooms:
         for index in range(len(found)):
             corners = truth.corners[np.argmax(truth.normal @ found.normal[index])]
             places = np.vstack([corners, corners.mean(axis=0)])

@@ -15,16 +15,23 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthoflow.engine.kernels import VARIABLE
 from orthoflow.engine.store import digest_of
-from orthoflow.products import Product
+from orthoflow.products import Planes, Product
 from orthoflow.sdk import Method, port_specs
-from orthoflow.testing.examples import example_inputs
+from orthoflow.testing.examples import example_inputs, example_room
 from orthoflow.testing.trials import Trial, TrialRun, run_trial
 
 _Product = TypeVar("_Product", bound=Product)
 
 _LIMIT_S: Final = 600
+# The smallest surface of a room has 2,300 points, which determine its direction to 0.003 deg.
+_ROOM_POINTS: Final = 20_000
+# Seeds of rooms, and the angles by which they are rotated about the vertical in degrees.
+_ROOMS: Final = ((2, 0.0), (3, 33.0), (4, 191.7))
 _PROGRAM: Final = """
 import json, pickle, sys
 from pathlib import Path
@@ -90,6 +97,20 @@ class Subject:
     def run_on(self, **inputs: Product) -> TrialRun:
         """Run the method with other inputs on some ports."""
         return _run(replace(self.trial, inputs={**self.trial.inputs, **inputs}))
+
+    @cached_property
+    def turned_rooms(self) -> list[tuple[Planes, Planes]]:
+        """The planes found in each of several rotated rooms, and the true ones."""
+        return [self.planes_in_room(seed, angle_deg) for seed, angle_deg in _ROOMS]
+
+    def planes_in_room(
+        self, seed: int, turned_deg: float, shift_m: NDArray[np.float64] | None = None
+    ) -> tuple[Planes, Planes]:
+        """Return the planes found in a room (see `example_room`), and the true ones."""
+        cloud, truth = example_room(
+            seed=seed, n_points=_ROOM_POINTS, turned_deg=turned_deg, shift_m=shift_m
+        )
+        return output_of(self.run_on(cloud=cloud), "planes", Planes), truth
 
     def run_on_photographs(self, **inputs: Product) -> TrialRun:
         """Run the method on the photographs of the suite, with other inputs on some ports."""
