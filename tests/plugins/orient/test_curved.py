@@ -61,8 +61,8 @@ def shifts_m(layer: Layer, true: NDArray[np.float64]) -> NDArray[np.float64]:
 # The drum, and the angles of cameras, their positions along it and distances.
 SCENES = {
     "vault": (
-        curved_scenes.vault(half_deg=45.0, length_m=1.2, band_m=(0.2, 0.35), height_m=0.08),
-        [(-30.0, -0.2, 2.4), (0.0, 0.2, 2.5), (30.0, -0.2, 2.4)],
+        curved_scenes.vault(half_deg=32.0, length_m=1.2, band_m=(0.2, 0.35), height_m=0.08),
+        [(-16.0, -0.2, 2.4), (16.0, 0.2, 2.5)],
     ),
     "spire": (
         curved_scenes.spire(half_deg=60.0, band_m=(3.2, 3.35), height_m=0.08),
@@ -106,7 +106,7 @@ def test_oriented_photos_are_unrolled_to_a_tenth_of_a_cell(name: str, tmp_path: 
     again = run(MatchGuided, context(tmp_path), more).ties
     inputs = {"ties": again, "photos": photos}
     cameras = run(OrientColmapBundle, context(tmp_path), inputs).cameras
-    assert [camera.status for camera in cameras.cameras] == ["ok"] * 3
+    assert [camera.status for camera in cameras.cameras] == ["ok"] * len(poses)
     for camera, viewer in zip(cameras.cameras, viewers, strict=True):
         assert np.linalg.norm(camera.viewing().centre_world - viewer.centre_world) < 1.5e-3
 
