@@ -32,7 +32,16 @@ from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
 from orthoflow.files.geotiff import epsg_of, epsg_wkt
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Cameras, Photo, Photos, Planes, PointCloud, PointLabels, Walls
+from orthoflow.products import (
+    Cameras,
+    Photo,
+    Photos,
+    Planes,
+    PointCloud,
+    PointLabels,
+    Surfaces,
+    Walls,
+)
 from orthoflow.records.runs import Run
 
 
@@ -63,6 +72,8 @@ def export_cloud(
         labels = product_of(run, digest, PointLabels, chosen.store)
         digest = taken[0]
         planes = last_product(run, {address: recorded}, Planes, chosen.store)
+        if surfaces := last_product(run, {address: recorded}, Surfaces, chosen.store):
+            planes = surfaces.planes
     cloud = product_of(run, digest, PointCloud, chosen.store)
     if len(cloud) == 0:
         raise ArgumentError(f"the cloud of {address} has no points")

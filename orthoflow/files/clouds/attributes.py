@@ -50,7 +50,7 @@ class AttributedCloud:
         colouring: meaning of the colours.
         neighbourhoods: neighbourhoods of the cloud.
         planes: planes of the run; None if there are no planes, and thus no deviations.
-        labels: plane labels of the points; None if `planes` is None.
+        labels: planes or surfaces of the points.
         photo_colours: colours for the colouring `photos`.
         photo_names: names of the photos in `photo_colours`, by number.
         wall: wall to whose raster and buffer the points are restricted, and from whose plane
@@ -276,7 +276,8 @@ class AttributedCloud:
             towards = stations[0] - world
         elif plane is not None and self.planes is not None:
             normals = np.vstack([self.planes.normal, self.cloud.up])
-            towards = normals[plane]
+            # The indices of curved surfaces follow those of planes.
+            towards = normals[np.minimum(plane, len(self.planes))]
         along = np.einsum("ij,ij->i", towards, normal)
         return np.where(along < 0.0, -1.0, 1.0).astype(np.float32)
 

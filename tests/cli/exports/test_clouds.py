@@ -26,6 +26,7 @@ from orthoflow.products import (
     PointCloud,
     PointLabels,
     Product,
+    Surfaces,
 )
 from tests import samples
 from tests.report_runs import HeldRun, cameras_product, cell, given, run_of
@@ -107,6 +108,18 @@ def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
     for box in ("1,2,3,4,5", "a,2,3,4,5,6", "1,2,nan,4,5,6"):
         with pytest.raises(ArgumentError, match="--box must be six numbers in metres"):
             exported(tmp_path, labelled(), box=box)
+
+
+def test_points_on_curved_surfaces_deviate_from_no_plane(tmp_path: Path) -> None:
+    (one,) = samples.surfaces().surfaces[:1]
+    found = Surfaces(surfaces=(replace(one, name="vault 1"),), up=one.zero_world, planes=planes())
+    marks = PointLabels(plane_index=(np.arange(N_SIDE**2) % 3 - 1).astype(np.int16))
+    made: dict[str, Product] = {"surfaces": found, "labels": marks}
+    scanned = replace(cloud(), stations=None)
+    run = toy_run(scan=({}, {"cloud": scanned}), curved=({"cloud": "scan"}, made))
+    (block,) = exported(tmp_path, run, colour="deviation")[1].blocks()
+    np.testing.assert_array_equal(np.isfinite(block["deviation"]), block["plane"] == 0)
+    assert (block["nz"][block["plane"] == 1] >= 0.0).all()
 
 
 @pytest.mark.parametrize(
