@@ -1,9 +1,10 @@
-"""Measure accuracy and time of `surface.cylinder`, and of other programs, on simulated buildings.
+"""Measure accuracy and time of `surface.*`, and of other programs, on simulated buildings.
 
-Domes are found by `surface.sphere`; they have no axis, and `place` is the error of their centre.
+As in the recipes, spheres, cylinders and cones are searched in all buildings, in this order; times
+are those of `surface.cylinder`. Spheres have no axis, and `place` is the error of their centre.
 
     python benchmarks/surface_detectors.py                        # 10 drawn buildings of each kind
-    python benchmarks/surface_detectors.py --rooms 50             # rooms of planes: no cylinders
+    python benchmarks/surface_detectors.py --rooms 50             # rooms of planes: none found
     python benchmarks/surface_detectors.py --points 10000000      # time in F
     python benchmarks/surface_detectors.py --peers
 
@@ -18,19 +19,22 @@ import math
 import os
 import tempfile
 import time
+import typing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from orthoflow_plugins.simulate.curved import SimulateCurved
+from orthoflow_plugins.simulate.curved_model import Subject
 from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow_plugins.surface.cylinder import SurfaceCylinder
 from orthoflow_plugins.surface.detection import Detection, detect
 from orthoflow_plugins.surface.search import Form
 from plane_detectors import pass_s
 
-from orthoflow.geometry import Sphere
-from orthoflow.products import PointCloud, Surface, Truth
+from orthoflow.geometry import Cone, Sphere
+from orthoflow.products import PointCloud, Surface, Surfaces, Truth
 from orthoflow.sdk import Method, StepContext
 
 SUBJECTS = ("barrel-vault", "cross-vault", "apse", "tower", "column")
@@ -44,24 +48,40 @@ def simulated(method: type[Method], seed: int, **params: object) -> tuple[PointC
 
 
 def detected(
-    cloud: PointCloud, seed: int = 0, *, form: Form = "cylinder", **params: object
+    cloud: PointCloud,
+    seed: int = 0,
+    *,
+    form: Form = "cylinder",
+    earlier: tuple[Surfaces | None, NDArray[np.int16] | None] = (None, None),
+    **params: object,
 ) -> Detection:
     known = SurfaceCylinder.Params.model_validate(params)
     ctx = StepContext(rng=np.random.default_rng(seed), cores=2, scratch=Path())
-    return detect(cloud, None, None, known, ctx, form=form)
+    return detect(cloud, earlier[1], earlier[0], known, ctx, form=form)
+
+
+def detected_in_turn(cloud: PointCloud, seed: int) -> tuple[Surface, ...]:
+    """Return the surfaces of all forms, found in the order of the recipes."""
+    found, labels = Surfaces(surfaces=(), up=cloud.up), None
+    for form in typing.get_args(Form):
+        new = detected(cloud, seed, form=form, earlier=(found, labels))
+        found, labels = replace(found, surfaces=found.surfaces + new.surfaces), new.labels
+    return found.surfaces
 
 
 def errors(found: Surface, true: Surface) -> tuple[float, float, float]:
-    """Return errors of axis (degrees), radius and place of the axis (mm) at the found point."""
+    """Return errors of axis (degrees), radius and place of the axis (mm) at the found middle."""
+    apart = found.middle_world - true.middle_world
     if isinstance(true.shape, Sphere):
-        off = float(np.linalg.norm(found.middle_world - true.middle_world))
+        off = float(np.linalg.norm(apart))
         return 0.0, 1000.0 * (found.radius_m - true.radius_m), 1000.0 * off
-    axis = true.shape.axis_world
-    sine = float(np.linalg.norm(np.cross(found.shape.axis_world, axis)))
+    axis, radius_m = true.axis_world, true.radius_m
+    sine = float(np.linalg.norm(np.cross(found.axis_world, axis)))
     turn = math.degrees(math.asin(min(1.0, sine)))
-    apart = found.shape.point_world - true.shape.point_world
+    if isinstance(true.shape, Cone):
+        radius_m += float(apart @ axis) * math.tan(true.shape.half_angle_rad)
     apart = apart - float(apart @ axis) * axis
-    return turn, 1000.0 * (found.radius_m - true.radius_m), 1000.0 * float(np.linalg.norm(apart))
+    return turn, 1000.0 * (found.radius_m - radius_m), 1000.0 * float(np.linalg.norm(apart))
 
 
 def report_accuracy(options: argparse.Namespace) -> None:
@@ -77,13 +97,16 @@ def report_accuracy(options: argparse.Namespace) -> None:
                 scan_step_m=options.step,
                 noise_m=options.noise_mm / 1000.0,
             )
-            form: Form = "sphere" if subject == "dome" else "cylinder"
-            found = list(detected(cloud, seed, form=form).surfaces)
+            found = list(detected_in_turn(cloud, seed))
             for true in truth.surfaces.surfaces:
                 n_true += 1
-                own = [item for item in found if errors(item, true)[0] < 1.0]
+                own = [
+                    item
+                    for item in found
+                    if isinstance(item.shape, type(true.shape)) and errors(item, true)[0] < 1.0
+                ]
                 if own:
-                    best = min(own, key=lambda item: abs(errors(item, true)[1]))
+                    best = min(own, key=lambda item: errors(item, true)[2])
                     found = [item for item in found if item is not best]
                     measured = errors(best, true)
                     ratio = abs(measured[1]) / (1000.0 * best.sigma_radius_m)
@@ -104,8 +127,8 @@ def report_accuracy(options: argparse.Namespace) -> None:
 
 
 def report_rooms(options: argparse.Namespace) -> None:
-    """Print the number of cylinders found in rooms that have none."""
-    n_found, n_rejected = 0, 0
+    """Print the number of curved surfaces found in rooms that have none."""
+    n_found = 0
     for seed in range(options.rooms):
         cloud, _ = simulated(
             SimulateRoom,
@@ -116,12 +139,11 @@ def report_rooms(options: argparse.Namespace) -> None:
             n_plaques=6,
             noise_m=options.noise_mm / 1000.0,
         )
-        found = detected(cloud, seed)
-        n_found += len(found.surfaces)
-        n_rejected += len(found.rejected)
-        for item in found.surfaces:
+        found = detected_in_turn(cloud, seed)
+        n_found += len(found)
+        for item in found:
             print(f"room {seed}: {item.name} of radius {item.radius_m:.2f} m", flush=True)
-    print(f"{n_found} cylinders in {options.rooms} rooms of planes, {n_rejected} rejected")
+    print(f"{n_found} curved surfaces in {options.rooms} rooms of planes")
 
 
 def report_times(options: argparse.Namespace) -> None:
@@ -195,7 +217,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--subject", choices=(*SUBJECTS, "dome"), action="append")
+    parser.add_argument("--subject", choices=typing.get_args(Subject), action="append")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--step", type=float, default=0.01, help="point spacing at 3 m, metres")
     parser.add_argument("--noise-mm", type=float, default=2.0)

@@ -24,7 +24,7 @@ from orthoflow_plugins.surface.kernels import count_votes, near_voxels
 from orthoflow_plugins.surface.rounds import Round, cross, fitted
 from orthoflow_plugins.surface.voxels import Voxels, keys_of
 
-Form = Literal["cylinder", "cone", "sphere"]
+Form = Literal["sphere", "cylinder", "cone"]
 
 # Size of a block, in voxels. The two voxels of a pair are in the same block or in adjacent ones.
 _BLOCK_VOXELS: Final = 6
