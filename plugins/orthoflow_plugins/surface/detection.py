@@ -44,7 +44,7 @@ _LEAST_POINTS: Final = 100
 # tolerance times this factor.
 _LARGEST_SHIFT: Final = 1.0
 # The profile of a surface is curved everywhere if its mean curvature is at least this many standard
-# deviations of the curvature along the arc (97.5 %, one-sided).
+# deviations of the curvature along the arc, and its radius as many of its own (97.5 %, one-sided).
 _CURVED_SIGMAS: Final = 1.96
 _OUTSIDE_RAD: Final = math.radians(200.0)
 # Number of parts into which the circle around an earlier surface is divided.
@@ -150,10 +150,14 @@ def detect(
         largest_m = params.max_scatter_share * fit.surface.radius_m + noise_m
         if is_steep or (is_cone and (is_straight or isinstance(shape, Cylinder))):
             rejected.append(Rejected(reason="cone" if is_steep else "cylinder", evidence=evidence))
-        elif counts[index] < _LEAST_POINTS or fit.shift_m > _LARGEST_SHIFT * limits.tolerance_m:
-            rejected.append(Rejected(reason="unstable", evidence=evidence))
         elif _CURVED_SIGMAS * fit.variation > 1.0:
             rejected.append(Rejected(reason="no circle", evidence=evidence))
+        elif (
+            counts[index] < _LEAST_POINTS
+            or fit.shift_m > _LARGEST_SHIFT * limits.tolerance_m
+            or _CURVED_SIGMAS * fit.surface.sigma_radius_m > fit.surface.radius_m
+        ):
+            rejected.append(Rejected(reason="unstable", evidence=evidence))
         elif fit.cell_scatter_m > largest_m:
             rejected.append(Rejected(reason="rough", evidence=evidence))
         else:
