@@ -161,7 +161,7 @@ def test_what_is_no_cylinder_is_rejected_with_the_reason(
 
 
 def profile_of(name: str, rng: np.random.Generator) -> tuple[NDArray[np.float64], float]:
-    """Return points of a vault and the radius of curvature of its crown."""
+    """Return points of a vault and the (mean) radius of curvature of its crown."""
     radius, share, half = rng.uniform([2.5, 0.5, 0.5], [4.0, 0.8, 0.85])
     angles, along = rng.uniform([[-half - 0.5], [-2.5]], [[half + 0.5], [2.5]], (2, 60_000))
     if name == "relief":
@@ -170,6 +170,12 @@ def profile_of(name: str, rng: np.random.Generator) -> tuple[NDArray[np.float64]
         phases = np.outer(radius * angles, waves[0]) + np.outer(along, waves[1]) + np.arange(40.0)
         level = radius + 0.006 * np.cos(phases).sum(axis=1) / math.sqrt(20.0)
         return np.column_stack([level * np.sin(angles), along, level * np.cos(angles)]), radius
+    if name == "polygon":
+        width = rng.uniform(0.07, 0.17)
+        level = radius / np.cos(angles % width - 0.5 * width)
+        return np.column_stack(
+            [level * np.sin(angles), along, level * np.cos(angles)]
+        ), level.mean()
     # A basket vault has haunches of a smaller radius; an ellipse, a smaller height.
     own = np.where((np.abs(angles) < half) | (name == "ellipse"), radius, share * radius)
     x = (radius - own) * math.sin(half) * np.sign(angles) + own * np.sin(angles)
@@ -178,7 +184,10 @@ def profile_of(name: str, rng: np.random.Generator) -> tuple[NDArray[np.float64]
     return np.column_stack([x, along, height * z]), radius / height
 
 
-@pytest.mark.parametrize(("name", "least"), [("ellipse", 0.5), ("relief", 0.3), ("basket", 0.1)])
+# Narrow flat strips are accepted: their mean radius is within its stated error.
+@pytest.mark.parametrize(
+    ("name", "least"), [("ellipse", 0.5), ("relief", 0.3), ("basket", 0.1), ("polygon", 0.0)]
+)
 def test_the_radius_of_a_crown_is_as_accurate_as_stated(
     name: str, least: float, tmp_path: Path
 ) -> None:
