@@ -88,9 +88,10 @@ def png(image: NDArray[np.uint8], exif: bytes) -> bytes:
     return _saved(image, "PNG", exif=exif)
 
 
-def tiff(image: NDArray[np.uint8], orientation: int = 1) -> bytes:
+def tiff(image: NDArray[np.uint8], orientation: int = 1, **more: object) -> bytes:
     """An uncompressed RGB TIFF file, its directory in front."""
-    return _saved(image, "TIFF", tiffinfo={ORIENTATION: orientation})
+    is_several = "append_images" in more
+    return _saved(image, "TIFF", tiffinfo={ORIENTATION: orientation}, save_all=is_several, **more)
 
 
 def _saved(image: NDArray[np.uint8], kind: str, **more: object) -> bytes:

@@ -168,11 +168,16 @@ def test_a_panorama_of_colmap_looks_where_its_front_does(tmp_path: Path) -> None
     )
 
 
-def test_rigs_of_colmap_give_each_camera_its_own_pose(tmp_path: Path) -> None:
+def rigged_model() -> pycolmap.Reconstruction:
+    """Two frames of three cameras."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 3, 2
     options.num_points3D = 20
-    written = pycolmap.synthesize_dataset(options)
+    return pycolmap.synthesize_dataset(options)
+
+
+def test_rigs_of_colmap_give_each_camera_its_own_pose(tmp_path: Path) -> None:
+    written = rigged_model()
     for form, write_model in (("bin", written.write_binary), ("txt", written.write_text)):
         folder = tmp_path / form
         folder.mkdir()
@@ -187,9 +192,10 @@ def test_rigs_of_colmap_give_each_camera_its_own_pose(tmp_path: Path) -> None:
 
 def test_of_several_reconstructions_the_one_with_most_photos_counts(tmp_path: Path) -> None:
     first, _ = colmap_model(tmp_path, "PINHOLE", PARAMS["PINHOLE"], "bin")
-    other = shutil.copytree(first[0].parent, tmp_path / "sparse" / "1")
-    (other / "images.txt").write_text("")
-    assert len(read_given_cameras(sorted(tmp_path.rglob("*.bin")))) == 2
+    shutil.copytree(first[0].parent, tmp_path / "sparse" / "2")
+    (tmp_path / "sparse" / "1").mkdir()
+    rigged_model().write_binary(str(tmp_path / "sparse" / "1"))
+    assert len(read_given_cameras(sorted(tmp_path.rglob("*.bin")))) == 6
 
 
 def oriented(name: str, seed: int) -> Camera:

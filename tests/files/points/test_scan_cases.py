@@ -34,6 +34,8 @@ def test_scans_of_other_programs_are_read_right(name: str, seed: int, tmp_path: 
     for part in case.warnings:
         assert part in read.warnings
     assert not any(part in read.warnings for part in case.not_reported)
+    (summary,) = [one.text for one in read.ctx.diagnostics if one.code == "scan-summary"]
+    assert f" {len(case.scene):,} points; fields read: " in summary
     np.testing.assert_allclose(
         cloud.points_world() - case.shift, case.scene.points, atol=case.atol_m, rtol=0.0
     )

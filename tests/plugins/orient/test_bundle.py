@@ -6,16 +6,18 @@ import itertools
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace as Fields
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import photo_ties
-from orthoflow_plugins.orient.bundle import OrientColmapBundle, adjust_block
+from orthoflow_plugins.orient.bundle import OrientColmapBundle, adjust_block, of_another_lens
 from orthoflow_plugins.orient.photos import Trusted, by_itself, tied_photo
 from orthoflow_plugins.orient.pnp import OrientPnp
-from orthoflow_plugins.orient.pose import estimate_pose, lens_groups
+from orthoflow_plugins.orient.pose import UNKNOWN, estimate_pose, lens_groups
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera
@@ -126,8 +128,9 @@ def with_exif(*focals_px: float) -> Photos:
 
 
 def test_exif_that_the_photos_contradict_is_not_used_and_that_is_reported(tmp_path: Path) -> None:
-    ctx = context(tmp_path)
-    together = bundle(bs.scan_ties(2, n=60), with_exif(*[1680.0] * 4), ctx, **ALONE)
+    """With half the focal length, as digital zoom leaves it, no photo is oriented."""
+    ctx, params = context(tmp_path), {"min_hull_ratio": 0.1, "max_sigma_wall_cells": 3.0}
+    together = bundle(bs.scan_ties(2, n=40), with_exif(*[420.0] * 4), ctx, **ALONE, **params)
     assert {camera.status for camera in together.cameras} == {"ok"}
     assert together.cameras[0].viewing().fx == pytest.approx(840.0, rel=0.02)
     assert "exif-focal-contradicted" in [each.code for each in ctx.diagnostics]
@@ -165,6 +168,36 @@ def test_photos_that_zoomed_share_no_lens_where_it_matters(
     for camera, other in zip(found, true, strict=True):
         assert camera.status == "ok"
         assert ms.wall_error_m(bs.SCENE, camera.viewing(), other) < 1.5 * (camera.sigma_wall_m or 0)
+
+
+def of_focal(log_focal: float, sigma: float) -> Any:
+    """What `of_another_lens` reads of a photo or of its orientation."""
+    covariance = np.diag([*np.zeros(6), sigma**2])
+    camera, lens = Fields(fx=1000.0 * np.exp(log_focal)), Fields(names=("focal",))
+    resection = Fields(camera=camera, covariance=covariance, lens=lens)
+    return Fields(resection=resection, estimate=Fields(resection=resection))
+
+
+@pytest.mark.parametrize(
+    ("offs", "sigma", "source", "others"),
+    [
+        # Two percent and five standard deviations.
+        ([0.019, 0.0], 0.0001, UNKNOWN, set()),
+        ([0.021, 0.0], 0.0001, UNKNOWN, {0}),
+        ([0.049, 0.0], 0.01, UNKNOWN, set()),
+        ([0.051, 0.0], 0.01, UNKNOWN, {0}),
+        # Those with less than half of the largest difference may only follow the shared lens.
+        ([0.1, -0.06, 0.04], 0.0001, UNKNOWN, {0, 1}),
+        # EXIF says that they share a lens.
+        ([0.1, 0.0], 0.0001, "exif", set()),
+    ],
+)
+def test_a_photo_has_another_lens_by_a_difference_that_matters_and_is_sure(
+    offs: list[float], sigma: float, source: str, others: set[int]
+) -> None:
+    block: Any = Fields(lens_of=(0,) * len(offs), lenses=(Fields(source=source),))
+    adjusted: Any = Fields(block=block, estimates=[of_focal(0.0, sigma)] * len(offs))
+    assert of_another_lens([of_focal(off, sigma) for off in offs], adjusted) == others
 
 
 def test_the_noise_of_ties_between_photos_is_found() -> None:

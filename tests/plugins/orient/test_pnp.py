@@ -20,6 +20,7 @@ from orthoflow.testing import photographed as ms
 from tests import tied_photos as tp
 from tests.long_loops import seeds
 from tests.method_runs import run
+from tests.raster_scenes import numbers
 from tests.scenes import SURVEY_SHIFT_M
 from tests.tied_photos import context, known_ties
 
@@ -58,8 +59,10 @@ def test_stated_errors_include_the_registration_that_the_cloud_shows(tmp_path: P
     points += np.outer(scan, nearer_m) + 0.001 * rng.normal(size=points.shape)
     x, y, z = points.astype(np.float32).T.copy()
     cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, scan=scan, up=np.array([0.0, 0.0, 1.0]))
-    inputs = {"ties": ties, "photos": calibrated(camera), "cloud": cloud}
-    found = run(OrientPnp, context(tmp_path), inputs).cameras.cameras[0]
+    inputs, ctx = {"ties": ties, "photos": calibrated(camera), "cloud": cloud}, context(tmp_path)
+    found = run(OrientPnp, ctx, inputs).cameras.cameras[0]
+    # The difference of two independent errors.
+    assert numbers(ctx)["scan_registration_mm"] == pytest.approx(6.0 / np.sqrt(2.0), rel=0.05)
     offset_m = is_other.mean() * nearer_m
     true_m = ms.wall_error_m(tp.SCENE, found.viewing().shifted(offset_m), camera)
     assert 0.7 < true_m / found.sigma_wall_m < 1.5

@@ -68,6 +68,18 @@ def test_what_one_wall_does_not_show_is_as_uncertain_as_what_it_shows_is_large()
     np.testing.assert_allclose(sigmas, [0.006, 0.0, 0.006], atol=1e-3)
 
 
+def test_a_match_is_of_the_mean_of_scans_or_of_the_fullest_or_between() -> None:
+    """Of two scans with 3 and 1 of 4 points, shifted by 8 mm and 0 mm, in one place."""
+    motions = np.zeros((2, 6, 1))
+    motions[0, 0, 0] = 0.008
+    shares, places = np.array([[0.75, 0.25]]), {"origin": ORIGIN, "centres": np.zeros((1, 3))}
+    found = ScanErrors(**places, extent_m=1.0, shares=shares, motions=motions, sigma_m=np.ones(2))
+    # The mean is 6 mm off, the fullest scan 8 mm; those between have an SD of 2 mm / sqrt(12).
+    errors = found.at(ORIGIN[None])
+    np.testing.assert_allclose(errors[0, 0], [0.007, 0.002 / 12**0.5], atol=1e-12)
+    np.testing.assert_allclose(errors[0, 1:], 0.0, atol=1e-12)
+
+
 def test_scans_without_a_common_surface_show_no_motions() -> None:
     assert scanned(np.zeros((2, 2, 3)), (1, 2), gap_m=1.0) is None
 

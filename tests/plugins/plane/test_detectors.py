@@ -224,6 +224,11 @@ def test_the_fit_follows_a_tolerance_below_its_default() -> None:
     assert again == params
     assert again.tolerances_m(0.0, 0.0) == (0.01, 0.01)
     assert Ransac.Params(tolerance_m=0.02).tolerances_m(0.0, 0.0) == (0.02, 0.015)
+    # By default, they follow the noise of single points, and errors common to neighbours by half.
+    right = {(1, 2): (50, 15), (20, 20): (80, 80), (2, 30): (120, 60)}
+    for noise_mm, found_mm in right.items():
+        found_m = Ransac.Params().tolerances_m(*(1e-3 * np.array(noise_mm)))
+        np.testing.assert_allclose(found_m, 1e-3 * np.array(found_mm), rtol=1e-9)
     with pytest.raises(ValidationError, match=r"must be at most tolerance_m = 0\.01"):
         Ransac.Params(tolerance_m=0.01, fit_tolerance_m=0.02)
 

@@ -241,18 +241,36 @@ def test_all_photos_that_are_cut_off_are_named_at_once(read: PhotoReader) -> Non
     writers = {"jpg": encode_jpeg, "png": encode_png, "tif": made.tiff, "webp": encode_webp}
     whole = {f"a.{suffix}": write(image) for suffix, write in writers.items()}
     cut = {name: content[: int(0.95 * len(content))] for name, content in whole.items()}
+    half = len(whole["a.jpg"]) // 2
+    cut["b.jpg"] = whole["a.jpg"][:half] + bytes(99) + whole["a.jpg"][half + 99 :]
     with pytest.raises(InputError) as caught:
         read.files({"0.jpg": encode_jpeg(image), **cut})
     lines = str(caught.value).splitlines()
     assert [line.split()[1] for line in lines] == sorted(cut)
     assert all("is damaged or truncated" in line or "cannot be decoded" in line for line in lines)
+    assert all("is damaged or truncated" in line for line in lines if ".jpg" in line)
 
 
-def test_bytes_that_a_decoder_passes_over_are_reported(read: PhotoReader) -> None:
-    whole = encode_jpeg(made.picture(256, 192))
-    padded = whole[:-2] + b"\0" * 40 + whole[-2:]
-    assert len(read.files({"a.jpg": padded, "b.jpg": whole})) == 2
-    assert "photo a.jpg: contains bytes that the decoder skips" in read.warnings
+def test_what_is_odd_about_a_photo_is_reported(read: PhotoReader) -> None:
+    picture = made.picture(320, 192)
+    whole, shifted = encode_jpeg(picture), np.full_like(picture, 90)
+    # A flipped bit changes all blocks after its own.
+    shifted[96:, 160:] += 60
+    shifted[112:, :160] += 60
+    exif = made.exif_block({made.MODEL: "NIKON D3X"}, {made.FOCAL: (1, 9)})
+    odd = {
+        "a.jpg": (whole[:-2] + b"\0" * 40 + whole[-2:], "contains bytes that the decoder skips"),
+        "b.jpg": (made.jpeg(picture, exif), "EXIF contains a focal length of 0.111111 mm"),
+        "c.jpg": (made.jpeg(picture, exif[:-5]), "has damaged EXIF data, of which"),
+        "d.tif": (
+            made.tiff(picture[:96], append_images=[Image.fromarray(picture)]),
+            "has 2 pages, of",
+        ),
+        "e.jpg": (encode_jpeg(shifted), "seems damaged from row 96 on"),
+    }
+    photos = read.files({"0.jpg": whole} | {name: encoded for name, (encoded, _) in odd.items()})
+    assert [photo.height for photo in photos] == [192] * 6
+    assert all(f"photo {name}: {remark}" in read.warnings for name, (_, remark) in odd.items())
 
 
 @pytest.mark.parametrize(
