@@ -15,14 +15,28 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import photo_ties
 from orthoflow_plugins.orient.bundle import OrientColmapBundle, adjust_block, of_another_lens
-from orthoflow_plugins.orient.photos import Trusted, by_itself, tied_photo
+from orthoflow_plugins.orient.photos import (
+    Trusted,
+    by_itself,
+    looked_at,
+    refused,
+    tied_photo,
+    with_believable_priors,
+)
 from orthoflow_plugins.orient.pnp import OrientPnp
-from orthoflow_plugins.orient.pose import UNKNOWN, estimate_pose, lens_groups
+from orthoflow_plugins.orient.pose import (
+    UNKNOWN,
+    TiedPhoto,
+    estimate_pose,
+    focal_without_exif,
+    lens_groups,
+)
+from orthoflow_plugins.orient.report import Oriented
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.key_points import Features
-from orthoflow.products import Cameras, Photo, Photos, Ties
+from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
 from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
 from tests import samples
@@ -136,6 +150,40 @@ def test_exif_that_the_photos_contradict_is_not_used_and_that_is_reported(tmp_pa
     assert "exif-focal-contradicted" in [each.code for each in ctx.diagnostics]
 
 
+def zoomed(ties: Ties, zoom: float, *photos: int) -> Ties:
+    """Return ties of which some photos have another focal length."""
+    true, pixels = bs.viewers()[3], ties.pixels_photo.copy()
+    middle, is_other = np.array([true.cx, true.cy]), np.isin(ties.photo, photos)
+    pixels[is_other] = middle + zoom * (pixels[is_other] - middle)
+    return replace(ties, pixels_photo=pixels)
+
+
+def test_exif_is_believed_that_one_photo_of_several_contradicts(tmp_path: Path) -> None:
+    ties, params = zoomed(bs.scan_ties(2, n=40), 0.5, 0, 1, 2), OrientColmapBundle.Params()
+    photos, ctx = with_exif(*[420.0] * 4).photos, context(tmp_path)
+    assert focal_without_exif(tied_photo(photos[3], ties, params, ctx.rng), params)
+    assert with_believable_priors(photos, ties, params, ctx) == list(photos)
+
+
+@pytest.mark.parametrize(("others", "again"), [((840.0, 850.0), 845.0), ((840.0, 900.0), None)])
+def test_a_refused_photo_gets_the_focal_length_in_which_the_others_agree(
+    tmp_path: Path, others: tuple[float, float], again: float | None
+) -> None:
+    ties, ctx = bs.scan_ties(2, n=40), context(tmp_path)
+    photos = with_exif(*others, 1680.0, 1680.0).photos[:3]
+    tied = [tied_photo(photo, ties, OrientColmapBundle.Params(), ctx.rng) for photo in photos]
+
+    def look(one: TiedPhoto) -> Oriented:
+        """Orient all but photos with the wrong focal length."""
+        found, focal_px = refused(one, "no pose"), one.photo.exif_focal_px
+        lens = replace(photos[0].lens_prior()[0], fx=focal_px, fy=focal_px)
+        camera = replace(found.camera, status="ok", intrinsics=Intrinsics.of(lens, source="exif"))
+        return found if focal_px == 1680.0 else replace(found, camera=camera)
+
+    last = looked_at(tied, look, ctx)[2].camera.intrinsics
+    assert (None if last is None else last.fx) == again
+
+
 @pytest.mark.parametrize(("method", "own"), [(OrientColmapBundle, ALONE), (OrientPnp, {})])
 def test_a_photo_whose_exif_the_others_contradict_is_tried_again_with_their_focal_length(
     tmp_path: Path, method: type[OrientPnp | OrientColmapBundle], own: dict[str, bool]
@@ -157,13 +205,10 @@ def test_photos_that_zoomed_share_no_lens_where_it_matters(
     tmp_path: Path, zoom: float, n_lenses: int
 ) -> None:
     """One of four photos is zoomed; even if unnoticed, its predicted error is not too small."""
-    ties, true = bs.scan_ties(2, n=90), [*bs.viewers()]
-    middle, pixels = np.array([true[3].cx, true[3].cy]), ties.pixels_photo.copy()
-    pixels[ties.photo == 3] = middle + zoom * (pixels[ties.photo == 3] - middle)
+    true = [*bs.viewers()]
     true[3] = replace(true[3], fx=zoom * true[3].fx, fy=zoom * true[3].fy)
-    found = bundle(
-        replace(ties, pixels_photo=pixels), without_exif(), context(tmp_path), **ALONE
-    ).cameras
+    ties = zoomed(bs.scan_ties(2, n=90), zoom, 3)
+    found = bundle(ties, without_exif(), context(tmp_path), **ALONE).cameras
     assert len({camera.intrinsics for camera in found}) == n_lenses
     for camera, other in zip(found, true, strict=True):
         assert camera.status == "ok"
