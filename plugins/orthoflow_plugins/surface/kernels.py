@@ -18,11 +18,6 @@ from orthoflow.geometry.slabs import Offsets
 
 # Number of entries of a row of moments: n, sums of x, y, z, and of xx, xy, xz, yy, yz, zz.
 MOMENTS: Final = 10
-# Maximum number of iterations of a robust solution. It ends when the solution changes by less than
-# _SETTLED (metres or radians). The scatter is estimated from about _SCATTER_SAMPLE observations.
-_ROUNDS: Final = 12
-_SETTLED: Final = 1e-8
-_SCATTER_SAMPLE: Final = 4_000
 # Number of points of a block of `sum_cells`.
 _BLOCK: Final = 128
 # A voxel at (i, j, k) has the key i << 40 | j << 20 | k.
@@ -234,55 +229,35 @@ def near_voxels(
 
 
 @compiled
-def solve_robustly(
+def solve_weighted(
     matrix: NDArray[np.float64],
     distances: NDArray[np.float64],
-    variances: NDArray[np.float64],
-    tukey: float,
-    solution: NDArray[np.float64],
     weights: NDArray[np.float64],
+    solution: NDArray[np.float64],
+    squares: NDArray[np.float64],
 ) -> float:
-    """Solve by least squares with Tukey's weights (see `robust_solution`).
+    """Solve matrix x = distances by weighted least squares.
 
     Args:
         matrix: (n, k) design.
         distances: (n,) observations.
-        variances: (n,) their variances.
-        tukey: Tukey's constant, in standard deviations.
-        solution: (k,) output.
-        weights: (n,) output.
+        weights: (n,) their weights.
+        solution: (k,) the previous solution; changed to the new one.
+        squares: (n,) output, squared residuals.
 
     Returns:
-        The standard deviation of the additional scatter.
+        The largest change of the solution.
     """
     n, k = matrix.shape
-    normal, right, extra = np.empty((k, k)), np.empty(k), 0.0
-    squares = np.empty(n)
-    step = max(1, n // _SCATTER_SAMPLE)
-    beyond = np.empty((n + step - 1) // step)
+    normal, right = np.empty((k, k)), np.empty(k)
+    _set_normal_equations(matrix, distances, weights, normal, right)
+    change = _solve(normal, right, solution)
     for p in range(n):
-        weights[p] = 1.0 / variances[p]
-    for _ in range(_ROUNDS):
-        _set_normal_equations(matrix, distances, weights, normal, right)
-        change = _solve(normal, right, solution)
-        for p in range(n):
-            rest = distances[p]
-            for a in range(k):
-                rest -= matrix[p, a] * solution[a]
-            squares[p] = rest * rest
-        # The median of squared residuals without measurement noise is 0.455 times the variance.
-        for p in range(beyond.shape[0]):
-            beyond[p] = squares[p * step] / 0.455 - variances[p * step]
-        extra = max(0.0, np.median(beyond))
-        count = 0
-        for p in range(n):
-            spread = variances[p] + extra
-            share = max(0.0, 1.0 - squares[p] / (tukey * tukey * spread))
-            weights[p] = share * share / spread
-            count += share > 0.0
-        if change < _SETTLED or count < 2 * k:
-            break
-    return math.sqrt(extra)
+        rest = distances[p]
+        for a in range(k):
+            rest -= matrix[p, a] * solution[a]
+        squares[p] = rest * rest
+    return change
 
 
 @kernel_part

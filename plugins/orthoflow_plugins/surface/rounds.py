@@ -11,10 +11,15 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Cone, CurvedShape, Cylinder, Sphere, basis_from_up
 from orthoflow.geometry.surfaces import along_and_across, middle_direction, zero_direction
-from orthoflow_plugins.surface.kernels import solve_robustly
+from orthoflow_plugins.surface.kernels import solve_weighted
 
 # Tukey's constant, in standard deviations.
 TUKEY: Final = 4.685
+# Maximum number of iterations of a robust solution. It ends when the solution changes by less than
+# _SETTLED (metres or radians). The scatter is estimated from about _SCATTER_SAMPLE observations.
+_ROUNDS: Final = 12
+_SETTLED: Final = 1e-8
+_SCATTER_SAMPLE: Final = 4_000
 # Maximum number of voxels in a fit.
 _MOST_VOXELS: Final = 2_000
 
@@ -220,10 +225,20 @@ def robust_solution(
     Returns:
         The solution (k,), the weights (n,), and the standard deviation of the additional scatter.
     """
-    solution, weights = np.zeros(matrix.shape[1]), np.empty(len(matrix))
     matrix, distances = np.ascontiguousarray(matrix), np.ascontiguousarray(distances)
-    extra = solve_robustly(matrix, distances, variances, TUKEY, solution, weights)
-    return solution, weights, extra
+    (n, k), step = matrix.shape, max(1, len(matrix) // _SCATTER_SAMPLE)
+    solution, squares, weights, extra = np.zeros(k), np.empty(n), 1.0 / variances, 0.0
+    for _ in range(_ROUNDS):
+        change = solve_weighted(matrix, distances, weights, solution, squares)
+        # The median of squared residuals without measurement noise is 0.455 times the variance.
+        # Compiling the median would take longer than compiling all the rest.
+        extra = max(0.0, float(np.median(squares[::step] / 0.455 - variances[::step])))
+        spread = variances + extra
+        share = np.maximum(0.0, 1.0 - squares / (TUKEY * TUKEY * spread))
+        weights = share * share / spread
+        if change < _SETTLED or np.count_nonzero(share) < 2 * k:
+            break
+    return solution, weights, math.sqrt(extra)
 
 
 def fitted(
