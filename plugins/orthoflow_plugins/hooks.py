@@ -34,10 +34,11 @@ _METHODS: Final = {
     "comparison",
     "plane.comparators:Open3dPatches": "open3d's detect_planar_patches, for comparison",
     "plane.given:GivenPlane": "a reference plane given by the user",
-    "surface.planes:SurfacePlanes": "planes as the first surfaces, to which curved ones are added",
     "surface.cylinder:SurfaceCylinder": "vaults, apses, towers and columns, from pairs of normals",
     "surface.cone:SurfaceCone": "spires and tapering towers, by the same search",
     "surface.sphere:SurfaceSphere": "domes and semi-domes, by the same search",
+    # Last, because a new plugin of a kind takes what the first method of the kind requires.
+    "surface.planes:SurfacePlanes": "planes as the first surfaces, to which curved ones are added",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
     "match.sift:MatchSift": "match RootSIFT key points of photos with those of the walls, by "
     "mutual nearest neighbours and the ratio test",
