@@ -1,6 +1,6 @@
 """Compare expected errors of photos with the truth, for clouds with correlated point errors.
 
-    python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...]
+    python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...] [--noise-m 0.02]
     python benchmarks/stated_errors.py --entry FOLDER --fountain FOLDER   # real photos, see below
 
 Drawn rooms: For each type of cloud, there are several rooms with different scan noise, cameras and
@@ -11,6 +11,8 @@ correlated over half a metre, as in stereo matching. Photos are matched at their
 relative to the scan, RMS over all photos; `stated` is the expected error; `wrong` counts accepted
 photos whose error exceeds five expected standard deviations. `cloud` is the mean offset of the
 points that a photo shows. The scan cannot reveal this offset, so `true` and `stated` exclude it.
+`walls` are the planes of at least 4 m² that were found within 1 degree and 15 mm. With
+`--noise-m`, the geometry of the rooms is drawn as well, and all points have this noise.
 
 Real photos: These are folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11)
 with `images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same
@@ -43,7 +45,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import pixels_by_point
 from orthoflow.geometry.scene_views import SceneCameras
-from orthoflow.products import Camera, Cameras, Photos, PointCloud, Wall
+from orthoflow.products import Camera, Cameras, Photos, Planes, PointCloud, Wall
 from orthoflow.sdk import StepContext
 
 CLOUDS: Final[dict[str, dict[str, float]]] = {
@@ -54,6 +56,9 @@ CLOUDS: Final[dict[str, dict[str, float]]] = {
     "far": {"shared_noise_m": 0.004, "shared_noise_length_m": 3.0},
 }
 _BUFFER_M: Final = 0.3
+# Minimum area of the planes that must be found, and the distance within which they count as found.
+_LARGE_M2: Final = 4.0
+_NEAR_M: Final = 0.015
 # Offsets are computed for every nth point of a wall.
 _EVERY: Final = 50
 # Photos from which no cloud of these folders was made.
@@ -67,20 +72,36 @@ def context(folder: str, seed: int) -> StepContext:
 
 @dataclass(frozen=True, kw_only=True)
 class Oriented:
-    """True and expected errors of the photos of a room, reasons for rejection, and wrong poses."""
+    """True and expected errors of the photos of a room, reasons for rejection, and wrong poses.
+
+    `walls` are the numbers of large planes found and of all large planes.
+    """
 
     errors_m: list[tuple[float, float]]
     refused: list[str]
     n_wrong: int
     cloud_m: float
+    walls: tuple[int, int]
 
 
-def simulated(cloud: str, seed: int, folder: str) -> SimulateRoom.Out:
+def simulated(cloud: str, seed: int, folder: str, noise_m: float | None) -> SimulateRoom.Out:
     """Build a room with the cloud errors given in `CLOUDS`, or with noise only."""
     chosen: dict[str, object] = {"scan_step_m": 0.004, "panorama_step_m": 0.02, "noise_m": 0.002}
     chosen |= {"photo_gsd_m": 0.003, "photo_layout": "quick", "textile_share": 0.33}
+    if noise_m is not None:
+        chosen |= {"geometry": "drawn", "noise_m": noise_m}
     params = SimulateRoom.Params.model_validate(chosen | CLOUDS[cloud])
     return SimulateRoom().run(SimulateRoom.In(), params, context(folder, seed))
+
+
+def walls_found(found: Planes, true: Planes) -> tuple[int, int]:
+    """Return the numbers of true planes of at least 4 m² that were found, and of all of them."""
+    sides = true.corners[:, [1, 3]] - true.corners[:, :1]
+    is_large = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) >= _LARGE_M2
+    middles = true.corners[is_large].mean(axis=1)
+    is_parallel = np.abs(true.normal[is_large] @ found.normal.T) >= np.cos(np.radians(1.0))
+    is_near = np.abs(middles @ found.normal.T - found.offset) <= _NEAR_M
+    return int((is_parallel & is_near).any(axis=1).sum()), int(is_large.sum())
 
 
 def cloud_shifts(
@@ -99,9 +120,9 @@ def cloud_shifts(
     return shifts
 
 
-def room(cloud: str, seed: int, folder: str) -> Oriented:
+def room(cloud: str, seed: int, folder: str, noise_m: float | None) -> Oriented:
     """Orient the photos of a drawn room."""
-    built = simulated(cloud, seed, folder)
+    built = simulated(cloud, seed, folder, noise_m)
     planes = Hough2d().run(Hough2d.In(cloud=built.cloud), Hough2d.Params(), context(folder, 1))
     walls = (
         RasterGrid()
@@ -140,7 +161,7 @@ def room(cloud: str, seed: int, folder: str) -> Oriented:
     shifts = [np.zeros(3)] * len(cameras.cameras)
     if CLOUDS[cloud]:
         with tempfile.TemporaryDirectory() as beside:
-            exact = simulated("plain", seed, beside).cloud
+            exact = simulated("plain", seed, beside, noise_m).cloud
             shifts = cloud_shifts(built.cloud, exact, walls.walls[0], true)
     there = [moved(one, -shift) for one, shift in zip(cameras.cameras, shifts, strict=True)]
     relative = replace(cameras, cameras=tuple(there))
@@ -156,6 +177,7 @@ def room(cloud: str, seed: int, folder: str) -> Oriented:
         refused=refused,
         n_wrong=sum(error.is_wrong for error in errors),
         cloud_m=float(np.sqrt(np.mean(np.square(shifts)))),
+        walls=walls_found(planes.planes, built.truth.planes),
     )
 
 
@@ -169,21 +191,23 @@ def moved(camera: Camera, by_m: NDArray[np.float64]) -> Camera:
 
 
 def drawn(chosen: argparse.Namespace) -> None:
-    print(f"{'cloud':12s} photos   cloud    true  stated  stated/true  wrong")
+    print(f"{'cloud':12s} photos   cloud    true  stated  stated/true  wrong  walls")
     for cloud in chosen.clouds:
         rooms = []
         for seed in range(chosen.first, chosen.first + chosen.rooms):
             with tempfile.TemporaryDirectory() as folder:
-                rooms.append(room(cloud, seed, folder))
+                rooms.append(room(cloud, seed, folder, chosen.noise_m))
             for reason in rooms[-1].refused:
                 print(f"  {cloud} {seed}: {reason}", flush=True)
         found = [pair for one in rooms for pair in one.errors_m]
         n_photos = len(found) + sum(len(one.refused) for one in rooms)
         true, stated = np.sqrt(np.mean(np.square(found), axis=0))
+        n_walls, n_true = np.sum([one.walls for one in rooms], axis=0)
         off = np.sqrt(np.mean([one.cloud_m**2 for one in rooms]))
         print(
             f"{cloud:12s} {len(found):2d}/{n_photos:<3d} {1e3 * off:6.2f}  {1e3 * true:6.2f}  "
-            f"{1e3 * stated:6.2f}  {stated / true:11.2f}  {sum(one.n_wrong for one in rooms):5d}",
+            f"{1e3 * stated:6.2f}  {stated / true:11.2f}  {sum(one.n_wrong for one in rooms):5d}  "
+            f"{n_walls}/{n_true}",
             flush=True,
         )
 
@@ -296,6 +320,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=3, help="rooms of each kind of cloud")
     parser.add_argument("--first", type=int, default=1, help="seed of the first room")
     parser.add_argument("--clouds", nargs="*", default=list(CLOUDS), choices=list(CLOUDS))
+    parser.add_argument("--noise-m", type=float, help="noise of the points in drawn rooms")
     parser.add_argument("--entry", type=Path)
     parser.add_argument("--fountain", type=Path)
     chosen = parser.parse_args()

@@ -667,8 +667,8 @@ def too_few(n_ties: int) -> str:
         return ""
     return (
         f"too few ties to the walls were found ({n_ties}; at least {_MIN_TIES} are required): the "
-        "photo shows none of the walls, its colours differ too much from the intensity, or the "
-        "cells are too coarse"
+        "photo shows none of the walls, its colours differ too much from the intensity, the cells "
+        "are too coarse, or the scan has too much noise"
     )
 
 
