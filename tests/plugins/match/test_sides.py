@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from orthoflow_plugins.match import sides
 from orthoflow_plugins.match.sides import FaceByPhotos
 
 from orthoflow.products import Planes, PointCloud
@@ -60,6 +62,18 @@ def test_photos_show_the_side_of_a_wall(tmp_path: Path, is_wrong: bool, cloud: P
         np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
     assert found.side_from == ("photos", "guess")
     assert metrics == {"n_planes_guessed": 1, "n_planes_turned": is_wrong, "n_planes_seen": 1}
+
+
+@pytest.mark.parametrize(
+    ("front", "behind", "n_turned", "n_seen"),
+    [(0, 16, 1, 1), (0, 15, 0, 0), (20, 40, 1, 1), (21, 40, 0, 0), (40, 20, 0, 1)],
+)
+def test_sixteen_matches_and_twice_those_of_the_other_side_decide(
+    front: int, behind: int, n_turned: int, n_seen: int, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(sides, "side_matches", lambda *_: np.array([[front, behind]]))
+    _, metrics = faced(planes(), tmp_path)
+    assert (metrics["n_planes_turned"], metrics["n_planes_seen"]) == (n_turned, n_seen)
 
 
 @pytest.mark.parametrize("viewpoint", ["stations", "view_from", "given"])

@@ -94,6 +94,7 @@ def stated(
     places_m: NDArray[np.float64],
     *,
     station: tuple[float, float, float] | None = None,
+    others: tuple[tuple[float, float, float], ...] = (),
     free_m: float = 1.0,
 ) -> dict[str, float]:
     """Return the causes of the void, given points (n, 3): metres right, down and in front."""
@@ -108,7 +109,7 @@ def stated(
 
     x, y, z = (np.ascontiguousarray(axis, dtype=np.float32) for axis in world(places_m).T)
     points = SampledPoints(origin=np.zeros(3), x=x, y=y, z=z, n_represented=1.0)
-    stations = None if station is None else world(np.array([station]))
+    stations = None if station is None else world(np.array([station, *others]))
     found = emptiness_of(
         wall,
         Slab(frame=frame, front_m=0.15, behind_m=0.25),
@@ -183,8 +184,10 @@ def test_a_screen_hides_the_wall_behind_it_from_a_station(along_m: float, cause:
     points = np.vstack([screen, np.repeat(room, 40, axis=0)])
     found = stated(points, station=(3.3, 0.3, 3.0))
     assert found.get(cause, 0.0) > 0.8
-    # No station sees the wall from behind.
-    assert stated(points, station=(3.3, 0.3, -3.0)) == {"hidden": pytest.approx(1.0)}
+    # No station sees the wall from behind, which hides nothing from the first.
+    behind = 3.3, 0.3, -3.0
+    assert stated(points, station=behind) == {"hidden": pytest.approx(1.0)}
+    assert stated(points, station=(3.3, 0.3, 3.0), others=(behind,)).get(cause, 0.0) > 0.8
 
 
 def screened(station: tuple[float, float, float], *stray: tuple[float, float, float]) -> float:
