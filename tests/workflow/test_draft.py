@@ -71,7 +71,7 @@ def inputs_of(workflow: Path) -> dict[str, list[str]]:
 
 def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     out = said("new", data, "-o", "jobs/hall 1.yaml")
-    assert said("check", "jobs/hall 1.yaml").startswith("hall-1 is valid: 21 steps")
+    assert said("check", "jobs/hall 1.yaml").startswith("hall-1 is valid: 24 steps")
     assert inputs_of(Path("jobs/hall 1.yaml")) == {
         "scan": ["hall.las"],
         "photos": ["a.jpg", "b.jpg", "c.jpg"],
@@ -118,7 +118,7 @@ def test_a_scan_alone_is_painted_from_its_own_colours_without_a_stand_in(data: P
     assert "room" not in text
     assert "orthoflow run direct.yaml" not in text
     # No step waits for a simulated room, none is skipped.
-    assert said("check", "workflow.yaml") == "workflow is valid: 8 steps\n"
+    assert said("check", "workflow.yaml") == "workflow is valid: 11 steps\n"
 
 
 def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) -> None:
