@@ -407,7 +407,7 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
     design, weights = fit.design, fit.weights()
     scores, products, used = _scores(fit)
     rows, columns = fit.rows[used], fit.columns[used]
-    factor = _flattening(fit, weights) ** -2
+    factor = _enlargement(fit, weights)
     largest = np.zeros((design.shape[1],) * 2)
     # With independent cells, each cell is a tile.
     alone = before = _mean_variance(design, independent_covariance(fit))
@@ -443,7 +443,7 @@ def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
     """
     scores, products, _ = _scores(fit)
     inverse = np.linalg.inv(products.sum(axis=0))
-    factor = _flattening(fit, fit.weights()) ** -2
+    factor = _enlargement(fit, fit.weights())
     return np.asarray(factor * inverse @ (scores.T @ scores) @ inverse)
 
 
@@ -482,7 +482,8 @@ def jackknife_covariance(
     return (n_tiles - 1) / n_tiles * (moves.T @ moves)
 
 
-def _flattening(fit: CellFit, weights: NDArray[np.float64]) -> float:
+def _enlargement(fit: CellFit, weights: NDArray[np.float64]) -> float:
+    """Return the factor by which weights that decrease with the residuals enlarge a covariance."""
     design, faded = fit.design, fit.faded()
     inside = 1.0 - faded**2
     ratios = fit.residuals_m() / fit.limit_m
@@ -490,4 +491,4 @@ def _flattening(fit: CellFit, weights: NDArray[np.float64]) -> float:
     slopes = inside * (inside - falls) / fit.variance_m2
     by_weights = float(np.trace(design.T @ (weights[:, None] * design)))
     by_slopes = float(np.trace(design.T @ (slopes[:, None] * design)))
-    return max(_FLATTENING_LEAST, by_slopes / by_weights)
+    return max(_FLATTENING_LEAST, by_slopes / by_weights) ** -2

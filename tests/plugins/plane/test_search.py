@@ -405,6 +405,22 @@ def test_stated_sigmas_of_walls_are_their_errors(
     assert (rms(trials) < CALIBRATED[1]).all(), rms(trials)
 
 
+def test_cells_with_mixed_distances_have_less_weight() -> None:
+    """A tenth of the cells is off by 1.1 mm, and their mean is 2 mm / sqrt(25) exact otherwise.
+
+    With these errors as weights, the plane would be off by an eighth of what it is without weights.
+    """
+    offs_m, share = [], 0.15
+    for seed in range(6):
+        sums = wall_of_cells(seed, reach_cells=0.0, relief_m=2e-4, mixed_share=share)
+        fit = adjust_plane(WALL_CELLS, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="any")
+        assert fit is not None
+        u, v = WALL_CELLS.centres_m()
+        middle = np.array([u.mean(), v.mean()]) @ WALL_CELLS.axes - 2.0 * WALL.normal
+        offs_m.append(fit.plane.distances_m(middle[None])[0] - WALL.distances_m(middle[None])[0])
+    assert abs(np.mean(offs_m)) < 0.3 * 0.1 * share * 0.5 * FIT_M
+
+
 @pytest.mark.parametrize("tails", ["laplace", "two widths"])
 def test_cells_that_fade_state_what_their_plane_scatters_by(tails: str) -> None:
     """If many cells fade, the weights overstate the information by a fifth to a quarter."""
