@@ -145,6 +145,7 @@ def test_a_cloud_without_a_place_is_refused() -> None:
         {"rotation_camera_from_world": None},
         {"translation_camera_from_world": np.full(3, np.nan)},
         {"covariance": -np.eye(6)},
+        {"covariance": np.full((6, 6), np.nan)},
     ],
 )
 def test_an_impossible_orientation_is_refused(changed: dict[str, Any]) -> None:
