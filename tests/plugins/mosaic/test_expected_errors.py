@@ -116,6 +116,20 @@ def test_errors_of_poses_and_depths_are_propagated_to_the_wall(
     np.testing.assert_allclose(stated[rows, columns], expected, rtol=rtol)
 
 
+def test_depth_errors_that_neighbours_share_are_stated() -> None:
+    """As of a stereo cloud: 5 mm over 5 cm, and 0.2 mm of single cells."""
+    rng, side = np.random.default_rng(6), round(0.05 / GSD_M)
+    patches_m = rng.normal(0.0, 0.005, (FRAME.height // side + 1, FRAME.width // side + 1))
+    shared_m = np.kron(patches_m, np.ones((side, side)))[: FRAME.height, : FRAME.width]
+    depth_m = (shared_m + rng.normal(0.0, 2e-4, FRAME.shape)).astype(np.float32)
+    found, flat = (
+        stated_m(camera(oblique()), wall=samples.wall(FRAME, depth_m=depths))[80, 130]
+        for depths in (depth_m, 0.0 * depth_m)
+    )
+    off_m = shown_m(oblique(), oblique(), np.array([[130.5, 80.5]]), np.array([0.005]))
+    assert found**2 - flat**2 == pytest.approx(np.square(off_m).mean(), rel=0.3)
+
+
 def test_a_lens_that_was_estimated_adds_what_its_photo_states() -> None:
     plain, wider = (stated_m(camera(oblique(), **known)) for known in ({}, {"sigma_wall_m": 0.01}))
     assert np.median(wider) == pytest.approx(0.01, rel=0.1)
