@@ -159,6 +159,7 @@ class RasterGrid(Method):
         }
         require_memory(list(frames.values()), is_tin=params.surface == "tin")
         walls: list[Wall] = []
+        rules: list[str] = []
         empty: list[Emptiness] = []
         sight = Sight(points=points, stations=cloud.stations)
         source: IntensitySource = "none" if cloud.rgb is None else "luminance"
@@ -180,7 +181,9 @@ class RasterGrid(Method):
             rule = params.surface or ("denoised" if is_curved else "median")
             wall = make(params.model_copy(update={"surface": rule}))
             if params.surface is None and not is_curved and is_noisy(ctx, wall):
-                wall = make(params.model_copy(update={"surface": "denoised"}))
+                rule = "denoised"
+                wall = make(params.model_copy(update={"surface": rule}))
+            rules.append(rule)
             wall = replace(wall, frame=slab.frame)
             if is_curved:
                 blank_beside(wall)
@@ -216,7 +219,7 @@ class RasterGrid(Method):
                     tuple(index for index, by in covered.items() if by == wall.plane_index)
                     for wall in walls
                 ),
-                details={"surface": params.surface or "median", "scan_step_m": [*steps_m]},
+                details={"surface": [*rules], "scan_step_m": [*steps_m]},
             )
         )
 

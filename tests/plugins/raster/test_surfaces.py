@@ -109,6 +109,7 @@ def test_the_median_is_denoised_after_gaps_are_closed_by_default_if_noise_exceed
     assert 0.25 * noise_m < np.nanstd(filtered_m - median_m) < noise_m
     is_noisy, ctx = noise_m > known.gsd_m, found[3][1]
     np.testing.assert_array_equal(default_m, filtered_m if is_noisy else median_m)
+    assert found[3][0].details["surface"] == ["denoised" if is_noisy else "median"]
     assert ("depths-smoothed" in {one.code for one in ctx.diagnostics}) == is_noisy
 
 
