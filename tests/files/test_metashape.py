@@ -169,7 +169,7 @@ def test_a_panorama_looks_where_its_camera_does(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "terms",
     [
-        {"k1": -0.05, "k2": 0.02, "k3": -0.01, "k4": 0.03},
+        {"k1": -0.05, "k2": 0.02, "k3": -0.01, "k4": 0.1},
         {"k1": -0.05, "k2": 0.02, "p1": 1e-3, "p2": -5e-4, "p3": 0.1, "p4": -0.05},
     ],
 )
