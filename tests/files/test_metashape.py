@@ -178,8 +178,8 @@ def test_terms_that_opencv_lacks_are_taken_over_by_the_others(
 ) -> None:
     terms = {"f": 500.0, **terms}
     (given,) = read(tmp_path, document(sensors=sensor_of(terms), cameras=posed("a.jpg")))
-    xy = np.random.default_rng(1).uniform([-0.6, -0.45], [0.6, 0.45], (50, 2))
-    points = np.column_stack([xy, np.ones(50)])
+    xy = np.random.default_rng(1).uniform([-0.6, -0.45], [0.6, 0.45], (500, 2))
+    points = np.column_stack([xy, np.ones(500)])
     assert np.abs(project(given, points) - formula(points, terms)).max() < MAX_LEFT_OUT_PX
 
 
