@@ -1,12 +1,11 @@
 """Draw mutants of the source by seed and report which of them the tests do not notice.
 
-    python tests/mutate.py --seed 1 --n 40 [--package plugins/orthoflow_plugins/plane] [--no-golden]
+    python benchmarks/mutants.py --seed 1 --n 40 [--package orthoflow/geometry] [--no-golden]
 
 Cosmic Ray makes and applies the mutants (extra `dev`); here they are drawn, and each is tested by
 the tests of its own folder, on a copy of the checkout. Exit code 0 when nine of ten were killed,
 2 when tests fail without any.
 """
-# ruff: noqa: T201
 
 from __future__ import annotations
 
