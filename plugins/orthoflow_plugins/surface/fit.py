@@ -52,6 +52,10 @@ _TILES_AROUND: Final = 72
 _MOST_TILES: Final = 200
 _LENGTHS: Final = (1.0, 2.0, 4.0, 8.0)
 _CORRELATED: Final = (0.25, 0.5, 0.75, 0.95)
+# Least norm of the remaining distances: points without noise may be exactly on the surface.
+_LEAST_SCATTER_M: Final = 1e-9
+# Variance, in square metres or radians, of parameters that the tiles do not determine.
+_UNDETERMINED: Final = 1e6
 # The profile is tested in sectors of at least this angle and this number of tiles, which are
 # divided into pieces of this number of tiles along the axis. There are at least three sectors if
 # there are enough tiles, and at most twelve. Angles from 25 to 45 degrees give the same results for
@@ -328,11 +332,14 @@ def _fitted(
     best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
     own = best.covariance(zero, own)
     zero = zero_direction(best.axis, cloud.up)
-    near = np.abs(rest) < bounds[3]
+    largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
+    near, on = np.abs(rest) < bounds[3], np.abs(rest) < largest_m
+    if not (near & on).any():
+        # The fit has left the points. Its variances cause the surface to be rejected.
+        near, on, own = near | True, on | True, _UNDETERMINED * np.eye(7)
     rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[near].sum() / n[near].sum())))
     is_on = np.zeros((around, along), dtype=np.bool_)
-    largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
-    is_on[i, j] = np.abs(rest) < largest_m
+    is_on[i, j] = on
     arc, ends = _extent(is_on, sums[:, :, 0], best.least_row_share)
     # Positions along the axis of a cone are measured from its apex.
     start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
@@ -582,7 +589,7 @@ def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
     The scatter is white noise plus relief whose correlation decreases exponentially with the
     distance. Their shares and the correlation length have the largest restricted likelihood
     (Patterson and Thompson 1971, doi:10.1093/biomet/58.3.545), which allows for the relief that the
-    fit has absorbed.
+    fit has absorbed. The variances are very large if the tiles do not determine the parameters.
 
     Args:
         tiles: the result of `_solved`.
@@ -591,25 +598,26 @@ def _covariance(tiles: _Means, n_own: int) -> NDArray[np.float64]:
     while len(tiles) > _MOST_TILES:
         tiles = tiles.merged(2)
     matrix = tiles.matrix[:, :n_own]
-    scale = np.linalg.norm(matrix, axis=0)
+    free = len(matrix) - n_own
+    if free <= 0 or np.linalg.matrix_rank(matrix) < n_own:
+        return _UNDETERMINED * np.eye(n_own)
     turn = math.pi / tiles.n_around * (tiles.i[:, None] - tiles.i)
     apart = np.hypot(tiles.n_around / math.pi * np.sin(turn), tiles.j[:, None] - tiles.j)
     if n_own == _N_SPHERE:
         apart = cdist(matrix[:, :3], matrix[:, :3]) * tiles.n_around / (2.0 * math.pi)
     white = np.diag(tiles.n.mean() / tiles.n)
-    columns = np.column_stack([matrix / scale, tiles.means])
+    columns = np.column_stack([matrix, tiles.means])
     best, least = white, math.inf
     relief = [np.exp(-apart / length) for length in _LENGTHS]
     for correlation, share in [(relief[0], 0.0), *itertools.product(relief, _CORRELATED)]:
         model = (1.0 - share) * white + share * correlation
         root = np.linalg.cholesky(model)
         whitened = linalg.solve_triangular(root, columns, lower=True)
-        triangle = np.linalg.cholesky(whitened.T @ whitened)
-        logs = np.log(np.diag(triangle))
-        free = len(matrix) - n_own
+        diagonal = np.maximum(np.abs(np.diag(np.linalg.qr(whitened, mode="r"))), _LEAST_SCATTER_M)
+        logs = np.log(diagonal)
         score = np.log(np.diag(root)).sum() + logs[:-1].sum() + free * logs[-1]
         if score < least:
-            best, least = triangle[-1, -1] ** 2 / free * model, score
+            best, least = diagonal[-1] ** 2 / free * model, score
     weighted = matrix * tiles.n[:, None]
     inverse = np.linalg.pinv(matrix.T @ weighted, hermitian=True)
     return np.asarray(inverse @ weighted.T @ best @ weighted @ inverse)

@@ -20,7 +20,7 @@ from orthoflow_plugins.surface.sphere import SurfaceSphere
 
 from orthoflow.errors import MethodError
 from orthoflow.products import PointCloud, PointLabels, Surfaces, Truth
-from orthoflow.sdk import Method
+from orthoflow.sdk import Method, StepContext
 from orthoflow.testing import Trial, run_trial
 from orthoflow.testing.surveyed import few_points
 from tests import samples
@@ -127,3 +127,17 @@ def test_labels_of_other_surfaces_are_refused(tmp_path: Path) -> None:
     cloud, labels = few_points(np.ones((3, 3))), PointLabels(plane_index=np.array([0, 1, 2], "i2"))
     with pytest.raises(MethodError, match="surface 2, but there are only 2 surfaces"):
         outputs(SurfaceCone, tmp_path, cloud=cloud, labels=labels, surfaces=samples.surfaces())
+
+
+@pytest.mark.long
+def test_a_cone_of_fewer_tiles_than_parameters_is_none(tmp_path: Path) -> None:
+    def context() -> StepContext:
+        return StepContext(rng=np.random.default_rng(5), cores=2, scratch=tmp_path)
+
+    params = SimulateCurved.Params(subject="tower", scan_step_m=0.015)
+    cloud = SimulateCurved().run(SimulateCurved.In(), params, context()).cloud
+    found: dict[str, Any] = {"surfaces": Surfaces(surfaces=(), up=cloud.up)}
+    for method in (SurfaceSphere, SurfaceCylinder, SurfaceCone):
+        out = method().run(method.In(cloud=cloud, **found), method.Params(), context())
+        found = {"surfaces": out.surfaces, "labels": out.labels}
+    assert [item.name for item in found["surfaces"].surfaces] == ["tower 0"]
