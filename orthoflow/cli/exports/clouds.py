@@ -71,9 +71,10 @@ def export_cloud(
             )
         labels = product_of(run, digest, PointLabels, chosen.store)
         digest = taken[0]
-        planes = last_product(run, {address: recorded}, Planes, chosen.store)
         if surfaces := last_product(run, {address: recorded}, Surfaces, chosen.store):
             planes = surfaces.planes
+        else:
+            planes = last_product(run, {address: recorded}, Planes, chosen.store)
     cloud = product_of(run, digest, PointCloud, chosen.store)
     if len(cloud) == 0:
         raise ArgumentError(f"the cloud of {address} has no points")

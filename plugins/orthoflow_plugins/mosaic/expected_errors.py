@@ -11,7 +11,7 @@ in different directions.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,13 +118,13 @@ def expected_errors_m(
             np.minimum(nodes[..., 0].astype(np.intp), frame.width - 1),
         ].astype(np.float64)
     )
-    *noises_m, patchy_m, point_m = _depth_noises_m(wall)
+    noises = _depth_noises(wall)
     excess = _excess_of_overlaps(wall, cameras, overlaps)
     position_m, depth_m = (0.0, None) if excess is None else excess
     if depth_m is not None:
         # Within 5 cm, relief looks like correlated errors, but overlaps distinguish between the
         # two.
-        patchy_m = depth_m
+        noises = noises._replace(shared_m=depth_m)
     for index, name in enumerate(sources):
         camera = cameras.get(name)
         if camera is None or camera.covariance is None:
@@ -140,8 +140,7 @@ def expected_errors_m(
                 continue
             down = down + rows.start
             variances = _between(of_pose, down, across, step)
-            known_m = (*noises_m, patchy_m, point_m)
-            variances += _depth_variances(wall, down, across, centre_world, known_m)
+            variances += _depth_variances(wall, down, across, centre_world, noises)
             errors_m[down, across] = np.sqrt(variances + position_m**2)
     return errors_m
 
@@ -209,13 +208,26 @@ def _between(
     return np.asarray(upper * (1.0 - down) + lower * down, dtype=np.float64)
 
 
-def _depth_noises_m(wall: Wall) -> tuple[float, float, float, float]:
-    """Return four standard deviations in metres, estimated from measured cells.
+class _DepthNoises(NamedTuple):
+    """Standard deviations of depths, in metres.
 
-    The first two are the noise of single measured and interpolated depths, and the third is the
-    error that neighbours share (0 if none). The last is the spread of the points in a cell on a
-    single surface (0 if unknown). Interpolated cells are not used: their neighbours are
-    interpolated between the same points.
+    Attributes:
+        measured_m: noise of single measured depths.
+        interpolated_m: noise of single interpolated depths.
+        shared_m: error that neighbouring depths share; 0 if none.
+        point_m: spread of the points in a cell on a single surface; 0 if unknown.
+    """
+
+    measured_m: float
+    interpolated_m: float
+    shared_m: float
+    point_m: float
+
+
+def _depth_noises(wall: Wall) -> _DepthNoises:
+    """Estimate the noise of depths from measured cells.
+
+    Interpolated cells are not used: their neighbours are interpolated between the same points.
     """
     every = max(1, -(-wall.depth_m.size // _NOISE_CELLS))
     rows = np.flatnonzero(np.arange(wall.frame.height) // _NOISE_ROWS % every == 0)
@@ -236,8 +248,8 @@ def _depth_noises_m(wall: Wall) -> tuple[float, float, float, float]:
     step = max(1, round(_PATCH_M / wall.frame.gsd_m))
     apart_m = depth_noise_m(depth_m[::step, ::step])
     is_patchy = apart_m > _PATCHY_TIMES * noise_m
-    patchy_m = float(np.sqrt(apart_m**2 - noise_m**2)) if is_patchy else 0.0
-    return noise_m, between_m, patchy_m, point_m
+    shared_m = float(np.sqrt(apart_m**2 - noise_m**2)) if is_patchy else 0.0
+    return _DepthNoises(noise_m, between_m, shared_m, point_m)
 
 
 def _depth_variances(
@@ -245,21 +257,20 @@ def _depth_variances(
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
     centre_world: NDArray[np.float64],
-    noises_m: tuple[float, ...],
+    noises: _DepthNoises,
 ) -> NDArray[np.float64]:
     """Return variances (n,), in m², of a wall coordinate due to depth errors.
 
-    The viewer is at `centre_world` (3,); `noises_m` is the result of `_depth_noises_m`.
+    The viewer is at `centre_world` (3,).
     """
-    noise_m, between_m, patchy_m, point_m = noises_m
     depths_m = np.nan_to_num(wall.depth_m[rows, columns].astype(np.float64))
     places = np.column_stack([columns, rows]).astype(np.float64) + 0.5
     beside_m, before_m = _seen_from(centre_world, wall.frame, places, depths_m)
     squares = np.minimum((beside_m**2).sum(axis=1) / before_m**2, _MOST_TANGENT**2)
     spread_m = np.nan_to_num(wall.sigma_m[rows, columns].astype(np.float64))
-    sigma_m = np.where(spread_m > _SPREAD_TIMES * point_m, spread_m, noise_m)
-    sigma_m[wall.mask[rows, columns] == SurfaceMask.RECOVERED] = between_m
-    return np.asarray(0.5 * squares * (sigma_m**2 + patchy_m**2), dtype=np.float64)
+    sigma_m = np.where(spread_m > _SPREAD_TIMES * noises.point_m, spread_m, noises.measured_m)
+    sigma_m[wall.mask[rows, columns] == SurfaceMask.RECOVERED] = noises.interpolated_m
+    return np.asarray(0.5 * squares * (sigma_m**2 + noises.shared_m**2), dtype=np.float64)
 
 
 def _seen_from(

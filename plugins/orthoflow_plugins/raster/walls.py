@@ -124,11 +124,13 @@ def _rastered(
     )
 
     surface = surface_of(cloud, slab, params, threads=threads)
-    # Interpolated depths have less noise than the points, which the filter is meant for.
-    noise_m = depth_noise_m(surface.depth_m.reshape(slab.frame.shape))
+    is_denoised, noise_m = params.surface == "denoised", 0.0
+    if is_denoised:
+        # Interpolated depths have less noise than the points, which the filter is meant for.
+        noise_m = depth_noise_m(surface.depth_m.reshape(slab.frame.shape))
     mask = close_gaps(cloud, slab, surface, params, threads=threads)
     surface = carried_to_centres(surface, slab, params, threads=threads)
-    if params.surface == "denoised":
+    if is_denoised:
         depth_m = denoised(surface.depth_m.reshape(slab.frame.shape), noise_m)
         surface = replace(surface, depth_m=depth_m.ravel())
     intensity, rgb, rgb_mask = surface.intensity, surface.rgb, None

@@ -336,7 +336,8 @@ def _fitted(
     near, on = np.abs(rest) < bounds[3], np.abs(rest) < largest_m
     if not (near & on).any():
         # The fit has left the points. Its variances cause the surface to be rejected.
-        near, on, own = near | True, on | True, _UNDETERMINED * np.eye(7)
+        near = on = np.ones_like(near)
+        own = _UNDETERMINED * np.eye(7)
     rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[near].sum() / n[near].sum())))
     is_on = np.zeros((around, along), dtype=np.bool_)
     is_on[i, j] = on
