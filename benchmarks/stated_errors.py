@@ -1,6 +1,6 @@
 """Compare expected errors of photos with the truth, for clouds with correlated point errors.
 
-    python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...] [--noise-m 0.02]
+    python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...] [--noise-m 0.005 0.03]
     python benchmarks/stated_errors.py --entry FOLDER --fountain FOLDER   # real photos, see below
 
 Drawn rooms: For each type of cloud, there are several rooms with different scan noise, cameras and
@@ -12,7 +12,8 @@ relative to the scan, RMS over all photos; `stated` is the expected error; `wron
 photos whose error exceeds five expected standard deviations. `cloud` is the mean offset of the
 points that a photo shows. The scan cannot reveal this offset, so `true` and `stated` exclude it.
 `walls` are the planes of at least 4 m² that were found within 1 degree and 15 mm. With
-`--noise-m`, the geometry of the rooms is drawn as well, and all points have this noise.
+`--noise-m`, the geometry of the rooms is drawn as well, and the noise of the points of each room
+is drawn between these two values.
 
 Real photos: These are folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11)
 with `images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same
@@ -190,18 +191,27 @@ def moved(camera: Camera, by_m: NDArray[np.float64]) -> Camera:
     )
 
 
+def rms(pairs: list[tuple[float, float]]) -> NDArray[np.float64]:
+    """Return the RMS of the true and of the expected errors."""
+    return np.asarray(np.sqrt(np.mean(np.reshape(pairs, (-1, 2)) ** 2, axis=0)))
+
+
 def drawn(chosen: argparse.Namespace) -> None:
     print(f"{'cloud':12s} photos   cloud    true  stated  stated/true  wrong  walls")
     for cloud in chosen.clouds:
         rooms = []
         for seed in range(chosen.first, chosen.first + chosen.rooms):
+            noise_m = chosen.noise_m and np.random.default_rng(seed).uniform(*chosen.noise_m)
             with tempfile.TemporaryDirectory() as folder:
-                rooms.append(room(cloud, seed, folder, chosen.noise_m))
+                rooms.append(room(cloud, seed, folder, noise_m))
+            true, stated = 1e3 * rms(rooms[-1].errors_m)
+            noise = f", noise {1e3 * noise_m:.1f} mm" if noise_m else ""
+            print(f"  {cloud} {seed}{noise}: true {true:.2f}, stated {stated:.2f} mm", flush=True)
             for reason in rooms[-1].refused:
                 print(f"  {cloud} {seed}: {reason}", flush=True)
         found = [pair for one in rooms for pair in one.errors_m]
         n_photos = len(found) + sum(len(one.refused) for one in rooms)
-        true, stated = np.sqrt(np.mean(np.square(found), axis=0))
+        true, stated = rms(found)
         n_walls, n_true = np.sum([one.walls for one in rooms], axis=0)
         off = np.sqrt(np.mean([one.cloud_m**2 for one in rooms]))
         print(
@@ -320,7 +330,9 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=3, help="rooms of each kind of cloud")
     parser.add_argument("--first", type=int, default=1, help="seed of the first room")
     parser.add_argument("--clouds", nargs="*", default=list(CLOUDS), choices=list(CLOUDS))
-    parser.add_argument("--noise-m", type=float, help="noise of the points in drawn rooms")
+    parser.add_argument(
+        "--noise-m", type=float, nargs=2, help="range of the noise of the points in drawn rooms"
+    )
     parser.add_argument("--entry", type=Path)
     parser.add_argument("--fountain", type=Path)
     chosen = parser.parse_args()

@@ -1,4 +1,4 @@
-"""How a command ends when one of our errors ends it: the numbers that scripts ask for."""
+"""Exit codes of errors, which scripts ask for, and names that a misspelt one may stand for."""
 
 from __future__ import annotations
 
@@ -31,3 +31,11 @@ def test_each_error_has_the_exit_code_of_its_kind(kind: str, exit_code: int) -> 
     error = getattr(errors, kind)
     assert issubclass(error, errors.OrthoflowError)
     assert error("why").exit_code == exit_code
+
+
+@pytest.mark.parametrize(("n_letters", "is_compared"), [(200, True), (201, False)])
+def test_names_of_two_hundred_letters_are_compared_and_no_longer_ones(
+    n_letters: int, is_compared: bool
+) -> None:
+    name = "x" * n_letters
+    assert errors.nearest(name, [name]) == (name if is_compared else "")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests import fetch_real_data
-from tests.fetch_real_data import LISTING, ROOT, fetch
+from benchmarks import fetch_real_data
+from benchmarks.fetch_real_data import LISTING, ROOT, fetch
 
 
 def test_the_listing_has_the_checksums_of_the_data(shared_data: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,22 @@ def test_detectors_find_the_planes_of_the_room(compare: Compare) -> None:
         # Mixed distances and mouldings on one side: more in the middle and in the tails.
         assert of("plane", variant, "excess_kurtosis") > 0.0
         assert of("plane", variant, "within_1_sigma") > 0.683
+
+
+def test_detectors_are_compared_over_several_rooms(tmp_path: Path, store: Path) -> None:
+    """The benchmark on two of its rooms: one run, one record, one page over both."""
+    rooms = ("usual", "one-station")
+    only = ("--only-data", ",".join(rooms), "--set", "room.scan_step_m=0.05")
+    Shell(tmp_path, store)("run", "plane-benchmark.yaml", *only, "-o", "run", timeout_s=900)
+    found = metrics_of(tmp_path / "run")
+    for room, name in product(rooms, ("hough2d", "hough3d", "ransac", "region")):
+        # Measured: at most 0.005 deg and 0.15 mm, with a point every five centimetres.
+        assert found[f"check@data={room},plane={name}", "plane_angle_deg"] <= 0.02
+        assert abs(found[f"check@data={room},plane={name}", "plane_offset_mm"]) <= 1.0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "2 of 2 datasets are complete" in page
+    assert "check: direction error of the main plane" in page
+    assert {path.stem for path in (tmp_path / "run" / "pages").iterdir()} == set(rooms)
 
 
 def test_photos_are_oriented_within_what_is_stated(compare: Compare) -> None:

@@ -11,6 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 from syrupy.assertion import SnapshotAssertion
 
+from docs import workflow_format
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import WorkflowError
@@ -18,7 +19,6 @@ from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.model import Workflow
 from orthoflow.workflow.source import shipped_workflow, shipped_workflows
 from orthoflow.workflow.views import mermaid, resolved_json, workflow_from_resolved, workflow_schema
-from tests import workflow_format
 from tests.laboratories import GOOD, load
 
 

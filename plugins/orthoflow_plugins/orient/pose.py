@@ -416,6 +416,8 @@ def no_pose(seen: SeenPoints) -> str:
 def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
     """Find the pose with the most inliers among the control points; None if there is none."""
     lens, control = lens_prior(tied.photo), tied.seen.take(~tied.is_check)
+    if len(control) < _LEAST_FOR_POSE:
+        return None
     threshold_px = params.threshold_px
     if threshold_px is None:
         # With an approximate lens, residuals of correct ties are larger.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -16,6 +16,13 @@ from orthoflow.products.walls import Layers, Orthoimages, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 
 
+# Any: a type, or a union with None.
+def ports(**types: Any) -> type[Ports]:
+    """Ports of these types, which are optional where the type may be None."""
+    optional = {name: None for name, kind in types.items() if type(None) in get_args(kind)}
+    return type("SomePorts", (Ports,), {"__annotations__": types, **optional})
+
+
 class Idle(Method):
     """Declares everything and computes nothing."""
 
@@ -27,39 +34,21 @@ class Idle(Method):
 
 class ReadScan(Idle):
     id = "read.scan"
+    In, Out = ports(files=InputFiles), ports(cloud=PointCloud)
 
     class Params(MethodParams):
         up: Literal["x", "y", "z", "-x", "-y", "-z"] = Field("z", description="Upward axis.")
 
-    class In(Ports):
-        files: InputFiles
-
-    class Out(Ports):
-        cloud: PointCloud
-
 
 class ReadPhotos(Idle):
     id = "read.photos"
-
-    class In(Ports):
-        files: InputFiles
-        calibration: InputFiles | None = None
-
-    class Out(Ports):
-        photos: Photos
+    In, Out = ports(files=InputFiles, calibration=InputFiles | None), ports(photos=Photos)
 
 
 class SimulateRoom(Idle):
     id = "simulate.room"
     determinism = "seeded"
-
-    class In(Ports):
-        pass
-
-    class Out(Ports):
-        cloud: PointCloud
-        photos: Photos
-        truth: Truth
+    In, Out = ports(), ports(cloud=PointCloud, photos=Photos, truth=Truth)
 
 
 class Limits(BaseModel):
@@ -74,6 +63,7 @@ class Limits(BaseModel):
 class Hough2d(Idle):
     id = "plane.hough2d"
     result_version = 3
+    In, Out = ports(cloud=PointCloud), ports(planes=Planes, labels=PointLabels)
 
     class Params(MethodParams):
         cell_m: float = Field(0.02, gt=0, description="Edge of an accumulator cell.")
@@ -86,13 +76,6 @@ class Hough2d(Idle):
             if self.cell_m > self.tolerance_m:
                 raise ValueError(f"cell_m {self.cell_m} must not exceed tolerance_m")
             return self
-
-    class In(Ports):
-        cloud: PointCloud
-
-    class Out(Ports):
-        planes: Planes
-        labels: PointLabels
 
 
 class Ransac(Hough2d):
@@ -109,45 +92,25 @@ class Ransac(Hough2d):
 
 class Grid(Idle):
     id = "raster.grid"
+    In, Out = ports(cloud=PointCloud, planes=Planes), ports(walls=Walls)
 
     class Params(MethodParams):
         gsd_m: float = Field(0.005, gt=0, description="Edge of a cell.")
 
-    class In(Ports):
-        cloud: PointCloud
-        planes: Planes
-
-    class Out(Ports):
-        walls: Walls
-
 
 class Sift(Idle):
     id = "match.sift"
-
-    class In(Ports):
-        photos: Photos
-        walls: Walls
-
-    class Out(Ports):
-        ties: Ties
+    In, Out = ports(photos=Photos, walls=Walls), ports(ties=Ties)
 
 
 class Guided(Sift):
     id = "match.guided"
-
-    class In(Sift.In):
-        cameras: Cameras
+    In = ports(photos=Photos, walls=Walls, cameras=Cameras)
 
 
 class Pnp(Idle):
     id = "orient.pnp"
-
-    class In(Ports):
-        ties: Ties
-        photos: Photos
-
-    class Out(Ports):
-        cameras: Cameras
+    In, Out = ports(ties=Ties, photos=Photos), ports(cameras=Cameras)
 
 
 class Bundle(Pnp):
@@ -157,42 +120,22 @@ class Bundle(Pnp):
 
 class Backward(Idle):
     id = "ortho.backward"
-
-    class In(Ports):
-        walls: Walls
-        photos: Photos
-        cameras: Cameras
-
-    class Out(Ports):
-        layers: Layers
+    In, Out = ports(walls=Walls, photos=Photos, cameras=Cameras), ports(layers=Layers)
 
 
 class Direct(Backward):
     id = "ortho.direct"
-
-    class In(Ports):  # type: ignore[assignment]
-        walls: Walls
-        cloud: PointCloud
+    In = ports(walls=Walls, cloud=PointCloud)
 
 
 class Seams(Idle):
     id = "mosaic.seams"
-
-    class In(Ports):
-        layers: Layers
-
-    class Out(Ports):
-        orthoimages: Orthoimages
+    In, Out = ports(layers=Layers), ports(orthoimages=Orthoimages)
 
 
 class InspectTruth(Idle):
     id = "inspect.truth"
-
-    class In(Ports):
-        orthoimages: Orthoimages
-        walls: Walls
-        truth: Truth
-        planes: Planes | None = None
-
-    class Out(Ports):
-        inspection: Inspection
+    In, Out = (
+        ports(orthoimages=Orthoimages, walls=Walls, truth=Truth, planes=Planes | None),
+        ports(inspection=Inspection),
+    )

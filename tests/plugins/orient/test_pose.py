@@ -152,6 +152,8 @@ def test_withheld_ties_have_no_say_in_the_start_and_four_places_make_none() -> N
     np.testing.assert_array_equal(start.agreeing, ~is_check)
     assert start.lens.source == "calibration"
     np.testing.assert_allclose(start.camera.centre_world, CAMERA.centre_world, atol=1e-3)
+    withheld = tied(photo(CAMERA), seen, is_check=np.ones(60, dtype=np.bool_))
+    assert lenses.robust_start(withheld, PARAMS) is None
     for n_places in (4, 5):
         places = seen.take(np.arange(40) % n_places)
         start = lenses.robust_start(tied(photo(CAMERA), places), PARAMS)

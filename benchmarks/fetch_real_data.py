@@ -1,6 +1,6 @@
-"""Fetch the public scans and photos that tests use where they are: `docs/real-data.md`.
+"""Fetch the public scans and photos that tests and measurements use: `docs/real-data.md`.
 
-    python tests/fetch_real_data.py [FOLDER]
+    python benchmarks/fetch_real_data.py [FOLDER]
 
 Downloads what is missing into FOLDER (by default `../shared/data`, where the tests look), from
 fixed commits of the repositories that published it, and compares every file with its checksum.
@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 DATA: Final = ROOT.parent / "shared" / "data"
-LISTING: Final = ROOT / "tests" / "real_data.json"
+LISTING: Final = ROOT / "benchmarks" / "real_data.json"
 _HOST: Final = "https://raw.githubusercontent.com"
 _TIMEOUT_S: Final = 120
 

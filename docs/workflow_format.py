@@ -1,6 +1,6 @@
 """The reference of the workflow format as Markdown, made of its models.
 
-`python tests/workflow_format.py` writes `docs/workflow-format.md`.
+`python docs/workflow_format.py` writes `docs/workflow-format.md`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from orthoflow.workflow.model import (
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "docs" / "workflow-format.md"
-COMMAND = "python tests/workflow_format.py"
+COMMAND = "python docs/workflow_format.py"
 
 # Headings, in the order of a file, with the section below each.
 SECTIONS: dict[str, type[BaseModel]] = {
