@@ -84,6 +84,7 @@ def test_detectors_are_compared_over_several_rooms(tmp_path: Path, store: Path) 
         assert abs(found[f"check@data={room},plane={name}", "plane_offset_mm"]) <= 1.0
     page = (tmp_path / "run" / "report.html").read_text()
     assert "2 of 2 datasets are complete" in page
+    assert "Over all datasets" in page
     assert "check: direction error of the main plane" in page
     assert {path.stem for path in (tmp_path / "run" / "pages").iterdir()} == set(rooms)
 
