@@ -128,7 +128,8 @@ class PhotoPairs:
         radius_px: search radius of the guided matching; if a homography is wrong, the matches are
             evenly distributed within this radius.
         is_mirrored: whether the mirrored photo matches better; if so, no wall counts as shown.
-        n_recognised: number of inliers before the guided matching.
+        n_recognised: number of inliers before the guided matching, of the mirrored photo if that
+            matches better.
         picture: "grey" or the name of the mixture.
     """
 
@@ -182,10 +183,9 @@ def pair_photo(
     first, features = seeker.first_look(walls)
     if not first.n_verified:
         return first
-    n_mirrored = seeker.n_verified_mirrored(first, walls)
+    n_mirrored = seeker.n_verified_mirrored(first.features, first, walls)
     if n_mirrored > first.n_verified:
-        refused = tuple(replace(pair, is_shown=False, homography=None) for pair in first.pairs)
-        return replace(first, pairs=refused, is_mirrored=True, n_recognised=first.n_verified)
+        return _refused(first, n_mirrored)
     # Wall cells per pixel of the reduced photo.
     ratios = [
         wall.sizes_px[pair.matches.second[pair.agreeing]]
@@ -214,9 +214,11 @@ def pair_in_colours(
         params: parameters of the matching.
 
     Returns:
-        The matches in grey, or in a mixture if that has more inliers.
+        The matches in grey, or in a mixture if that has more inliers than the photo in grey, also
+        mirrored.
     """
-    best = pair_photo(photo_grey(photo), walls, params)
+    grey = photo_grey(photo)
+    best = pair_photo(grey, walls, params)
     if best.n_recognised >= CLEARLY:
         return best
     smaller = params.model_copy(update={"max_side_px": min(params.max_side_px, _LONGEST_SIDE_PX)})
@@ -230,7 +232,12 @@ def pair_in_colours(
             best = replace(tried, picture=name)
         if best.n_recognised >= CLEARLY:
             break
-    return best
+    if best.picture == "grey":
+        return best
+    # A mixture may show only a symmetric part of a mirrored photo.
+    seeker = _Seeker(grey=grey, params=params)
+    n_mirrored = seeker.n_verified_mirrored(seeker.key_points(best.scale), best, walls)
+    return _refused(best, n_mirrored) if n_mirrored > best.n_recognised else best
 
 
 def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
@@ -378,15 +385,22 @@ class _Seeker:
                 pairs.append(verified(index, matches, (features, wall), radius_px))
         return PhotoPairs(features=features, scale=scale, pairs=tuple(pairs), radius_px=radius_px)
 
-    def n_verified_mirrored(self, first: PhotoPairs, walls: Sequence[Features | None]) -> int:
-        """Count the inliers of the mirrored photo on the walls that are shown.
+    def n_verified_mirrored(
+        self, features: Features, found: PhotoPairs, walls: Sequence[Features | None]
+    ) -> int:
+        """Count the inliers of mirrored key points on the walls that are shown.
 
         A symmetric facade partly matches its own mirror image, with a plausible pose.
         """
-        mirrored = first.features.mirrored(self.grey.shape[1])
-        few = len(mirrored) <= _FIRST_IN_PHOTO
-        shown = _shown(first, _strongest(walls) if few else walls)
-        return self.pairs(mirrored, first.scale, shown).n_verified
+        few = len(features) <= _FIRST_IN_PHOTO
+        shown = _shown(found, _strongest(walls) if few else walls)
+        return self.pairs(features.mirrored(self.grey.shape[1]), found.scale, shown).n_verified
+
+
+def _refused(pairs: PhotoPairs, n_mirrored: int) -> PhotoPairs:
+    """Return the matches of a photo whose mirror image has more inliers."""
+    refused = tuple(replace(pair, is_shown=False, homography=None) for pair in pairs.pairs)
+    return replace(pairs, pairs=refused, is_mirrored=True, n_recognised=n_mirrored)
 
 
 def _strongest(walls: Sequence[Features | None]) -> list[Features | None]:

@@ -75,7 +75,7 @@ class MatchSift(Method):
 
     id: ClassVar[str] = "match.sift"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_ties", label="ties"),
         MetricSpec("n_rejected", label="ties rejected"),

@@ -69,26 +69,25 @@ def test_where_photos_are_upside_down_the_run_goes_no_further(tmp_path: Path) ->
 
 
 def test_a_photo_of_nothing_known_is_warned_of(tmp_path: Path) -> None:
-    photo = level_photo()
-    blank = replace(photo, encoded=encode_png(np.full((photo.height, photo.width), 128, np.uint8)))
-    ties, codes = sift(tmp_path, blank)
+    ties, codes = sift(tmp_path, photo_with(np.full((480, 640), 128, np.uint8)))
     assert not (ties.role != TieRole.REJECTED).any()
     assert codes == ["photo-shows-no-wall"]
 
 
-def test_a_mirrored_photo_is_recognised_as_such(tmp_path: Path) -> None:
-    # The right fifth of the wall is the mirror image of its left fifth.
+@pytest.mark.parametrize("share", [0.04, 0.06, 0.2])
+def test_a_mirrored_photo_is_recognised_as_such(tmp_path: Path, share: float) -> None:
+    # The right side of the wall is the mirror image of its left side. Narrow sides are coloured, so
+    # a mixture shows hardly anything else.
     (wall,) = mw.walls(1).walls
-    assert wall.intensity is not None
-    side = wall.frame.width // 5
-    symmetric = wall.intensity.copy()
+    side, symmetric = round(share * wall.frame.width), np.array(wall.intensity)
     symmetric[:, -side:] = symmetric[:, side - 1 :: -1]
     flat = np.where(np.isfinite(symmetric), 0.0, np.nan).astype(np.float32)
     palace = replace(mw.walls(1), walls=(replace(wall, intensity=symmetric, depth_m=flat),))
-    grey = np.nan_to_num(symmetric * 255.0).clip(0, 255).astype(np.uint8)
-    size = {"width": grey.shape[1], "height": grey.shape[0]}
-    photo = Photo(name="a.png", encoded=encode_png(grey[:, ::-1].copy()), **size)
-    ties, codes = sift(tmp_path, photo, palace)
+    mirrored = np.repeat(np.nan_to_num(symmetric * 255.0)[:, ::-1, None], 3, axis=2)
+    if share < 0.1:
+        sides = np.r_[:side, -side:0]
+        mirrored[:, sides] = 110.0 + (mirrored[:, sides] - 110.0) * [0.5, -0.25, 0.0]
+    ties, codes = sift(tmp_path, photo_with(mirrored.clip(0, 255).astype(np.uint8)), palace)
     assert not (ties.role != TieRole.REJECTED).any()
     assert codes == ["photo-mirrored"]
 
@@ -184,7 +183,8 @@ def grey_of(seed: int) -> NDArray[np.uint8]:
 
 
 def photo_with(rgb: NDArray[np.uint8]) -> Photo:
-    return Photo(name="a.png", encoded=encode_png(rgb), width=CAMERA.width, height=CAMERA.height)
+    height, width = rgb.shape[:2]
+    return Photo(name="a.png", encoded=encode_png(rgb), width=width, height=height)
 
 
 def wall_with(red: float, green: float) -> Walls:
