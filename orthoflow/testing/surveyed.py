@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.geometry import up_vector
-from orthoflow.products import Planes, PointCloud, PointLabels, Product, Truth
+from orthoflow.products import Planes, PointCloud, PointLabels, Product, Surfaces, Truth
 from orthoflow.sdk import StepContext
 
 _SCAN_STEP_M: Final = 0.08
@@ -84,9 +84,15 @@ def _labels() -> PointLabels:
     return PointLabels(plane_index=np.where(true < _N_PLANES, true, -1).astype(np.int16))
 
 
+def _surfaces() -> Surfaces:
+    planes = _planes()
+    return Surfaces(surfaces=(), up=planes.up, planes=planes)
+
+
 SURVEYED: Final[Mapping[str, Callable[[], Product]]] = {
     "cloud": lambda: _room()[0],
     "truth": lambda: _room()[1],
     "planes": cache(_planes),
     "labels": cache(_labels),
+    "surfaces": cache(_surfaces),
 }
