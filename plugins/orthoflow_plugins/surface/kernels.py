@@ -20,6 +20,8 @@ from orthoflow.geometry.slabs import Offsets
 MOMENTS: Final = 10
 # Number of points of a block of `sum_cells`.
 _BLOCK: Final = 128
+# Resolution of the boxes of these blocks.
+_UNITS_PER_M: Final = 1024.0
 # A voxel at (i, j, k) has the key i << 40 | j << 20 | k.
 KEY_BITS: Final = 20
 
@@ -399,11 +401,13 @@ def sum_cells(
 @kernel_part
 def _reach(values: NDArray[np.float32], axis: int, middle: NDArray[np.float64]) -> float:
     """Set the middle of a block along an axis; return half its length."""
-    low, high = values[0], values[0]
+    low = high = np.int32(values[0] * _UNITS_PER_M)
     for p in range(values.shape[0]):
-        low, high = min(low, values[p]), max(high, values[p])
-    middle[axis] = 0.5 * (float(low) + float(high))
-    return 0.5 * (float(high) - float(low))
+        # Minima of floats would not be vectorised, because values may be NaN.
+        value = np.int32(values[p] * _UNITS_PER_M)
+        low, high = min(low, value), max(high, value)
+    middle[axis] = 0.5 * (float(low) + float(high)) / _UNITS_PER_M
+    return (0.5 * (float(high) - float(low)) + 1.0) / _UNITS_PER_M
 
 
 @kernel_part
