@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import Cone, Cylinder, Sphere
+from orthoflow.geometry.slabs import read_only_view
 from orthoflow.geometry.surfaces import zero_direction
+from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud, Surface, Surfaces, surface_kind
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.surface.fit import CYLINDER_SLOPE, fit_all
+from orthoflow_plugins.surface.kernels import replace_labels
 from orthoflow_plugins.surface.parameters import DetectorParams
 from orthoflow_plugins.surface.rounds import Round
 from orthoflow_plugins.surface.search import (
@@ -163,12 +166,16 @@ def detect(
         else:
             kept[index] = replace(found[index], evidence=evidence)
     n_before = 0 if earlier is None else len(earlier)
-    rank = np.full(len(found) + len(known) + 1, -1, dtype=np.int16)
-    rank[list(kept)] = n_before + np.arange(len(kept))
-    rank[len(found) : -1] = n_before + np.arange(-len(known), 0)
-    labels = rank[labels]
-    if earlier is not None and plane_index is not None:
-        labels = np.where(labels < 0, plane_index, labels)
+    numbers = np.full(len(found) + len(known), -1, dtype=np.int16)
+    numbers[list(kept)] = n_before + np.arange(len(kept))
+    numbers[len(found) :] = n_before + np.arange(-len(known), 0)
+    before = plane_index if earlier is not None and plane_index is not None else labels[:0]
+    before = read_only_view(before)
+
+    def renumber(first: int, end: int) -> None:
+        replace_labels(labels[first:end], numbers, before[first:end])
+
+    in_parts(renumber, len(labels), threads=ctx.cores)
     return Detection(
         surfaces=tuple(
             _named(fitted[index].surface, n_before + place, cloud.up, is_oriented=is_oriented)

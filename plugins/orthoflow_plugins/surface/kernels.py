@@ -398,6 +398,22 @@ def sum_cells(
                 sums[cell, 2] += distance * distance
 
 
+@compiled
+def replace_labels(
+    labels: NDArray[np.int16], numbers: NDArray[np.int16], plane: NDArray[np.int16]
+) -> None:
+    """Replace the labels of points by the numbers of their surfaces.
+
+    Args:
+        labels: (n,) index of the surface of each point, -1 for none; changed.
+        numbers: (s,) number of each surface, -1 for none.
+        plane: (n,) labels of points without a number; empty for -1.
+    """
+    for p in range(labels.shape[0]):
+        label = numbers[labels[p]] if labels[p] >= 0 else -1
+        labels[p] = plane[p] if label < 0 and plane.shape[0] > 0 else label
+
+
 @kernel_part
 def _reach(values: NDArray[np.float32], axis: int, middle: NDArray[np.float64]) -> float:
     """Set the middle of a block along an axis; return half its length."""
