@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
@@ -121,20 +122,22 @@ def detect(
         form=form,
     )
     is_cone = form == "cone"
-    found, rejected = search(
-        levels, limits, cloud.up, ctx.rng, ctx.progress, is_oriented=is_oriented, earlier=known
-    )
-    found = [with_bridged_gaps(item, _BRIDGED_RAD) for item in found[: params.max_surfaces]]
-    ctx.progress(0.8, "fitting surfaces")
-    fitted, labels = fit_all(
-        [*found, *known],
-        cloud,
-        None if plane_index is None else (plane_index, _rows_of(tests, plane_index)),
-        [limits.tolerance_at(item.round.radius_m) for item in (*found, *known)],
-        noise_m,
-        is_cone=is_cone,
-        cores=ctx.cores,
-    )
+    # Threads of the linear algebra library would cost more than they save for such small systems.
+    with threadpoolctl.threadpool_limits(1):
+        found, rejected = search(
+            levels, limits, cloud.up, ctx.rng, ctx.progress, is_oriented=is_oriented, earlier=known
+        )
+        found = [with_bridged_gaps(item, _BRIDGED_RAD) for item in found[: params.max_surfaces]]
+        ctx.progress(0.8, "fitting surfaces")
+        fitted, labels = fit_all(
+            [*found, *known],
+            cloud,
+            None if plane_index is None else (plane_index, _rows_of(tests, plane_index)),
+            [limits.tolerance_at(item.round.radius_m) for item in (*found, *known)],
+            noise_m,
+            is_cone=is_cone,
+            cores=ctx.cores,
+        )
     counts = np.array([item.surface.n_points for item in fitted], dtype=np.int64)
     kept: dict[int, Found] = {}
     for index in np.argsort(-counts, kind="stable").tolist():

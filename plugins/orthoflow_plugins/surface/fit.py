@@ -9,7 +9,6 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-import threadpoolctl
 from numpy.typing import NDArray
 from scipy import linalg, ndimage, special
 from scipy.spatial.distance import cdist
@@ -222,9 +221,7 @@ def fit_all(  # noqa: PLR0913
         bounds = cells.bounds[index]
         return _fitted(found[index], own, bounds, n_points, cloud, near, is_cone=is_cone)
 
-    # Threads of the linear algebra library would cost more than they save for such small systems.
-    with threadpoolctl.threadpool_limits(1):
-        fitted = list(in_order(fit, range(len(new)), threads=cores))
+    fitted = list(in_order(fit, range(len(new)), threads=cores))
     # Far from the surface found among voxels, distances are not linear in the parameters, and
     # points of the surface may be too far away to be summed.
     is_far = [item.shift_m > _FAR_SIGMAS * item.noise_m for item in fitted]
