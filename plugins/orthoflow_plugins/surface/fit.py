@@ -195,8 +195,7 @@ def fit_all(  # noqa: PLR0913
     if not new:
         return [], np.full(len(cloud), -1, dtype=np.int16)
     labels = np.empty(len(cloud), dtype=np.int16)
-    cells = _cells_of(found, tolerances_m, noise_m)
-    n_cells = int(cells.sizes[-1, 0] + cells.sizes[-1, 1] * cells.sizes[-1, 2])
+    cells, n_cells = _cells_of(found, tolerances_m, noise_m)
     offsets = read_only(cloud.x, cloud.y, cloud.z)
     planes = plane_labels or (np.zeros(0, dtype=np.int16), np.zeros((0, 4)))
     parts = even_parts(len(cloud), _PARTS)
@@ -215,8 +214,9 @@ def fit_all(  # noqa: PLR0913
     labelled = labels[sample]
 
     def fit(index: int) -> FittedSurface:
-        first, around, along, _ = cells.sizes[index].tolist()
-        own = total[first : first + around * along].reshape(around, along, 3)
+        first, around, along = cells.sizes[index].tolist()
+        columns, own = cells.columns[first : first + around], np.zeros((around, along, 3))
+        own[columns >= 0] = total[columns[columns >= 0, None] + np.arange(along)]
         n_points, near = int(counts[:, index].sum()), sample[labelled == index]
         bounds = cells.bounds[index]
         return _fitted(found[index], own, bounds, n_points, cloud, near, is_cone=is_cone)
@@ -247,9 +247,10 @@ def fit_all(  # noqa: PLR0913
     ], labels
 
 
-def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> Cells:
-    rounds, bounds, sizes, opens = [], [], [], []
-    first, first_open = 0, 0
+def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> tuple[Cells, int]:
+    """Return the cells of surfaces, and their number."""
+    rounds, bounds, sizes, columns = [], [], [], []
+    n_cells, n_columns = 0, 0
     for item, tolerance_m in zip(found, tolerances_m, strict=True):
         low_m, high_m = item.along_m
         radius_m = item.round.radius_m
@@ -264,11 +265,13 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
         scatter_m = max(noise_m, item.evidence["scatter_mm"] / 1000.0)
         within_m = min(tolerance_m, max(_LEAST_SUM_M, _SUM_SIGMAS * scatter_m))
         bounds.append((low_m, high_m, tolerance_m, within_m))
-        sizes.append((first, around, along, first_open))
-        opens.append(item.is_open[np.arange(around) * len(item.is_open) // around])
-        first += around * along
-        first_open += around
-    return Cells(np.array(rounds), np.array(bounds), np.array(sizes), np.concatenate(opens))
+        sizes.append((n_columns, around, along))
+        is_open = item.is_open[np.arange(around) * len(item.is_open) // around]
+        columns.append(np.where(is_open, n_cells + along * (np.cumsum(is_open) - 1), -1))
+        n_cells += along * int(is_open.sum())
+        n_columns += around
+    cells = Cells(np.array(rounds), np.array(bounds), np.array(sizes), np.concatenate(columns))
+    return cells, n_cells
 
 
 def _fitted(

@@ -316,15 +316,14 @@ class Cells(NamedTuple):
         rounds: (s, 13) the surfaces.
         bounds: (s, 4) float64 smallest and largest position along the axis, tolerance for the
             labels, tolerance for the sums.
-        sizes: (s, 4) int64 first cell of the surface, cells around, cells along, and the first
-            entry of its angles in `is_open`.
-        is_open: (a,) bool, for each cell around each surface, whether points are accepted there.
+        sizes: (s, 3) int64 first column of the surface, columns around, and cells along.
+        columns: (a,) int64 first cell of each column, -1 where no points are accepted.
     """
 
     rounds: NDArray[np.float64]
     bounds: NDArray[np.float64]
     sizes: NDArray[np.int64]
-    is_open: NDArray[np.bool_]
+    columns: NDArray[np.int64]
 
 
 @kernel_part
@@ -503,12 +502,12 @@ def _compare(
         work[2, p], work[3, p] = off, (angle + math.pi) * columns_per_rad
         work[4, p] = row if (abs(off) <= reach) & (row >= 0.0) & (row <= rows) else -1.0
     for p in range(x.shape[0]):
-        off, column = work[2, p], min(int(work[3, p]), around - 1)
-        if work[4, p] < 0.0 or not cells.is_open[sizes[s, 3] + column]:
+        off, cell = work[2, p], cells.columns[sizes[s, 0] + min(int(work[3, p]), around - 1)]
+        if work[4, p] < 0.0 or cell < 0:
             continue
         if abs(off) < abs(work[0, p]):
             work[1, p] = abs(work[0, p]) if index[0, p] >= 0 else math.inf
             work[0, p], index[0, p] = off, s
-            index[1, p] = sizes[s, 0] + column * rows + min(int(work[4, p]), rows - 1)
+            index[1, p] = cell + min(int(work[4, p]), rows - 1)
         elif index[0, p] >= 0:
             work[1, p] = min(work[1, p], abs(off))
