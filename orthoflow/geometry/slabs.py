@@ -93,11 +93,14 @@ class Slab:
         frame: raster on the plane.
         front_m: maximum distance in front of the plane.
         behind_m: maximum distance behind the plane, positive.
+        rms_m: root mean square distance of the points of the plane, an upper limit of their noise;
+            0 if unknown.
     """
 
     frame: WallFrame
     front_m: float
     behind_m: float
+    rms_m: float = 0.0
 
     @property
     def n_cells(self) -> int:

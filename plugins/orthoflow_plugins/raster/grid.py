@@ -95,7 +95,7 @@ class RasterGrid(Method):
 
     id: ClassVar[str] = "raster.grid"
     determinism: ClassVar[Determinism] = "exact"
-    result_version: ClassVar[int] = 6
+    result_version: ClassVar[int] = 7
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
         MetricSpec("omega_deg", label="direction of the first wall's normal (omega)"),
@@ -154,6 +154,11 @@ class RasterGrid(Method):
                 frame=frame,
                 front_m=extent_of(index).front_m,
                 behind_m=extent_of(index).behind_m,
+                rms_m=(
+                    curved.surfaces[index].rms_m
+                    if index in curved.surfaces
+                    else float(planes.rms_m[index])
+                ),
             )
             for index, frame in frames.items()
         }

@@ -50,7 +50,8 @@ class RasterParams(MethodParams):
     surface: Surface | None = Field(
         default=None,
         description="Depth of a cell. median (default on planes): median of the layer with the "
-        "most points (layers are more than 2 cm apart), without outliers; denoised (default on "
+        "most points (layers are more than 2 cm and four standard deviations of the noise apart), "
+        "without outliers; denoised (default on "
         "curved surfaces, parts of which every photo sees obliquely, and on planes whose depth "
         "noise exceeds gsd_m): the same after edge-preserving smoothing; nearest: depth of the "
         "point nearest to the centre, also from neighbouring cells (markiewicz2015); centre: the "

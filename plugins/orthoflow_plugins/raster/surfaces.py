@@ -35,7 +35,7 @@ from orthoflow_plugins.raster.parameters import RasterParams
 
 # Rules by which a cell gets the values of a single point instead of the mean of several.
 ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
-# Minimum difference in depth between layers in a cell.
+# Minimum difference in depth between layers in a cell, unless noise causes such differences.
 LAYER_M: Final = 0.02
 # Radius of the filter for the surface `denoised`; sigma of the Gaussian weights is half the radius.
 DENOISE_CELLS: Final = 4
@@ -94,6 +94,7 @@ class CellSurface:
         intensity: float32; NaN for void cells. None if the cloud has no intensity.
         rgb: (cells, 3) uint8; 0 for void cells. None if the cloud has no colour.
         has_rgb: (cells,) True for cells with a colour; None if all cells with points have one.
+        layer_m: depths that differ by more belong to different layers.
         percentiles_m: (cells, k) float32 percentiles of depths in metres; NaN for cells without
             points. None if not requested.
         places: (cells, 2) float32 mean position of the points of a cell, to the right of and below
@@ -108,6 +109,7 @@ class CellSurface:
     places: NDArray[np.float32]
     percentiles_m: NDArray[np.float32] | None = None
     has_rgb: NDArray[np.bool_] | None = None
+    layer_m: float = LAYER_M
 
 
 def surface_of(cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int) -> CellSurface:
@@ -146,7 +148,7 @@ def carried_to_centres(
     rgb = None if surface.rgb is None else surface.rgb.copy()
     interpolate(
         few,
-        Surroundings(surface.places, slab.frame.width, LAYER_M),
+        Surroundings(surface.places, slab.frame.width, surface.layer_m),
         cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb),
         cell_values(np.empty(0, dtype=np.float32), intensity=intensity, rgb=rgb),
         reach_cells=0.0,
@@ -229,12 +231,17 @@ def _surface_of_all(
     sigma_m = _spread_m(count, moments)
     del moments  # This frees a third of the memory used so far, since the next passes need more.
     if params.surface != "mean":
-        layer_m, gsd_m = LAYER_M, slab.frame.gsd_m
-        depth_m = np.empty(count.size, dtype=np.float32)
-        for cells, depths_m, ends in _grouped(cloud, slab, count, threads=threads):
-            _sort_depths(depths_m, ends, depth_m[cells], layer_m, threads=threads)
-        raster_m = depth_m.reshape(slab.frame.shape)
-        raster_m = without_specks(raster_m, gsd_m=gsd_m, layer_m=layer_m, threads=threads)
+        layer_m = LAYER_M
+        raster_m = _medians_m(cloud, slab, count, layer_m, threads=threads)
+        # In sparse rasters, most neighbouring cells are at steps, whose height is not noise.
+        noise_m = min(slab.rms_m, depth_noise_m(raster_m))
+        if layer_m < _CLOSE_SIGMAS * noise_m:
+            # The nearer of two points of a surface would be a layer, which displaces the surface.
+            layer_m = _CLOSE_SIGMAS * noise_m
+            raster_m = _medians_m(cloud, slab, count, layer_m, threads=threads)
+        raster_m = without_specks(
+            raster_m, gsd_m=slab.frame.gsd_m, layer_m=layer_m, threads=threads
+        )
         depth_m = raster_m.ravel()
     few = kernels.FewPoints(
         n_inside=count,
@@ -256,7 +263,18 @@ def _surface_of_all(
         rgb=rgb,
         has_rgb=has_rgb,
         places=few.places,
+        layer_m=LAYER_M if params.surface == "mean" else layer_m,
     )
+
+
+def _medians_m(
+    cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], layer_m: float, *, threads: int
+) -> NDArray[np.float32]:
+    """Return the median depth (rows, cols) of the largest layer of each cell."""
+    depth_m = np.empty(count.size, dtype=np.float32)
+    for cells, depths_m, ends in _grouped(cloud, slab, count, threads=threads):
+        _sort_depths(depths_m, ends, depth_m[cells], layer_m, threads=threads)
+    return depth_m.reshape(slab.frame.shape)
 
 
 def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -561,7 +579,7 @@ def close_gaps(
     values = cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb)
     is_found = interpolate(
         narrow,
-        Surroundings(surface.places, slab.frame.width, LAYER_M),
+        Surroundings(surface.places, slab.frame.width, surface.layer_m),
         values,
         values,
         reach_cells=reach_cells,
@@ -604,7 +622,7 @@ def _recover_between_neighbours(
     window = np.ones((2 * span_cells + 1,) * 2, dtype=np.uint8)
     near = cv2.dilate(is_void.reshape(slab.frame.shape).view(np.uint8), window)
     is_near = np.asarray(near, dtype=np.bool_).ravel()
-    chosen = _points_on(cloud, slab, surface, is_near, LAYER_M, threads=threads)
+    chosen = _points_on(cloud, slab, surface, is_near, surface.layer_m, threads=threads)
     for step in range(1, params.recover_scan_steps + 1):
         sums = kernels.Sums(
             n=np.zeros(n_cells, dtype=np.uint16),
@@ -612,7 +630,7 @@ def _recover_between_neighbours(
             intensity=np.zeros(n_cells if intensity.size else 0, dtype=np.float32),
             rgb=np.zeros((n_cells if rgb.size else 0, 3), dtype=np.float32),
         )
-        reach = kernels.Reach(step, float(span_cells), LAYER_M)
+        reach = kernels.Reach(step, float(span_cells), surface.layer_m)
         for points in _grids(cloud, chosen):
             grid = kernels.ScanGrid(points, offsets, matrix)
             voids = is_void.reshape(slab.frame.shape)

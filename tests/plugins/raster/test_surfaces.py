@@ -35,9 +35,8 @@ def scattered(
 ) -> tuple[PointCloud, NDArray[np.float64], NDArray[np.float64]]:
     """Return random points on a wall with steps, their columns and rows (n, 2), and depths."""
     rng = np.random.default_rng(seed)
-    rows, columns = known.shape
-    n_points = int(per_cell * rows * columns)
-    places = rng.uniform([0, 0], [columns, rows], (n_points, 2))
+    n_points = int(per_cell * np.prod(known.shape))
+    places = rng.uniform(0.0, known.shape[::-1], (n_points, 2))
     depths_m = scenes.relief_m(places[:, 0]) + noise_m * rng.normal(size=n_points)
     grey = np.full((n_points, 3), 120, dtype=np.uint8)
     intensity = rng.random(n_points, dtype=np.float32)
@@ -99,14 +98,16 @@ def test_the_median_is_denoised_after_gaps_are_closed_by_default_if_noise_exceed
         {"surface": "denoised"},
         {},
     )
+    planes = dataclasses.replace(known.planes(), rms_m=np.array([noise_m]))
     found = [
-        scenes.rastered(cloud, known.planes(), tmp_path, gsd_m=known.gsd_m, **params)
-        for params in variants
+        scenes.rastered(cloud, planes, tmp_path, gsd_m=known.gsd_m, **params) for params in variants
     ]
     measured_m, median_m, filtered_m, default_m = (walls.walls[0].depth_m for walls, _ in found)
     expected_m = denoised(median_m, depth_noise_m(measured_m))
     np.testing.assert_allclose(filtered_m, expected_m, atol=1e-6)
     assert 0.25 * noise_m < np.nanstd(filtered_m - median_m) < noise_m
+    # Two points of a cell are not on different surfaces because of their noise.
+    assert abs(np.nanmedian(median_m - scenes.relief_m(np.arange(80) + 0.5))) < 0.06 * noise_m
     is_noisy, ctx = noise_m > known.gsd_m, found[3][1]
     np.testing.assert_array_equal(default_m, filtered_m if is_noisy else median_m)
     assert found[3][0].details["surface"] == ["denoised" if is_noisy else "median"]
