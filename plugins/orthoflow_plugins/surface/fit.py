@@ -6,7 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +164,24 @@ class _Means(Rows):
         )
 
 
-def fit_all(  # noqa: PLR0913
+class _Near(NamedTuple):
+    """The points near a surface.
+
+    Attributes:
+        sums: (around, along, 3) number of points of each cell, sums of their distances and of the
+            squares of these.
+        bounds: see `Cells`.
+        n_points: number of labelled points.
+        sample: indices of some of these points; empty if their scans are unknown.
+    """
+
+    sums: NDArray[np.float64]
+    bounds: NDArray[np.float64]
+    n_points: int
+    sample: NDArray[np.int64]
+
+
+def fit_all(
     found: list[Found],
     cloud: PointCloud,
     plane_labels: tuple[NDArray[np.int16], NDArray[np.float64]] | None,
@@ -173,7 +190,6 @@ def fit_all(  # noqa: PLR0913
     *,
     is_cone: bool,
     cores: int,
-    n_passes: int = _PASSES,
 ) -> tuple[list[FittedSurface], NDArray[np.int16]]:
     """Fit surfaces to all points near them, and label the points.
 
@@ -186,21 +202,57 @@ def fit_all(  # noqa: PLR0913
         noise_m: standard deviation of points across surfaces.
         is_cone: whether the surfaces are cones.
         cores: number of threads.
-        n_passes: maximum number of passes over the points.
 
     Returns:
         The fitted surfaces, and the index of the surface of each point, -1 for none.
     """
-    new = [item for item in found if not item.is_earlier]
-    if not new:
+    n_new = sum(not item.is_earlier for item in found)
+    if not n_new:
         return [], np.full(len(cloud), -1, dtype=np.int16)
-    labels = np.empty(len(cloud), dtype=np.int16)
-    cells, n_cells = _cells_of(found, tolerances_m, noise_m)
-    offsets = read_only(cloud.x, cloud.y, cloud.z)
     planes = plane_labels or (np.zeros(0, dtype=np.int16), np.zeros((0, 4)))
+    labels = np.empty(len(cloud), dtype=np.int16)
+    found, moved_m = [*found], [0.0] * n_new
+    nears: list[_Near] = []
+    fitted: list[FittedSurface] = []
+
+    def fit(index: int) -> FittedSurface:
+        near, old = nears[index], before[index] if before else None
+        # The points near most surfaces remain the same when others are moved.
+        if old and old.n_points == near.n_points and np.array_equal(old.sums, near.sums):
+            return fitted[index]
+        return _fitted(found[index], near, cloud, is_cone=is_cone)
+
+    for number in range(_PASSES):
+        cells = _cells_of(found, tolerances_m, noise_m)
+        before, nears = nears, _summed(cells, cloud, planes, labels, cores=cores)
+        fitted = list(in_order(fit, range(n_new), threads=cores))
+        # Far from the surface found among voxels, distances are not linear in the parameters, and
+        # points of the surface may be too far away to be summed.
+        far = [at for at, it in enumerate(fitted) if it.shift_m > _FAR_SIGMAS * it.noise_m]
+        if number == _PASSES - 1 or not far:
+            break
+        for index in far:
+            found[index] = replace(found[index], round=fitted[index].round)
+            moved_m[index] += fitted[index].shift_m
+    shifts_m = [item.shift_m + moved for item, moved in zip(fitted, moved_m, strict=True)]
+    return [
+        replace(item, shift_m=shift_m) for item, shift_m in zip(fitted, shifts_m, strict=True)
+    ], labels
+
+
+def _summed(
+    cells: Cells,
+    cloud: PointCloud,
+    planes: tuple[NDArray[np.int16], NDArray[np.float64]],
+    labels: NDArray[np.int16],
+    *,
+    cores: int,
+) -> list[_Near]:
+    """Label the points, and sum their distances in the cells of each surface."""
+    offsets = read_only(cloud.x, cloud.y, cloud.z)
     parts = even_parts(len(cloud), _PARTS)
-    sums = np.zeros((_PARTS, n_cells, 3))
-    counts = np.zeros((_PARTS, len(found)), dtype=np.int64)
+    sums = np.zeros((_PARTS, cells.columns.max() + cells.sizes[:, 2].max(), 3))
+    counts = np.zeros((_PARTS, len(cells.rounds)), dtype=np.int64)
 
     def run(part: int) -> None:
         own = parts[part]
@@ -209,46 +261,18 @@ def fit_all(  # noqa: PLR0913
 
     in_threads([partial(run, part) for part in range(_PARTS)], threads=cores)
     total = sums.sum(axis=0)
-    sample = spread_index(len(cloud), min(_SCAN_SAMPLE, len(cloud)))
-    sample = sample if cloud.scan is not None else sample[:0]
-    labelled = labels[sample]
-
-    def fit(index: int) -> FittedSurface:
-        first, around, along = cells.sizes[index].tolist()
+    n_sample = 0 if cloud.scan is None else min(_SCAN_SAMPLE, len(cloud))
+    sample = spread_index(len(cloud), n_sample)
+    results = []
+    for index, (first, around, along) in enumerate(cells.sizes.tolist()):
         columns, own = cells.columns[first : first + around], np.zeros((around, along, 3))
         own[columns >= 0] = total[columns[columns >= 0, None] + np.arange(along)]
-        n_points, near = int(counts[:, index].sum()), sample[labelled == index]
-        bounds = cells.bounds[index]
-        return _fitted(found[index], own, bounds, n_points, cloud, near, is_cone=is_cone)
-
-    fitted = list(in_order(fit, range(len(new)), threads=cores))
-    # Far from the surface found among voxels, distances are not linear in the parameters, and
-    # points of the surface may be too far away to be summed.
-    is_far = [item.shift_m > _FAR_SIGMAS * item.noise_m for item in fitted]
-    if n_passes == 1 or not any(is_far):
-        return fitted, labels
-    moved = [
-        replace(item, round=fit.round) if far else item
-        for item, fit, far in zip(new, fitted, is_far, strict=True)
-    ]
-    again, labels = fit_all(
-        [*moved, *found[len(new) :]],
-        cloud,
-        plane_labels,
-        tolerances_m,
-        noise_m,
-        is_cone=is_cone,
-        cores=cores,
-        n_passes=n_passes - 1,
-    )
-    return [
-        replace(item, shift_m=item.shift_m + first.shift_m)
-        for item, first in zip(again, fitted, strict=True)
-    ], labels
+        n_points, on = int(counts[:, index].sum()), sample[labels[sample] == index]
+        results.append(_Near(own, cells.bounds[index], n_points, on))
+    return results
 
 
-def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> tuple[Cells, int]:
-    """Return the cells of surfaces, and their number."""
+def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> Cells:
     rounds, bounds, sizes, columns = [], [], [], []
     n_cells, n_columns = 0, 0
     for item, tolerance_m in zip(found, tolerances_m, strict=True):
@@ -270,20 +294,11 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
         columns.append(np.where(is_open, n_cells + along * (np.cumsum(is_open) - 1), -1))
         n_cells += along * int(is_open.sum())
         n_columns += around
-    cells = Cells(np.array(rounds), np.array(bounds), np.array(sizes), np.concatenate(columns))
-    return cells, n_cells
+    return Cells(np.array(rounds), np.array(bounds), np.array(sizes), np.concatenate(columns))
 
 
-def _fitted(
-    found: Found,
-    sums: NDArray[np.float64],
-    bounds: NDArray[np.float64],
-    n_points: int,
-    cloud: PointCloud,
-    sample: NDArray[np.int64],
-    *,
-    is_cone: bool,
-) -> FittedSurface:
+def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> FittedSurface:
+    sums, bounds, n_points, sample = near
     around, along = sums.shape[:2]
     size_m = (bounds[1] - bounds[0]) / along
     i, j = np.nonzero(sums[:, :, 0] >= 1.0)
@@ -291,8 +306,7 @@ def _fitted(
     angles = ((i + 0.5) / around - 0.5) * 2.0 * math.pi
     places = bounds[0] + (j + 0.5) * size_m
     within = np.maximum(square - total**2 / n, 0.0)
-    many = n >= 2.0
-    noise_m = math.sqrt(float(within[many].sum() / max(1.0, (n[many] - 1.0).sum())))
+    noise_m = math.sqrt(float(within.sum() / max(1.0, (n - 1.0).sum())))
     is_sphere = found.round.is_sphere
     n_own = _N_SPHERE if is_sphere else 6 if is_cone else 5
     variance = max(noise_m, 1e-5) ** 2
@@ -333,12 +347,12 @@ def _fitted(
     own = best.covariance(zero, own)
     zero = zero_direction(best.axis, cloud.up)
     largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
-    near, on = np.abs(rest) < bounds[3], np.abs(rest) < largest_m
-    if not (near & on).any():
+    is_near, on = np.abs(rest) < bounds[3], np.abs(rest) < largest_m
+    if not (is_near & on).any():
         # The fit has left the points. Its variances cause the surface to be rejected.
-        near = on = np.ones_like(near)
+        is_near = on = np.ones_like(on)
         own = _UNDETERMINED * np.eye(7)
-    rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[near].sum() / n[near].sum())))
+    rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[is_near].sum() / n[is_near].sum())))
     is_on = np.zeros((around, along), dtype=np.bool_)
     is_on[i, j] = on
     arc, ends = _extent(is_on, sums[:, :, 0], best.least_row_share)
