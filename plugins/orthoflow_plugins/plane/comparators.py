@@ -106,12 +106,12 @@ class SegmentProposer(Proposer):
     def __init__(self, search: Search, params: DetectorParams, open3d: Any) -> None:
         """Store the settings; open3d has no constraints, so the search rejects other planes."""
         self._params, self._open3d = params, open3d
-        self._passed_over = np.zeros(len(search.claims), dtype=bool)
+        self._passed_over = np.zeros(len(search.is_free), dtype=bool)
         self._last = np.zeros(0, dtype=np.int64)
 
     def propose(self, search: Search) -> Candidate | None:
         """Return the plane with the most inliers; None if it has too few."""
-        free = np.flatnonzero((search.claims < 0) & ~self._passed_over)
+        free = np.flatnonzero(search.is_free & ~self._passed_over)
         if len(free) < max(3.0, search.least_points):
             return None
         cloud = self._open3d.geometry.PointCloud()

@@ -120,13 +120,13 @@ class Voters:
         reach_m = float(np.linalg.norm(positions_m, axis=1).max(initial=0.0))
         self.smear_bins = max(1, round(0.3 * reach_m * float(self.slopes.max()) / bin_m))
 
-    def recount(self, claims: NDArray[np.int16]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Count the points of the sample that are not assigned to a plane (negative claims).
+    def recount(self, is_free: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Count the points of the sample that are not yet assigned to a plane.
 
         Returns:
             The positions (3, k) whose votes have changed, and the changes (k,).
         """
-        free = self._position_of_point[(claims < 0) & (self._position_of_point >= 0)]
+        free = self._position_of_point[is_free & (self._position_of_point >= 0)]
         counts = np.bincount(free, minlength=len(self.votes))
         change = self._votes_of(counts) - self.votes
         self.votes += change
@@ -257,7 +257,7 @@ class HoughProposer(Proposer):
     def _vote(self, search: Search) -> None:
         tasks = []
         for group, voters in enumerate(self._voters):
-            positions_m, change = voters.recount(search.claims)
+            positions_m, change = voters.recount(search.is_free)
             reach = np.abs(voters.positions_m).max(axis=1, initial=0.0) / self.bin_m
             # Use even numbers, so that the centre of the box is between two pixels.
             shape = 2 * np.ceil([reach[2], math.hypot(reach[0], reach[1])]).astype(int) + 2

@@ -213,7 +213,7 @@ class ConsensusProposer(Proposer):
 
     def _count_near(self, hypotheses: NDArray[np.float64], search: Search) -> NDArray[np.int64]:
         asked = self._shuffled[:_SECOND_POINTS]
-        free_m = self._points_m.take(asked[search.claims[asked] < 0], axis=0)
+        free_m = self._points_m.take(asked[search.is_free[asked]], axis=0)
         apart_m = np.abs(free_m @ hypotheses[:, :3].T - hypotheses[:, 3])
         return np.asarray(np.sum(apart_m <= search.cloud.tolerance_m, axis=0, dtype=np.int64))
 
@@ -259,8 +259,8 @@ class ConsensusProposer(Proposer):
 
     def _draw(self, search: Search) -> None:
         """Draw hypotheses. Score new and earlier ones with few points, and the best with more."""
-        claims, up, params = search.claims, search.cloud.up, self._params
-        free = self._order[claims[self._order] < 0]
+        is_free, up, params = search.is_free, search.cloud.up, self._params
+        free = self._order[is_free[self._order]]
         earlier, self._hypotheses = self._hypotheses, self._hypotheses[:0]
         self._scores = Scores(*np.zeros((3, 0)))
         if len(free) < 3:
@@ -274,7 +274,7 @@ class ConsensusProposer(Proposer):
         chosen = leans_as_asked(hypotheses[:, :3], up, params.constraint, limit_deg)
         chosen &= ~are_near(hypotheses, self._rejected, search.cloud.tolerance_m).any(axis=1)
         hypotheses = hypotheses[chosen]
-        asked = self._shuffled[claims[self._shuffled] < 0][:_SECOND_POINTS]
+        asked = self._shuffled[is_free[self._shuffled]][:_SECOND_POINTS]
         self._asked_m = self._points_m.take(asked, axis=0)
         first = self._scored(hypotheses, self._asked_m[:_FIRST_POINTS], search)
         ranked = hypotheses[np.argsort(-first.value, kind="stable")]
@@ -310,7 +310,7 @@ class ConsensusProposer(Proposer):
 
     def _polished(self, search: Search) -> tuple[NDArray[np.float64], float]:
         """Fit the last hypothesis to the points within its tolerance while its score improves."""
-        hypothesis, points_m = self._last, self._points_m[search.claims < 0]
+        hypothesis, points_m = self._last, self._points_m[search.is_free]
         best = self._scored(hypothesis[None], points_m, search)
         for _ in range(_POLISHED):
             distances_m = points_m @ hypothesis[:3] - hypothesis[3]

@@ -221,7 +221,7 @@ class RegionProposer(Proposer):
 
     def propose(self, search: Search) -> Candidate | None:
         """Return the plane of the region with the most unassigned points."""
-        free = self._region_of_sample[(search.claims < 0) & (self._region_of_sample >= 0)]
+        free = self._region_of_sample[search.is_free & (self._region_of_sample >= 0)]
         counts = np.bincount(free, minlength=len(self.n_points))
         constraint, by_normal = self._params.constraint, self._params.criterion == "normal"
         limit_deg = self._params.max_tilt_deg + _LEAN_CAUTION_DEG

@@ -159,24 +159,21 @@ class Search:
     Attributes:
         cloud: the cloud.
         params: criteria for planes and for the end of the search.
-        claims: (m,) int16 plane of each point of the sample; -1 if not yet assigned.
-        n_taken: number of planes, including rejected candidates, to which points were assigned.
-        n_points: number of points of the sample that are not yet assigned.
+        is_free: (m,) True for points of the sample that are not yet assigned to a plane.
+        n_points: number of these points.
         refusals: the criterion for each rejected candidate, and its share of all points.
     """
 
     cloud: PreparedCloud
     params: DetectorParams
-    claims: NDArray[np.int16] = field(init=False)
-    n_taken: int = field(init=False, default=0)
+    is_free: NDArray[np.bool_] = field(init=False)
     n_points: int = field(init=False)
     refusals: list[tuple[Criterion, float]] = field(init=False, default_factory=list)
     _free: tuple[NDArray[np.float64], BlockedPoints] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self.n_points = len(self.cloud.sample.index)
-        self.claims = np.full(self.n_points, -1, dtype=np.int16)
-        self._away_m = np.full(self.n_points, np.inf)
+        self.is_free = np.ones(self.n_points, dtype=np.bool_)
         self.box_corners_m = self.cloud.box_corners()
 
     @property
@@ -188,33 +185,31 @@ class Search:
     @property
     def least_points(self) -> float:
         """Minimum number of sample points on a plane."""
-        return self.params.min_share * len(self.claims)
+        return self.params.min_share * len(self.is_free)
 
     def free(self) -> tuple[NDArray[np.float64], BlockedPoints]:
         """Return the points that are not yet assigned, as offsets (m, 3) and in blocks."""
         if self._free is None:
-            offsets_m = self.cloud.sample.offsets_m.take(np.flatnonzero(self.claims < 0), axis=0)
+            offsets_m = self.cloud.sample.offsets_m.take(np.flatnonzero(self.is_free), axis=0)
             self._free = offsets_m, blocked(offsets_m)
         return self._free
 
     def claim(self, raster: SurfaceRaster, support: Support) -> None:
-        """Assign points to a plane, except those that are nearer to an earlier plane."""
+        """Assign the free points near a plane, or a rejected candidate, to it."""
         points_m, bounds_m = self.cloud.sample.offsets_m, self.cloud.bounds_of(support.bounds_m)
         (x, y, z), (a, b, c) = points_m.T, raster.plane.normal
         # The sum of products is faster than a matrix product.
         away_m = np.abs(a * x + b * y + c * z - raster.plane.offset_m)
-        near = np.flatnonzero((away_m <= bounds_m[0]) & (away_m < self._away_m))
+        near = np.flatnonzero((away_m <= bounds_m[0]) & self.is_free)
         u, v = (points_m[near] @ raster.axes.T).T
         held = (u >= bounds_m[1]) & (u <= bounds_m[2]) & (v >= bounds_m[3]) & (v <= bounds_m[4])
-        self.claims[near[held]] = self.n_taken
-        self._away_m[near[held]] = away_m[near[held]]
-        self.n_taken += 1
-        self.n_points = int(np.count_nonzero(self.claims < 0))
+        self.is_free[near[held]] = False
+        self.n_points = int(np.count_nonzero(self.is_free))
         self._free = None
 
     def refuse(self, criterion: Criterion, n_points: float = 0.0) -> None:
         """Record the criterion that rejects a candidate with `n_points` points of the sample."""
-        self.refusals.append((criterion, n_points / max(1, len(self.claims))))
+        self.refusals.append((criterion, n_points / max(1, len(self.is_free))))
 
 
 def detect(
@@ -322,7 +317,7 @@ def find_planes(
     """Find all planes in the sample of a cloud, fit them to all points, and label the points.
 
     Args:
-        search: the search; its claims and those of its cloud are set.
+        search: the search; its free points and the claims of its cloud are set.
         proposer: the detector.
         on_found: function that is called after each plane, with the number of planes so far.
     """
@@ -336,7 +331,7 @@ def greedy_search(
 ) -> list[FoundPlane]:
     """Find planes in the sample one by one until a stopping rule applies; see `find_planes`."""
     params, found, n_rejected = search.params, list[FoundPlane](), 0
-    least_left = params.stop_unclassified_share * len(search.claims)
+    least_left = params.stop_unclassified_share * len(search.is_free)
     while len(found) < params.n_planes_max and n_rejected < _REJECTED_MOST:
         if search.n_points < least_left:
             break
