@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,16 @@ def errors(planes: Planes, truth: Rectangle) -> tuple[float, float]:
     found = planes.plane(nearest(planes, normal, centre))
     angle = angle_between_deg(found.normal, normal)
     return min(angle, 180.0 - angle), abs(float(found.distances_m(centre[None])[0]))
+
+
+def expect(
+    planes: Planes, truths: Iterable[Rectangle], angle_deg: float, miss_m: float = 3e-4
+) -> None:
+    """Assert that the errors of the planes nearest to true ones are below limits."""
+    for truth in truths:
+        found = errors(planes, truth)
+        assert found[0] < angle_deg, truth.name
+        assert found[1] < miss_m, truth.name
 
 
 def prepared(points: NDArray[np.float64], *, parts: int = 1) -> PreparedCloud:

@@ -53,10 +53,11 @@ def seen_by(
     noise_m: float = 0.0,
     sigma_px: float = 0.5,
     sigma_m: float = 1e-4,
+    depths_m: tuple[float, float] = (-0.3, 0.1),
 ) -> SeenPoints:
     """Points about the wall as the camera sees them."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform([0.2, -0.3, 0.2], [2.8, 0.1, 1.8], (6 * n, 3))
+    rng, (low, high) = np.random.default_rng(seed), depths_m
+    points = rng.uniform([0.2, low, 0.2], [2.8, high, 1.8], (6 * n, 3))
     pixels = camera.project(points)[:, :2]
     inside = np.flatnonzero(camera.sees(pixels))[:n]
     seen = pixels[inside] + noise_px * rng.normal(size=(n, 2))

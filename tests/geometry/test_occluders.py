@@ -133,7 +133,7 @@ def test_without_stations_few_points_that_are_spread_evenly_hide_nothing() -> No
     line = np.array([0.4, 0.5, 0.6]) + np.linspace(0.0, 2.0, 120)[:, None] * [0.5, 0.6, 0.3]
     face = np.column_stack([rng.uniform(0.0, 3.0, (3_000, 2)), np.full(3_000, 1.3)])
 
-    def is_kept(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_kept(points: NDArray[np.float64], space: Box = space) -> NDArray[np.bool_]:
         found = occluders_in(cloud_of(points), space, None, n_least=6, threads=1)
         return counts_at(found, points, space.low) >= found.n_least
 
@@ -142,6 +142,12 @@ def test_without_stations_few_points_that_are_spread_evenly_hide_nothing() -> No
     assert is_kept(stray)[is_inside].mean() < 0.05
     assert is_kept(line).all()
     assert is_kept(face).mean() > 0.95
+    # In a hall, voxels are 2.6 times as wide, so surfaces have 7 times as many points in them.
+    hall = Box(low=np.zeros(3), high=np.full(3, 20.0), spacing_m=0.005)
+    stray, clump = rng.uniform(9.0, 10.0, (36_000, 3)), rng.normal(5.0, 0.01, (12, 3))
+    kept = is_kept(np.vstack([stray, clump]), hall)
+    assert kept[: len(stray)].mean() < 0.1
+    assert not kept[len(stray) :].any()
 
 
 def test_voxels_grow_where_a_box_would_have_too_many() -> None:

@@ -436,8 +436,6 @@ def _start(
                 own = posed(alone[best], own)
                 with suppress(GeometryError):
                     own = fitted(item.tied.control(item.estimate.agreeing), own)
-        else:
-            own = posed(alone[members[0]], own)
         cameras.append(own.shifted(middle))
     return tuple(cameras)
 

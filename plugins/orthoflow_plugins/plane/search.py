@@ -115,7 +115,7 @@ _NO_PLANE: Final = (
     "no plane was found in {count} points ({size}) with tolerance_m {tolerance:.3g} and min_share "
     "{share:.2%}: {why}; {advice} ({method})"
 )
-_CRITERIA: Final[Mapping[Criterion, str]] = {
+CRITERIA: Final[Mapping[Criterion, str]] = {
     "few": "the largest candidate has {share:.2%} of the points",
     "small": "the largest candidate, which has {share:.2%} of the points, covers less than "
     "{area:.2g} m2",
@@ -609,7 +609,7 @@ def _why_none(cloud: PointCloud, search: Search, wider_m: float | None, method: 
     why, tolerance_m = _NO_CANDIDATE, search.cloud.tolerance_m
     if search.refusals:
         criterion, share = max(search.refusals, key=lambda refusal: refusal[1])
-        why = _CRITERIA[criterion].format(share=share, area=search.min_area_m2)
+        why = CRITERIA[criterion].format(share=share, area=search.min_area_m2)
     advice = _ADVICE.format(wider=_WIDER[-1] * tolerance_m)
     if wider_m is not None:
         advice = _ADVICE_WIDER.format(wider=wider_m)

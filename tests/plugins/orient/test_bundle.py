@@ -163,14 +163,28 @@ def test_exif_is_believed_that_one_photo_of_several_contradicts(tmp_path: Path) 
     photos, ctx = with_exif(*[420.0] * 4).photos, context(tmp_path)
     assert focal_without_exif(tied_photo(photos[3], ties, params, ctx.rng), params)
     assert with_believable_priors(photos, ties, params, ctx) == list(photos)
+    # A photo with another focal length in EXIF is not of this lens.
+    photos = with_exif(*[420.0] * 3, 845.0).photos
+    first, *_, last = with_believable_priors(photos, bs.scan_ties(2, n=40), params, ctx)
+    assert first.exif_focal_px == pytest.approx(840.0, rel=0.1)
+    assert last == photos[3]
 
 
-@pytest.mark.parametrize(("others", "again"), [((840.0, 850.0), 845.0), ((840.0, 900.0), None)])
+@pytest.mark.parametrize(
+    ("others", "camera", "again"),
+    [
+        *(((840.0, 850.0), "Phone", 845.0), ((840.0, 900.0), "Phone", None)),
+        # One photo, another camera, or less than 15 % show nothing.
+        *(((840.0,), "Phone", None), ((840.0, 850.0), "Other", None)),
+        ((1500.0, 1500.0), "Phone", None),
+    ],
+)
 def test_a_refused_photo_gets_the_focal_length_in_which_the_others_agree(
-    tmp_path: Path, others: tuple[float, float], again: float | None
+    tmp_path: Path, others: tuple[float, ...], camera: str, again: float | None
 ) -> None:
     ties, ctx = bs.scan_ties(2, n=40), context(tmp_path)
-    photos = with_exif(*others, 1680.0, 1680.0).photos[:3]
+    photos = with_exif(*others, *[1680.0] * (4 - len(others))).photos[: len(others) + 1]
+    photos = (*photos[:-1], replace(photos[-1], camera=camera))
     tied = [tied_photo(photo, ties, OrientColmapBundle.Params(), ctx.rng) for photo in photos]
 
     def look(one: TiedPhoto) -> Oriented:
@@ -180,7 +194,7 @@ def test_a_refused_photo_gets_the_focal_length_in_which_the_others_agree(
         camera = replace(found.camera, status="ok", intrinsics=Intrinsics.of(lens, source="exif"))
         return found if focal_px == 1680.0 else replace(found, camera=camera)
 
-    last = looked_at(tied, look, ctx)[2].camera.intrinsics
+    last = looked_at(tied, look, ctx)[-1].camera.intrinsics
     assert (None if last is None else last.fx) == again
 
 
@@ -204,7 +218,10 @@ def test_a_photo_whose_exif_the_others_contradict_is_tried_again_with_their_foca
 def test_photos_that_zoomed_share_no_lens_where_it_matters(
     tmp_path: Path, zoom: float, n_lenses: int
 ) -> None:
-    """One of four photos is zoomed; even if unnoticed, its predicted error is not too small."""
+    """One of four photos is zoomed; even if unnoticed, its predicted error is not too small.
+
+    With `shared`, they share a lens in any case.
+    """
     true = [*bs.viewers()]
     true[3] = replace(true[3], fx=zoom * true[3].fx, fy=zoom * true[3].fy)
     ties = zoomed(bs.scan_ties(2, n=90), zoom, 3)
@@ -213,6 +230,8 @@ def test_photos_that_zoomed_share_no_lens_where_it_matters(
     for camera, other in zip(found, true, strict=True):
         assert camera.status == "ok"
         assert ms.wall_error_m(bs.SCENE, camera.viewing(), other) < 1.5 * (camera.sigma_wall_m or 0)
+    shared = bundle(ties, without_exif(), context(tmp_path), intrinsics="shared", **ALONE)
+    assert [len(lens["photos"]) for lens in shared.details["lenses"]] == [4]
 
 
 def of_focal(log_focal: float, sigma: float) -> Any:

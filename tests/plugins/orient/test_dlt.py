@@ -208,8 +208,6 @@ def test_relief_must_be_ten_deviations_of_the_points(sigma_m: float, is_enough: 
     assert dlt.relief(seen.points_world)[0] == pytest.approx(0.05, rel=0.02)
     found = estimated(camera(), seen)
     assert isinstance(found, Estimate) == is_enough
-    if isinstance(found, str):
-        assert "a DLT needs 10 times as much relief" in found
 
 
 def test_skew_is_given_whether_it_is_kept_or_not() -> None:

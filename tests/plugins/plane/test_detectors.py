@@ -27,7 +27,7 @@ from orthoflow.sdk import Method, StepContext
 from orthoflow.testing import example_room
 from tests import plane_scenes
 from tests.long_loops import long_only
-from tests.plane_scenes import ROOM, STATION, Rectangle, cloud_of, errors, nearest, sampled, turned
+from tests.plane_scenes import ROOM, STATION, Rectangle, cloud_of, expect, nearest, sampled, turned
 
 DETECTORS: dict[str, tuple[type[Method], dict[str, Any]]] = {
     "hough2d": (Hough2d, {}),
@@ -77,11 +77,9 @@ def test_every_surface_of_a_room_is_found_and_nothing_else(
     raw, front = planes.details["raw"][nearest(planes, ROOM[0].normal, ROOM[0].centre)], ROOM[0]
     assert np.abs(raw["normal"] @ front.normal) > np.cos(np.radians(1.0))
     assert abs(np.abs(raw["normal"] @ np.array(front.centre)) - abs(raw["offset_m"])) < 0.02
+    expect(planes, ROOM, 0.02, 2e-4)  # 2 mm noise over thousands of points
     start = 0
     for truth in ROOM:
-        angle_deg, miss_m = errors(planes, truth)
-        assert angle_deg < 0.02, truth.name
-        assert miss_m < 2e-4, truth.name  # 2 mm noise over thousands of points
         n_points = truth.n_points // 2
         own = labels[start : start + n_points]
         # Points in a strip of some millimetres along the edges may belong to either surface.
@@ -131,10 +129,7 @@ def test_what_else_was_scanned_neither_hides_nor_moves_the_walls(
         ghosts = seen - 2.0 * depth_m[:, None] * ROOM[0].normal
         points = np.concatenate([points, ghosts])
     planes = detect(detector, cloud_of(points, stations=STATION), tmp_path)[0].planes
-    for truth in expected:
-        angle_deg, miss_m = errors(planes, truth)
-        assert angle_deg < 0.03
-        assert miss_m < 3e-4
+    expect(planes, expected, 0.03)
 
 
 @every_method
@@ -151,7 +146,7 @@ def test_a_constraint_leaves_only_its_planes_as_tilted_as_allowed(
     wall = Rectangle("wall", (0, 2, 0), (3, 0, 0), (0, np.sin(lean), np.cos(lean)), 20_000)
     cloud = cloud_of(sampled((wall, ROOM[4]))[FEW])
     keep = detect(detector, cloud, tmp_path, constraint="vertical", max_tilt_deg=8.0)[0]
-    assert errors(keep.planes, wall)[0] < 0.02
+    expect(keep.planes, [wall], 0.02)
 
 
 @any_method
@@ -179,9 +174,7 @@ def test_thinning_finds_the_same_planes_and_labels_every_point(
     cloud = cloud_of(sampled()[HALF], stations=STATION)
     out, _ = detect(detector, cloud, tmp_path, thinning=5)
     front = ROOM[0]
-    angle_deg, miss_m = errors(out.planes, front)
-    assert angle_deg < 0.02
-    assert miss_m < 3e-4
+    expect(out.planes, [front], 0.02)
     index = nearest(out.planes, front.normal, np.array(front.centre))
     assert np.mean(out.labels.plane_index[: front.n_points // 2] == index) > 0.97
     assert out.planes.n_points.sum() == np.count_nonzero(out.labels.plane_index >= 0)
@@ -244,10 +237,7 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
     one, other = (detect("ransac-msac", cloud, tmp_path, cores=n)[0].planes for n in (3, 1))
     np.testing.assert_array_equal(one.offset, other.offset)
     assert not np.array_equal(one.offset, whole.offset)
-    for truth in ROOM[:6]:
-        angle_deg, miss_m = errors(one, truth)
-        assert angle_deg < 0.02
-        assert miss_m < 3e-4  # 1.7 times the error with all points
+    expect(one, ROOM[:6], 0.02)
 
 
 # --- reports ---
@@ -335,6 +325,7 @@ def detected(method: Any, points: NDArray[np.float64], folder: Path) -> Any:
     out, ctx = plane_scenes.detect(method, cloud_of(points), folder, seed=5)
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["tolerance_m"] == out.planes.tolerance_m
+    assert metrics["noise_mm"] == pytest.approx(1e3 * measure_noise(points)[0], rel=1e-3)
     return out.planes
 
 

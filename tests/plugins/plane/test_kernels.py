@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final
+from types import SimpleNamespace
+from typing import Any, Final
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from orthoflow_plugins.plane.kernels import (
     refine_robustly,
 )
 from orthoflow_plugins.plane.planes import measure_planes
-from orthoflow_plugins.plane.support import INNER_SHARE, Support, SurfaceRaster, measure_cells
+from orthoflow_plugins.plane.support import INNER_SHARE, SurfaceRaster, measure_cells
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane, wall_axes
@@ -305,13 +306,7 @@ def test_planes_that_cross_share_the_points_by_distance(seed: int) -> None:
     cloud, rasters = crossed(seed)
     search, points_m = search_in(cloud), cloud.sample.offsets_m
     for k, raster in enumerate(rasters):
-        support = Support(
-            cells=np.ones(raster.shape, dtype=bool),
-            part_of_cell=np.zeros(raster.shape, dtype=np.int32),
-            parts_m=raster.bounds_m()[None],
-            bounds_m=raster.bounds_m(),
-            n_points=0,
-        )
+        support: Any = SimpleNamespace(bounds_m=raster.bounds_m())
         search.claim(raster, support)
         expected = nearest_holder(points_m, rasters[: k + 1])
         np.testing.assert_array_equal(search.is_free, expected < 0)

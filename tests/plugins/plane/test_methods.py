@@ -46,7 +46,7 @@ from tests.plane_scenes import (
     Rectangle,
     cloud_of,
     detect,
-    errors,
+    expect,
     prepared,
     sampled,
     search_in,
@@ -73,10 +73,7 @@ def test_other_ways_to_vote_find_the_same_walls(
     cloud = cloud_of(sampled()[::2], stations=STATION)
     planes = detect(method, cloud, tmp_path, **options)[0].planes
     assert len(planes) >= n_true
-    for truth in ROOM[:n_true]:
-        angle_deg, miss_m = errors(planes, truth)
-        assert angle_deg < 0.02
-        assert miss_m < 3e-4
+    expect(planes, ROOM[:n_true], 0.02)
 
 
 def test_raw_coordinates_with_one_vote_per_cell_are_refused() -> None:
@@ -130,10 +127,7 @@ def test_a_slope_is_found_whatever_its_inclination(slope_deg: float, tmp_path: P
     slope = np.radians(slope_deg)
     roof = Rectangle("roof", (0, 0, 3), (3, 0, 0), (0, np.cos(slope), np.sin(slope)), 20_000)
     planes = detect(Hough3d, cloud_of(sampled((roof, ROOM[4]))), tmp_path)[0].planes
-    for truth in (roof, ROOM[4]):
-        angle_deg, miss_m = errors(planes, truth)
-        assert angle_deg < 0.05
-        assert miss_m < 3e-4
+    expect(planes, (roof, ROOM[4]), 0.05)
 
 
 @pytest.mark.parametrize("step_deg", [1.0, 5.0])
@@ -242,10 +236,7 @@ def test_comparators_find_the_large_planes_of_a_room(method: type[Method], tmp_p
     cloud = cloud_of(sampled()[::2], stations=STATION)
     out, _ = detect(method, cloud, tmp_path / "all")
     # Chance decides whether open3d finds small planes, and its patches need a higher density.
-    for truth in (ROOM[0], ROOM[4], ROOM[5]):
-        angle_deg, miss_m = errors(out.planes, truth)
-        assert angle_deg < 0.03
-        assert miss_m < 3e-4
+    expect(out.planes, (ROOM[0], ROOM[4], ROOM[5]), 0.03)
     own = out.labels.plane_index[: ROOM[0].n_points // 2]
     assert np.mean(own == np.bincount(own[own >= 0]).argmax()) > 0.97
     # With a constraint, the planes that open3d finds first are skipped.

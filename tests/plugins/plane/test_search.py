@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +20,12 @@ from orthoflow_plugins.plane.fit import (
     independent_covariance,
     jackknife_covariance,
 )
+from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.proposing import Candidate, Constraint, Proposer
 from orthoflow_plugins.plane.search import (
+    CRITERIA,
+    Criterion,
     Search,
     find_planes,
     fit_to_all,
@@ -30,10 +36,13 @@ from orthoflow_plugins.plane.search import (
 from orthoflow_plugins.plane.support import CellSums, SurfaceRaster, crowded_cells, support_of
 from scipy import ndimage
 
+from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane, angle_between_deg, wall_axes
 from tests.plane_scenes import (
     ROOM,
     Rectangle,
+    cloud_of,
+    detect,
     prepared,
     sampled,
     search_in,
@@ -89,17 +98,14 @@ def crowd_in_a_slab() -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("points", "candidate", "params", "criterion"),
     [
-        (sampled((wall(), FAR)), proposed(ALONG_Y, 2.0), {"min_share": 0.7}, "few"),
         (sampled((wall(), FAR)), proposed(ALONG_Y, 5.0), {}, "scattered"),
-        (filled_slab(), proposed(ALONG_Y, 2.0), {}, "scattered"),
-        (sampled((wall(half_m=(2.0, 0.03)), FAR)), proposed(ALONG_Y, 2.0), {}, "strip"),
         (sampled((*ROOM[:6], STOOL)), surface(STOOL), {"min_share": 0.01}, "small"),
         (crowd_in_a_slab(), proposed(ALONG_Y, 2.0), {"min_share": 0.05}, "smear"),
         (barrel(3.0), proposed(ALONG_Y, 2.0), {}, "bent"),
         (sampled((RAMP, FAR)), proposed((0.0, 1.0, -0.25), 1.94, "vertical"), {}, "tilt"),
         (barrel(12.0), proposed(ALONG_Y, 2.0), {}, None),
     ],
-    ids=["few", "none", "filled", "strip", "small", "smear", "barrel", "tilt", "wide barrel"],
+    ids=["none", "small", "smear", "barrel", "tilt", "wide barrel"],
 )
 def test_a_refusal_has_the_criterion_that_refused(
     points: NDArray[np.float64], candidate: Candidate, params: dict[str, Any], criterion: str | None
@@ -107,6 +113,30 @@ def test_a_refusal_has_the_criterion_that_refused(
     search = search_in(prepared(points), **params)
     assert (verify(candidate, search) is None) == (criterion is not None)
     assert [name for name, _ in search.refusals] == ([criterion] if criterion else [])
+
+
+@pytest.mark.parametrize(
+    ("points", "params", "criterion"),
+    [
+        (sampled((wall(), FAR)), {"min_share": 0.7}, "few"),
+        (filled_slab(), {}, "scattered"),
+        (sampled((wall(half_m=(2.0, 0.03)),)), {}, "strip"),
+        (barrel(2.0), {}, "bent"),
+        (sampled((RAMP, FAR)), {"constraint": "vertical"}, "tilt"),
+    ],
+    ids=["few", "filled", "strip", "barrel", "tilt"],
+)
+def test_a_cloud_without_planes_is_refused_with_the_criterion(
+    points: NDArray[np.float64], params: dict[str, Any], criterion: Criterion, tmp_path: Path
+) -> None:
+    with pytest.raises(MethodError) as refusal:
+        detect(Hough2d, cloud_of(points), tmp_path, **params)
+    reason = re.sub(r"\\{.*?\\}", "(.*)", re.escape(CRITERIA[criterion]))
+    found = re.search(f": {reason};", str(refusal.value))
+    assert found is not None
+    # Not all candidates have a share; the wall has 57 %, the arc less than its 5 cm.
+    for share in found.groups():
+        assert 50.0 < float(share.rstrip("%")) < 65.0
 
 
 @pytest.mark.parametrize("exact", [False, True])
@@ -364,6 +394,17 @@ def wall_of_cells(
     return sums_of_steps(steps.sum(axis=2), (steps**2).sum(axis=2))
 
 
+def fitted_walls(n_walls: int, **how: float) -> Iterator[tuple[AdjustedPlane, NDArray[np.float64]]]:
+    """Yield fits to cells of drawn walls, and the middle of the cells."""
+    u, v = WALL_CELLS.centres_m()
+    middle = np.array([u.mean(), v.mean()]) @ WALL_CELLS.axes - 2.0 * WALL.normal
+    for seed in range(n_walls):
+        sums = wall_of_cells(seed, **how)
+        fit = adjust_plane(WALL_CELLS, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="any")
+        assert fit is not None
+        yield fit, middle
+
+
 def ratios(
     found: Plane, covariance: NDArray[np.float64], true: Plane, middle: NDArray[np.float64]
 ) -> list[float]:
@@ -391,16 +432,10 @@ def rms(values: list[list[float]]) -> NDArray[np.float64]:
 def test_stated_sigmas_of_walls_are_their_errors(
     reach_cells: float, relief_m: float, mixed_share: float
 ) -> None:
-    trials = []
-    for seed in range(60):
-        sums = wall_of_cells(
-            seed, reach_cells=reach_cells, relief_m=relief_m, mixed_share=mixed_share
-        )
-        fit = adjust_plane(WALL_CELLS, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="any")
-        assert fit is not None
-        u, v = WALL_CELLS.centres_m()
-        middle = np.array([u.mean(), v.mean()]) @ WALL_CELLS.axes - 2.0 * WALL.normal
-        trials.append(ratios(fit.plane, fit.stated()[0], WALL, middle))
+    how = {"reach_cells": reach_cells, "relief_m": relief_m, "mixed_share": mixed_share}
+    trials = [
+        ratios(fit.plane, fit.stated()[0], WALL, middle) for fit, middle in fitted_walls(60, **how)
+    ]
     assert (rms(trials) > CALIBRATED[0]).all(), rms(trials)
     assert (rms(trials) < CALIBRATED[1]).all(), rms(trials)
 
@@ -410,14 +445,11 @@ def test_cells_with_mixed_distances_have_less_weight() -> None:
 
     With these errors as weights, the plane would be off by an eighth of what it is without weights.
     """
-    offs_m, share = [], 0.15
-    for seed in range(6):
-        sums = wall_of_cells(seed, reach_cells=0.0, relief_m=2e-4, mixed_share=share)
-        fit = adjust_plane(WALL_CELLS, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="any")
-        assert fit is not None
-        u, v = WALL_CELLS.centres_m()
-        middle = np.array([u.mean(), v.mean()]) @ WALL_CELLS.axes - 2.0 * WALL.normal
-        offs_m.append(fit.plane.distances_m(middle[None])[0] - WALL.distances_m(middle[None])[0])
+    share = 0.15
+    offs_m = [
+        fit.plane.distances_m(middle[None])[0] - WALL.distances_m(middle[None])[0]
+        for fit, middle in fitted_walls(6, reach_cells=0.0, relief_m=2e-4, mixed_share=share)
+    ]
     assert abs(np.mean(offs_m)) < 0.3 * 0.1 * share * 0.5 * FIT_M
 
 
