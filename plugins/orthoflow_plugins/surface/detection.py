@@ -138,10 +138,13 @@ def detect(
             is_cone=is_cone,
             cores=ctx.cores,
         )
-    counts = np.array([item.surface.n_points for item in fitted], dtype=np.int64)
-    kept: dict[int, Found] = {}
+    counts = np.array([item.surface.n_points if item else 0 for item in fitted], dtype=np.int64)
+    kept: dict[int, tuple[Found, Surface]] = {}
     for index in np.argsort(-counts, kind="stable").tolist():
         fit, evidence = fitted[index], dict(found[index].evidence)
+        if fit is None:
+            rejected.append(Rejected(reason="unstable", evidence=evidence))
+            continue
         evidence |= {
             "scatter_mm": 1000.0 * fit.cell_scatter_m,
             "radius_m": fit.surface.radius_m,
@@ -167,7 +170,7 @@ def detect(
         elif fit.cell_scatter_m > largest_m:
             rejected.append(Rejected(reason="rough", evidence=evidence))
         else:
-            kept[index] = replace(found[index], evidence=evidence)
+            kept[index] = replace(found[index], evidence=evidence), fit.surface
     n_before = 0 if earlier is None else len(earlier)
     numbers = np.full(len(found) + len(known), -1, dtype=np.int16)
     numbers[list(kept)] = n_before + np.arange(len(kept))
@@ -181,10 +184,10 @@ def detect(
     in_parts(renumber, len(labels), threads=ctx.cores)
     return Detection(
         surfaces=tuple(
-            _named(fitted[index].surface, n_before + place, cloud.up, is_oriented=is_oriented)
-            for place, index in enumerate(kept)
+            _named(surface, n_before + place, cloud.up, is_oriented=is_oriented)
+            for place, (_, surface) in enumerate(kept.values())
         ),
-        accepted=tuple(kept.values()),
+        accepted=tuple(item for item, _ in kept.values()),
         labels=labels,
         plane_tests=tests,
         rejected=rejected,

@@ -190,7 +190,7 @@ def fit_all(
     *,
     is_cone: bool,
     cores: int,
-) -> tuple[list[FittedSurface], NDArray[np.int16]]:
+) -> tuple[list[FittedSurface | None], NDArray[np.int16]]:
     """Fit surfaces to all points near them, and label the points.
 
     Args:
@@ -204,7 +204,8 @@ def fit_all(
         cores: number of threads.
 
     Returns:
-        The fitted surfaces, and the index of the surface of each point, -1 for none.
+        The fitted surfaces, or None where the fit leaves the points, and the index of the surface
+        of each point, -1 for none.
     """
     n_new = sum(not item.is_earlier for item in found)
     if not n_new:
@@ -213,9 +214,9 @@ def fit_all(
     labels = np.empty(len(cloud), dtype=np.int16)
     found, moved_m = [*found], [0.0] * n_new
     nears: list[_Near] = []
-    fitted: list[FittedSurface] = []
+    fitted: list[FittedSurface | None] = []
 
-    def fit(index: int) -> FittedSurface:
+    def fit(index: int) -> FittedSurface | None:
         near, old = nears[index], before[index] if before else None
         # The points near most surfaces remain the same when others are moved.
         if old and old.n_points == near.n_points and np.array_equal(old.sums, near.sums):
@@ -228,15 +229,19 @@ def fit_all(
         fitted = list(in_order(fit, range(n_new), threads=cores))
         # Far from the surface found among voxels, distances are not linear in the parameters, and
         # points of the surface may be too far away to be summed.
-        far = [at for at, it in enumerate(fitted) if it.shift_m > _FAR_SIGMAS * it.noise_m]
+        far = {
+            index: item
+            for index, item in enumerate(fitted)
+            if item and item.shift_m > _FAR_SIGMAS * item.noise_m
+        }
         if number == _PASSES - 1 or not far:
             break
-        for index in far:
-            found[index] = replace(found[index], round=fitted[index].round)
-            moved_m[index] += fitted[index].shift_m
-    shifts_m = [item.shift_m + moved for item, moved in zip(fitted, moved_m, strict=True)]
+        for index, item in far.items():
+            found[index] = replace(found[index], round=item.round)
+            moved_m[index] += item.shift_m
     return [
-        replace(item, shift_m=shift_m) for item, shift_m in zip(fitted, shifts_m, strict=True)
+        item and replace(item, shift_m=item.shift_m + before_m)
+        for item, before_m in zip(fitted, moved_m, strict=True)
     ], labels
 
 
@@ -297,7 +302,8 @@ def _cells_of(found: list[Found], tolerances_m: list[float], noise_m: float) -> 
     return Cells(np.array(rounds), np.array(bounds), np.array(sizes), np.concatenate(columns))
 
 
-def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> FittedSurface:
+def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> FittedSurface | None:
+    """Fit a surface to the points near it; return None if the fit leaves them."""
     sums, bounds, n_points, sample = near
     around, along = sums.shape[:2]
     size_m = (bounds[1] - bounds[0]) / along
@@ -313,6 +319,8 @@ def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> F
     points = found.round.points(angles, places, total / n, found.zero)
 
     core = places >= found.along_m[0]
+    if not core.any():
+        return None
 
     def cells_of(
         surface: Round, at: tuple[NDArray[np.float64], ...], means: NDArray[np.float64]
@@ -342,30 +350,27 @@ def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> F
     own += _scan_effect(best, zero, n_own, cloud, sample)
     rest, _ = best.outwards(points)
     middle_m = 0.0 if is_sphere else float(n @ places / n.sum())
-    fitted = best
-    best, own = best.moved(middle_m), _moved_covariance(own, middle_m)
-    own = best.covariance(zero, own)
+    middle = best.moved(middle_m)
+    own = middle.covariance(zero, _moved_covariance(own, middle_m))
     zero = zero_direction(best.axis, cloud.up)
     largest_m = _EXTENT_SIGMAS * np.sqrt(noise_m**2 / n + extra_m**2) + _EXTENT_SLACK_M
     is_near, on = np.abs(rest) < bounds[3], np.abs(rest) < largest_m
-    if not (is_near & on).any():
-        # The fit has left the points. Its variances cause the surface to be rejected.
-        is_near = on = np.ones_like(on)
-        own = _UNDETERMINED * np.eye(7)
+    if min(best.radius_m, middle.radius_m) <= 0.0 or not (is_near & on).any():
+        return None
     rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[is_near].sum() / n[is_near].sum())))
     is_on = np.zeros((around, along), dtype=np.bool_)
     is_on[i, j] = on
-    arc, ends = _extent(is_on, sums[:, :, 0], best.least_row_share)
+    arc, ends = _extent(is_on, sums[:, :, 0], middle.least_row_share)
     # Positions along the axis of a cone are measured from its apex.
-    start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
+    start_m = bounds[0] - middle_m + (middle.radius_m / middle.slope if middle.slope > 0.0 else 0.0)
     along_m = float(start_m + size_m * ends[0]), float(start_m + size_m * ends[1])
     if is_sphere:
         # Rows of cells are between planes across the axis.
-        least, most = (math.acos(min(1.0, max(-1.0, at / best.radius_m))) for at in along_m[::-1])
-        along_m, arc = (best.radius_m * least, best.radius_m * most), (-most, most)
+        least, most = (math.acos(min(1.0, max(-1.0, at / middle.radius_m))) for at in along_m[::-1])
+        along_m, arc = (middle.radius_m * least, middle.radius_m * most), (-most, most)
     surface = Surface(
         name="",
-        shape=best.shape(cloud.origin, is_concave=found.side > 0.0),
+        shape=middle.shape(cloud.origin, is_concave=found.side > 0.0),
         covariance=own,
         n_points=n_points,
         rms_m=rms_m,
@@ -377,7 +382,7 @@ def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> F
         surface=surface,
         cell_scatter_m=extra_m,
         noise_m=noise_m,
-        round=fitted,
+        round=best,
         shift_m=float(np.abs(rest - total / n).max()),
         slope=slope,
         variation=variation,
