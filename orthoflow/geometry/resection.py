@@ -63,6 +63,10 @@ class SeenPoints(Rows):
     sigma_m: NDArray[np.float64]
     scan_errors: NDArray[np.float64] | None = None
 
+    def scaled(self, factor: float) -> SeenPoints:
+        """Return the points with multiplied standard deviations."""
+        return replace(self, sigma_px=factor * self.sigma_px, sigma_m=factor * self.sigma_m)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Resection:

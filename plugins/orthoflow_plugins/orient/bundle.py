@@ -122,7 +122,7 @@ class OrientColmapBundle(Method):
 
     id: ClassVar[str] = "orient.colmap-bundle"
     determinism: ClassVar[Determinism] = "seeded"
-    result_version: ClassVar[int] = 6
+    result_version: ClassVar[int] = 7
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,
         MetricSpec("n_photo_points", label="tie points visible in several photos"),

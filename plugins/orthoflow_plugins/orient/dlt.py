@@ -95,7 +95,7 @@ class OrientDlt(Method):
 
     id: ClassVar[str] = "orient.dlt"
     determinism: ClassVar[Determinism] = "seeded"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "Abdel-Aziz, Karara 1971, Direct linear transformation, doi:10.14358/PERS.81.2.103",

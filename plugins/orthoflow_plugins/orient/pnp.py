@@ -45,7 +45,7 @@ class OrientPnp(Method):
 
     id: ClassVar[str] = "orient.pnp"
     determinism: ClassVar[Determinism] = "seeded"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.6, 4.3)",

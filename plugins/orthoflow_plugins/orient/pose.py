@@ -435,7 +435,9 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
     # Ties with the same point count only once towards a pose.
     if len(set(map(tuple, tied.seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
-    return Start(camera=best[0], lens=replace(lens, prior=best[0]), agreeing=agreeing)
+    if lens.source == UNKNOWN:
+        lens = replace(lens, prior=best[0])
+    return Start(camera=best[0], lens=lens, agreeing=agreeing)
 
 
 def adjusted(
@@ -457,9 +459,14 @@ def adjusted(
     camera, agreeing = start.camera, start.agreeing
     unit = unit_deviation(misfit(seen, camera).normalised[agreeing & ~is_check])
     for _ in range(MAX_ROUNDS):
-        used = agreeing & ~is_check
+        used, before = agreeing & ~is_check, unit
         lens = start.lens.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
-        control, soft_limit = seen.take(used), math.inf if solve else SOFT_LIMIT * unit
+        # The ties must agree with their standard deviations, since the weight of the prior of the
+        # lens is relative to theirs. The residuals are smaller, because the unknowns follow them.
+        n_free = 2 * used.sum() - POSE_PARAMETERS - lens.sigmas.size
+        follow = math.sqrt(2.0 * used.sum() / max(n_free, 1))
+        scale, soft_limit = unit * follow, math.inf if solve else SOFT_LIMIT / follow
+        control = seen.take(used).scaled(scale)
         # Use the lens of the prior if the lens is not adjusted.
         begin = camera if lens.sigmas.size else posed(prior, camera)
         if solve:
@@ -467,14 +474,17 @@ def adjusted(
         else:
             camera = fitted(control, begin, prior=prior, lens=lens, soft_limit=soft_limit)
         fit = misfit(seen, camera)
-        before, unit = unit, unit_deviation(fit.normalised[used])
+        unit = unit_deviation(fit.normalised[used])
         limit = without_chance(fit.normalised[~is_check], params.rejection_sigma * unit)
         again = fit.normalised <= limit
         if np.array_equal(again & ~is_check, used) and abs(unit / before - 1.0) < _SETTLED_SHARE:
             break
         agreeing = again
-    resection = stated(
+    found = stated(
         control, camera, prior=prior, lens=lens, independent=False, soft_limit=soft_limit
+    )
+    resection = replace(
+        found, sigma0=scale * found.sigma0, variance_factor=scale**2 * found.variance_factor
     )
     source = start.lens.source
     return Estimate(resection=resection, source=source, fit=fit, agreeing=again, limit=limit)
