@@ -36,7 +36,7 @@ from orthoflow_plugins.orient.report import Oriented
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.key_points import Features
-from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
+from orthoflow.products import Cameras, Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
 from tests import samples
@@ -212,6 +212,20 @@ def test_a_photo_whose_exif_the_others_contradict_is_tried_again_with_their_foca
     assert cameras[3].viewing().fx == pytest.approx(840.0, rel=0.03)
     again = [each.subject for each in ctx.diagnostics if each.code == "exif-focal-left-out"]
     assert again == ["d.png"]
+
+
+@pytest.mark.parametrize(("method", "own"), [(OrientColmapBundle, ALONE), (OrientPnp, {})])
+def test_few_of_the_ties_that_are_used_agree_by_chance(
+    tmp_path: Path, method: type[OrientPnp | OrientColmapBundle], own: dict[str, bool]
+) -> None:
+    """Four of five are anywhere within 8 px: of those within 3.5 sigma, a fifth would be wrong."""
+    ties, rng = bs.scan_ties(2, n=600, wrong_share=0.0), np.random.default_rng(3)
+    off_px = (np.arange(len(ties.photo)) % 5 > 0)[:, None] * rng.uniform(-8.0, 8.0, (2400, 2))
+    spread = replace(ties, pixels_photo=ties.pixels_photo + off_px)
+    found = tp.oriented(method, spread, bs.photos(calibrated=True), context(tmp_path), **own)
+    assert found.ties is not None
+    is_used = found.ties.role == TieRole.CONTROL
+    assert 0.02 < off_px[is_used].any(axis=1).mean() < 0.12
 
 
 @pytest.mark.parametrize(("zoom", "n_lenses"), [*long_only((0.92, 1)), (0.8, 4)])

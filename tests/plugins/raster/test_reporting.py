@@ -98,7 +98,7 @@ def test_cells_that_are_advised_are_no_longer_too_fine(ctx: StepContext) -> None
 def emptiness(**shares: float) -> Emptiness:
     return Emptiness(
         behind_m=0.4321 if "behind" in shares else math.nan,
-        before_m=2.7654 if "before" in shares else math.nan,
+        before_m=2.7254 if "before" in shares else math.nan,
         shares={cause: shares.get(cause, 0.0) for cause in reporting.CAUSES},
     )
 
