@@ -337,14 +337,25 @@ def test_the_noise_of_a_flat_wall_is_measured(noise_m: float) -> None:
     assert found == pytest.approx((noise_m, noise_m), rel=0.15)
 
 
+@pytest.mark.usefixtures("all_places")
+def test_errors_that_neighbours_share_are_no_smaller_than_those_of_single_points() -> None:
+    rough, smooth = (sampled((FLAT,), noise_m=noise_m)[::3] for noise_m in (0.02, 0.005))
+    points = np.concatenate([rough, smooth[::2] + np.array([0.0, 5.0, 0.0])])
+    assert measure_noise(points) == pytest.approx((0.02, 0.02), rel=0.15)
+
+
 def test_errors_that_neighbours_share_show_in_large_neighbourhoods() -> None:
     points = sampled((FLAT,))
-    points[:, 1] += 0.015 * waves(np.random.default_rng(4), points[:, [0, 2]])
+    off_m = 0.015 * waves(np.random.default_rng(4), points[:, [0, 2]])
+    points[:, 1] += off_m
     found = measure_noise(points)
     assert found is not None
     single_m, shared_m = found
     assert single_m < 0.006
     assert shared_m > 0.004
+    # If a third of the walls is flat, it is relief.
+    points[:, 1] -= np.where(points[:, 0] < 4.0, off_m, 0.0)
+    assert max(measure_noise(points) or (1.0,)) < 0.003
 
 
 @pytest.mark.usefixtures("all_places")

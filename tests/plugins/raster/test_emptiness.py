@@ -208,3 +208,6 @@ def test_a_station_may_stand_anywhere(far_m: float) -> None:
     # Distant stray points do not enlarge the voxels.
     assert screened((0.3, 0.3, 5.0), (far_m, far_m, far_m)) == pytest.approx(1.0)
     assert screened((20.0, 0.3, 5.0), (far_m, far_m, far_m)) == 0.0
+    # Single points in voxels are stray and hide nothing.
+    lattice = 0.11 * np.stack(np.indices((20, 10, 10)), axis=-1).reshape(-1, 3) + [1.0, -0.2, 0.1]
+    assert screened((20.0, 0.3, 5.0), *lattice) == 0.0
