@@ -280,11 +280,12 @@ def test_metrics_are_those_of_the_planes_and_labels(detector: str, tmp_path: Pat
 
 def test_points_on_no_plane_are_reported_where_they_are_more_than_on_any(tmp_path: Path) -> None:
     cloud, _ = example_room(n_points=40_000)
-    _, ctx = detect("hough2d", cloud, tmp_path, n_planes_max=1)
-    (share,) = (item.value for item in ctx.metrics if item.name == "labelled_share")
+    _, ctx = detect("hough2d", cloud, tmp_path, n_planes_max=3)
+    metrics = {item.name: item.value for item in ctx.metrics}
     (found,) = (item for item in ctx.diagnostics if item.code == "points-on-no-plane")
-    assert found.values["share"] == pytest.approx(1.0 - share)
-    assert found.values["largest"] == pytest.approx(share)
+    assert found.values["share"] == pytest.approx(1.0 - metrics["labelled_share"])
+    assert found.values["largest"] == pytest.approx(metrics["first_share"])
+    assert (found.values["min_share"], found.values["tolerance_m"]) == (0.0005, 0.1)
 
 
 every_kind = pytest.mark.parametrize("method", [Hough2d, Hough3d, Ransac, Region])
@@ -325,7 +326,10 @@ def detected(method: Any, points: NDArray[np.float64], folder: Path) -> Any:
     out, ctx = plane_scenes.detect(method, cloud_of(points), folder, seed=5)
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["tolerance_m"] == out.planes.tolerance_m
-    assert metrics["noise_mm"] == pytest.approx(1e3 * measure_noise(points)[0], rel=1e-3)
+    noise_m = measure_noise(points) or (0.0, 0.0)
+    expected = 1e3 * noise_m[0], *method.Params().tolerances_m(*noise_m)
+    found = [metrics[name] for name in ("noise_mm", "tolerance_m", "fit_tolerance_m")]
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
     return out.planes
 
 

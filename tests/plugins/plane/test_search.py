@@ -118,13 +118,14 @@ def test_a_refusal_has_the_criterion_that_refused(
 @pytest.mark.parametrize(
     ("points", "params", "criterion"),
     [
-        (sampled((wall(), FAR)), {"min_share": 0.7}, "few"),
+        # Candidates below 70 % of `min_share` are not refined.
+        *((sampled((wall(), FAR)), {"min_share": share}, "few") for share in (0.7, 0.9)),
         (filled_slab(), {}, "scattered"),
         (sampled((wall(half_m=(2.0, 0.03)),)), {}, "strip"),
         (barrel(2.0), {}, "bent"),
         (sampled((RAMP, FAR)), {"constraint": "vertical"}, "tilt"),
     ],
-    ids=["few", "filled", "strip", "barrel", "tilt"],
+    ids=["few", "far too few", "filled", "strip", "barrel", "tilt"],
 )
 def test_a_cloud_without_planes_is_refused_with_the_criterion(
     points: NDArray[np.float64], params: dict[str, Any], criterion: Criterion, tmp_path: Path
