@@ -13,7 +13,7 @@ photos whose error exceeds five expected standard deviations. `cloud` is the mea
 points that a photo shows. The scan cannot reveal this offset, so `true` and `stated` exclude it.
 `walls` are the planes of at least 4 m² that were found within 1 degree and 15 mm. With
 `--noise-m`, the geometry of the rooms is drawn as well, and the noise of the points of each room
-is drawn between these two values.
+is drawn between these two values, independently of the room.
 
 Real photos: These are folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11)
 with `images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same
@@ -192,8 +192,8 @@ def moved(camera: Camera, by_m: NDArray[np.float64]) -> Camera:
 
 
 def rms(pairs: list[tuple[float, float]]) -> NDArray[np.float64]:
-    """Return the RMS of the true and of the expected errors."""
-    return np.asarray(np.sqrt(np.mean(np.reshape(pairs, (-1, 2)) ** 2, axis=0)))
+    """Return the RMS of the true and of the expected errors; NaN if no photo is oriented."""
+    return np.asarray(np.sqrt(np.mean(np.square(pairs or [(np.nan, np.nan)]), axis=0)))
 
 
 def drawn(chosen: argparse.Namespace) -> None:
@@ -201,12 +201,15 @@ def drawn(chosen: argparse.Namespace) -> None:
     for cloud in chosen.clouds:
         rooms = []
         for seed in range(chosen.first, chosen.first + chosen.rooms):
-            noise_m = chosen.noise_m and np.random.default_rng(seed).uniform(*chosen.noise_m)
+            # A second key makes the noise independent of the room, which the seed alone draws.
+            noise_m = chosen.noise_m and np.random.default_rng([seed, 1]).uniform(*chosen.noise_m)
             with tempfile.TemporaryDirectory() as folder:
                 rooms.append(room(cloud, seed, folder, noise_m))
-            true, stated = 1e3 * rms(rooms[-1].errors_m)
             noise = f", noise {1e3 * noise_m:.1f} mm" if noise_m else ""
-            print(f"  {cloud} {seed}{noise}: true {true:.2f}, stated {stated:.2f} mm", flush=True)
+            shown = "no photo is oriented"
+            if rooms[-1].errors_m:
+                shown = "true {:.2f}, stated {:.2f} mm".format(*1e3 * rms(rooms[-1].errors_m))
+            print(f"  {cloud} {seed}{noise}: {shown}", flush=True)
             for reason in rooms[-1].refused:
                 print(f"  {cloud} {seed}: {reason}", flush=True)
         found = [pair for one in rooms for pair in one.errors_m]
