@@ -96,23 +96,6 @@ def test_a_lock_is_shared_by_many_or_held_by_one(tmp_path: Path) -> None:
     assert not is_locked(path)
 
 
-def test_a_file_system_without_locks_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import fcntl
-
-    def refuse(descriptor: int, mode: int) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    path = tmp_path / "lock"
-    with pytest.raises(StoreError) as caught, shared_lock(path):
-        pass
-    assert str(caught.value) == (
-        f"cannot lock {path}: No locks available; use a file system that supports locks"
-    )
-
-
 # --- disks ---
 
 

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from orthoflow_plugins.inspect.figures import (
-    colour_error_map,
-    depth_error_map,
     enlargement,
     vector_map,
 )
@@ -21,7 +19,6 @@ from orthoflow_plugins.inspect.findings import (
     report,
 )
 
-from orthoflow.files.images import decode_image
 from orthoflow.products import Finding
 from tests.inspect_scenes import image_of
 from tests.raster_scenes import context, numbers
@@ -138,21 +135,6 @@ def arrows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     monkeypatch.setattr(Axes, "quiver", draw)
     monkeypatch.setattr(Axes, "quiverkey", draw_key)
     return kept
-
-
-def test_maps_have_the_width_of_a_column_and_a_colour_bar() -> None:
-    error = np.full((1_800, 450), 30.0)
-    error[:900] = np.nan
-    frame = image_of(np.full((1_800, 450), 80.0)).frame
-    shown = decode_image(colour_error_map(error, frame), "map").astype(int)
-    assert shown.shape[1] == 1003
-    middle = shown[:, 502]
-    # Unknown cells are grey; half of the range has the middle colour.
-    np.testing.assert_allclose(middle[200], (138, 148, 158), atol=12)
-    np.testing.assert_allclose(middle[1200], (188, 55, 84), atol=12)
-    square = depth_error_map(np.full((300, 300), 0.01), image_of(np.full((300, 300), 80.0)).frame)
-    red, _, blue = decode_image(square, "map")[300, 502]
-    assert red > blue
 
 
 def test_arrows_point_from_true_to_shown_places(arrows: list[tuple[Any, ...]]) -> None:

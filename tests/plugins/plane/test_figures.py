@@ -15,7 +15,6 @@ from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.region import Region
 
-from orthoflow.files.drawing import plane_ink
 from tests.plane_scenes import STATION, Rectangle, cloud_of, detect, sampled
 
 ORIGIN: Final = np.array([100.0, 200.0, 50.0])
@@ -80,32 +79,6 @@ def test_deviations_are_drawn_with_the_gauss_curve_of_their_fit(
         np.testing.assert_allclose(found[5:-5], expected[5:-5], atol=0.35)
 
 
-def test_planes_are_drawn_with_their_points_and_rectangles(
-    drawings: dict[str, Any], tmp_path: Path
-) -> None:
-    planes, labels = detected(Hough2d, tmp_path)
-    above, below = drawings["planes"].axes
-    # Axes of the view, which is from an azimuth of -60 and an elevation of 35 degrees.
-    azimuth, elevation = math.radians(-60.0), math.radians(35.0)
-    towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-    across = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-    rise = np.array([0.0, 0.0, math.cos(elevation)]) - math.sin(elevation) * towards
-    view = np.array([across, rise])
-    flat = POINTS @ view.T
-    # Points on no plane are drawn, and planes that face the viewer.
-    turned = np.flatnonzero(planes.normal @ np.cross(across, rise) > 0.0)
-    assert 2 < len(turned) < len(planes)
-    for k, drawn in zip((-1, *turned), lines(above), strict=True):
-        np.testing.assert_allclose(drawn, flat[labels == k].T, atol=1e-6)
-    backdrop, *rectangles = lines(below)
-    np.testing.assert_allclose(backdrop, flat.T, atol=1e-6)
-    for corners, drawn in zip(planes.part_corners, rectangles, strict=True):
-        around = (corners[[0, 1, 2, 3, 0]] - ORIGIN) @ view.T
-        np.testing.assert_allclose(drawn, around.T, atol=1e-9)
-    legend = drawings["planes"].legends[0].texts
-    assert [text.get_text() for text in legend] == list(planes.names)
-
-
 def test_thickness_is_drawn_by_plane_material_and_row(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -134,30 +107,6 @@ def test_thickness_is_drawn_by_plane_material_and_row(
     every, dark, bright = lines(in_row)
     assert every.shape[1] == planes.scan_row.n_points == dark.shape[1] + bright.shape[1]
     assert np.std(every[1]) == pytest.approx(2.0, rel=0.2)
-
-
-def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
-    drawings: dict[str, Any], tmp_path: Path
-) -> None:
-    planes, _ = detected(Hough2d, tmp_path)
-    above, below, *_ = drawings["accumulator"].axes
-    plan, extent = image(above)
-    assert plan.sum() == len(POINTS)
-    centre = extent.reshape(2, 2).mean(axis=1)
-    np.testing.assert_allclose(lines(below)[0][:, 0], brightest(below), atol=1e-9)
-    # The floor is not a line in the plan.
-    walls = np.flatnonzero(np.abs(planes.normal[:, 2]) < 0.5)
-    for k, line, mark in zip(walls, lines(above)[1:], lines(below)[1:], strict=True):
-        corners = planes.corners[k] - ORIGIN
-        np.testing.assert_allclose(line.T, corners[[1, 2], :2])
-        # From the centre of the plan, r = x cos + y sin.
-        angle, distance_m = np.radians(mark[0, 0]), mark[1, 0]
-        direction = np.array([np.cos(angle), np.sin(angle)])
-        assert abs(planes.normal[k, :2] @ direction) == pytest.approx(1.0, abs=1e-4)
-        assert distance_m == pytest.approx(direction @ (corners.mean(axis=0)[:2] - centre))
-    # A plane has the same colour in all figures.
-    for axes in (above, below):
-        assert [line.get_color() for line in axes.lines[1:]] == [plane_ink(k) for k in walls]
 
 
 def test_directions_sections_and_voxels_show_the_planes(

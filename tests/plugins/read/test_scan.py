@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.read import figures, scales
+from orthoflow_plugins.read import scales
 from orthoflow_plugins.read.assembly import CloudAssembly, rounding_m
-from orthoflow_plugins.read.figures import plan_view, polar_view_png, scan_lines_png
+from orthoflow_plugins.read.figures import plan_view, polar_view_png
 from orthoflow_plugins.read.scales import ColourScale, IntensityScale, choose_scales, normalise
 from orthoflow_plugins.read.scan import ReadScan
 
@@ -648,32 +648,3 @@ def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool
 
 
 # --- rows and columns in rectangular coordinates ---
-
-
-def wall_scan(*, station_y: float = -2.0) -> PointCloud:
-    """Return walls of 4 m x 2 m in y = 0 and 1 m x 2 m beside it, in 80 rows and 200 columns."""
-    row, column = (grid.ravel() for grid in np.mgrid[:80, :200])
-    x, z = 0.025 * column, 0.025 * row
-    on_main = column < 160
-    points = np.column_stack([np.minimum(x, 4.0), np.where(on_main, 0.0, -(x - 4.0)), z])
-    cloud = cloud_of(points, stations=np.array([[2.0, station_y, 1.0]]))
-    # The left half is dark.
-    intensity = np.where(x < 2.0, 0.0, 1.0).astype(np.float32)
-    rows, columns = row.astype(np.uint32), column.astype(np.uint32)
-    return replace(cloud, row=rows, column=columns, intensity=intensity)
-
-
-def test_rows_and_columns_are_lines_over_the_fullest_wall() -> None:
-    shown = pixels(scan_lines_png(wall_scan()))[..., ::-1]
-    # 3.975 m are 1200 pixels, and points within 15 cm of the wall are drawn.
-    assert shown.shape[1] == 1200
-    assert shown.shape[0] == pytest.approx(1200 * 1.975 / 3.975, abs=8)
-    is_row = (shown == figures.ROW_RGB).all(axis=2)
-    is_column = (shown == figures.COLUMN_RGB).all(axis=2)
-    # Every third of 80 rows and every seventh of 167 columns are straight from edge to edge; the
-    # last columns are on the other wall, behind each other and outside the picture.
-    full_rows = (is_row | is_column).mean(axis=1) > 0.98
-    full_columns = is_column.mean(axis=0) > 0.98
-    assert 26 <= full_rows.sum() <= 27
-    assert full_columns.sum() == 23
-    assert set(np.diff(np.flatnonzero(full_rows))) <= {22, 23}

@@ -21,7 +21,6 @@ from orthoflow_plugins.simulate.building import (
     wall_side,
 )
 from orthoflow_plugins.simulate.room_model import (
-    CEILING_M,
     DESIGNED,
     MOST_TEXTILE,
     Room,
@@ -295,20 +294,3 @@ def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:
             assert not overlaps(one, other)
     # All kinds are equally likely; the fourth is empty.
     assert max(kinds.values()) < 1.6 * min(kinds.values())
-
-
-def test_cornices_are_up_to_three_even_steps_below_the_ceiling() -> None:
-    counts = set()
-    for found in map(drawn, range(30)):
-        steps = [
-            (depth_m, extent[2])
-            for depth_m, extent in found.stone
-            # Along the whole wall, without a skirting board.
-            if extent[1] - extent[0] > 5.7 and extent[3] > CEILING_M
-        ]
-        counts.add(len(steps))
-        for number, (depth_m, low_m) in enumerate(steps):
-            assert depth_m == pytest.approx(steps[-1][0] * (number + 1) / len(steps))
-            height_m = CEILING_M - steps[0][1]
-            assert low_m == pytest.approx(CEILING_M - height_m * (1.0 - number / len(steps)))
-    assert counts == {0, 1, 2, 3}
