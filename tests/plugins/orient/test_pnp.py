@@ -86,14 +86,24 @@ def test_a_factor_of_sigmas_changes_no_pose(tmp_path: Path, known: bool, factor:
     assert same.sigma_wall_m == pytest.approx(right.sigma_wall_m, rel=0.02)
 
 
-@pytest.mark.parametrize(("n_other", "is_refused"), [(190, True), (60, False)])
-def test_photos_of_equal_walls_are_refused(tmp_path: Path, n_other: int, is_refused: bool) -> None:
-    camera = ms.camera_before()
-    own = known_ties(camera, 3)
-    # The same content is on a wall 5 m to the right; with few ties there, it is a repeated motif.
-    other = known_ties(camera, 4, n=n_other)
-    away_m = np.array([5.0, 0.0, 0.0])
-    both = tp.joined(own, replace(other, points_world=other.points_world + away_m))
+@pytest.mark.parametrize(
+    ("n_other", "wrong_share", "away_m", "y_m", "is_refused"),
+    [
+        (190, 0.0, 5.0, -2.6, True),
+        # With few ties there, it is a repeated motif.
+        *((60, 0.0, 5.0, -2.6, False), (190, 0.7, 5.0, -2.6, False)),
+        # Poses near each other show the same wall, and nobody sees a wall from behind.
+        *((190, 0.0, 0.1, -2.6, False), (190, 0.0, 0.0, 2.6, False)),
+    ],
+)
+def test_photos_of_equal_walls_are_refused(
+    tmp_path: Path, n_other: int, wrong_share: float, away_m: float, y_m: float, is_refused: bool
+) -> None:
+    """The same content is on a wall to the right."""
+    camera, beyond = (ms.camera_before(centre=(1.2, y, 1.1)) for y in (-2.6, y_m))
+    other = known_ties(beyond, 4, n=n_other, wrong_share=wrong_share)
+    other = replace(other, points_world=other.points_world + np.array([away_m, 0.0, 0.0]))
+    both = tp.joined(known_ties(camera, 3), other)
     found = orient(both, calibrated(camera), context(tmp_path)).cameras[0]
     assert found.is_ambiguous == is_refused
     assert (found.status == "ok") != is_refused
