@@ -229,5 +229,11 @@ def test_points_without_redundancy_count_as_independent(n_points: int, sigma0: f
         towards=np.tile([0.0, 0.0, 1.0], (n_points, 1)),
         cofactors=np.linalg.inv(flat.T @ flat),
     )
-    stated = honest_covariance(points, sigma0)
-    np.testing.assert_allclose(stated, sigma0**2 * points.cofactors, atol=1e-12)
+    independent = sigma0**2 * points.cofactors
+    np.testing.assert_allclose(honest_covariance(points, sigma0), independent, atol=1e-12)
+    if n_points == 3:
+        # No residual shows the errors of scans.
+        errors = rng.normal(0.0, 1e-3, (n_points, 3, 2))
+        moved = points.cofactors @ np.einsum("npd,ndq->pq", points.pulls, errors)
+        stated = honest_covariance(replace(points, scan_errors=errors), sigma0)
+        np.testing.assert_allclose(stated, independent + moved @ moved.T, rtol=1e-6)
