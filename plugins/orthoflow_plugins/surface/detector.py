@@ -74,7 +74,7 @@ class DetectorOut(Ports):
 class Detector(Method):
     """Base class of the detectors of curved surfaces."""
 
-    result_version = 8
+    result_version = 9
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[MetricSpec | str, ...]] = (
         MetricSpec("n_surfaces", label="curved surfaces found"),

@@ -358,16 +358,7 @@ def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> F
     if min(best.radius_m, middle.radius_m) <= 0.0 or not (is_near & on).any():
         return None
     rms_m = math.sqrt(max(0.0, float((within + n * rest**2)[is_near].sum() / n[is_near].sum())))
-    is_on = np.zeros((around, along), dtype=np.bool_)
-    is_on[i, j] = on
-    arc, ends = _extent(is_on, sums[:, :, 0], middle.least_row_share)
-    # Positions along the axis of a cone are measured from its apex.
-    start_m = bounds[0] - middle_m + (middle.radius_m / middle.slope if middle.slope > 0.0 else 0.0)
-    along_m = float(start_m + size_m * ends[0]), float(start_m + size_m * ends[1])
-    if is_sphere:
-        # Rows of cells are between planes across the axis.
-        least, most = (math.acos(min(1.0, max(-1.0, at / middle.radius_m))) for at in along_m[::-1])
-        along_m, arc = (middle.radius_m * least, middle.radius_m * most), (-most, most)
+    along_m, arc = _ends(middle, sums, bounds, (i[on], j[on]), rest[on], middle_m)
     surface = Surface(
         name="",
         shape=middle.shape(cloud.origin, is_concave=found.side > 0.0),
@@ -387,6 +378,84 @@ def _fitted(found: Found, near: _Near, cloud: PointCloud, *, is_cone: bool) -> F
         slope=slope,
         variation=variation,
     )
+
+
+def _ends(
+    best: Round,
+    sums: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    cells: tuple[NDArray[np.int64], NDArray[np.int64]],
+    distances: NDArray[np.float64],
+    middle_m: float,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of positions along the axis and of angles of a `Surface`.
+
+    Args:
+        best: the surface.
+        sums: see `_Near`.
+        bounds: see `Cells`.
+        cells: indices (m,) of the cells on the surface around the axis and along it.
+        distances: (m,) their mean distances.
+        middle_m: position along the axis of the surface's point.
+    """
+    (around, along), size_m = sums.shape[:2], (bounds[1] - bounds[0]) / sums.shape[1]
+    is_on = np.zeros((around, along), dtype=np.bool_)
+    is_on[cells] = True
+    if best.is_sphere:
+        places_m = bounds[0] + (np.arange(along) + 0.5) * size_m
+        is_on = _above_springing(
+            is_on, cells, distances, sums[cells][:, 0], places_m, best.radius_m
+        )
+    arc, ends = _extent(is_on, sums[:, :, 0], best.least_row_share)
+    # Positions along the axis of a cone are measured from its apex.
+    start_m = bounds[0] - middle_m + (best.radius_m / best.slope if best.slope > 0.0 else 0.0)
+    along_m = float(start_m + size_m * ends[0]), float(start_m + size_m * ends[1])
+    if best.is_sphere:
+        # Rows of cells are between planes across the axis.
+        least, most = (math.acos(min(1.0, max(-1.0, at / best.radius_m))) for at in along_m[::-1])
+        along_m, arc = (best.radius_m * least, best.radius_m * most), (-most, most)
+    return along_m, arc
+
+
+def _above_springing(
+    is_on: NDArray[np.bool_],
+    cells: tuple[NDArray[np.int64], NDArray[np.int64]],
+    distances: NDArray[np.float64],
+    counts: NDArray[np.float64],
+    places_m: NDArray[np.float64],
+    radius_m: float,
+) -> NDArray[np.bool_]:
+    """Return the cells of a sphere without those of walls below or beside it.
+
+    A drum continues a dome without an edge, and leaves its sphere only by millimetres in the first
+    decimetres. The means of rows show where the meridians become straight.
+
+    Args:
+        is_on: (around, along) whether a cell is on the sphere.
+        cells: indices (m,) of these cells around the axis and along it.
+        distances: (m,) their mean distances.
+        counts: (m,) their numbers of points.
+        places_m: (along,) positions of the rows along the axis.
+        radius_m: radius of the sphere.
+    """
+    # Walls cross a sphere in lines one or two cells wide, also below its springing line.
+    square = np.ones((3, 3), dtype=np.bool_)
+    wide = ndimage.binary_opening(np.pad(is_on, ((4, 4), (0, 0)), mode="wrap"), square)
+    is_on = is_on & ndimage.binary_dilation(wide, square, iterations=2)[4:-4]
+    kept = is_on[cells]
+    rows, weights = cells[1][kept], counts[kept]
+    own = np.unique(rows)
+    n = np.bincount(rows, weights)[own]
+    means = np.bincount(rows, weights * distances[kept])[own] / n
+    arcs_m = radius_m * np.arccos(np.clip(places_m[own] / radius_m, -1.0, 1.0))
+    # Each row of this matrix contains the distances of a line that begins in this row of cells.
+    expected = np.hypot(radius_m, np.maximum(arcs_m - arcs_m[:, None], 0.0)) - radius_m
+    squares, free = (means - expected) ** 2 @ n, len(own) - 2
+    gain = float(n @ means**2 - squares.min())
+    chance = special.fdtrc(1, free, free * gain / max(squares.min(), 1e-12)) if free > 0 else 1.0
+    if chance < _LEVELS[1]:
+        is_on[:, places_m < places_m[own[np.argmin(squares)]]] = False
+    return is_on
 
 
 def _inside(cells: _Means, weights: NDArray[np.float64], *, is_open_beside: bool) -> _Means:
